@@ -86,16 +86,38 @@ def import_(
     ] = "",
     polled: Annotated[
         bool,
+        typer.Option("--polled", help="Samples were polled from a controller of --rate: put them on its clock."),
+    ] = False,
+    resample: Annotated[
+        float | None,
         typer.Option(
-            "--polled", help="Timestamps jitter because samples were polled: resample to an even clock at --rate."
+            "--resample",
+            help="Put samples with uneven times, or polled ones, on an even clock of this rate, Hz; holes are gaps.",
+            min=0.001,
         ),
+    ] = None,
+    time_unit: Annotated[
+        str | None, typer.Option("--time-unit", help="Unit of the times: s, ms, us or ns; default: s.")
+    ] = None,
+    topic: Annotated[
+        str | None, typer.Option("--topic", help="Topic of joint states, if a bag has several with the robot's joints.")
+    ] = None,
+    joints: Annotated[
+        str, typer.Option("--joints", help="Joint names in the file, in the robot's order: NAME,NAME,...")
+    ] = "",
+    by_position: Annotated[
+        bool, typer.Option("--by-position", help="Take joints of other names in the order of the file.")
     ] = False,
 ) -> None:
     """Convert measurements of other tools to a recording.
 
-    CSV columns: t (s), q1..qn, tau1..taun or current1..currentn, optionally the reference qr1..qrn; SI units. MAT, NPZ
-    and Parquet: the same names, or positions, torques, times. ROS 2 bags (.mcap): sensor_msgs/msg/JointState. Logs of
-    a bus (candump -l, .asc, .blf, .trc): SYNC and TPDOs, as the session configuration maps them.
+    CSV columns: t (s), q1..qn, tau1..taun or current1..currentn, optionally the reference qr1..qrn; SI units. Columns
+    may be named after joints, such as elbow/position and elbow/effort. MAT, NPZ and Parquet: the same names, or
+    positions, torques, times. LeRobot data sets (file or folder): observation.state, and an effort or current. ROS 2
+    bags (.mcap, .db3, or the folder): sensor_msgs/msg/JointState, joints by their names. Logs of a bus (candump -l,
+    .asc, .blf, .trc): SYNC and TPDOs, as the session configuration maps them.
+
+    Missing samples are gaps. Damaged lines are left out, counted and named.
 
     A recording of armident (.mcap) is resampled to --rate, with an anti-alias filter.
 
@@ -110,7 +132,8 @@ def import_(
     if config is None and not own:
         raise ConfigError(f"{file}: --config is missing, the robot configuration")
     if file.suffix.lower() in SUFFIXES:
-        if effort is not None or motor_side or rate is not None or names or polled:
+        others = (effort, motor_side, rate, names, polled, resample, time_unit, topic, joints, by_position)
+        if any(others):
             raise ConfigError(f"{file}: a bus log takes no option but --config and --out")
         session = load_session(str(config))
         logged = recording_from_log(file, session, load_robot(session.robot))
@@ -131,10 +154,15 @@ def import_(
         rate_hz=rate,
         names={key: value for key, _, value in pairs},
         polled=polled,
+        resample_hz=resample,
+        time_unit=time_unit,
+        topic=topic,
+        joints=[name.strip() for name in joints.split(",")] if joints else None,
+        by_position=by_position,
     )
     write_recording(recording, out)
-    rows, fields = recording.samples.sync.size, _fields(recording)
-    print(f"{out}: {rows} samples at {recording.sample_rate_hz:g} Hz, {fields}")
+    rows, gaps, fields = recording.samples.sync.size, recording.counters.get("samples.in_gaps", 0), _fields(recording)
+    print(f"{out}: {rows} samples at {recording.sample_rate_hz:g} Hz, {f'{gaps} in gaps, ' if gaps else ''}{fields}")
 
 
 def _fields(recording: "Recording") -> str:

@@ -96,7 +96,7 @@ class Joint(FrozenModel):
     rotor_inertia
         ``True`` if the rotor inertia ``ia`` is a separate parameter of the model.
     source_name
-        Name of the joint in the file that the geometry comes from, if that is not ``name``.
+        Name of the joint in its URDF and in messages of ROS 2; ``None``: the same as ``name``.
     """
 
     name: JointName
@@ -105,7 +105,7 @@ class Joint(FrozenModel):
     limits: Limits = Limits()
     drive: Drive = Drive()
     rotor_inertia: bool = True
-    source_name: str | None = None
+    source_name: Annotated[str, Field(min_length=1)] | None = None
 
     @model_validator(mode="before")
     @classmethod
@@ -273,6 +273,9 @@ class RobotConfig(FrozenModel):
         names = [j.name for j in self.joints]
         if len({name.lower() for name in names}) != n:
             raise ValueError("joints: names must be unique, without regard to case")
+        sources = [j.source_name for j in self.joints if j.source_name is not None]
+        if len(set(sources)) != len(sources):
+            raise ValueError("joints: source names must be unique")
         if self.transmission is not None:
             if len(self.transmission) != n or any(len(row) != n for row in self.transmission):
                 raise ValueError(f"transmission: expected {n} rows of {n} numbers (motor rows, joint columns)")

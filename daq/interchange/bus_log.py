@@ -1,42 +1,36 @@
-"""Conversion between recordings and logs of CAN tools: candump, BLF, ASC and other formats of python-can.
+"""Conversion between recordings and logs of CAN tools: candump, Vector ASC and BLF, PEAK TRC.
 
 The session configuration defines the frames that hold samples. They are processed like captured frames: matched to
 their SYNC, with every SYNC accounted for.
 """
 
 import hashlib
-import itertools
+import logging
 import os
-import sys
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import can
 import numpy as np
 from numpy.typing import NDArray
-from rich.console import Console
-from rich.progress import Progress, SpinnerColumn, TextColumn
 
 from armident.configs import ConfigError, DataError, RobotConfig, SessionConfig
-from armident.configs.yaml_loader import is_file
-from armident.daq.interchange.sandbox import error_line
+from armident.daq.interchange.log_clock import check_sync_period
+from armident.daq.interchange.log_file import SUFFIXES, read_log
 from armident.daq.matching.assembler import Assembler, Batch
 from armident.daq.matching.streams import CapturedStream, bus_numbers, captured_streams
 from armident.daq.recording import Gap, Recording, Stream
-from armident.drivers.can.frames import Frames, frames
+from armident.drivers.can.frames import Frames
 from armident.drivers.canopen.objects import COB_SYNC
 
-SUFFIXES = (".log", ".asc", ".blf", ".trc")
-"""File name suffixes of logs: candump -l, Vector ASC and BLF, PEAK TRC."""
+__all__ = ["SUFFIXES", "recording_from_log", "write_log"]
 
 _BATCH = 4096
-_SMALLEST_OBJECT = 16
-"""Size of the header of an object in a BLF file, bytes."""
 _TURN_NS = 1_000_000_000
 _ANSWER_NS = 20_000
 """Time between frames of a SYNC in a log written from a recording, which has only the time of the SYNC, ns."""
+NOTES = "import_notes"
+"""Key of the metadata with everything that an import left out or interpreted."""
 
 
 def recording_from_log(path: Path, session: SessionConfig, robot: RobotConfig) -> Recording:
@@ -49,16 +43,19 @@ def recording_from_log(path: Path, session: SessionConfig, robot: RobotConfig) -
     session, robot
         Mapping of the TPDOs, and scales of their objects.
 
+    Lines and blocks that are damaged are left out, counted and named in warnings and in the metadata.
+
     Raises
     ------
     ConfigError
         If there is no such file, it lacks a bus of the session, or the session's buses carry CAN FD.
     DataError
-        If it cannot be read as such a log, or holds no SYNC.
+        If it cannot be read as such a log, holds no SYNC, its SYNC period differs from that of the session, or a drive
+        sends no TPDO of the length that the session maps.
     """
     _check_classic(session, str(path))
     streams = captured_streams(session, robot)
-    log = _read(path)
+    log = read_log(path)
     read = [log.of(path, bus.channel, len(session.all_buses) > 1) for bus in session.all_buses]
     for bus, frames_of_it in zip(session.all_buses, read, strict=True):
         if not np.any(frames_of_it["can_id"] == COB_SYNC):
@@ -67,6 +64,8 @@ def recording_from_log(path: Path, session: SessionConfig, robot: RobotConfig) -
                 f"{path}: no SYNC ({COB_SYNC:X}h) among its {frames_of_it.size} frames{where}: "
                 "samples cannot be matched"
             )
+        check_sync_period(path, frames_of_it, session)
+    wrong = _wrong_lengths(path, read, streams, robot)
     assembler = Assembler(
         [stream.bus for stream in streams],
         [joint.name for joint in robot.joints],
@@ -80,7 +79,11 @@ def recording_from_log(path: Path, session: SessionConfig, robot: RobotConfig) -
     found = {stream.bus.name: _stream(stream, parts) for stream in streams}
     if found["samples"].sync.size == 0:
         wanted = ", ".join(f"{cob:X}h" for cob in streams[0].bus.cob_ids)
-        raise DataError(f"{path}: no SYNC was answered by all drives; the session expects TPDOs {wanted}")
+        silent = _silent(read, streams, robot)
+        raise DataError(f"{path}: no SYNC was answered by all drives; the session expects TPDOs {wanted}{silent}")
+    notes = (*log.notes, *wrong)
+    for note in notes:
+        logging.getLogger(__name__).warning("%s: %s", path, note)
     gaps: list[Gap] = [gap for part in parts for gap in part.gaps]
     return Recording(
         None,
@@ -89,9 +92,39 @@ def recording_from_log(path: Path, session: SessionConfig, robot: RobotConfig) -
         1.0 / session.sync_period,
         found,
         tuple(gaps),
-        counters=assembler.counters | {"log.foreign": log.foreign},
-        metadata={"source": path.name, "source_sha256": _digest(path)},
+        counters=assembler.counters | {"log.foreign": log.foreign, "log.skipped": log.skipped},
+        metadata={"source": path.name, "source_sha256": _digest(path)} | ({NOTES: "; ".join(notes)} if notes else {}),
     )
+
+
+def _wrong_lengths(
+    path: Path, read: Sequence[Frames], streams: Sequence[CapturedStream], robot: RobotConfig
+) -> tuple[str, ...]:
+    """Return a sentence for every TPDO some of whose frames have another length; refuse if all of them have."""
+    notes = []
+    for stream in streams:
+        for joint, cob_id in zip(robot.joints, stream.bus.cob_ids, strict=True):
+            lengths = np.concatenate([frames["length"][frames["can_id"] == cob_id] for frames in read])
+            others = lengths[lengths != stream.bus.length]
+            if not others.size:
+                continue
+            found = "/".join(str(length) for length in np.unique(others))
+            mapped = ", ".join(stream.tpdo.dtype.names or ())
+            what = (
+                f"TPDO {cob_id:X}h of {joint.name} has {found} bytes, "
+                f"the session maps {stream.bus.length} ({mapped}; streams.{stream.bus.name})"
+            )
+            if others.size == lengths.size:
+                raise DataError(f"{path}: {what}")
+            notes.append(f"{what}: {others.size} of {lengths.size} frames left out")
+    return tuple(notes)
+
+
+def _silent(read: Sequence[Frames], streams: Sequence[CapturedStream], robot: RobotConfig) -> str:
+    """Return the joints whose TPDOs are not in the log, for messages."""
+    seen = np.unique(np.concatenate([frames["can_id"] for frames in read]))
+    silent = [j.name for j, cob_id in zip(robot.joints, streams[0].bus.cob_ids, strict=True) if cob_id not in seen]
+    return f"; there is none of {', '.join(silent)}" if silent else ""
 
 
 def _check_classic(session: SessionConfig, where: str) -> None:
@@ -148,106 +181,6 @@ def write_log(recording: Recording, path: Path) -> None:
         raise ConfigError(f"{path}: cannot be written: {error.strerror}") from error
     finally:
         temporary.unlink(missing_ok=True)
-
-
-@dataclass(frozen=True)
-class _Log:
-    """Classic data frames with 11-bit identifiers, the number of each one's bus, and the number of other frames."""
-
-    frames: Frames
-    bus: NDArray[np.int64]
-    buses: tuple[str, ...]
-    foreign: int
-
-    def of(self, path: Path, bus: str, several: bool) -> Frames:
-        """Return the frames of one bus.
-
-        Parameters
-        ----------
-        path
-            The log, for messages.
-        bus
-            Name of the bus.
-        several
-            The session has several buses; otherwise the frames of the only bus in the log are returned.
-        """
-        if len(self.buses) < 2 and not (self.buses and several):
-            return self.frames
-        if bus not in self.buses:
-            raise ConfigError(f"{path}: holds the buses {', '.join(self.buses)}; the session's is {bus}")
-        chosen: Frames = self.frames[self.bus == self.buses.index(bus)]
-        return chosen
-
-
-def _read(path: Path) -> _Log:
-    if not is_file(path):
-        raise ConfigError(f"{path}: no such file")
-    numbers: dict[str, int] = {}
-    parts: list[tuple[Frames, NDArray[np.int64]]] = []
-    foreign = done = 0
-    try:
-        with _progress(path) as advance:
-            for messages in _batches(path):
-                batch, bus = frames(len(messages)), np.zeros(len(messages), np.int64)
-                count = 0
-                for message in messages:
-                    done += 1
-                    if message.is_error_frame or message.is_remote_frame or message.is_extended_id or message.is_fd:
-                        foreign += 1
-                        continue
-                    row = batch[count]
-                    row["t_ns"] = round(message.timestamp * 1e9)
-                    row["can_id"], row["length"] = message.arbitration_id, message.dlc
-                    row["data"][: message.dlc] = np.frombuffer(bytes(message.data), np.uint8)
-                    bus[count] = numbers.setdefault(str(message.channel), len(numbers))
-                    count += 1
-                parts.append((batch[:count], bus[:count]))
-                advance(done)
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be read: {error.strerror or error}") from error
-    except Exception as error:  # python-can's readers raise various errors for malformed files
-        raise DataError(
-            f"{path}: not a readable {path.suffix[1:]} log (after {done} frames): {error_line(error)}"
-        ) from error
-    if not parts:
-        raise DataError(f"{path}: no frames in it")
-    read = np.concatenate([part[0] for part in parts])
-    early = np.flatnonzero(read["t_ns"] < 0)
-    if early.size:
-        raise DataError(f"{path}: frame {early[0] + 1} has a time of {read['t_ns'][early[0]] * 1e-9:.6g} s")
-    return _Log(read, np.concatenate([p[1] for p in parts]), tuple(numbers), foreign)
-
-
-class _BlfReader(can.BLFReader):
-    """BLF reader of python-can, which would loop forever on objects of size zero."""
-
-    def _parse_data(self, data: bytes) -> Iterator[can.Message]:
-        at = data.find(b"LOBJ")
-        while 0 <= at <= len(data) - 16:
-            size = int.from_bytes(data[at + 8 : at + 12], "little")
-            if size < _SMALLEST_OBJECT:
-                raise ValueError(f"an object of {size} bytes")
-            at = data.find(b"LOBJ", at + size, at + size + 8)
-        yield from super()._parse_data(data)
-
-
-def _batches(path: Path) -> Iterator[list[can.Message]]:
-    # Absolute times; by default those of an ASC log would begin at zero.
-    options = {"relative_timestamp": False} if path.suffix.lower() == ".asc" else {}
-    opened = _BlfReader(path) if path.suffix.lower() == ".blf" else can.LogReader(path, **options)
-    with opened as reader:
-        messages = iter(reader)
-        while batch := list(itertools.islice(messages, _BATCH)):
-            yield batch
-
-
-@contextmanager
-def _progress(path: Path) -> Iterator[Callable[[int], None]]:
-    """Show the number of frames read, on a terminal."""
-    columns = SpinnerColumn(), TextColumn("{task.description}: {task.completed:.0f} frames")
-    with Progress(*columns, console=Console(stderr=True), transient=True, disable=not sys.stderr.isatty()) as progress:
-        task = progress.add_task(path.name, total=None)
-        yield lambda done: progress.update(task, completed=done)
 
 
 def _stream(stream: CapturedStream, parts: Sequence[Batch]) -> Stream:

@@ -1,0 +1,310 @@
+"""Tables in text files: header, quotes, comments, decimal commas, dates, and lines that are damaged."""
+
+import csv
+import math
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armident.configs import ConfigError, DataError
+from armident.daq.interchange.text_files import encoding_of, excerpt
+
+_COMMENTS = ("#", "%", "//")
+_DELIMITERS = (";", "\t", ",")
+_MOST_BAD_SHARE = 0.05
+"""Share of lines with damaged values above which a file is refused; a single line is always left out."""
+_LONGEST_HEAD = 100
+"""Lines before the first line of values."""
+_TAIL = 50
+"""Lines whose last value is compared with that of a last line without an end."""
+_DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+(?:[eE][-+]?\d+)?$")
+_UNIT = re.compile(
+    r"[\[(]?\s*(?:s|sec|ms|us|ns|µs|rad|deg|°|m|mm|n\.?\s?m|nm|a|ma|v|-|rad/s|m/s)\s*[\])]?$", re.IGNORECASE
+)
+
+
+@dataclass(frozen=True)
+class CsvTable:
+    """Values of a table in a text file.
+
+    Parameters
+    ----------
+    header
+        Name of each column; ``None`` if there is no header line.
+    units
+        Text of the line of units below the header, one per column; empty if there is none.
+    values
+        Values (N, columns); NaN where a cell is empty, and in the whole row of a damaged line.
+    lines
+        Line number of each row, (N,).
+    notes
+        Sentences on lines that were left out.
+    """
+
+    header: list[str] | None
+    units: list[str]
+    values: NDArray[np.float64]
+    lines: NDArray[np.int64]
+    notes: tuple[str, ...] = ()
+
+
+@dataclass
+class _Head:
+    """Beginning of a file: the columns and the first line of values, from 1."""
+
+    delimiter: str | None
+    columns: int
+    first: int
+    header: list[str] | None = None
+    units: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+
+
+def read_csv(path: Path) -> CsvTable:
+    """Return the table of a text file.
+
+    Lines of comments are passed over. Lines with another number of columns, or with a cell that is no number, are
+    damaged: their rows are NaN. Columns are separated by commas, semicolons, tabs or spaces; decimal commas are read
+    where they are not the separator. The first column, and those named after time, may hold dates (ISO 8601).
+
+    Parameters
+    ----------
+    path
+        The file.
+
+    Raises
+    ------
+    ConfigError
+        If it cannot be opened.
+    DataError
+        If it is no table of numbers, or too many of its lines are damaged.
+    """
+    try:
+        encoding = encoding_of(path)
+        with path.open(encoding=encoding, errors="replace", newline="") as file:
+            head = _head(path, file)
+        names = len(head.header or ())
+        if head.header is not None and names != head.columns:
+            hint = _commas_hint(head.columns, head)
+            raise DataError(f"{path}: {names} names in the header, {head.columns} columns of values{hint}")
+        return _fast(path, encoding, head) or _slow(path, encoding, head)
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read: {error.strerror or 'an error of the file system'}") from error
+
+
+def cells_of(line: str, delimiter: str | None) -> list[str]:
+    """Return the cells of a line without quotes and spaces around them.
+
+    Parameters
+    ----------
+    line
+        The line.
+    delimiter
+        Separator of the cells; ``None``: spaces.
+    """
+    text = line.strip("\r\n\0")
+    if delimiter is None:
+        words = text.replace('"', "").split()
+    elif '"' in text:
+        try:
+            words = next(csv.reader([text], delimiter=delimiter, skipinitialspace=True), [])
+        except csv.Error:
+            words = text.split(delimiter)
+    else:
+        words = text.split(delimiter)
+    return [word.strip().strip("'") for word in words]
+
+
+def seconds_of_date(text: str) -> float | None:
+    """Return the seconds since 1970 of a date with time of day (ISO 8601), or ``None``.
+
+    Parameters
+    ----------
+    text
+        The date; UTC if it has no zone.
+    """
+    if len(text) < 10 or text[4:5] != "-":
+        return None
+    # Python reads six digits of a second; the others are added.
+    found = re.fullmatch(r"(.*:\d\d)[.,](\d+)(.*)", text)
+    whole, digits, zone = found.groups() if found else (text, "", "")
+    try:
+        moment = datetime.fromisoformat(whole + zone)
+        moment = moment if moment.tzinfo is not None else moment.replace(tzinfo=UTC)
+        return moment.timestamp() + (float(f"0.{digits}") if digits else 0.0)
+    except (ValueError, OverflowError):
+        return None
+
+
+def _head(path: Path, lines: Iterator[str]) -> _Head:
+    """Find the first line of values and the header before it."""
+    before: list[tuple[int, str, bool]] = []
+    for number, line in enumerate(lines, start=1):
+        text = line.strip().strip("\0")
+        if number > _LONGEST_HEAD or len(text) > 1_000_000:
+            break
+        if not text or text.lower().startswith("sep="):
+            continue
+        comment = text.startswith(_COMMENTS)
+        delimiter = _delimiter(text)
+        cells = cells_of(text, delimiter)
+        if comment or not _are_values(cells):
+            before.append((number, text.lstrip("#%/ ") if comment else text, comment))
+            continue
+        return _with_header(_Head(delimiter, len(cells), number), before)
+    shown = f": line {before[0][0]} is {excerpt(before[0][1])}" if before else ""
+    raise DataError(f"{path}: no values in it{shown}")
+
+
+def _with_header(head: _Head, before: Sequence[tuple[int, str, bool]]) -> _Head:
+    """Find header and units among the lines before the values: those with as many cells."""
+    fits = [cells for _, text, _ in before if len(cells := cells_of(text, head.delimiter)) in _widths(head.columns)]
+    if not fits and before and not before[-1][2]:
+        # A header that does not fit the values is named by the caller.
+        fits = [cells_of(before[-1][1], head.delimiter)]
+    fits = [cells[: head.columns] if not any(cells[head.columns :]) else cells for cells in fits]
+    named = [cells for cells in fits if not all(not cell or _UNIT.match(cell) for cell in cells)]
+    if head.columns > 1 or (fits and not before[-1][2]):
+        if named:
+            head.header = named[-1]
+            head.units = next((c for c in fits[fits.index(named[-1]) + 1 :] if len(c) == head.columns), [])
+        elif fits:
+            head.header = fits[-1]
+    return head
+
+
+def _widths(columns: int) -> tuple[int, int]:
+    """Return the numbers of cells of a header: one more if it ends with a separator."""
+    return columns, columns + 1
+
+
+def _delimiter(text: str) -> str | None:
+    return next((each for each in _DELIMITERS if each in text), None)
+
+
+def _are_values(cells: Sequence[str]) -> bool:
+    """Return ``True`` if a line holds values: numbers, dates and empty cells, and at least one number."""
+    numbers = [_number(cell) for cell in cells]
+    known = all(value is not None or not cell for cell, value in zip(cells, numbers, strict=True))
+    return known and any(value is not None for value in numbers)
+
+
+def _number(cell: str) -> float | None:
+    try:
+        return float(cell) if "_" not in cell else None
+    except ValueError:
+        if _DECIMAL_COMMA.match(cell):
+            return float(cell.replace(",", "."))
+        return seconds_of_date(cell)
+
+
+def _fast(path: Path, encoding: str, head: _Head) -> CsvTable | None:
+    """Return a table of numbers alone; ``None`` if it holds anything else."""
+    try:
+        with path.open(encoding=encoding, newline="") as file:
+            lines = file.readlines()
+        if not lines[-1].endswith(("\n", "\r")) or "\0" in lines[-1]:
+            return None
+        rows = lines[head.first - 1 :]
+        values = np.loadtxt(rows, delimiter=head.delimiter, ndmin=2, comments=None, quotechar='"')
+    except (ValueError, IndexError):
+        return None
+    numbers = np.arange(head.first, head.first + len(rows))
+    if len(values) != len(rows):
+        numbers = numbers[[bool(row.strip()) for row in rows]]
+    if len(values) != len(numbers) or values.shape[1] != head.columns:
+        return None
+    return CsvTable(head.header, head.units, values, numbers, tuple(head.notes))
+
+
+@dataclass
+class _Bad:
+    """Damaged lines: their number, and the first of them."""
+
+    count: int = 0
+    first: str = ""
+
+    def add(self, text: str) -> None:
+        self.count += 1
+        self.first = self.first or text
+
+
+def _slow(path: Path, encoding: str, head: _Head) -> CsvTable:
+    """Return the table of a file with empty cells, dates, decimal commas, comments or damaged lines."""
+    rows: list[list[float]] = []
+    numbers: list[int] = []
+    bad = _Bad()
+    commas = repeated = 0
+    cells: list[str] = []
+    ends: list[int] = []
+    line = ""
+    with path.open(encoding=encoding, errors="replace", newline="") as file:
+        for number, line in enumerate(file, start=1):
+            text = line.strip().strip("\0")
+            if number < head.first or not text or text.startswith(_COMMENTS):
+                continue
+            cells = cells_of(text, head.delimiter)
+            if cells == head.header:
+                repeated += 1
+                continue
+            row, problem = _row(cells, head)
+            commas += any(_DECIMAL_COMMA.match(cell) is not None for cell in cells) and not problem
+            if problem:
+                bad.add(f"line {number}{problem}")
+            rows.append(row)
+            numbers.append(number)
+            ends = [*ends[-_TAIL:], len(cells[-1])]
+    if not rows:
+        raise DataError(f"{path}: no values in it")
+    notes = list(head.notes)
+    if line and not line.endswith(("\n", "\r")) and len(rows) > 1 and _is_cut(rows[-1], ends):
+        damaged = math.isnan(rows[-1][0]) and all(map(math.isnan, rows[-1]))
+        if damaged and bad.count:
+            bad.count -= 1
+        notes.append(f"the last line ({numbers[-1]}) is cut off and left out")
+        rows.pop()
+        numbers.pop()
+    if bad.count > max(1, _MOST_BAD_SHARE * len(rows)) or (bad.count and len(rows) == 1):
+        others = f" (and {bad.count - 1} more of {len(rows)} lines)" if bad.count > 1 else ""
+        raise DataError(f"{path}: {bad.first}{others}{_commas_hint(len(cells), head)}")
+    if bad.count:
+        one = f"1 line of {len(rows)} is" if bad.count == 1 else f"{bad.count} of {len(rows)} lines are"
+        notes.append(f"{one} damaged and left out{', the first' if bad.count > 1 else ''}: {bad.first}")
+    if commas:
+        notes.append(f"decimal commas are read as decimal points ({commas} lines)")
+    if repeated:
+        notes.append(f"header repeated and passed over: {repeated} times")
+    values = np.array(rows, dtype=np.float64)
+    return CsvTable(head.header, head.units, values, np.array(numbers), tuple(notes))
+
+
+def _row(cells: list[str], head: _Head) -> tuple[list[float], str]:
+    """Return the values of a line, and the problem with it as the end of a sentence."""
+    if len(cells) == head.columns + 1 and not cells[-1]:
+        cells = cells[:-1]
+    if len(cells) != head.columns:
+        return [math.nan] * head.columns, f" has {len(cells)} columns, expected {head.columns}"
+    values: list[float] = []
+    for k, cell in enumerate(cells, start=1):
+        value = _number(cell) if cell else math.nan
+        if value is None:
+            return [math.nan] * head.columns, f", column {k}: expected a number, found {excerpt(cell)}"
+        values.append(value)
+    return values, ""
+
+
+def _is_cut(row: Sequence[float], ends: Sequence[int]) -> bool:
+    """Return ``True`` if a last line without an end is damaged, or its last cell is shorter than all before."""
+    return all(map(math.isnan, row)) or ends[-1] < min(ends[:-1], default=0)
+
+
+def _commas_hint(columns: int, head: _Head) -> str:
+    names = len(head.header or ())
+    if head.delimiter == "," and names < columns <= 2 * names:
+        return "; decimal commas in a table with commas between columns: write it with semicolons"
+    return ""

@@ -1,0 +1,106 @@
+"""Resampling of samples with uneven times onto an even clock."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+
+from armident.configs import DataError
+
+HOLE = 1.5
+"""Steps longer than this number of usual ones, and than usual jitter beyond it, are holes."""
+_USUAL = 0.8
+"""Share of the steps whose deviations from the median are usual jitter."""
+_FEWEST = 4
+"""Rows that a cubic spline needs; shorter pieces between holes are left out."""
+_MOST_UNEVEN = 0.5
+"""Share of steps that are holes above which the rows are no samples of one motion."""
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class EvenSamples:
+    """Samples on an even clock, with gaps.
+
+    Parameters
+    ----------
+    numbers
+        Number of each sample, from 0, strictly increasing, (M,).
+    values
+        Quantities, (M, n) each.
+    holes
+        Number of holes.
+    left_out
+        Rows of pieces too short to resample.
+    steps_s
+        Quantiles 0.01, 0.5 and 0.99 of the steps of the times, s.
+    """
+
+    numbers: NDArray[np.int64]
+    values: dict[str, Floats]
+    holes: int
+    left_out: int
+    steps_s: tuple[float, float, float]
+
+
+def usual_rate(times: Floats) -> float:
+    """Return the rate of the usual step, 1/s.
+
+    Parameters
+    ----------
+    times
+        Times (N,), s, strictly increasing.
+    """
+    return 1.0 / float(np.median(np.diff(times)))
+
+
+def onto_even_times(times: Floats, raw: Mapping[str, Floats], rate_hz: float) -> EvenSamples:
+    """Return samples at even times: positions by cubic splines, efforts linearly; nothing across holes.
+
+    Parameters
+    ----------
+    times
+        Times (N,), s, strictly increasing.
+    raw
+        Quantities (N, n); ``position`` and ``demand`` are smooth, others are not.
+    rate_hz
+        Rate of the even clock, 1/s, not much below that of the rows.
+
+    Raises
+    ------
+    DataError
+        If there are too few rows, or too many holes.
+    """
+    steps = np.diff(times)
+    if steps.size + 1 < _FEWEST:
+        raise DataError(f"only {steps.size + 1} rows: too few to resample")
+    median = float(np.median(steps))
+    jitter = float(np.quantile(np.abs(steps / median - 1.0), _USUAL))
+    holes = np.flatnonzero(steps > (HOLE + jitter) * median)
+    if holes.size > _MOST_UNEVEN * steps.size:
+        raise DataError(f"{holes.size} of {steps.size} steps are holes: the rows are no samples of one clock")
+    numbers: list[NDArray[np.int64]] = []
+    values: dict[str, list[Floats]] = {name: [] for name in raw}
+    left_out = 0
+    relative = times - times[0]
+    for piece in np.split(np.arange(times.size), holes + 1):
+        own = relative[piece]
+        clock = np.arange(np.ceil(own[0] * rate_hz - 1e-6), np.floor(own[-1] * rate_hz + 1e-6) + 1, dtype=np.int64)
+        if piece.size < _FEWEST or not clock.size:
+            left_out += piece.size
+            continue
+        at = np.clip(clock / rate_hz, own[0], own[-1])
+        numbers.append(clock)
+        for name, array in raw.items():
+            if name in ("position", "demand"):
+                values[name].append(np.ascontiguousarray(CubicSpline(own, array[piece])(at)))
+            else:
+                values[name].append(np.stack([np.interp(at, own, column) for column in array[piece].T], axis=1))
+    if not numbers:
+        raise DataError("no piece without a hole is long enough to resample")
+    low, middle, high = (float(x) for x in np.quantile(steps, [0.01, 0.5, 0.99]))
+    joined = {name: np.concatenate(parts) for name, parts in values.items()}
+    return EvenSamples(np.concatenate(numbers), joined, holes.size, left_out, (low, middle, high))

@@ -1,0 +1,141 @@
+"""Data sets of LeRobot: Parquet with ``observation.state``, ``action`` and, where recorded, effort or current."""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armident.configs import DataError
+from armident.daq.interchange.table_columns import listed
+
+STATE, ACTION = "observation.state", "action"
+_EFFORTS = {
+    "tau": ("effort", "efforts", "torque", "torques", "joint_effort", "joint_torque"),
+    "current": ("current", "currents", "joint_current", "motor_current"),
+}
+"""Last words of the columns of observations that are an effort."""
+_BETWEEN_S = 1.0
+"""Gap between two episodes, s: the time between them is not recorded."""
+_SUFFIXES = (".pos", ".position", "_pos", "_position")
+
+
+def is_lerobot(arrays: Mapping[str, Any]) -> bool:
+    """Return ``True`` if the columns are those of a LeRobot data set.
+
+    Parameters
+    ----------
+    arrays
+        Columns by name.
+    """
+    return STATE in arrays
+
+
+def data_files(folder: Path) -> list[Path]:
+    """Return the Parquet files of a data set in order; none if the folder is no data set.
+
+    Parameters
+    ----------
+    folder
+        A folder with ``meta/info.json`` and ``data``.
+    """
+    if not (folder / "meta" / "info.json").is_file():
+        return []
+    return sorted((folder / "data").glob("**/*.parquet"))
+
+
+def lerobot_table(path: Path, arrays: Mapping[str, Any]) -> tuple[dict[str, NDArray[np.float64]], list[str]]:
+    """Return times, positions, demand and effort of a data set, and notes.
+
+    Parameters
+    ----------
+    path
+        File or folder of the data set, for the names of the joints in ``meta/info.json``.
+    arrays
+        Columns by name.
+
+    Raises
+    ------
+    DataError
+        If it has no effort, or columns of unequal length.
+    """
+    features = _features(path)
+    table: dict[str, NDArray[np.float64]] = {}
+    notes: list[str] = []
+    efforts = {
+        base: next((name for name in arrays if name.startswith("observation.") and name.split(".")[-1] in words), None)
+        for base, words in _EFFORTS.items()
+    }
+    if not any(efforts.values()):
+        raise DataError(
+            f"{path}: this data set has no effort or current of its joints, which a model is identified from; "
+            f"expected observation.effort or observation.current, found {listed(list(arrays))}"
+        )
+    sources = {"position": STATE, "demand": ACTION, "effort": efforts["tau"], "current": efforts["current"]}
+    bases = {"position": "q", "demand": "qr", "effort": "tau", "current": "current"}
+    state_names = _names(features, STATE)
+    for quantity, source in sources.items():
+        if source is None or source not in arrays:
+            continue
+        values = _matrix(path, source, arrays[source])
+        names = _names(features, source) or state_names
+        if names and len(names) == values.shape[1]:
+            word = "target position" if quantity == "demand" else quantity
+            table |= {f"{name}/{word}": values[:, j] for j, name in enumerate(names)}
+        else:
+            table[bases[quantity]] = values
+    if len({len(values) for values in table.values()}) > 1:
+        raise DataError(f"{path}: its columns have unequal lengths")
+    if "timestamp" in arrays:
+        table["t"] = _one_clock(np.asarray(arrays["timestamp"], np.float64).ravel(), arrays, notes)
+    return table, notes
+
+
+def _one_clock(times: NDArray[np.float64], arrays: Mapping[str, Any], notes: list[str]) -> NDArray[np.float64]:
+    """Return times that increase over all episodes, each of which begins at zero."""
+    if "episode_index" not in arrays or times.size < 2:
+        return times
+    episode = np.asarray(arrays["episode_index"]).ravel()
+    begins = np.flatnonzero(np.diff(episode) != 0) + 1
+    step = float(np.median(np.diff(times)))
+    made = times.copy()
+    for begin in begins:
+        # Whole periods, so that the gap is one.
+        between = max(1.0, round(_BETWEEN_S / step)) * step if step > 0 else _BETWEEN_S
+        made[begin:] += made[begin - 1] + between - made[begin]
+    if begins.size:
+        notes.append(f"{begins.size + 1} episodes one after the other, with a gap of {_BETWEEN_S:g} s between them")
+    return made
+
+
+def _matrix(path: Path, name: str, column: Any) -> NDArray[np.float64]:
+    try:
+        rows = np.stack([np.asarray(row, np.float64).ravel() for row in column])
+    except (ValueError, TypeError) as error:
+        raise DataError(f"{path}: {name} has rows of unequal lengths, or values that are no numbers") from error
+    return rows
+
+
+def _features(path: Path) -> Mapping[str, Any]:
+    for folder in (path, *list(path.resolve().parents)[:4]):
+        try:
+            found = json.loads((folder / "meta" / "info.json").read_text(encoding="utf-8"))
+        except (OSError, ValueError):
+            continue
+        features = found.get("features") if isinstance(found, dict) else None
+        if isinstance(features, dict):
+            return features
+    return {}
+
+
+def _names(features: Mapping[str, Any], column: str) -> list[str]:
+    """Return the names of the joints of a column, without the word for position; empty if there are none."""
+    entry = features.get(column)
+    names = entry.get("names") if isinstance(entry, dict) else None
+    if isinstance(names, dict):
+        names = next((each for each in names.values() if isinstance(each, list)), None)
+    if not isinstance(names, list) or not all(isinstance(each, str) for each in names):
+        return []
+    return [next((each.removesuffix(end) for end in _SUFFIXES if each.endswith(end)), each) for each in names]

@@ -1,0 +1,87 @@
+"""Comparison of the SYNC period in a log with that of the session."""
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armident.configs import DataError, SessionConfig
+from armident.drivers.can.frames import Frames
+from armident.drivers.canopen.objects import COB_SYNC
+
+PERIOD_TOLERANCE = 0.02
+"""Largest difference of both periods, relative.
+
+Clocks of computers and adapters agree to 0.1 %; the next period that a session can mean differs by far more.
+"""
+_FEWEST = 10
+"""SYNCs below which a log tells no period."""
+_HOLE_PERIODS = 10
+"""Steps longer than this number of usual ones are not counted: SYNCs may be lacking there."""
+
+
+def check_sync_period(path: Path, frames: Frames, session: SessionConfig) -> None:
+    """Refuse a log whose SYNCs come at another period than that of the session.
+
+    Parameters
+    ----------
+    path
+        The log, for messages.
+    frames
+        Its frames of one bus, (N,).
+    session
+        The session, with SYNC period and counter.
+
+    Raises
+    ------
+    DataError
+        If both periods differ; the message states both.
+    """
+    syncs = frames[frames["can_id"] == COB_SYNC]
+    found = sync_period_ns(syncs["t_ns"], _steps(syncs, session.sync.counter))
+    if found is None:
+        return
+    period, uncertainty = found
+    expected = session.sync.period_us * 1000
+    if abs(period - expected) > PERIOD_TOLERANCE * expected + uncertainty:
+        raise DataError(
+            f"{path}: SYNC comes every {period * 1e-6:.4g} ms ({1e9 / period:.4g} Hz) in this log, "
+            f"but the session says {expected * 1e-6:.4g} ms (sync.period_us: {session.sync.period_us}): "
+            "use the session that the log was recorded with"
+        )
+
+
+def sync_period_ns(t_ns: NDArray[np.int64], steps: NDArray[np.int64] | None) -> tuple[float, float] | None:
+    """Return the mean SYNC period and its uncertainty, ns; ``None`` if there are too few SYNCs.
+
+    Parameters
+    ----------
+    t_ns
+        Times of the SYNCs, (N,), ns.
+    steps
+        Number of periods from each SYNC to the next by its counter, (N - 1,); ``None``: one each.
+    """
+    if t_ns.size < _FEWEST:
+        return None
+    elapsed = np.diff(t_ns).astype(np.float64)
+    periods = np.ones(elapsed.size) if steps is None else steps.astype(np.float64)
+    # Coarse time stamps make a median of 0.
+    usual = float(np.median(elapsed)) or float(np.mean(elapsed))
+    counted = (elapsed >= 0) & (elapsed <= _HOLE_PERIODS * max(usual, 1.0)) & (periods > 0) & (periods <= _HOLE_PERIODS)
+    total = float(periods[counted].sum())
+    if counted.sum() < _FEWEST - 1 or not total:
+        return None
+    period = float(elapsed[counted].sum()) / total
+    if period <= 0:
+        return None
+    late = np.cumsum(np.where(counted, elapsed - period * periods, 0.0))
+    spread = float(np.quantile(late, 0.95) - np.quantile(late, 0.05))
+    return period, spread / total
+
+
+def _steps(syncs: Frames, overflow: int) -> NDArray[np.int64] | None:
+    """Return the number of periods between SYNCs by their counter, or ``None`` if they have none."""
+    if not overflow or not np.all(syncs["length"] > 0):
+        return None
+    counter = syncs["data"][:, 0].astype(np.int64)
+    return np.diff(counter) % overflow

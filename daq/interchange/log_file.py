@@ -1,0 +1,137 @@
+"""Reading of bus logs: whole lines and objects are kept, others are counted and named."""
+
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import Progress, SpinnerColumn, TextColumn
+
+from armident.configs import ConfigError, DataError
+from armident.configs.yaml_loader import is_file
+from armident.daq.interchange.blf import read_blf
+from armident.daq.interchange.log_frames import FrameCollector, LogFrames
+from armident.daq.interchange.log_lines import AscLines, CandumpLines, Line, LineParser, TrcLines
+from armident.daq.interchange.text_files import encoding_of, excerpt
+
+SUFFIXES = (".log", ".asc", ".blf", ".trc")
+"""File name suffixes of logs: candump -l, Vector ASC and BLF, PEAK TRC."""
+
+_SHOW_EVERY = 4096
+_LONGEST_LINE = 4096
+"""Lines of text logs have some hundred characters; longer ones are no lines of a log."""
+
+
+def read_log(path: Path) -> LogFrames:
+    """Return the frames of a bus log.
+
+    Parameters
+    ----------
+    path
+        The log; its suffix tells the format.
+
+    Raises
+    ------
+    ConfigError
+        If there is no such file, or it cannot be opened.
+    DataError
+        If it is not such a log, or holds no frames.
+    """
+    if not is_file(path):
+        raise ConfigError(f"{path}: no such file")
+    parsers: dict[str, type[CandumpLines] | type[AscLines] | type[TrcLines]] = {
+        ".log": CandumpLines,
+        ".asc": AscLines,
+        ".trc": TrcLines,
+    }
+    frames = FrameCollector()
+    suffix = path.suffix.lower()
+    try:
+        if suffix == ".blf":
+            read_blf(path, frames)
+            return frames.finish(path, added_up=False)
+        parser: LineParser = parsers[suffix]()
+        _read_lines(path, parser, frames)
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read: {error.strerror or 'an error of the file system'}") from error
+    frames.notes[:0] = parser.notes
+    return frames.finish(path, parser.added_up)
+
+
+def _read_lines(path: Path, parser: LineParser, frames: FrameCollector) -> None:
+    malformed: list[tuple[int, str]] = []
+    bad = without_time = number = 0
+    line = ""
+    kind: object = Line.COMMENT
+    with path.open(encoding=encoding_of(path), errors="replace", newline="\n") as file, _progress(path) as advance:
+        while line := file.readline(_LONGEST_LINE):
+            number += 1
+            kind = parser.parse(line.strip())
+            if isinstance(kind, tuple):
+                frames.add(*kind)
+            elif kind is Line.FOREIGN:
+                frames.foreign += 1
+            elif kind is Line.MALFORMED:
+                bad += 1
+                malformed = malformed or [(number, line)]
+            without_time += kind is Line.WITHOUT_TIME
+            if number % _SHOW_EVERY == 0:
+                advance(frames.count)
+            last = line
+    if number and not last.endswith("\n"):
+        bad -= _cut(frames, kind, number)
+        malformed = malformed if bad else []
+    _check_lines(path, parser, frames, malformed, bad, without_time)
+
+
+def _cut(frames: FrameCollector, kind: object, number: int) -> int:
+    """Leave out the last line if it is cut off; return 1 if it was counted as malformed."""
+    if kind is Line.MALFORMED:
+        frames.skipped += 1
+        frames.notes.append(f"the last line ({number}) is cut off and left out")
+        return 1
+    last = frames.last() if isinstance(kind, tuple) else None
+    if last is not None and frames.length_of(last[0]) not in (None, last[1]):
+        frames.drop_last()
+        frames.skipped += 1
+        frames.notes.append(f"the last line ({number}) is cut off and left out")
+    return 0
+
+
+def _check_lines(
+    path: Path, parser: LineParser, frames: FrameCollector, malformed: list[tuple[int, str]], bad: int, untimed: int
+) -> None:
+    version = getattr(parser, "unknown_version", None)
+    if version is not None and (bad > frames.count or not frames.count):
+        raise DataError(f"{path}: FILEVERSION={excerpt(version)} is not read; versions 1.0 to 2.1 are")
+    if untimed > frames.count:
+        raise DataError(
+            f"{path}: its frames have no times, as candump shows them on the screen; "
+            "`candump -l` or `candump -L` writes the format that is read"
+        )
+    if bad > frames.count + frames.foreign:
+        number, line = malformed[0]
+        raise DataError(f"{path}: not a {parser.name} log: line {number} is {excerpt(line)}")
+    if bad or untimed:
+        frames.skipped += bad + untimed
+    if bad == 1:
+        number, line = malformed[0]
+        frames.notes.append(f"line {number} is not a line of a {parser.name} log and left out: {excerpt(line)}")
+    elif bad:
+        number, line = malformed[0]
+        frames.notes.append(
+            f"{bad} lines are not lines of a {parser.name} log and left out, "
+            f"the first is line {number}: {excerpt(line)}"
+        )
+    if untimed:
+        frames.notes.append(f"{untimed} lines without a time left out")
+
+
+@contextmanager
+def _progress(path: Path) -> Iterator[Callable[[int], None]]:
+    """Show the number of frames read, on a terminal."""
+    columns = SpinnerColumn(), TextColumn("{task.description}: {task.completed:.0f} frames")
+    with Progress(*columns, console=Console(stderr=True), transient=True, disable=not sys.stderr.isatty()) as progress:
+        task = progress.add_task(path.name, total=None)
+        yield lambda done: progress.update(task, completed=done)

@@ -1,0 +1,205 @@
+"""Frames of a bus log in arrays, with everything that was left out and the reason for it."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armident.configs import ConfigError, DataError
+from armident.drivers.can.frames import FRAME, Frames
+
+_BATCH = 65536
+"""Frames that are kept as Python objects before they become an array."""
+_ODD_STEP_NS = 1_000_000_000
+"""A single time stamp that differs by more from both of its neighbours is not a time of its frame, ns."""
+LATEST_NS = 9_000_000_000 * 1_000_000_000
+"""Upper bound of times, ns: int64 holds those up to the year 2262."""
+
+
+@dataclass(frozen=True)
+class LogFrames:
+    """Classic data frames with 11-bit identifiers, in the order of the log.
+
+    Parameters
+    ----------
+    frames
+        The frames, (N,), with times in ns.
+    bus
+        Number of the bus of each frame, (N,).
+    buses
+        Names of the buses.
+    foreign
+        Number of other frames: CAN FD, extended identifiers, remote and error frames.
+    notes
+        One sentence for everything that was left out or interpreted.
+    skipped
+        Number of lines or objects that were left out.
+    """
+
+    frames: Frames
+    bus: NDArray[np.int64]
+    buses: tuple[str, ...]
+    foreign: int
+    notes: tuple[str, ...] = ()
+    skipped: int = 0
+
+    def of(self, path: Path, bus: str, several: bool) -> Frames:
+        """Return the frames of one bus.
+
+        Parameters
+        ----------
+        path
+            The log, for messages.
+        bus
+            Name of the bus.
+        several
+            The session has several buses; otherwise the frames of the only bus in the log are returned.
+        """
+        if len(self.buses) < 2 and not (self.buses and several):
+            return self.frames
+        if bus not in self.buses:
+            raise ConfigError(f"{path}: holds the buses {', '.join(self.buses)}; the session's is {bus}")
+        chosen: Frames = self.frames[self.bus == self.buses.index(bus)]
+        return chosen
+
+
+@dataclass
+class FrameCollector:
+    """Collects the frames of a log, and counts what it leaves out."""
+
+    foreign: int = 0
+    skipped: int = 0
+    notes: list[str] = field(default_factory=list)
+    _numbers: dict[str, int] = field(default_factory=dict)
+    _rows: list[tuple[int, int, bytes, int]] = field(default_factory=list)
+    _parts: list[tuple[Frames, NDArray[np.int64]]] = field(default_factory=list)
+    _done: int = 0
+
+    @property
+    def count(self) -> int:
+        """Number of frames so far."""
+        return self._done + len(self._rows)
+
+    def add(self, t_ns: int, can_id: int, data: bytes, channel: str) -> None:
+        """Add a classic data frame with an 11-bit identifier.
+
+        Parameters
+        ----------
+        t_ns
+            Time, ns.
+        can_id
+            Identifier.
+        data
+            At most eight bytes.
+        channel
+            Name of its bus.
+        """
+        number = self._numbers.setdefault(channel, len(self._numbers))
+        self._rows.append((t_ns, can_id, data, number))
+        if len(self._rows) >= _BATCH:
+            self._flush()
+
+    def length_of(self, can_id: int) -> int | None:
+        """Return the length of the frame before the last one with an identifier; ``None`` if there is none."""
+        self._flush()
+        joined = np.concatenate([part[0] for part in self._parts]) if self._parts else np.zeros(0, FRAME)
+        rows = np.flatnonzero(joined["can_id"] == can_id)
+        return int(joined["length"][rows[-2]]) if rows.size > 1 else None
+
+    def last(self) -> tuple[int, int] | None:
+        """Return identifier and length of the last frame."""
+        self._flush()
+        return (int(self._parts[-1][0]["can_id"][-1]), int(self._parts[-1][0]["length"][-1])) if self._parts else None
+
+    def drop_last(self) -> None:
+        """Leave out the last frame."""
+        self._flush()
+        frames, bus = self._parts[-1]
+        self._parts[-1] = (frames[:-1], bus[:-1])
+
+    def finish(self, path: Path, added_up: bool | None = None) -> LogFrames:
+        """Return the frames.
+
+        Parameters
+        ----------
+        path
+            The log, for messages.
+        added_up
+            Add up the times, as each is the time since the frame before; ``None``: do so if they say it.
+
+        Raises
+        ------
+        DataError
+            If there are none.
+        """
+        self._flush()
+        if not self._parts or not sum(part[0].size for part in self._parts):
+            others = f", only {self.foreign} others" if self.foreign else ""
+            raise DataError(f"{path}: no data frames with 11-bit identifiers in it{others}")
+        frames = np.concatenate([part[0] for part in self._parts])
+        bus = np.concatenate([part[1] for part in self._parts])
+        if added_up is None and _are_differences(frames["t_ns"]):
+            frames["t_ns"] = np.cumsum(frames["t_ns"])
+            self.notes.append("times are those since the frame before (candump -td): added up")
+        odd = _odd_times(frames["t_ns"])
+        if odd.any():
+            first, count = int(np.flatnonzero(odd)[0]) + 1, int(odd.sum())
+            self.notes.append(
+                f"frames left out because their time is far from that of both neighbours: {count}, the first is {first}"
+            )
+            self.skipped += count
+            frames, bus = frames[~odd], bus[~odd]
+        return LogFrames(frames, bus, tuple(self._numbers), self.foreign, tuple(self.notes), self.skipped)
+
+    def _flush(self) -> None:
+        if not self._rows:
+            return
+        batch = np.zeros(len(self._rows), FRAME)
+        t_ns, can_id, data, number = zip(*self._rows, strict=True)
+        batch["t_ns"], batch["can_id"] = t_ns, can_id
+        batch["length"] = [len(octets) for octets in data]
+        batch["data"] = np.frombuffer(b"".join(octets.ljust(8, b"\0") for octets in data), np.uint8).reshape(-1, 8)
+        self._parts.append((batch, np.array(number, np.int64)))
+        self._done += len(self._rows)
+        self._rows.clear()
+
+
+_LATEST_DIFFERENCE_NS = 1_000_000 * 1_000_000_000
+"""Times above 11 days are those of a clock, not differences."""
+_DESCENDING_SHARE = 0.05
+"""Share of frames that are earlier than the one before above which times are differences.
+
+A clock that is set back, or two buses in one log, make far fewer of them; of differences, about half are.
+"""
+
+
+def _are_differences(t_ns: NDArray[np.int64]) -> bool:
+    """Return ``True`` if each time is the time since the frame before."""
+    if t_ns.size < 3 or t_ns.max() > _LATEST_DIFFERENCE_NS:
+        return False
+    steps = np.diff(t_ns)
+    constant = bool(np.all(steps[1:] == 0) and t_ns[1] > 0)
+    return constant or float(np.mean(steps < 0)) > _DESCENDING_SHARE
+
+
+def _odd_times(t_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Return the frames whose time is far from both neighbours, which agree with each other, (N,)."""
+    odd = np.zeros(t_ns.size, np.bool_)
+    if t_ns.size > 2:
+        steps = np.abs(np.diff(t_ns))
+        around = np.abs(t_ns[2:] - t_ns[:-2])
+        odd[1:-1] = (steps[:-1] > _ODD_STEP_NS) & (steps[1:] > _ODD_STEP_NS) & (around < _ODD_STEP_NS)
+    return odd
+
+
+def nanoseconds(seconds: str, fraction: str | None) -> int | None:
+    """Return a time in ns from its decimal digits, or ``None`` if it is no possible time.
+
+    Parameters
+    ----------
+    seconds, fraction
+        Digits before and after the decimal point.
+    """
+    t_ns = int(seconds[:11]) * 1_000_000_000 + int((fraction or "0")[:9].ljust(9, "0"))
+    return t_ns if t_ns < LATEST_NS else None

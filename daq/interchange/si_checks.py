@@ -1,0 +1,103 @@
+"""Checks of imported values: SI units, side of the gears, and a demand that the joints followed."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armident.configs import DataError, RobotConfig
+from armident.daq.recording import Field
+
+OMITTED = "-"
+"""Name with which a quantity of a file is left out."""
+
+_POSITION_FACTOR, _TORQUE_FACTOR = 3.0, 10.0
+"""Positions and torques beyond these multiples of the joint's limits are taken as a wrong unit."""
+
+_MOVED_SHARE = 1e-3
+"""Share of its position range that a joint must move for its demand to be checked."""
+_UNEXPLAINED_SHARE = 0.5
+"""Largest share of the power of a joint's motion that its demand may leave unexplained."""
+
+
+def unit_of(quantity: str, robot: RobotConfig) -> str:
+    """Return the SI unit of a quantity of a robot's joints.
+
+    Parameters
+    ----------
+    quantity
+        ``position``, ``demand``, ``torque``, ``current`` or ``voltage``.
+    robot
+        The robot, for the types of its joints.
+    """
+    kinds = {joint.type for joint in robot.joints}
+    if quantity in ("position", "demand"):
+        return "rad" if kinds == {"revolute"} else "m" if kinds == {"prismatic"} else "rad|m"
+    if quantity == "torque":
+        return "N m" if kinds == {"revolute"} else "N" if kinds == {"prismatic"} else "N m|N"
+    return "A" if quantity == "current" else "V"
+
+
+def check_units(
+    path: Path,
+    robot: RobotConfig,
+    fields: Mapping[str, Field],
+    raw: Mapping[str, NDArray[np.float64]],
+    known: slice,
+) -> None:
+    """Refuse values far outside the limits in SI units on the stated side.
+
+    Parameters
+    ----------
+    path
+        The file, for messages.
+    robot
+        The robot, for its limits and gears.
+    fields
+        Side of each quantity.
+    raw
+        Values of each quantity, (N, n).
+    known
+        Rows with a demand.
+
+    Raises
+    ------
+    DataError
+        If positions or torques are far beyond their limits, or no joint followed its demand.
+    """
+    transmission = robot.transmission_matrix
+    for name, values in raw.items():
+        values = values[known] if name == "demand" else values
+        motor = fields[name].side == "motor"
+        if name in ("position", "demand"):
+            joint = values @ np.linalg.inv(transmission).T if motor else values
+            limits = [max(abs(end) for end in j.limits.position) for j in robot.joints]
+            factor, hint = _POSITION_FACTOR, "rad (or m), joint side unless --motor-side"
+        elif name == "torque":
+            joint = values @ transmission if motor else values
+            limits = [j.limits.torque for j in robot.joints]
+            factor, hint = _TORQUE_FACTOR, "N m (or N), joint side unless --motor-side"
+        else:
+            continue
+        peaks = np.abs(joint).max(axis=0)
+        for axis, peak, limit in zip(robot.joints, peaks, limits, strict=True):
+            if peak > factor * limit:
+                raise DataError(
+                    f"{path}: {name} of {axis.name} reaches {peak:.4g}, its limit is {limit:.4g}: expected {hint}"
+                )
+    if "demand" in raw:
+        _check_demand(path, robot, raw["demand"][known], raw["position"][known])
+
+
+def _check_demand(path: Path, robot: RobotConfig, demand: NDArray[np.float64], position: NDArray[np.float64]) -> None:
+    """Refuse a demand that does not move like the joints: another unit, or another quantity."""
+    motion = np.sum((position - position.mean(axis=0)) ** 2, axis=0)
+    residual = np.sum((demand - demand.mean(axis=0) - position + position.mean(axis=0)) ** 2, axis=0)
+    for k in np.flatnonzero(residual > _UNEXPLAINED_SHARE * motion):
+        joint, moved, wanted = robot.joints[k], np.ptp(position[:, k]), np.ptp(demand[:, k])
+        if moved > _MOVED_SHARE * np.ptp(joint.limits.position):
+            raise DataError(
+                f"{path}: {joint.name} moved by {moved:.4g}, but its demand by {wanted:.4g}: "
+                f"give both in the same unit, or omit the demand with --map demand={OMITTED}"
+            )

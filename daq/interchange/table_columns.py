@@ -1,0 +1,238 @@
+"""Columns of a table by quantity and joint: ``q1``, ``q0``, names of joints, and units in names."""
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armident.configs import DataError, RobotConfig
+from armident.daq.interchange.joint_names import match_joints
+
+NAMES: Mapping[str, tuple[str, ...]] = {
+    "time": ("t", "time", "times", "timestamp", "timestamps", "__time", "stamp", "elapsed"),
+    "position": ("q", "qm", "position", "positions", "actual_q"),
+    "torque": ("tau", "torque", "torques", "effort", "efforts"),
+    "current": ("current", "currents", "actual_current"),
+    "voltage": ("voltage", "vir"),
+    "demand": ("qr", "qg", "target_positions", "target_q"),
+}
+"""Accepted names of each quantity; ``q`` also stands for columns ``q1..qn`` and ``q0..q(n-1)``."""
+
+_WORDS: Mapping[str, frozenset[str]] = {
+    "position": frozenset({"position", "positions", "pos", "q"}),
+    "torque": frozenset({"effort", "efforts", "torque", "torques", "tau"}),
+    "current": frozenset({"current", "currents"}),
+    "voltage": frozenset({"voltage", "voltages"}),
+}
+"""Words of a column name, beside the name of a joint, that tell its quantity."""
+_DEMANDED = frozenset({"desired", "reference", "target", "setpoint", "command", "commanded", "demand", "goal"})
+"""Words of a column name that tell a demand."""
+_WORD = re.compile(r"[^\W_]+")
+_UNIT = re.compile(r"^(.*?)\s*[\[(]([^\])]*)[\])]$")
+_TIME_UNIT = re.compile(r"^(.*?)_(s|sec|ms|us|ns)$", re.IGNORECASE)
+_LISTED = 40
+"""Number of column names in a message."""
+SCALES: Mapping[str, float] = {
+    "deg": np.pi / 180, "degree": np.pi / 180, "degrees": np.pi / 180, "°": np.pi / 180,
+    "mm": 1e-3, "ma": 1e-3, "mnm": 1e-3, "nmm": 1e-3, "mv": 1e-3,
+}  # fmt: skip
+"""Factors to SI of units in brackets after a name."""
+
+Table = Mapping[str, NDArray[np.float64]]
+
+
+@dataclass(frozen=True)
+class Columns:
+    """Values of one quantity.
+
+    Parameters
+    ----------
+    values
+        Values (N, n).
+    labels
+        Name of each column in the file.
+    notes
+        Sentences on what was assumed.
+    """
+
+    values: NDArray[np.float64]
+    labels: tuple[str, ...]
+    notes: tuple[str, ...] = ()
+
+
+def listed(names: Sequence[str]) -> str:
+    """Return names for a message.
+
+    Parameters
+    ----------
+    names
+        Any number of names; the first ones are listed.
+    """
+    more = f" and {len(names) - _LISTED} more" if len(names) > _LISTED else ""
+    return ", ".join(names[:_LISTED]) + more
+
+
+def without_units(table: Table, units: Sequence[str] = ()) -> tuple[dict[str, NDArray[np.float64]], str, list[str]]:
+    """Return the table without units in its names and in SI, the unit of its time, and notes on conversions.
+
+    Parameters
+    ----------
+    table
+        Columns by name, such as ``q1 [deg]`` or ``time_ms``.
+    units
+        A unit for each column, from a line of units; may be empty.
+
+    Raises
+    ------
+    DataError
+        If two names are equal without their units.
+    """
+    made: dict[str, NDArray[np.float64]] = {}
+    time_unit, converted = "", []
+    for k, (name, values) in enumerate(table.items()):
+        bare, unit = name, units[k].strip("[]() ") if k < len(units) else ""
+        if found := _UNIT.match(name):
+            bare, unit = found[1].strip(), found[2].strip()
+        if (found := _TIME_UNIT.match(name)) and found[1].lower() in NAMES["time"]:
+            bare, unit = found[1], found[2]
+        if bare.lower() in NAMES["time"]:
+            time_unit = "s" if unit.lower() == "sec" else unit.lower().replace("µ", "u")
+        elif unit.lower() in SCALES:
+            values = values * SCALES[unit.lower()]
+            converted.append(f"{name} from {unit}")
+        if bare in made:
+            raise DataError(f"two columns are named {bare}; found {listed(list(table))}")
+        made[bare] = values
+    return made, time_unit, [f"converted to SI units: {listed(converted)}"] if converted else []
+
+
+def find_time(table: Table, name: str | None = None) -> tuple[str, NDArray[np.float64]] | None:
+    """Return name and values (N,) of the column of times, or ``None``.
+
+    Parameters
+    ----------
+    table
+        Columns by name.
+    name
+        Name that the user has given.
+    """
+    if name is not None and name not in table:
+        raise DataError(f"no array named {name!r}; found {listed(list(table))}")
+    lower = {each.lower(): each for each in reversed(list(table))}
+    for base in (name,) if name is not None else NAMES["time"]:
+        found = base if base in table else lower.get(base.lower())
+        if found is not None:
+            values = table[found]
+            if values.ndim != 1:
+                raise DataError(f"{found} has {values.shape[-1]} axes, expected one column of times")
+            return found, values
+    return None
+
+
+def find_columns(
+    table: Table,
+    quantity: str,
+    robot: RobotConfig,
+    name: str | None = None,
+    *,
+    by_position: bool = False,
+    joints: Sequence[str] | None = None,
+) -> Columns | None:
+    """Return the columns of a quantity in the robot's order, or ``None`` if there are none.
+
+    Parameters
+    ----------
+    table
+        Columns (N,), or arrays (N, n), by name.
+    quantity
+        A key of `NAMES`.
+    robot
+        The robot, for number and names of its joints.
+    name
+        Name that the user has given for this quantity.
+    by_position, joints
+        Choice of the joints by the user (`armident.daq.interchange.joint_names`).
+
+    Raises
+    ------
+    DataError
+        If joints are missing, or there are too many.
+    """
+    for base in (name,) if name is not None else NAMES[quantity]:
+        found = _numbered(table, base, robot.n)
+        if found is not None:
+            return found
+    if name is not None:
+        raise DataError(f"no array named {name!r}; found {listed(list(table))}")
+    return _by_joint(table, quantity, robot, by_position, joints)
+
+
+def _numbered(table: Table, base: str, n: int) -> Columns | None:
+    """Return an array of a name, or the columns ``base1..basen`` or ``base0..base(n-1)``."""
+    found = list(table)
+    lower = {each.lower(): each for each in reversed(found)}
+    whole = table.get(base, table.get(lower.get(base.lower(), "")))
+    if whole is not None:
+        values = whole[:, None] if whole.ndim == 1 else whole
+        if values.ndim != 2 or values.shape[1] != n:
+            raise DataError(f"{base} has {values.shape[-1]} axes, the robot has {n}; found {listed(found)}")
+        return Columns(values, (base,) * n if whole.ndim == 1 else tuple(f"{base}{j + 1}" for j in range(n)))
+    numbers = {}
+    for key, each in lower.items():
+        digits = re.fullmatch(re.escape(base.lower()) + r"[_.\[( ]?(\d{1,2})[\])]?", key)
+        if digits:
+            numbers[int(digits[1])] = each
+    if not numbers.keys() & {0, 1}:
+        return None
+    first = 0 if 0 in numbers else 1
+    labels = [numbers.get(first + j, f"{base}{first + j}") for j in range(n)]
+    absent = [label for j, label in enumerate(labels) if first + j not in numbers]
+    if absent:
+        raise DataError(f"no column {absent[0]}, the robot has {n} joints; found {listed(found)}")
+    if first + n in numbers:
+        raise DataError(f"has a column {numbers[first + n]}, but the robot has {n} joints; found {listed(found)}")
+    if any(table[label].ndim != 1 for label in labels):
+        raise DataError(f"{labels[0]} has {table[labels[0]].ndim} dimensions, expected a column")
+    note = (f"columns are counted from 0: {labels[0]} is {_FIRST}",) if first == 0 else ()
+    return Columns(np.stack([table[label] for label in labels], axis=1), tuple(labels), note)
+
+
+_FIRST = "the first joint"
+
+
+def _by_joint(
+    table: Table, quantity: str, robot: RobotConfig, by_position: bool, joints: Sequence[str] | None
+) -> Columns | None:
+    """Return the columns that are named after joints and quantity, such as ``/joint_states/elbow/position``."""
+    of_joint: dict[str, str] = {}
+    for name, values in table.items():
+        rest = _joint_of(name, quantity)
+        if rest and values.ndim == 1:
+            of_joint.setdefault(rest, name)
+    if not of_joint:
+        return None
+    chosen = of_joint
+    if joints is not None:
+        # A joint is named as in its columns, with or without what is common to all of them.
+        chosen = {next((j for j in joints if rest == j or re.search(rf"(^|\W){re.escape(j)}$", rest)), rest): name
+                  for rest, name in of_joint.items()}  # fmt: skip
+    match = match_joints(list(chosen), robot.joints, by_position=by_position, joints=joints)
+    labels = tuple(chosen[each] for each in match.names)
+    return Columns(np.stack([table[label] for label in labels], axis=1), labels, match.remarks)
+
+
+def _joint_of(name: str, quantity: str) -> str | None:
+    """Return the part of a column's name that tells its joint, if the column is of a quantity."""
+    words = [(found[0].lower(), found.start(), found.end()) for found in _WORD.finditer(name)]
+    demanded = any(word in _DEMANDED for word, _, _ in words)
+    wanted = "position" if quantity == "demand" else quantity
+    if len(words) < 2 or wanted not in _WORDS or demanded != (quantity == "demand"):
+        return None
+    if words[-1][0] in _WORDS[wanted]:
+        end = words[-2][1] if words[-2][0] in _DEMANDED and len(words) > 2 else words[-1][1]
+        return name[:end].strip(" ./_-:[]")
+    if words[0][0] in _WORDS[wanted]:
+        return name[words[0][2] :].strip(" ./_-:[]")
+    return None

@@ -1,0 +1,213 @@
+"""Reading of tables of measurements: CSV, NPZ, MAT, Parquet, and data sets of LeRobot."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armident.configs import ConfigError, DataError, RobotConfig
+from armident.configs.yaml_loader import is_file
+from armident.daq.interchange.csv_files import read_csv
+from armident.daq.interchange.lerobot import data_files, is_lerobot, lerobot_table
+from armident.daq.interchange.sandbox import read_in_subprocess
+from armident.daq.interchange.table_columns import without_units
+
+Table = dict[str, NDArray[np.float64]]
+_LATER_MAT = b"MATLAB 7.3"
+
+
+@dataclass(frozen=True)
+class Source:
+    """Named arrays of a file.
+
+    Parameters
+    ----------
+    path
+        The file.
+    table
+        Arrays by name, (N,) or (N, n).
+    lines
+        Line number of each row in a text file, (N,); ``None`` for other formats.
+    time_unit
+        Unit in the name of the column of times; empty if there is none.
+    notes
+        Sentences on what was left out or assumed.
+    """
+
+    path: Path
+    table: Table
+    lines: NDArray[np.int64] | None = None
+    time_unit: str = ""
+    notes: tuple[str, ...] = ()
+
+    def place(self, row: int, name: str) -> str:
+        """Return the position of a value in the file, for messages.
+
+        Parameters
+        ----------
+        row
+            Row, from 0.
+        name
+            Name of the column.
+        """
+        where = f"row {row}" if self.lines is None else f"line {self.lines[row]}"
+        return f"{self.path}: {where}, column {name}"
+
+
+def read_table(path: Path) -> Source:
+    """Return the arrays of a table, in SI units where the names of columns tell another unit.
+
+    Parameters
+    ----------
+    path
+        File or folder; its suffix tells the format.
+
+    Raises
+    ------
+    ConfigError
+        If there is no such file, or its format is unknown.
+    DataError
+        If it cannot be read.
+    """
+    files = data_files(path)
+    if not files and not is_file(path):
+        raise ConfigError(f"{path}: no such file")
+    kind = path.suffix.lower()
+    if files:
+        parts = [_parquet(file) for file in files]
+        found = {name: np.concatenate([part[name] for part in parts if name in part]) for name in parts[0]}
+        return _from_arrays(path, found)
+    if kind in (".csv", ".txt", ".tsv"):
+        return _csv(path)
+    readers = {".npz": _npz, ".mat": _mat, ".parquet": _parquet}
+    if kind in readers:
+        return _from_arrays(path, readers[kind](path))
+    raise ConfigError(
+        f"{path}: cannot import {kind or 'a file without suffix'}; expected .csv, .mat, .npz, .parquet, "
+        "the folder of a LeRobot data set, a bag of ROS 2, or the log of a bus (.log, .asc, .blf, .trc)"
+    )
+
+
+def read_pair(path: Path, effort: Path, robot: RobotConfig) -> Source:
+    """Return two tables with free or no headers as one; effort is torque or the drive's own signal.
+
+    Parameters
+    ----------
+    path, effort
+        Text files of positions and efforts, with one column per joint, or a single column sample by sample.
+    robot
+        The robot, for the number of its joints.
+
+    Raises
+    ------
+    ConfigError
+        If there is no such file.
+    DataError
+        If the numbers of columns or rows differ.
+    """
+    columns: Table = {}
+    notes: list[str] = []
+    lines = None
+    for file, base in ((path, "q"), (effort, "tau")):
+        if not is_file(file):
+            raise ConfigError(f"{file}: no such file")
+        table = read_csv(file)
+        values = table.values
+        if values.shape[1] == 1:
+            if not np.isfinite(values).all():
+                row = int(np.flatnonzero(~np.isfinite(values[:, 0]))[0])
+                raise DataError(f"{file}: line {table.lines[row]} has no number")
+            if values.shape[0] % robot.n == 0:
+                values = values.reshape(-1, robot.n)
+        if values.shape[1] != robot.n:
+            raise DataError(f"{file}: {values.shape[1]} columns, but {robot.name} has {robot.n} joints")
+        columns |= {f"{base}{j + 1}": values[:, j] for j in range(robot.n)}
+        notes += [f"{file.name}: {note}" for note in table.notes]
+        lines = table.lines if len(table.lines) == len(values) else None
+    rows = {len(v) for v in columns.values()}
+    if len(rows) != 1:
+        raise DataError(f"{path} and {effort}: {' and '.join(str(r) for r in sorted(rows))} rows")
+    return Source(path, columns, lines, notes=tuple(notes))
+
+
+def _csv(path: Path) -> Source:
+    table = read_csv(path)
+    if table.header is None:
+        raise DataError(f"{path}: no header line; expected t,q1..,tau1.. (or a pair of files with --effort)")
+    twice = sorted({name for name in table.header if name and table.header.count(name) > 1})
+    if twice:
+        raise DataError(f"{path}: several columns are named {twice[0]}")
+    columns = {name: table.values[:, k] for k, name in enumerate(table.header) if name}
+    units = [unit for name, unit in zip(table.header, table.units, strict=False) if name]
+    return _converted(Source(path, columns, table.lines, notes=table.notes), units)
+
+
+def _from_arrays(path: Path, arrays: Mapping[str, Any]) -> Source:
+    if is_lerobot(arrays):
+        table, notes = lerobot_table(path, arrays)
+        return Source(path, table, notes=tuple(notes))
+    return _converted(Source(path, _numeric(arrays)), [])
+
+
+def _converted(source: Source, units: list[str]) -> Source:
+    try:
+        table, time_unit, notes = without_units(source.table, units)
+    except DataError as error:
+        raise DataError(f"{source.path}: {error}") from error
+    return replace(source, table=table, time_unit=time_unit, notes=(*source.notes, *notes))
+
+
+def _numeric(arrays: Mapping[str, Any]) -> Table:
+    """Return the real arrays; vectors as (N,), and dates as seconds since the first."""
+    table: Table = {}
+    for name, value in arrays.items():
+        if not isinstance(value, np.ndarray) or not value.size:
+            continue
+        if value.dtype.kind == "M":
+            table[name] = (value - value.min()) / np.timedelta64(1, "ns") * 1e-9
+        elif value.dtype.kind in "iuf":
+            array = value.astype(np.float64)
+            table[name] = array.ravel() if array.ndim == 2 and 1 in array.shape else array
+    return table
+
+
+def _npz(path: Path) -> dict[str, Any]:
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            return {name: archive[name] for name in archive.files}
+    except Exception as error:  # zipfile, zlib and numpy raise various errors for damaged files
+        raise DataError(f"{path}: not a readable NPZ file: damaged, or not an archive of numeric arrays") from error
+
+
+def _parquet(path: Path) -> dict[str, Any]:
+    try:
+        import pyarrow
+        import pyarrow.parquet
+    except ImportError as error:
+        raise ConfigError(f"{path}: Parquet needs the package pyarrow (pip install pyarrow)") from error
+    try:
+        table = pyarrow.parquet.read_table(path)  # type: ignore[no-untyped-call]
+        return {name: table.column(name).to_numpy() for name in table.column_names}
+    except Exception as error:  # pyarrow raises various errors for damaged files
+        raise DataError(f"{path}: not a readable Parquet file: damaged, or cut off") from error
+
+
+def _mat(path: Path) -> dict[str, Any]:
+    from scipy.io import loadmat
+
+    with path.open("rb") as file:
+        if file.read(len(_LATER_MAT)) == _LATER_MAT:
+            raise DataError(f"{path}: MAT version 7.3 is not supported; save it with -v7")
+
+    def read() -> dict[str, Any]:
+        arrays: dict[str, Any] = loadmat(path)
+        return arrays
+
+    try:
+        # Some damaged files crash scipy's reader.
+        return dict(read_in_subprocess(read))
+    except (OSError, ValueError) as error:
+        raise DataError(f"{path}: not a readable MAT file: damaged, or none of version 7 or before") from error

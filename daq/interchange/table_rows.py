@@ -1,0 +1,216 @@
+"""Rows of a table: quantities of the joints, complete rows, and the numbers of their samples."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armident.configs import DataError, RobotConfig
+from armident.daq.interchange.si_checks import OMITTED
+from armident.daq.interchange.table_columns import Columns, find_columns, find_time, listed
+from armident.daq.interchange.table_files import Source
+from armident.daq.recording.model import Quantity
+
+EFFORTS: tuple[Quantity, ...] = ("torque", "current", "voltage")
+_MOST_BAD_SHARE = 0.05
+"""Share of incomplete rows above which a table is refused; a single row is always left out."""
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Complete rows of a table.
+
+    Parameters
+    ----------
+    values
+        Position, effort and, if there is one, demand, (N, n) each.
+    labels
+        Names of the columns of each quantity in the file.
+    row
+        Number of each row in the file, from 0, (N,).
+    times
+        Times (N,), in the unit of the file; ``None`` if there is no column of times.
+    time_name
+        Name of that column.
+    notes
+        Sentences on what was left out or assumed.
+    """
+
+    values: dict[Quantity, Floats]
+    labels: dict[Quantity, tuple[str, ...]]
+    row: NDArray[np.int64]
+    times: Floats | None
+    time_name: str = "t"
+    notes: tuple[str, ...] = ()
+
+    def taken(self, chosen: NDArray[np.int64] | NDArray[np.bool_]) -> "Rows":
+        """Return some of the rows.
+
+        Parameters
+        ----------
+        chosen
+            Indices, or one truth value for each row.
+        """
+        times = None if self.times is None else self.times[chosen]
+        values = {name: array[chosen] for name, array in self.values.items()}
+        return replace(self, values=values, row=self.row[chosen], times=times)
+
+
+def complete_rows(
+    source: Source,
+    robot: RobotConfig,
+    names: dict[str, str],
+    *,
+    by_position: bool = False,
+    joints: Sequence[str] | None = None,
+) -> Rows:
+    """Return the rows of a table that have time, all positions and all efforts.
+
+    Rows without any of them belong to something else and are passed over. Rows of one time are joined, where one has
+    what the other lacks. Others are left out and named.
+
+    Parameters
+    ----------
+    source
+        The table.
+    robot
+        The robot, for its joints.
+    names
+        Names of the file by quantity; ``-`` leaves one out.
+    by_position, joints
+        Choice of the joints by the user.
+
+    Raises
+    ------
+    DataError
+        If a quantity is missing, or too many rows are incomplete.
+    """
+    try:
+        found: dict[Quantity, Columns] = {}
+        quantities: tuple[Quantity, ...] = ("position", *EFFORTS, "demand")
+        for quantity in quantities:
+            if names.get(quantity) == OMITTED or (quantity in EFFORTS and any(e in found for e in EFFORTS)):
+                continue
+            columns = find_columns(
+                source.table, quantity, robot, names.get(quantity), by_position=by_position, joints=joints
+            )
+            if columns is not None:
+                found[quantity] = columns
+        time = None if names.get("time") == OMITTED else find_time(source.table, names.get("time"))
+    except DataError as error:
+        raise DataError(f"{source.path}: {error}") from error
+    if "position" not in found or not any(e in found for e in EFFORTS):
+        raise DataError(
+            f"{source.path}: expected columns q1..q{robot.n} and tau1..tau{robot.n} (or current, voltage); "
+            f"found {listed(list(source.table))}; --map QUANTITY=NAME names others"
+        )
+    lengths = {len(columns.values) for columns in found.values()} | ({len(time[1])} if time is not None else set())
+    if len(lengths) > 1:
+        raise DataError(f"{source.path}: its arrays have {' and '.join(map(str, sorted(lengths)))} rows")
+    notes = [note for columns in found.values() for note in columns.notes]
+    rows = Rows(
+        {quantity: np.array(columns.values, np.float64) for quantity, columns in found.items()},
+        {quantity: columns.labels for quantity, columns in found.items()},
+        np.arange(lengths.pop(), dtype=np.int64),
+        None if time is None else time[1],
+        "t" if time is None else time[0],
+        tuple(dict.fromkeys(notes)),
+    )
+    return _single(_without_odd_times(source, _complete(source, _joined(rows))))
+
+
+def _without_odd_times(source: Source, rows: Rows) -> Rows:
+    """Return the rows without those whose time is out of order while their neighbours are in order."""
+    if rows.times is None or rows.times.size < 4:
+        return rows
+    t = rows.times
+    odd = np.zeros(t.size, np.bool_)
+    odd[1:-1] = (t[:-2] < t[2:]) & ((t[1:-1] < t[:-2]) | (t[1:-1] > t[2:]))
+    count = int(odd.sum())
+    if not count or count > max(1, _MOST_BAD_SHARE * t.size) or np.any(np.diff(t[~odd]) < 0):
+        return rows
+    where = source.place(int(rows.row[np.flatnonzero(odd)[0]]), rows.time_name)
+    note = f"rows whose time is out of order left out: {count}, the first: {where}"
+    return replace(rows.taken(~odd), notes=(*rows.notes, note))
+
+
+def _single(rows: Rows) -> Rows:
+    """Return the rows without those that repeat time and values of the row before."""
+    if rows.times is None or rows.times.size < 2:
+        return rows
+    everything = np.concatenate(list(rows.values.values()), axis=1)
+    equal = (everything[1:] == everything[:-1]) | (np.isnan(everything[1:]) & np.isnan(everything[:-1]))
+    twice = np.append(False, (np.diff(rows.times) == 0) & equal.all(axis=1))
+    if not twice.any():
+        return rows
+    note = f"{int(twice.sum())} rows are there twice, with the same time: one of each is kept"
+    return replace(rows.taken(~twice), notes=(*rows.notes, note))
+
+
+def _needed(rows: Rows) -> Floats:
+    return np.concatenate([values for name, values in rows.values.items() if name != "demand"], axis=1)
+
+
+def _joined(rows: Rows) -> Rows:
+    """Join rows of one time, one of which has the positions and the other the efforts."""
+    if rows.times is None or rows.times.size < 2:
+        return rows
+    have = np.isfinite(_needed(rows))
+    same = (np.diff(rows.times) == 0) & ~have[1:].all(axis=1) & ~have[:-1].all(axis=1)
+    pairs = np.flatnonzero(same & ~(have[1:] & have[:-1]).any(axis=1))
+    if not pairs.size:
+        return rows
+    for values in rows.values.values():
+        earlier, later = values[pairs], values[pairs + 1]
+        values[pairs] = np.where(np.isfinite(earlier), earlier, later)
+    kept = np.ones(rows.row.size, np.bool_)
+    kept[pairs + 1] = False
+    joined = rows.taken(kept)
+    return replace(joined, notes=(*rows.notes, f"rows of one time joined: {pairs.size}"))
+
+
+def _complete(source: Source, rows: Rows) -> Rows:
+    needed = _needed(rows)
+    have = np.isfinite(needed)
+    nothing = ~have.any(axis=1)
+    timed = np.ones(len(have), np.bool_) if rows.times is None else np.isfinite(rows.times)
+    whole = have.all(axis=1) & timed
+    partial = ~whole & ~nothing if rows.times is not None else ~whole
+    passed = int((nothing & ~partial & timed).sum())
+    notes = list(rows.notes)
+    count, total = int(partial.sum()), int(whole.sum() + partial.sum())
+    if count and count > max(1, _MOST_BAD_SHARE * total):
+        raise DataError(_incomplete(source, rows, partial, whole))
+    if not whole.any():
+        raise DataError(f"{source.path}: no row has both positions and efforts of all joints")
+    if count:
+        first = int(np.flatnonzero(partial)[0])
+        of = f"{count} row{'s' if count > 1 else ''} left out"
+        notes.append(f"{of}, the first: {_first_missing(source, rows, first)}")
+    if passed:
+        notes.append(f"{passed} rows without positions and efforts passed over")
+    return replace(rows.taken(whole), notes=tuple(notes))
+
+
+def _incomplete(source: Source, rows: Rows, partial: NDArray[np.bool_], whole: NDArray[np.bool_]) -> str:
+    """Return the message for a table with too many incomplete rows."""
+    count = int(partial.sum())
+    if not whole.any() and rows.times is not None:
+        return (
+            f"{source.path}: no row has both positions and efforts of all joints ({count} rows have some of them): "
+            "sparse rows of several topics; export them on one clock"
+        )
+    first = int(np.flatnonzero(partial)[0])
+    return f"{_first_missing(source, rows, first)} (and {count - 1} more of {partial.size} rows)"
+
+
+def _first_missing(source: Source, rows: Rows, row: int) -> str:
+    where = int(rows.row[row])
+    for name, values in rows.values.items():
+        missing = np.flatnonzero(~np.isfinite(values[row]))
+        if name != "demand" and missing.size:
+            return f"{source.place(where, rows.labels[name][missing[0]])}: {values[row, missing[0]]} is not a number"
+    return f"{source.place(where, rows.time_name)}: nan is not a number"

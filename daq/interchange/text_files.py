@@ -1,0 +1,45 @@
+"""Text files of other tools: their encoding, and parts of them in messages."""
+
+import codecs
+from pathlib import Path
+
+_HEAD = 65536
+"""Bytes at the beginning of a file that decide its encoding."""
+_LONGEST = 60
+"""Longest part of a file in a message, characters."""
+
+
+def encoding_of(path: Path) -> str:
+    """Return the encoding of a text file: UTF-8, UTF-16 by its mark, or Windows-1252.
+
+    Parameters
+    ----------
+    path
+        The file.
+
+    Raises
+    ------
+    OSError
+        If it cannot be read.
+    """
+    with path.open("rb") as file:
+        head = file.read(_HEAD)
+    if head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        return "utf-16"
+    try:
+        codecs.getincrementaldecoder("utf-8")().decode(head)
+    except UnicodeDecodeError:
+        return "cp1252"
+    return "utf-8-sig"
+
+
+def excerpt(text: str) -> str:
+    """Return the beginning of a text in quotes, for messages of one line.
+
+    Parameters
+    ----------
+    text
+        Any text.
+    """
+    shown = " ".join("".join(c if c.isprintable() else " " for c in text).split())
+    return f"'{shown[:_LONGEST]}...'" if len(shown) > _LONGEST else f"'{shown}'"
