@@ -2,7 +2,7 @@
 
 import signal
 import threading
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from armident.configs import RobotConfig, load_robot
@@ -18,6 +18,9 @@ def import_recording(
     rate_hz: float | None = None,
     names: Mapping[str, str] | None = None,
     polled: bool = False,
+    topic: str | None = None,
+    joints: Sequence[str] | None = None,
+    by_position: bool = False,
 ) -> Recording:
     """Read measured motion and effort from a file of another format; SI units.
 
@@ -25,8 +28,8 @@ def import_recording(
     ----------
     path
         CSV with a header line (``t``, ``q1..qn``, ``tau1..taun`` or ``current1..currentn``, optionally ``qr1..qrn``),
-        MAT (up to version 7), NPZ, Parquet, or joint states in an MCAP file of ROS 2. A recording of armident is
-        resampled to ``rate_hz`` with an anti-alias filter.
+        MAT (up to version 7), NPZ, Parquet, or joint states in a bag of ROS 2 (MCAP, SQLite, or its folder). A
+        recording of armident is resampled to ``rate_hz`` with an anti-alias filter.
     robot
         The robot that was measured: a configuration, or the path or shipped name of one; needed except for a
         recording of armident, which contains it.
@@ -41,6 +44,12 @@ def import_recording(
         ``-`` leaves a quantity out.
     polled
         True if samples were polled, so that their times jitter: they are put on an even clock.
+    topic
+        Topic of joint states, if a bag has several with the robot's joints.
+    joints
+        Names in a bag of the robot's joints, in the robot's order; by default those of the robot.
+    by_position
+        True to take joints of other names in the order of the bag.
 
     Raises
     ------
@@ -58,7 +67,18 @@ def import_recording(
 
     config = robot if robot is None or isinstance(robot, RobotConfig) else load_robot(robot)
     second = None if effort is None else Path(effort)
-    return read(Path(path), config, effort=second, motor_side=motor_side, rate_hz=rate_hz, names=names, polled=polled)
+    return read(
+        Path(path),
+        config,
+        effort=second,
+        motor_side=motor_side,
+        rate_hz=rate_hz,
+        names=names,
+        polled=polled,
+        topic=topic,
+        joints=joints,
+        by_position=by_position,
+    )
 
 
 def capture(

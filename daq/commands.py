@@ -62,7 +62,9 @@ def command(
 
 
 def import_(
-    file: Annotated[Path, typer.Argument(help="CSV, MAT, NPZ, Parquet, rosbag2, bus log, or recording.")],
+    file: Annotated[
+        Path, typer.Argument(help="CSV, MAT, NPZ, Parquet, ROS 2 bag (file or folder), bus log, or recording.")
+    ],
     out: Annotated[Path, typer.Option("--out", help="The recording to write.")],
     config: Annotated[
         str | None,
@@ -99,6 +101,9 @@ def import_(
     time_unit: Annotated[
         str | None, typer.Option("--time-unit", help="Unit of the times: s, ms, us or ns; default: s.")
     ] = None,
+    topic: Annotated[
+        str | None, typer.Option("--topic", help="Topic of joint states, if a bag has several with the robot's joints.")
+    ] = None,
     joints: Annotated[
         str, typer.Option("--joints", help="Joint names in the file, in the robot's order: NAME,NAME,...")
     ] = "",
@@ -111,8 +116,8 @@ def import_(
     CSV columns: t (s), q1..qn, tau1..taun or current1..currentn, optionally the reference qr1..qrn; SI units. Columns
     may be named after joints, such as elbow/position and elbow/effort. MAT, NPZ and Parquet: the same names, or
     positions, torques, times. LeRobot data sets (file or folder): observation.state, and an effort or current. ROS 2
-    bags (.mcap): sensor_msgs/msg/JointState. Logs of a bus (candump -l, .asc, .blf, .trc): SYNC and TPDOs, as the
-    session configuration maps them.
+    bags (.mcap, .db3, or the folder): sensor_msgs/msg/JointState, joints by their names. Logs of a bus (candump -l,
+    .asc, .blf, .trc): SYNC and TPDOs, as the session configuration maps them.
 
     Missing samples are gaps. Damaged lines are left out, counted and named.
 
@@ -129,7 +134,7 @@ def import_(
     if config is None and not own:
         raise ConfigError(f"{file}: --config is missing, the robot configuration")
     if file.suffix.lower() in SUFFIXES:
-        others = (effort, motor_side, rate, names, polled, resample, time_unit, joints, by_position)
+        others = (effort, motor_side, rate, names, polled, resample, time_unit, topic, joints, by_position)
         if any(others):
             raise ConfigError(f"{file}: a bus log takes no option but --config and --out")
         session = load_session(str(config))
@@ -153,6 +158,7 @@ def import_(
         polled=polled,
         resample_hz=resample,
         time_unit=time_unit,
+        topic=topic,
         joints=[name.strip() for name in joints.split(",")] if joints else None,
         by_position=by_position,
     )

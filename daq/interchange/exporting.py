@@ -134,4 +134,9 @@ def _write_mat(_: Recording, table: dict[str, NDArray[np.float64]], path: Path) 
 def _write_rosbag(recording: Recording, table: dict[str, NDArray[np.float64]], path: Path) -> None:
     from armident.daq.interchange.rosbag import write_joint_states
 
-    write_joint_states(path, [joint.name for joint in recording.robot.joints], recording.samples.t_ns, table)
+    # Stamps are those of the sampling clock: times of reception jitter, and other tools take stamps for sampling times.
+    samples = recording.samples
+    t_ns = samples.t_ns[0] + np.round((samples.sync - samples.sync[0]) * (1e9 / recording.sample_rate_hz)).astype(
+        np.int64
+    )
+    write_joint_states(path, [j.source_name or j.name for j in recording.robot.joints], t_ns, table)

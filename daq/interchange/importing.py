@@ -1,4 +1,4 @@
-"""Import of measured motion from CSV, MAT, NPZ, Parquet, LeRobot data sets and rosbag2."""
+"""Import of measured motion from CSV, MAT, NPZ, Parquet, LeRobot data sets and bags of ROS 2."""
 
 import hashlib
 import logging
@@ -11,19 +11,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armident.configs import ConfigError, DataError, RobotConfig
+from armident.daq.interchange.bag_files import bag_files, is_bag
 from armident.daq.interchange.lerobot import data_files
 from armident.daq.interchange.rate_conversion import at_rate
+from armident.daq.interchange.sample_clock import gaps_and_counters
 from armident.daq.interchange.sampling import Sampled, sampled
 from armident.daq.interchange.si_checks import OMITTED, check_units, unit_of
 from armident.daq.interchange.table_columns import NAMES
 from armident.daq.interchange.table_files import Source, read_pair, read_table
 from armident.daq.interchange.table_rows import Rows, complete_rows
-from armident.daq.recording import Field, Gap, Recording, Stream, is_recording, read_recording
+from armident.daq.recording import Field, Recording, Stream, is_recording, read_recording
 from armident.daq.recording.model import Side
 
 __all__ = ["NAMES", "OMITTED", "import_recording"]
 
-NOTES = "import_notes"
+NOTES = "source_remarks"
 """Key of the metadata with everything that an import left out or assumed."""
 
 
@@ -38,6 +40,7 @@ def import_recording(
     polled: bool = False,
     resample_hz: float | None = None,
     time_unit: str | None = None,
+    topic: str | None = None,
     joints: Sequence[str] | None = None,
     by_position: bool = False,
 ) -> Recording:
@@ -47,7 +50,7 @@ def import_recording(
     ----------
     path
         CSV with a header line, MAT (up to version 7), NPZ, Parquet, a LeRobot data set (file or folder), or joint
-        states in an MCAP of ROS 2; SI units.
+        states in a bag of ROS 2 (MCAP, SQLite, or a folder); SI units.
         A recording of armident is resampled to ``rate_hz`` (`armident.daq.interchange.rate_conversion`).
     robot
         The robot that was measured; ``None`` for a recording: the one inside it.
@@ -70,6 +73,8 @@ def import_recording(
         Metadata of the recording tell the method.
     time_unit
         Unit of the times: ``s``, ``ms``, ``us`` or ``ns``.
+    topic
+        Topic of joint states of a bag.
     joints
         Names of the joints in the file, in the robot's order.
     by_position
@@ -84,7 +89,7 @@ def import_recording(
         contradict the rate, values far outside the limits, or a demand that no joint followed.
     """
     if is_recording(path):
-        if effort is not None or motor_side or names or polled or time_unit or joints or by_position:
+        if effort is not None or motor_side or names or polled or time_unit or topic or joints or by_position:
             raise ConfigError(f"{path}: a recording of armident takes no option but --rate, --config and --out")
         return _resampled(path, robot, rate_hz if rate_hz is not None else resample_hz)
     if robot is None:
@@ -94,8 +99,14 @@ def import_recording(
     if unknown:
         raise ConfigError(f"--map: no quantity named {unknown[0]!r}; expected one of {', '.join(NAMES)}")
     _check_rates(rate_hz, polled, resample_hz)
-    source = _source(path, effort, robot)
-    rows = complete_rows(source, robot, names, by_position=by_position, joints=joints)
+    if effort is None and is_bag(path) and not data_files(path):
+        source = _bag(path, robot, topic, joints, by_position)
+        rows = complete_rows(source, robot, names)
+    elif topic is not None:
+        raise ConfigError(f"{path}: --topic is an option of ROS 2 bags")
+    else:
+        source = read_pair(path, effort, robot) if effort is not None else read_table(path)
+        rows = complete_rows(source, robot, names, by_position=by_position, joints=joints)
     side: Side = "motor" if motor_side else "joint"
     fields: dict[str, Field] = {
         name: Field(
@@ -142,14 +153,13 @@ def _check_rates(rate_hz: float | None, polled: bool, resample_hz: float | None)
         raise ConfigError(f"--rate {rate_hz:g} and --resample {resample_hz:g} contradict each other; give one of them")
 
 
-def _source(path: Path, effort: Path | None, robot: RobotConfig) -> Source:
-    if effort is not None:
-        return read_pair(path, effort, robot)
-    if path.suffix.lower() == ".mcap" and path.is_file():
-        from armident.daq.interchange.rosbag import read_joint_states
+def _bag(path: Path, robot: RobotConfig, topic: str | None, joints: Sequence[str] | None, by_position: bool) -> Source:
+    """Return the joint states of a bag of ROS 2."""
+    from armident.daq.interchange.rosbag import read_joint_states
 
-        return Source(path, read_joint_states(path, robot))
-    return read_table(path)
+    states = read_joint_states(path, robot, topic=topic, joints=joints, by_position=by_position)
+    times = (states.t_ns - states.t_ns[0]) / 1e9
+    return Source(path, {"t": times, "q": states.q, "tau": states.tau}, notes=states.remarks, t_ns=states.t_ns)
 
 
 def _recording(
@@ -164,28 +174,14 @@ def _recording(
         demand, field = raw.pop("demand")[known], own.pop("demand")
         streams["demand"] = Stream("demand", 1, sync[known], t_ns[known], {"demand": field}, {"demand": demand})
     streams["samples"] = Stream("samples", 1, sync, t_ns, own, raw)
-    gaps, counters = _gaps_and_counters(streams)
+    gaps, counters = gaps_and_counters(streams)
     return Recording(None, robot, None, rate, streams, gaps=gaps, counters=counters, metadata=facts)
 
 
-def _gaps_and_counters(streams: Mapping[str, Stream]) -> tuple[tuple[Gap, ...], dict[str, int]]:
-    gaps: list[Gap] = []
-    counters: dict[str, int] = {}
-    for name, stream in streams.items():
-        steps = np.diff(stream.sync)
-        for k in np.flatnonzero(steps > 1):
-            gaps.append(Gap(name, int(stream.sync[k]) + 1, int(stream.sync[k + 1]) - 1, reason="not in the source"))
-        lost = int((steps - 1).sum())
-        counters |= {
-            f"{name}.expected": stream.sync.size + lost, f"{name}.rows": stream.sync.size, f"{name}.in_gaps": lost
-        }  # fmt: skip
-    return tuple(gaps), counters
-
-
 def _digest(path: Path) -> str:
-    """Return the SHA-256 of a file, or of the files of a data set in their order."""
+    """Return the SHA-256 of a file, or of the files of a folder in their order."""
     digest = hashlib.sha256()
-    for file in data_files(path) or [path]:
+    for file in data_files(path) or (bag_files(path)[0] if path.is_dir() else [path]):
         with file.open("rb") as opened:
             while block := opened.read(1 << 20):
                 digest.update(block)

@@ -1,109 +1,254 @@
-"""Joint states (sensor_msgs/msg/JointState) in rosbag2 files, which are MCAP files."""
+"""Joint states (sensor_msgs/msg/JointState) in bags of ROS 2: read by joint names and stamps, and written."""
 
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from mcap.reader import make_reader
-from mcap.summary import Summary
-from mcap_ros2.decoder import DecoderFactory
 from mcap_ros2.writer import Writer
 from numpy.typing import NDArray
 
 from armident.configs import DataError, RobotConfig
-from armident.daq.interchange.sandbox import error_line
+from armident.daq.interchange.bag_files import BagReader
+from armident.daq.interchange.joint_messages import DEFINITION, MESSAGE_TYPE, MessageTable, TopicMessages
+from armident.daq.interchange.joint_names import JointMatch, match_joints
 
 TOPIC = "/joint_states"
-_TYPE = "sensor_msgs/msg/JointState"
-DEFINITION = """std_msgs/Header header
-string[] name
-float64[] position
-float64[] velocity
-float64[] effort
-================================================================================
-MSG: std_msgs/Header
-builtin_interfaces/Time stamp
-string frame_id
-================================================================================
-MSG: builtin_interfaces/Time
-int32 sec
-uint32 nanosec
-"""
 _NS = 1_000_000_000
 
+LATEST_S = 0.1
+"""Longest delay, s, of a message behind those of later stamps: several nodes send at their own pace."""
 
-def read_joint_states(path: Path, robot: RobotConfig) -> dict[str, NDArray[np.float64]]:
-    """Return times ``t`` (N,), s, positions ``q`` and efforts ``tau`` (N, n) of a robot's joints.
+CLOCKS_DIFFER = 0.1
+"""Relative difference of stamps and times of recording above which they are not of one clock, as in a simulation."""
 
-    Joints are found by their names. If the bag has none of the robot's names but the same number of joints, they are
-    taken in the bag's order. Times are the message stamps, or the log times if stamps are not set.
+SIMULATED_S = 1e8
+"""Stamps below this time, s, are those of a simulation, whose clock begins at 0."""
+
+
+@dataclass(frozen=True)
+class JointStates:
+    """Joint states of a robot.
+
+    Parameters
+    ----------
+    t_ns
+        Times, ns, (N,), increasing.
+    q, tau
+        Positions and efforts, SI units, (N, n), in the robot's order.
+    remarks
+        Sentences on what was assumed, passed over or is missing, for the user.
+    """
+
+    t_ns: NDArray[np.int64]
+    q: NDArray[np.float64]
+    tau: NDArray[np.float64]
+    remarks: tuple[str, ...] = ()
+
+
+def read_joint_states(
+    path: Path,
+    robot: RobotConfig,
+    *,
+    topic: str | None = None,
+    joints: Sequence[str] | None = None,
+    by_position: bool = False,
+) -> JointStates:
+    """Return positions and efforts of a robot's joints from a bag.
+
+    Joints are found by their names in every message (`armident.daq.interchange.joint_names`). Other joints are passed
+    over. Messages of one stamp with parts of the robot's joints are one sample. Times are the stamps, or the times of
+    recording if no stamp is set. What is damaged is left out, with a remark.
 
     Parameters
     ----------
     path
-        The rosbag2 file.
+        MCAP or SQLite file, either compressed with zstd, or folder of a bag.
     robot
         The robot, for the names of its joints.
+    topic
+        Topic to read; ``None``: the only one with the robot's joints.
+    joints
+        Names in the bag of the robot's joints, in the robot's order; ``None``: those of the robot.
+    by_position
+        True to take joints of other names in the order of the messages.
 
     Raises
     ------
+    ConfigError
+        If there is no such bag.
     DataError
-        If it is not a rosbag2 MCAP file, has no joint states or those of several robots, or lacks a joint.
+        If it is no bag, has no joint states, those of several robots, no joint of a name, or contradictory times.
     """
-    t: list[int] = []
-    q: list[list[float]] = []
-    tau: list[list[float]] = []
+    reader = BagReader(path, MESSAGE_TYPE)
+    found: dict[str, TopicMessages] = {}
+    for message in reader:
+        found.setdefault(message.topic, TopicMessages(message.topic)).add(message.logged_ns, message.data)
     try:
-        with path.open("rb") as file:
-            reader = make_reader(file, decoder_factories=[DecoderFactory()])
-            topic = _topic(path, reader.get_summary())
-            order: list[int] | None = None
-            for _, _, logged, message in reader.iter_decoded_messages(topics=[topic]):
-                names = list(message.name)
-                order = _order(path, robot, names) if order is None else order
-                stamp = message.header.stamp
-                t.append(stamp.sec * _NS + stamp.nanosec or logged.log_time)
-                for values, into, what in ((message.position, q, "positions"), (message.effort, tau, "efforts")):
-                    if len(values) != len(names):
-                        raise DataError(
-                            f"{path}: message {len(t)} of {topic} has {len(values)} {what} of {len(names)} joints"
-                        )
-                    into.append([values[k] for k in order])
-    except DataError:
-        raise
-    except Exception as error:  # the readers of MCAP, zstd and ROS 2 messages raise various errors for damaged files
-        raise DataError(f"{path}: not a readable rosbag2 file: {error_line(error)}") from error
-    if not t:
-        raise DataError(f"{path}: no message on {topic}")
-    times = np.array(t, dtype=np.int64)
-    return {"t": (times - times[0]) / _NS, "q": np.array(q, np.float64), "tau": np.array(tau, np.float64)}
+        chosen, match, remarks = _choose(reader, found, robot, topic, joints, by_position)
+        t_ns, q, tau, passed = _samples(chosen, match, robot)
+    except DataError as error:
+        lost = f" ({'; '.join(reader.losses)})" if reader.losses else ""
+        raise DataError(f"{path}: {error}{lost}") from error
+    return JointStates(t_ns, q, tau, (*match.remarks, *remarks, *passed, *chosen.remarks(), *reader.losses))
 
 
-def _topic(path: Path, summary: Summary | None) -> str:
-    """Return the only topic of joint states."""
-    if summary is None:
-        raise DataError(f"{path}: has no summary; `ros2 bag reindex` or `mcap recover` writes one")
-    topics = sorted(
-        channel.topic
-        for channel in summary.channels.values()
-        if channel.schema_id in summary.schemas and summary.schemas[channel.schema_id].name == _TYPE
-    )
+def _choose(
+    reader: BagReader,
+    found: dict[str, TopicMessages],
+    robot: RobotConfig,
+    topic: str | None,
+    joints: Sequence[str] | None,
+    by_position: bool,
+) -> tuple[TopicMessages, JointMatch, list[str]]:
+    """Return the messages of the topic, the robot's joints in them, and a remark on other topics."""
+    topics = sorted(name for name, kind in reader.topics.items() if kind == MESSAGE_TYPE)
     if not topics:
-        have = ", ".join(sorted(channel.topic for channel in summary.channels.values())) or "nothing"
-        raise DataError(f"{path}: no topic of {_TYPE}; found {have}")
-    if len(topics) > 1:
-        raise DataError(f"{path}: joint states of several robots: {', '.join(topics)}")
-    return topics[0]
+        have = ", ".join(f"{name} ({kind})" for name, kind in sorted(reader.topics.items())) or "no topic"
+        raise DataError(f"no topic of {MESSAGE_TYPE} in CDR; found {have}")
+    if topic is not None:
+        name = topic if topic in topics else f"/{topic}"
+        if name not in topics:
+            raise DataError(f"--topic: no joint states on {topic}; the bag has {', '.join(topics)}")
+        topics = [name]
+    full = [found[name] for name in topics if name in found]
+    if not full:
+        raise DataError(f"no message on {', '.join(topics)}")
+    if len(full) == 1:
+        full[0].refuse_unusable()
+        return full[0], match_joints(full[0].names(), robot.joints, by_position=by_position, joints=joints), []
+    matches: list[tuple[TopicMessages, JointMatch]] = []
+    for messages in full:
+        try:
+            match = match_joints(messages.names(), robot.joints, by_position=by_position, joints=joints)
+        except DataError:
+            continue
+        matches.append((messages, match))
+    contents = "; ".join(f"{m.topic}: {m.count} messages of {', '.join(m.names())}" for m in full)
+    if len(matches) != 1:
+        how = "joints of the robot on several topics" if matches else "no topic has the joints of the robot"
+        wanted = ", ".join(joint.source_name or joint.name for joint in robot.joints)
+        raise DataError(f"{how}; --topic NAME chooses one of {contents}; the robot has {wanted}")
+    chosen, match = matches[0]
+    return chosen, match, [f"topic {chosen.topic} is read, as only it has the joints of the robot ({contents})"]
 
 
-def _order(path: Path, robot: RobotConfig, names: list[str]) -> list[int]:
-    """Return the index of each joint of a robot among the names."""
-    wanted = [joint.name for joint in robot.joints]
-    if set(wanted) <= set(names):
-        return [names.index(name) for name in wanted]
-    if not set(wanted) & set(names) and len(names) == robot.n:
-        return list(range(robot.n))
-    missing = ", ".join(name for name in wanted if name not in names)
-    raise DataError(f"{path}: no joint {missing} of {robot.name} among {', '.join(names)}")
+def _samples(
+    messages: TopicMessages, match: JointMatch, robot: RobotConfig
+) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64], list[str]]:
+    """Return times (N,), positions and efforts (N, n) of the stamps with all joints, and remarks on the others."""
+    tables = messages.tables()
+    ours = [table for table in tables if set(table.names) & set(match.names)]
+    others = [table for table in tables if table not in ours]
+    remarks = []
+    if others:
+        names = dict.fromkeys(name for table in others for name in table.names)
+        count = sum(table.number.size for table in others)
+        remarks.append(f"{count} messages of other joints passed over: {', '.join(names)}")
+    for what, given in (("positions", [t.q for t in ours]), ("efforts", [t.tau for t in ours])):
+        if all(values is None for values in given):
+            raise DataError(f"the messages on {messages.topic} have no {what} of {', '.join(match.names)}")
+    times, remark = _times(messages.topic, ours)
+    remarks += remark
+    stamps = np.unique(np.concatenate(times))
+    shape = (2, stamps.size, robot.n)
+    values, known = np.zeros(shape), np.zeros(shape, dtype=bool)
+    repeated = 0
+    for table, t in zip(ours, times, strict=True):
+        repeated += _fill(values, known, np.searchsorted(stamps, t), table, match.names, messages.topic)
+    if repeated:
+        remarks.append(f"{repeated} messages on {messages.topic} repeat the one before, and are passed over")
+    whole = known.all(axis=(0, 2))
+    if not whole.any():
+        raise DataError(
+            f"no stamp on {messages.topic} has positions and efforts of all joints {', '.join(match.names)}: "
+            "messages of different stamps are not joined"
+        )
+    if not whole.all():
+        first = int(np.flatnonzero(~whole)[0])
+        lacks = [name for k, name in enumerate(match.names) if not known[:, first, k].all()]
+        remarks.append(
+            f"{int((~whole).sum())} stamps without all joints are left out, the first "
+            f"{(stamps[first] - stamps[0]) / _NS:.6g} s after the begin: without {', '.join(lacks)}"
+        )
+    return stamps[whole], values[0, whole], values[1, whole], remarks
+
+
+def _times(topic: str, tables: Sequence[MessageTable]) -> tuple[list[NDArray[np.int64]], list[str]]:
+    """Return the times of the messages of each table, and a remark if they are not the stamps."""
+    stamps = np.concatenate([table.stamp for table in tables])
+    logged = np.concatenate([table.logged for table in tables])
+    number = np.concatenate([table.number for table in tables])
+    remarks: list[str] = []
+    unset = int((stamps == 0).sum())
+    if unset == stamps.size:
+        stamps, remarks = logged, [f"stamps on {topic} are not set: times are those of recording"]
+    elif unset and stamps.max() > SIMULATED_S * _NS:
+        raise DataError(f"{unset} of {stamps.size} messages on {topic} have no stamp: their times are unknown")
+    if (stamps < 0).any():
+        raise DataError(f"message {number[stamps < 0][0]} on {topic} has a stamp before 1970")
+    for order in (np.argsort(number), np.lexsort((number, logged))):
+        back = np.maximum.accumulate(stamps[order]) - stamps[order]
+        if back.max() <= LATEST_S * _NS:
+            break
+    else:
+        k = int(np.flatnonzero(back > LATEST_S * _NS)[0])
+        raise DataError(
+            f"message {number[order][k]} on {topic} has a stamp {back[k] / _NS:.6g} s before that of an earlier one: "
+            "the clock was set back, or the bag holds several runs"
+        )
+    _refuse_jump(topic, stamps[order], logged[order], number[order])
+    ends = np.cumsum([table.number.size for table in tables])[:-1]
+    return np.split(stamps, ends), remarks
+
+
+def _refuse_jump(topic: str, stamps: NDArray[np.int64], logged: NDArray[np.int64], number: NDArray[np.int64]) -> None:
+    """Refuse stamps that jump ahead of the recorder's clock, where both otherwise advance alike."""
+    steps, walls = np.diff(stamps) / _NS, np.diff(logged) / _NS
+    ahead = steps - walls
+    usual = steps < LATEST_S
+    if not usual.any() or abs(walls[usual].sum() - steps[usual].sum()) > CLOCKS_DIFFER * steps[usual].sum():
+        return
+    k = int(np.argmax(ahead))
+    if ahead[k] > max(LATEST_S, steps[k] / 2):
+        raise DataError(
+            f"message {number[k + 1]} on {topic} has a stamp {steps[k]:.6g} s after that of the one before, and was "
+            f"recorded {walls[k]:.6g} s after it: the clock was set"
+        )
+
+
+def _fill(
+    values: NDArray[np.float64],
+    known: NDArray[np.bool_],
+    rows: NDArray[np.intp],
+    table: MessageTable,
+    names: Iterable[str],
+    topic: str,
+) -> int:
+    """Enter the joints of a table in ``values`` (2, N, n) at its rows; return the number of messages known before."""
+    repeats = np.zeros(rows.size, dtype=bool)
+    for k, name in enumerate(names):
+        if name not in table.names:
+            continue
+        column = table.names.index(name)
+        for part, given in enumerate((table.q, table.tau)):
+            if given is None:
+                continue
+            # The last of several messages at one stamp is compared with the others, and with those of other tables.
+            value = given[:, column]
+            before, had = values[part, rows, k], known[part, rows, k]
+            values[part, rows, k], known[part, rows, k] = value, True
+            entered = values[part, rows, k]
+            clash = (entered != value) & ~(np.isnan(entered) & np.isnan(value))
+            clash |= had & (before != value) & ~(np.isnan(before) & np.isnan(value))
+            if clash.any():
+                raise DataError(
+                    f"message {table.number[clash][0]} on {topic} has the stamp of another one and another value of "
+                    f"{name}: two nodes send the same joint"
+                )
+            repeats |= had
+    repeats[np.setdiff1d(np.arange(rows.size), np.unique(rows, return_index=True)[1])] = True
+    return int(repeats.sum())
 
 
 def write_joint_states(
@@ -131,7 +276,7 @@ def write_joint_states(
     )
     with path.open("wb") as file:
         writer = Writer(file)
-        schema = writer.register_msgdef(_TYPE, DEFINITION)
+        schema = writer.register_msgdef(MESSAGE_TYPE, DEFINITION)
         for k, at in enumerate(t_ns.tolist()):
             message = {
                 "header": {"stamp": {"sec": at // _NS, "nanosec": at % _NS}, "frame_id": ""},

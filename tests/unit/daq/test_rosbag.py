@@ -1,70 +1,198 @@
-"""Joint states of ROS 2: order by name, times by stamps, and one clear line for every error."""
+"""Joint states of ROS 2: joints by name in every message, times by stamps, and one clear line for every error."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
-from mcap_ros2.writer import Writer
-from numpy.typing import NDArray
+from typer.testing import CliRunner
 
-from armident.configs import DataError, load_robot
+from armident.configs import ConfigError, DataError
+from armident.daq.cli import application
+from armident.daq.interchange.exporting import columns, export_recording
 from armident.daq.interchange.importing import import_recording
-from armident.daq.interchange.rosbag import DEFINITION, TOPIC, read_joint_states, write_joint_states
-from armident.daq.recording import write_recording
+from armident.daq.interchange.rosbag import TOPIC, JointStates, read_joint_states, write_joint_states
+from armident.daq.recording import Recording, read_recording, write_recording
+from tests.unit.daq.bags import NAMES, ROWS, STEP_NS, T0, TAU, TX40, Q, State, mcap_bag, motion, states
 
-TX40 = load_robot("tx40.yaml")
-NAMES = [joint.name for joint in TX40.joints]
-T0 = 1_700_000_000_000_000_000
-Floats = NDArray[np.float64]
+EXCHANGED = [0, 1, 3, 4, 2, 5]
 
 
-def states(path: Path, names: list[str], q: Floats, tau: Floats, topic: str = TOPIC, stamped: bool = True) -> Path:
-    """A bag of joint states at 1 kHz, written message by message."""
-    with path.open("wb") as file:
-        writer = Writer(file)
-        schema = writer.register_msgdef("sensor_msgs/msg/JointState", DEFINITION)
-        for k in range(len(q)):
-            at = T0 + k * 1_000_000
-            stamp = {"sec": at // 10**9, "nanosec": at % 10**9} if stamped else {"sec": 0, "nanosec": 0}
-            message = {
-                "header": {"stamp": stamp, "frame_id": "base"},
-                "name": names,
-                "position": q[k].tolist(),
-                "velocity": [],
-                "effort": tau[k].tolist(),
-            }
-            writer.write_message(topic, schema, message, at if not stamped else at + k % 7 * 1000, at, k)
-        writer.finish()  # type: ignore[no-untyped-call]
-    return path
-
-
-def motion(joints: int) -> tuple[Floats, Floats]:
-    rng = np.random.default_rng(6)
-    return rng.uniform(-1, 1, (200, joints)), rng.uniform(-3, 3, (200, joints))
+def assert_motion(found: JointStates | Recording, rows: slice | np.ndarray = slice(None)) -> None:
+    """The values are those of the motion, in the robot's order."""
+    if isinstance(found, JointStates):
+        q, tau = found.q, found.tau
+    else:
+        q, tau = found.samples.raw["position"], found.samples.raw["torque"]
+    np.testing.assert_array_equal(q, Q[rows])
+    np.testing.assert_array_equal(tau, TAU[rows])
 
 
 @pytest.mark.parametrize("stamped", [True, False])
 def test_joints_are_found_by_name_among_others(tmp_path: Path, stamped: bool) -> None:
-    q, tau = motion(7)
-    names = ["gripper", *reversed(NAMES)]
-    recording = import_recording(states(tmp_path / "a.mcap", names, q, tau, stamped=stamped), TX40)
-    np.testing.assert_array_equal(recording.samples.raw["position"], q[:, :0:-1])
-    np.testing.assert_array_equal(recording.samples.raw["torque"], tau[:, :0:-1])
-    assert recording.sample_rate_hz == pytest.approx(1000.0, rel=1e-9)
+    names = [*reversed(NAMES), "gripper"]
+    messages = states(names, [5, 4, 3, 2, 1, 0, 0], stamped=stamped)
+    recording = import_recording(mcap_bag(tmp_path / "a.mcap", messages), TX40)
+    assert_motion(recording)
+    assert recording.sample_rate_hz == pytest.approx(500.0, rel=1e-12)
+    assert ("times are those of recording" in recording.metadata.get("source_remarks", "")) is not stamped
 
 
-def test_joints_of_other_names_are_taken_in_their_order(tmp_path: Path) -> None:
-    q, tau = motion(6)
-    found = read_joint_states(states(tmp_path / "a.mcap", [f"a{k}" for k in range(6)], q, tau), TX40)
-    np.testing.assert_array_equal(found["q"], q)
+def test_names_of_another_case_are_matched_and_said(tmp_path: Path) -> None:
+    names = [NAMES[k].capitalize() for k in EXCHANGED]
+    found = read_joint_states(mcap_bag(tmp_path / "a.mcap", states(names, EXCHANGED)), TX40)
+    assert_motion(found)
+    assert "Joint_4 as joint_4" in found.remarks[0]
+
+
+def test_names_of_the_urdf_find_the_joints(tmp_path: Path) -> None:
+    robot = TX40.model_copy(
+        update={"joints": tuple(j.model_copy(update={"source_name": f"Axis {k}/θ"}) for k, j in enumerate(TX40.joints))}
+    )
+    names = [f"Axis {k}/θ" for k in reversed(range(6))]
+    found = read_joint_states(mcap_bag(tmp_path / "a.mcap", states(names, range(5, -1, -1))), robot)
+    assert_motion(found)
+    assert found.remarks == ()
+
+
+def test_joints_of_other_names_are_refused_unless_position_or_names_are_given(tmp_path: Path) -> None:
+    names = [f"a{k}" for k in EXCHANGED]
+    path = mcap_bag(tmp_path / "a.mcap", states(names, EXCHANGED))
+    with pytest.raises(
+        DataError, match=r"the file has a0, a1, a3, a4, a2, a5; the robot has joint_1.*--joints.*--by-pos"
+    ):
+        read_joint_states(path, TX40)
+    by_position = read_joint_states(path, TX40, by_position=True)
+    np.testing.assert_array_equal(by_position.q, Q[:, EXCHANGED])
+    assert "taken by position: a0 as joint_1, a1 as joint_2, a3 as joint_3" in by_position.remarks[0]
+    assert_motion(read_joint_states(path, TX40, joints=[f"a{k}" for k in range(6)]))
+
+
+def test_messages_without_names_are_taken_by_position_only(tmp_path: Path) -> None:
+    path = mcap_bag(tmp_path / "a.mcap", states(()))
+    with pytest.raises(DataError, match=r"the file has \(unnamed 1\), .*--by-position"):
+        read_joint_states(path, TX40)
+    assert_motion(read_joint_states(path, TX40, by_position=True))
+
+
+def test_an_order_that_changes_is_followed(tmp_path: Path) -> None:
+    later = states([NAMES[k] for k in EXCHANGED], EXCHANGED)[50:]
+    assert_motion(read_joint_states(mcap_bag(tmp_path / "a.mcap", states()[:50] + later), TX40))
+
+
+def test_messages_of_a_gripper_and_of_another_arm_are_passed_over(tmp_path: Path) -> None:
+    fingers = [State(T0 + k * STEP_NS + 700, ["left", "right"], [0.01, 0.01], [1, 1]) for k in range(0, ROWS, 9)]
+    other = [replace(m, at=m.at + STEP_NS // 2) for m in states([f"right_{n}" for n in NAMES], EXCHANGED)]
+    recording = import_recording(mcap_bag(tmp_path / "a.mcap", states() + fingers + other), TX40)
+    assert_motion(recording)
+    assert recording.sample_rate_hz == pytest.approx(500.0)
+    remark = recording.metadata["source_remarks"]
+    assert f"{ROWS + len(fingers)} messages of other joints passed over: left, right, right_joint_1" in remark
+
+
+def test_two_arms_need_a_choice(tmp_path: Path) -> None:
+    left, right = ([f"{side}_{name}" for name in NAMES] for side in ("left", "right"))
+    messages = states(left) + [replace(m, at=m.at + 300) for m in states(right, EXCHANGED)]
+    path = mcap_bag(tmp_path / "a.mcap", messages)
+    with pytest.raises(DataError, match=r"several arms: prefixes 'left', 'right'; the file has left_joint_1.*--joints"):
+        read_joint_states(path, TX40)
+    assert_motion(read_joint_states(path, TX40, joints=left))
+
+
+def test_joints_of_one_stamp_in_two_messages_are_one_sample(tmp_path: Path) -> None:
+    first, second = states(NAMES[:2], [0, 1]), states(NAMES[2:], [2, 3, 4, 5], delay=3 * STEP_NS)
+    assert_motion(read_joint_states(mcap_bag(tmp_path / "a.mcap", first + second), TX40))
+    positions = [replace(m, tau=()) for m in states()]
+    efforts = [replace(m, q=(), delay=40) for m in states()]
+    assert_motion(read_joint_states(mcap_bag(tmp_path / "b.mcap", positions + efforts), TX40))
+    recording = import_recording(mcap_bag(tmp_path / "c.mcap", first + second[:30] + second[34:]), TX40)
+    assert_motion(recording, np.delete(np.arange(ROWS), [30, 31, 32, 33]))
+    assert [(gap.first, gap.last) for gap in recording.gaps] == [(30, 33)]
+    assert "4 stamps without all joints are left out, the first 0.06 s" in recording.metadata["source_remarks"]
+    apart = [replace(m, at=m.at + 50_000) for m in second]
+    with pytest.raises(DataError, match="messages of different stamps are not joined"):
+        read_joint_states(mcap_bag(tmp_path / "d.mcap", first + apart), TX40)
+
+
+def test_a_topic_is_chosen(tmp_path: Path) -> None:
+    wished = [replace(m, q=m.q[::-1], topic="/wished") for m in states()]
+    path = mcap_bag(tmp_path / "a.mcap", states() + wished)
+    with pytest.raises(
+        DataError, match=r"--topic NAME chooses one of /joint_states: 120 messages of joint_1.*; /wished"
+    ):
+        read_joint_states(path, TX40)
+    assert_motion(read_joint_states(path, TX40, topic="/joint_states"))
+    np.testing.assert_array_equal(read_joint_states(path, TX40, topic="wished").q, Q[:, ::-1])
+    with pytest.raises(DataError, match=r"--topic: no joint states on /other; the bag has /joint_states, /wished"):
+        read_joint_states(path, TX40, topic="/other")
+    gripper = [replace(m, names=["left"], q=[0.1], tau=[1.0], topic="/gripper/joint_states") for m in states()]
+    found = read_joint_states(mcap_bag(tmp_path / "b.mcap", states() + gripper), TX40)
+    assert_motion(found)
+    assert "/joint_states is read, as only it has the joints of the robot" in found.remarks[0]
+
+
+def test_dropped_messages_are_a_gap(tmp_path: Path) -> None:
+    path = mcap_bag(tmp_path / "a.mcap", states()[:40] + states()[57:])
+    for rate in (None, 500.0):
+        recording = import_recording(path, TX40, rate_hz=rate)
+        assert_motion(recording, recording.samples.sync)
+        assert [(gap.first, gap.last, gap.joint) for gap in recording.gaps] == [(40, 56, None)]
+        assert recording.counters["samples.in_gaps"] == 17
+        assert recording.sample_rate_hz == pytest.approx(500.0, rel=1e-12)
+    with pytest.raises(DataError, match=r"--rate 1000 contradicts .* usual step of 0\.002 s is a rate of 500 Hz"):
+        import_recording(path, TX40, rate_hz=1000.0)
+    holed = mcap_bag(tmp_path / "b.mcap", states()[:40] + states()[70:])
+    with pytest.raises(DataError, match=r"no sample for 0\.062 s: --polled does not fill holes"):
+        import_recording(holed, TX40, rate_hz=500.0, polled=True)
+
+
+def test_times_that_contradict_each_other_are_refused(tmp_path: Path) -> None:
+    moved = [replace(m, at=m.at - 500_000_000, delay=500_001_000) for m in states()[60:]]
+    with pytest.raises(
+        DataError, match=r"message 61 on /joint_states has a stamp 0\.498 s before .* clock was set back"
+    ):
+        read_joint_states(mcap_bag(tmp_path / "a.mcap", states()[:60] + moved), TX40)
+    moved = [replace(m, at=m.at + 900_000_000, delay=1000 - 900_000_000) for m in states()[60:]]
+    with pytest.raises(
+        DataError, match=r"stamp 0\.902 s after that of the one before, and was recorded 0\.002 s after"
+    ):
+        read_joint_states(mcap_bag(tmp_path / "b.mcap", states()[:60] + moved), TX40)
+    unset = [replace(m, stamped=False) for m in states()[:3]]
+    with pytest.raises(DataError, match=r"3 of 120 messages on /joint_states have no stamp"):
+        read_joint_states(mcap_bag(tmp_path / "c.mcap", unset + states()[3:]), TX40)
+    twice = [replace(m, q=np.add(m.q, 0.01), delay=2000) for m in states()]
+    with pytest.raises(DataError, match=r"another value of joint_1: two nodes send the same joint"):
+        read_joint_states(mcap_bag(tmp_path / "d.mcap", states() + twice), TX40)
+    jitter = np.random.default_rng(1).integers(-300_000, 300_000, ROWS)
+    uneven = [replace(m, at=m.at + int(d)) for m, d in zip(states(), jitter, strict=True)]
+    with pytest.raises(DataError, match="not a whole number of periods"):
+        import_recording(mcap_bag(tmp_path / "e.mcap", uneven), TX40)
+
+
+def test_repeated_messages_are_passed_over(tmp_path: Path) -> None:
+    found = read_joint_states(mcap_bag(tmp_path / "a.mcap", states() + states()[7:9]), TX40)
+    assert_motion(found)
+    assert "2 messages on /joint_states repeat the one before" in found.remarks[0]
+
+
+def test_one_odd_message_is_left_out_and_said(tmp_path: Path) -> None:
+    messages = states()
+    messages[20] = replace(messages[20], tau=messages[20].tau[:5])
+    messages[70] = replace(messages[70], names=[*NAMES[:5], NAMES[0]])
+    recording = import_recording(mcap_bag(tmp_path / "a.mcap", messages), TX40)
+    assert_motion(recording, np.delete(np.arange(ROWS), [20, 70]))
+    assert [gap.first for gap in recording.gaps] == [20, 70]
+    remarks = recording.metadata["source_remarks"]
+    assert "message 21 on /joint_states has 5 efforts of 6 joints" in remarks
+    assert "message 71 on /joint_states has a joint twice" in remarks
 
 
 def test_ros_reads_the_written_values(tmp_path: Path) -> None:
-    q, tau = motion(6)
-    columns = {f"q{j + 1}": q[:, j] for j in range(6)} | {f"tau{j + 1}": tau[:, j] for j in range(6)}
-    write_joint_states(tmp_path / "a.mcap", NAMES, T0 + np.arange(200) * 1_000_000, columns)
+    q, tau = motion()
+    table = {f"q{j + 1}": q[:, j] for j in range(6)} | {f"tau{j + 1}": tau[:, j] for j in range(6)}
+    write_joint_states(tmp_path / "a.mcap", NAMES, T0 + np.arange(ROWS) * 1_000_000, table)
     with (tmp_path / "a.mcap").open("rb") as file:
         reader = make_reader(file, decoder_factories=[DecoderFactory()])
         assert reader.get_header().profile == "ros2"
@@ -74,20 +202,60 @@ def test_ros_reads_the_written_values(tmp_path: Path) -> None:
     assert decoded[3].header.stamp.nanosec == 3_000_000
 
 
+def test_an_exported_capture_comes_back_with_the_same_numbers(tmp_path: Path) -> None:
+    source = [f"Axis-{k}" for k in range(6)]
+    robot = TX40.model_copy(
+        update={
+            "joints": tuple(j.model_copy(update={"source_name": s}) for j, s in zip(TX40.joints, source, strict=True))
+        }
+    )
+    made = import_recording(mcap_bag(tmp_path / "a.mcap", states(source)[:50] + states(source)[53:]), robot)
+    jitter = np.random.default_rng(2).integers(0, 60_000, ROWS - 3)
+    received = replace(made.samples, t_ns=made.samples.t_ns + jitter)
+    capture = replace(made, streams={"samples": received})
+    export_recording(capture, tmp_path / "b.mcap")
+    back = import_recording(tmp_path / "b.mcap", robot)
+    assert back.sample_rate_hz == pytest.approx(made.sample_rate_hz, rel=1e-9)
+    np.testing.assert_array_equal(back.samples.sync, made.samples.sync)
+    assert [(gap.first, gap.last) for gap in back.gaps] == [(50, 52)]
+    assert "source_remarks" not in back.metadata
+    before, after = columns(capture), columns(back)
+    for name in before:
+        np.testing.assert_allclose(after[name], before[name], rtol=1e-12)
+
+
 def test_an_invalid_bag_is_reported_in_one_line(tmp_path: Path) -> None:
-    q, tau = motion(6)
-    with pytest.raises(DataError, match=r"no joint joint_6 of tx40 among"):
-        read_joint_states(states(tmp_path / "a.mcap", [*NAMES[:5], "tool"], q, tau), TX40)
-    with pytest.raises(DataError, match=r"message 1 of /joint_states has 5 efforts of 6 joints"):
-        read_joint_states(states(tmp_path / "b.mcap", NAMES, q, tau[:, :5]), TX40)
+    with pytest.raises(DataError, match=r"no joint joint_6; the file has .*tool; the robot has .*joint_6"):
+        read_joint_states(mcap_bag(tmp_path / "a.mcap", states([*NAMES[:5], "tool"])), TX40)
+    with pytest.raises(DataError, match=r"message 1 on /joint_states has 5 efforts of 6 joints, and 119 more"):
+        read_joint_states(mcap_bag(tmp_path / "b.mcap", [replace(m, tau=m.tau[:5]) for m in states()]), TX40)
+    with pytest.raises(DataError, match=r"/joint_states have no efforts of joint_1, joint_2"):
+        read_joint_states(mcap_bag(tmp_path / "f.mcap", [replace(m, tau=()) for m in states()]), TX40)
     (tmp_path / "c.mcap").write_bytes(b"not one")
-    with pytest.raises(DataError, match=r"c\.mcap: not a readable rosbag2 file"):
+    with pytest.raises(DataError, match=r"c\.mcap: not an MCAP file"):
         read_joint_states(tmp_path / "c.mcap", TX40)
-    ours = import_recording(states(tmp_path / "d.mcap", NAMES, q, tau), TX40)
+    ours = import_recording(mcap_bag(tmp_path / "d.mcap", states()), TX40)
     write_recording(ours, tmp_path / "ours.mcap")
-    with pytest.raises(DataError, match=r"no topic of sensor_msgs/msg/JointState; found .*/samples"):
+    with pytest.raises(DataError, match=r"no topic of sensor_msgs/msg/JointState in CDR; found .*/samples"):
         read_joint_states(tmp_path / "ours.mcap", TX40)
-    whole = (tmp_path / "d.mcap").read_bytes()
-    (tmp_path / "e.mcap").write_bytes(whole[: len(whole) // 2])
-    with pytest.raises(DataError, match=r"e\.mcap"):
-        read_joint_states(tmp_path / "e.mcap", TX40)
+    with pytest.raises(DataError, match=r"no topic .*; found /joint_states \(sensor_msgs/msg/Imu\)"):
+        read_joint_states(mcap_bag(tmp_path / "e.mcap", states(), message_type="sensor_msgs/msg/Imu"), TX40)
+    with pytest.raises(ConfigError, match=r"--topic is an option of ROS 2 bags"):
+        import_recording(tmp_path / "a.csv", TX40, topic="/a")
+
+
+def test_the_command_has_the_options_and_says_what_was_assumed(tmp_path: Path) -> None:
+    names = [f"a{k}" for k in range(6)]
+    path = mcap_bag(tmp_path / "a.mcap", states(names)[:40] + states(names, topic="/other") + states(names)[50:])
+    command = ["import", str(path), "--config", "tx40.yaml", "--out", str(tmp_path / "out.mcap")]
+    run = CliRunner().invoke
+    refused = run(application(["import"]), command)
+    assert refused.exit_code == 3
+    assert "--topic" in refused.output
+    done = run(application(["import"]), [*command, "--topic", TOPIC, "--joints", ", ".join(names)])
+    assert done.exit_code == 0, done.output
+    assert "110 samples at 500 Hz, 10 in gaps, position, torque" in done.output
+    assert read_recording(tmp_path / "out.mcap").gaps[0].first == 40
+    done = run(application(["import"]), [*command, "--topic", "/other", "--by-position"])
+    assert done.exit_code == 0, done.output
+    assert "joints taken by position: a0 as joint_1" in done.output

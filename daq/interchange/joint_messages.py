@@ -1,0 +1,166 @@
+"""Messages of type sensor_msgs/msg/JointState of one topic, decoded into one table for each list of joint names."""
+
+import struct
+from array import array
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from mcap.records import Schema
+from mcap_ros2.decoder import DecoderFactory
+from numpy.typing import NDArray
+
+from armident.configs import DataError
+
+MESSAGE_TYPE = "sensor_msgs/msg/JointState"
+DEFINITION = """std_msgs/Header header
+string[] name
+float64[] position
+float64[] velocity
+float64[] effort
+================================================================================
+MSG: std_msgs/Header
+builtin_interfaces/Time stamp
+string frame_id
+================================================================================
+MSG: builtin_interfaces/Time
+int32 sec
+uint32 nanosec
+"""
+_NS = 1_000_000_000
+
+
+@dataclass(frozen=True, eq=False)
+class MessageTable:
+    """Messages with one list of names, and with the same quantities, M of them.
+
+    Parameters
+    ----------
+    names
+        Names of the m joints.
+    number
+        Number of each message on its topic, from 1, (M,).
+    stamp, logged
+        Stamp in the header and time of recording, ns, (M,).
+    q, tau
+        Positions and efforts, (M, m); ``None`` if the messages have none.
+    """
+
+    names: tuple[str, ...]
+    number: NDArray[np.int64]
+    stamp: NDArray[np.int64]
+    logged: NDArray[np.int64]
+    q: NDArray[np.float64] | None
+    tau: NDArray[np.float64] | None
+
+
+@dataclass
+class _Rows:
+    """Values of messages of one kind as they come."""
+
+    times: "array[int]" = field(default_factory=lambda: array("q"))
+    q: "array[float]" = field(default_factory=lambda: array("d"))
+    tau: "array[float]" = field(default_factory=lambda: array("d"))
+
+
+class TopicMessages:
+    """Collects the messages of a topic.
+
+    Parameters
+    ----------
+    topic
+        Name of the topic.
+
+    Attributes
+    ----------
+    count
+        Number of messages so far, unusable ones included.
+    """
+
+    def __init__(self, topic: str) -> None:
+        self.topic = topic
+        self.count = 0
+        self._decode = _decoder()
+        self._rows: dict[tuple[tuple[str, ...], bool, bool], _Rows] = {}
+        self._odd: Counter[str] = Counter()
+        self._first_odd: dict[str, int] = {}
+
+    def add(self, logged_ns: int, data: bytes) -> None:
+        """Add a message; one that cannot be used is counted.
+
+        Parameters
+        ----------
+        logged_ns
+            Time of recording, ns.
+        data
+            Its content in CDR.
+        """
+        self.count += 1
+        try:
+            message = self._decode(data)
+            names, q, tau = tuple(message.name), message.position, message.effort
+            stamp = message.header.stamp.sec * _NS + message.header.stamp.nanosec
+        except (ValueError, struct.error, EOFError, IndexError, MemoryError, OverflowError):
+            self._refuse("is damaged")
+            return
+        if not names:
+            names = tuple(f"(unnamed {k + 1})" for k in range(max(len(q), len(tau))))
+        for values, what in ((q, "positions"), (tau, "efforts")):
+            if len(values) not in (0, len(names)):
+                self._refuse(f"has {len(values)} {what} of {len(names)} joints")
+                return
+        if len(set(names)) < len(names):
+            self._refuse(f"has a joint twice: {', '.join(names)}")
+            return
+        if not (len(q) or len(tau)):
+            self._refuse("has neither positions nor efforts")
+            return
+        rows = self._rows.setdefault((names, len(q) > 0, len(tau) > 0), _Rows())
+        rows.times.extend((self.count, stamp, logged_ns))
+        rows.q.extend(q)
+        rows.tau.extend(tau)
+
+    def names(self) -> list[str]:
+        """Return the names of all joints so far, in the order in which they came first."""
+        return list(dict.fromkeys(name for names, _, _ in self._rows for name in names))
+
+    def tables(self) -> list[MessageTable]:
+        """Return the usable messages."""
+        found = []
+        for (names, has_q, has_tau), rows in self._rows.items():
+            number, stamp, logged = np.array(rows.times, dtype=np.int64).reshape(-1, 3).T
+            q, tau = (np.array(values, dtype=np.float64).reshape(-1, len(names)) for values in (rows.q, rows.tau))
+            found.append(MessageTable(names, number, stamp, logged, q if has_q else None, tau if has_tau else None))
+        return found
+
+    def remarks(self) -> list[str]:
+        """Return descriptions of the messages that cannot be used."""
+        return [
+            f"message {self._first_odd[reason]} on {self.topic} {reason}" + (f", and {n - 1} more" if n > 1 else "")
+            for reason, n in self._odd.items()
+        ]
+
+    def refuse_unusable(self) -> None:
+        """Raise if no message can be used.
+
+        Raises
+        ------
+        DataError
+            With the reasons.
+        """
+        if not self._rows:
+            raise DataError("; ".join(self.remarks()))
+
+    def _refuse(self, reason: str) -> None:
+        self._odd[reason] += 1
+        self._first_odd.setdefault(reason, self.count)
+
+
+def _decoder() -> Callable[[bytes], Any]:
+    """Return the decoder of joint states; their definition is the same in all bags, and absent from some."""
+    schema = Schema(id=1, name=MESSAGE_TYPE, encoding="ros2msg", data=DEFINITION.encode())
+    decode = DecoderFactory().decoder_for("cdr", schema)
+    assert decode is not None
+    return decode
