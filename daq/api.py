@@ -18,6 +18,8 @@ def import_recording(
     rate_hz: float | None = None,
     names: Mapping[str, str] | None = None,
     polled: bool = False,
+    resample_hz: float | None = None,
+    time_unit: str | None = None,
     topic: str | None = None,
     joints: Sequence[str] | None = None,
     by_position: bool = False,
@@ -44,6 +46,10 @@ def import_recording(
         ``-`` leaves a quantity out.
     polled
         True if samples were polled, so that their times jitter: they are put on an even clock.
+    resample_hz
+        Rate of an even clock, Hz, for samples with uneven times, or polled ones; holes stay gaps.
+    time_unit
+        Unit of the times: ``s``, ``ms``, ``us`` or ``ns``; seconds by default.
     topic
         Topic of joint states, if a bag has several with the robot's joints.
     joints
@@ -73,6 +79,8 @@ def import_recording(
         effort=second,
         motor_side=motor_side,
         rate_hz=rate_hz,
+        resample_hz=resample_hz,
+        time_unit=time_unit,
         names=names,
         polled=polled,
         topic=topic,

@@ -29,7 +29,7 @@ _BATCH = 4096
 _TURN_NS = 1_000_000_000
 _ANSWER_NS = 20_000
 """Time between frames of a SYNC in a log written from a recording, which has only the time of the SYNC, ns."""
-NOTES = "import_notes"
+NOTES = "source_remarks"
 """Key of the metadata with everything that an import left out or interpreted."""
 
 

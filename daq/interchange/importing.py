@@ -1,4 +1,4 @@
-"""Import of measured motion from CSV, MAT, NPZ, Parquet, LeRobot data sets and rosbag2."""
+"""Import of measured motion from CSV, MAT, NPZ, Parquet, LeRobot data sets and bags of ROS 2."""
 
 import hashlib
 import logging
@@ -14,17 +14,18 @@ from armident.configs import ConfigError, DataError, RobotConfig
 from armident.daq.interchange.bag_files import bag_files, is_bag
 from armident.daq.interchange.lerobot import data_files
 from armident.daq.interchange.rate_conversion import at_rate
+from armident.daq.interchange.sample_clock import gaps_and_counters
 from armident.daq.interchange.sampling import Sampled, sampled
 from armident.daq.interchange.si_checks import OMITTED, check_units, unit_of
 from armident.daq.interchange.table_columns import NAMES
 from armident.daq.interchange.table_files import Source, read_pair, read_table
 from armident.daq.interchange.table_rows import Rows, complete_rows
-from armident.daq.recording import Field, Gap, Recording, Stream, is_recording, read_recording
+from armident.daq.recording import Field, Recording, Stream, is_recording, read_recording
 from armident.daq.recording.model import Side
 
 __all__ = ["NAMES", "OMITTED", "import_recording"]
 
-NOTES = "import_notes"
+NOTES = "source_remarks"
 """Key of the metadata with everything that an import left out or assumed."""
 
 
@@ -73,7 +74,7 @@ def import_recording(
     time_unit
         Unit of the times: ``s``, ``ms``, ``us`` or ``ns``.
     topic
-        Topic of joint states, if a bag has several with the robot's joints.
+        Topic of joint states of a bag.
     joints
         Names of the joints in the file, in the robot's order.
     by_position
@@ -98,13 +99,13 @@ def import_recording(
     if unknown:
         raise ConfigError(f"--map: no quantity named {unknown[0]!r}; expected one of {', '.join(NAMES)}")
     _check_rates(rate_hz, polled, resample_hz)
-    if effort is None and not data_files(path) and is_bag(path):
+    if effort is None and is_bag(path) and not data_files(path):
         source = _bag(path, robot, topic, joints, by_position)
         rows = complete_rows(source, robot, names)
     elif topic is not None:
         raise ConfigError(f"{path}: --topic is an option of ROS 2 bags")
     else:
-        source = read_table(path) if effort is None else read_pair(path, effort, robot)
+        source = read_pair(path, effort, robot) if effort is not None else read_table(path)
         rows = complete_rows(source, robot, names, by_position=by_position, joints=joints)
     side: Side = "motor" if motor_side else "joint"
     fields: dict[str, Field] = {
@@ -157,8 +158,8 @@ def _bag(path: Path, robot: RobotConfig, topic: str | None, joints: Sequence[str
     from armident.daq.interchange.rosbag import read_joint_states
 
     states = read_joint_states(path, robot, topic=topic, joints=joints, by_position=by_position)
-    t = (states.t_ns - states.t_ns[0]) / 1e9
-    return Source(path, {"t": t, "q": states.q, "tau": states.tau}, time_unit="s", notes=states.remarks)
+    times = (states.t_ns - states.t_ns[0]) / 1e9
+    return Source(path, {"t": times, "q": states.q, "tau": states.tau}, notes=states.remarks, t_ns=states.t_ns)
 
 
 def _recording(
@@ -173,28 +174,14 @@ def _recording(
         demand, field = raw.pop("demand")[known], own.pop("demand")
         streams["demand"] = Stream("demand", 1, sync[known], t_ns[known], {"demand": field}, {"demand": demand})
     streams["samples"] = Stream("samples", 1, sync, t_ns, own, raw)
-    gaps, counters = _gaps_and_counters(streams)
+    gaps, counters = gaps_and_counters(streams)
     return Recording(None, robot, None, rate, streams, gaps=gaps, counters=counters, metadata=facts)
 
 
-def _gaps_and_counters(streams: Mapping[str, Stream]) -> tuple[tuple[Gap, ...], dict[str, int]]:
-    gaps: list[Gap] = []
-    counters: dict[str, int] = {}
-    for name, stream in streams.items():
-        steps = np.diff(stream.sync)
-        for k in np.flatnonzero(steps > 1):
-            gaps.append(Gap(name, int(stream.sync[k]) + 1, int(stream.sync[k + 1]) - 1, reason="not in the source"))
-        lost = int((steps - 1).sum())
-        counters |= {
-            f"{name}.expected": stream.sync.size + lost, f"{name}.rows": stream.sync.size, f"{name}.in_gaps": lost
-        }  # fmt: skip
-    return tuple(gaps), counters
-
-
 def _digest(path: Path) -> str:
-    """Return the SHA-256 of a file, or of the files of a data set in their order."""
+    """Return the SHA-256 of a file, or of the files of a folder in their order."""
     digest = hashlib.sha256()
-    for file in data_files(path) or bag_files(path)[0]:
+    for file in data_files(path) or (bag_files(path)[0] if path.is_dir() else [path]):
         with file.open("rb") as opened:
             while block := opened.read(1 << 20):
                 digest.update(block)

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from armident.configs import DataError, RobotConfig
 from armident.daq.interchange.even_times import onto_even_times, usual_rate
 from armident.daq.interchange.resample import onto_even_clock
+from armident.daq.interchange.sample_clock import sample_numbers
 from armident.daq.interchange.table_files import Source
 from armident.daq.interchange.table_rows import Rows
 from armident.daq.interchange.time_stamps import EQUAL, clock_of, in_seconds, repeated_share
@@ -85,6 +86,9 @@ def sampled(
     DataError
         If times, rate and motion contradict each other, or there is neither a time nor a rate.
     """
+    if source.t_ns is not None and not polled and resample_hz is None:
+        numbers, rate = sample_numbers(source.t_ns[rows.row], rate_hz)
+        return Sampled(rate, numbers, rows.values)
     times, notes = _times(source, rows, robot, time_unit)
     everything = np.concatenate([values for name, values in rows.values.items() if name != "demand"], axis=1)
     repeated = repeated_share(everything) if len(everything) > 1 else 0.0
@@ -128,7 +132,7 @@ def _times(source: Source, rows: Rows, robot: RobotConfig, unit: str | None) -> 
 def _from_polled(rows: Rows, times: Floats | None, rate_hz: float, polled: bool, notes: list[str]) -> Sampled:
     longest = float(np.diff(times).max(initial=0.0)) if times is not None else 0.0
     if longest * rate_hz > _LONGEST_POLLED:
-        raise DataError(f"no sample for {longest:.6g} s: polled samples are not interpolated over such a hole")
+        raise DataError(f"no sample for {longest:.6g} s: --polled does not fill holes")
     raw = {str(name): values for name, values in rows.values.items()}
     even = onto_even_clock(raw)
     count = len(even.values["position"])

@@ -14,6 +14,7 @@ from armident.daq.interchange.csv_files import read_csv
 from armident.daq.interchange.lerobot import data_files, is_lerobot, lerobot_table
 from armident.daq.interchange.sandbox import read_in_subprocess
 from armident.daq.interchange.table_columns import without_units
+from armident.daq.interchange.text_files import printable
 
 Table = dict[str, NDArray[np.float64]]
 _LATER_MAT = b"MATLAB 7.3"
@@ -35,6 +36,8 @@ class Source:
         Unit in the name of the column of times; empty if there is none.
     notes
         Sentences on what was left out or assumed.
+    t_ns
+        Stamps of the messages of a bag, ns, (N,).
     """
 
     path: Path
@@ -42,6 +45,7 @@ class Source:
     lines: NDArray[np.int64] | None = None
     time_unit: str = ""
     notes: tuple[str, ...] = ()
+    t_ns: NDArray[np.int64] | None = None
 
     def place(self, row: int, name: str) -> str:
         """Return the position of a value in the file, for messages.
@@ -137,15 +141,17 @@ def _csv(path: Path) -> Source:
     table = read_csv(path)
     if table.header is None:
         raise DataError(f"{path}: no header line; expected t,q1..,tau1.. (or a pair of files with --effort)")
-    twice = sorted({name for name in table.header if name and table.header.count(name) > 1})
+    header = [printable(name) for name in table.header]
+    twice = sorted({name for name in header if name and header.count(name) > 1})
     if twice:
         raise DataError(f"{path}: several columns are named {twice[0]}")
-    columns = {name: table.values[:, k] for k, name in enumerate(table.header) if name}
-    units = [unit for name, unit in zip(table.header, table.units, strict=False) if name]
+    columns = {name: table.values[:, k] for k, name in enumerate(header) if name}
+    units = [unit for name, unit in zip(header, table.units, strict=False) if name]
     return _converted(Source(path, columns, table.lines, notes=table.notes), units)
 
 
 def _from_arrays(path: Path, arrays: Mapping[str, Any]) -> Source:
+    arrays = {printable(name): values for name, values in arrays.items()}
     if is_lerobot(arrays):
         table, notes = lerobot_table(path, arrays)
         return Source(path, table, notes=tuple(notes))

@@ -41,5 +41,16 @@ def excerpt(text: str) -> str:
     text
         Any text.
     """
-    shown = " ".join("".join(c if c.isprintable() else " " for c in text).split())
+    shown = printable(text)
     return f"'{shown[:_LONGEST]}...'" if len(shown) > _LONGEST else f"'{shown}'"
+
+
+def printable(text: str) -> str:
+    """Return a text in one line, without characters that are not printable.
+
+    Parameters
+    ----------
+    text
+        Any text.
+    """
+    return " ".join("".join(c if c.isprintable() else " " for c in text).split())

@@ -48,7 +48,7 @@ def test_a_last_line_that_is_cut_off_is_left_out_and_said(
         found = read(path)
     assert same(found, ROWS - 1)
     assert "the last line" in caplog.text
-    assert "cut off" in found.metadata["import_notes"]
+    assert "cut off" in found.metadata["source_remarks"]
     assert found.counters["log.skipped"] == 1
 
 
@@ -57,7 +57,7 @@ def test_a_last_line_without_an_end_is_read_if_it_is_whole(tmp_path: Path) -> No
     path.write_text("".join(lines).rstrip("\n"))
     found = read(path)
     assert same(found)
-    assert "import_notes" not in found.metadata
+    assert "source_remarks" not in found.metadata
 
 
 @pytest.mark.parametrize("share", [0.3, 0.6, 0.95])
@@ -74,7 +74,7 @@ def test_a_blf_that_is_cut_off_is_read_up_to_there_and_said(
     assert 0.5 * share * 3000 < rows < 3000
     np.testing.assert_array_equal(found.samples.raw["position"], captured(3000).samples.raw["position"][:rows])
     assert "the file is cut off" in caplog.text
-    assert "of 24600 frames" in found.metadata["import_notes"]
+    assert "of 24600 frames" in found.metadata["source_remarks"]
 
 
 def test_a_damaged_block_of_a_blf_is_a_gap(tmp_path: Path) -> None:
@@ -85,7 +85,7 @@ def test_a_damaged_block_of_a_blf_is_a_gap(tmp_path: Path) -> None:
     data[second + 4000 : second + 4400] = b"\xff" * 400
     path.write_bytes(data)
     found = read(path)
-    assert "1 damaged block left out" in found.metadata["import_notes"]
+    assert "1 damaged block left out" in found.metadata["source_remarks"]
     assert 5000 < found.samples.sync.size < 9000
     assert found.samples.sync[-1] == 8999
     assert found.gaps
@@ -127,7 +127,7 @@ def test_other_frames_and_lines_of_a_log_are_counted_and_named(tmp_path: Path) -
     assert same(found)
     assert found.counters["log.foreign"] == 4
     assert found.counters["log.skipped"] == 1
-    assert found.metadata["import_notes"] == (
+    assert found.metadata["source_remarks"] == (
         "line 1 is not a line of a candump log and left out: 'Disabled standard output while logging.'"
     )
 
@@ -142,8 +142,8 @@ def test_a_tpdo_of_another_length_is_named_with_both_lengths(tmp_path: Path) -> 
     lines[place] = short[place]
     path.write_text("".join(lines))
     found = read(path)
-    assert "183h of joint_3 has 6 bytes" in found.metadata["import_notes"]
-    assert f"1 of {ROWS} frames" in found.metadata["import_notes"]
+    assert "183h of joint_3 has 6 bytes" in found.metadata["source_remarks"]
+    assert f"1 of {ROWS} frames" in found.metadata["source_remarks"]
     assert {gap.joint for gap in found.gaps if gap.stream == "samples"} == {"joint_3"}
 
 
@@ -196,7 +196,7 @@ def test_differences_of_times_in_candump_are_added_up(tmp_path: Path, screen: bo
     path.write_text("".join(relative))
     found = read(path)
     assert same(found)
-    assert "added up" in found.metadata["import_notes"]
+    assert "added up" in found.metadata["source_remarks"]
     assert found.samples.t_ns[-1] - found.samples.t_ns[0] == pytest.approx((ROWS - 1) * PERIOD_NS, rel=0.02)
 
 
@@ -206,7 +206,7 @@ def test_times_from_zero_in_candump_stay_as_they_are(tmp_path: Path) -> None:
     path.write_text("".join(f"({float(li.split()[0][1:-1]) - zero:010.6f}) {li.split(' ', 1)[1]}" for li in lines))
     found = read(path)
     assert same(found)
-    assert "import_notes" not in found.metadata
+    assert "source_remarks" not in found.metadata
 
 
 def test_times_of_an_asc_log_since_the_event_before_are_added_up(tmp_path: Path) -> None:
@@ -228,7 +228,7 @@ def test_times_of_an_asc_log_since_the_event_before_are_added_up(tmp_path: Path)
     path.write_text("".join(made))
     found = read(path)
     assert same(found)
-    assert "timestamps relative" in found.metadata["import_notes"]
+    assert "timestamps relative" in found.metadata["source_remarks"]
     assert found.samples.t_ns[-1] - found.samples.t_ns[0] == pytest.approx((ROWS - 1) * PERIOD_NS, rel=0.02)
 
 
@@ -258,7 +258,7 @@ def test_a_date_that_is_not_understood_is_not_needed(tmp_path: Path) -> None:
     path.write_text(text, encoding="utf-8")
     found = read(path)
     assert same(found)
-    assert "times begin at zero" in found.metadata["import_notes"]
+    assert "times begin at zero" in found.metadata["source_remarks"]
 
 
 TRC = {
@@ -307,6 +307,6 @@ def test_a_single_frame_with_an_odd_time_is_left_out(tmp_path: Path) -> None:
     lines[700] = "(0000000012.000000) " + lines[700].split(" ", 1)[1]
     path.write_text("".join(lines))
     found = read(path)
-    assert "time is far from that of both neighbours: 1, the first is 701" in found.metadata["import_notes"]
+    assert "time is far from that of both neighbours: 1, the first is 701" in found.metadata["source_remarks"]
     assert found.counters["samples.in_gaps"] <= 2
     assert found.samples.sync.size >= ROWS - 2

@@ -89,8 +89,8 @@ def test_units_in_names_are_converted_and_said(tmp_path: Path) -> None:
     found = import_recording(written(tmp_path / "a.csv", values, names), TX40)
     assert same(found, motion())
     assert found.sample_rate_hz == pytest.approx(1000)
-    assert "times are in ms" in found.metadata["import_notes"]
-    assert "q1 [deg] from deg" in found.metadata["import_notes"]
+    assert "times are in ms" in found.metadata["source_remarks"]
+    assert "q1 [deg] from deg" in found.metadata["source_remarks"]
     with pytest.raises(DataError, match="--time-unit us contradicts the name of the column, which says ms"):
         import_recording(tmp_path / "a.csv", TX40, time_unit="us")
 
@@ -100,7 +100,7 @@ def test_decimal_commas_are_read_between_semicolons_and_named_between_commas(tmp
     path.write_text(path.read_text().replace(".", ","))
     found = import_recording(path, TX40)
     assert same(found, motion())
-    assert "decimal commas are read" in found.metadata["import_notes"]
+    assert "decimal commas are read" in found.metadata["source_remarks"]
     path = written(tmp_path / "b.csv", motion() + 0.5, cell="{:.6f}")
     path.write_text(path.read_text().replace(".", ","))
     with pytest.raises(DataError, match=r"13 names in the header, 26 columns of values; decimal commas"):
@@ -127,7 +127,7 @@ def test_damaged_lines_are_gaps_and_named(tmp_path: Path) -> None:
     path.write_text("\n".join(lines) + "\n" + lines[-1][:40])
     found = import_recording(path, TX40)
     assert [(gap.first, gap.last) for gap in found.gaps] == [(99, 99), (200, 200), (301, 301)]
-    notes = found.metadata["import_notes"]
+    notes = found.metadata["source_remarks"]
     assert "3 of 400 lines are damaged and left out, the first: line 102, column 2: expected a number" in notes
     assert "the last line (403) is cut off" in notes
 
@@ -144,7 +144,7 @@ def test_rows_of_other_topics_are_passed_over_and_rows_of_one_time_joined(tmp_pa
     found = import_recording(tmp_path / "a.csv", TX40)
     assert same(found, values)
     assert not found.gaps
-    assert "100 rows without positions and efforts passed over" in found.metadata["import_notes"]
+    assert "100 rows without positions and efforts passed over" in found.metadata["source_remarks"]
     (tmp_path / "b.csv").write_text("\n".join([",".join(names), *rows]).replace(",31.5", ",").replace("0.0", "0.1", 1))
     shifted = [r if k % 3 else f"{float(r.split(',')[0]) + 2e-4:.9g}," + r.split(",", 1)[1] for k, r in enumerate(rows)]
     (tmp_path / "b.csv").write_text("\n".join([",".join(names), *shifted]) + "\n")
@@ -202,8 +202,8 @@ def test_a_single_time_out_of_order_is_a_gap(tmp_path: Path, odd: float) -> None
     values[200, 0] = odd
     found = import_recording(written(tmp_path / "a.csv", values), TX40)
     assert [(gap.first, gap.last) for gap in found.gaps] == [(200, 200)]
-    assert "left out: 1, the first:" in found.metadata["import_notes"]
-    assert "line 202, column t" in found.metadata["import_notes"]
+    assert "left out: 1, the first:" in found.metadata["source_remarks"]
+    assert "line 202, column t" in found.metadata["source_remarks"]
 
 
 def test_times_with_too_few_digits_need_a_rate(tmp_path: Path) -> None:
@@ -221,7 +221,7 @@ def test_rows_that_are_there_twice_are_taken_once(tmp_path: Path) -> None:
     values = motion()
     found = import_recording(written(tmp_path / "a.csv", values[np.sort(np.append(np.arange(400), [7, 90]))]), TX40)
     assert same(found, values)
-    assert "2 rows are there twice" in found.metadata["import_notes"]
+    assert "2 rows are there twice" in found.metadata["source_remarks"]
 
 
 def jittering(rows: int = 3000, share: float = 0.2) -> np.ndarray:
@@ -267,7 +267,7 @@ def test_polled_rows_with_times_are_put_on_the_clock_of_the_controller(tmp_path:
     asked_for = import_recording(path, PANDA, rate_hz=1000.0, polled=True)
     assert found.sha256 == asked_for.sha256
     assert abs(len(found.samples.sync) - len(q)) < 30
-    assert "polled samples put on a clock of 1000 Hz" in found.metadata["import_notes"]
+    assert "polled samples put on a clock of 1000 Hz" in found.metadata["source_remarks"]
     with pytest.raises(DataError, match=r"the motion takes .* at the 250 Hz of --resample, but .* by the column"):
         import_recording(path, PANDA, resample_hz=250.0)
 
@@ -303,7 +303,7 @@ def test_a_lerobot_data_set_is_imported_as_file_and_folder(tmp_path: Path, names
         assert found.sample_rate_hz == pytest.approx(50, rel=1e-4)
         assert [(gap.first, gap.last) for gap in found.gaps if gap.stream == "samples"] == [(200, 248)]
         assert "demand" in found.samples.fields
-        assert "2 episodes" in found.metadata["import_notes"]
+        assert "2 episodes" in found.metadata["source_remarks"]
 
 
 def test_joints_of_a_lerobot_data_set_are_found_by_name_and_its_effort_is_needed(tmp_path: Path) -> None:
