@@ -102,7 +102,7 @@ def test_the_long_run_variance_allows_for_serial_correlation() -> None:
 
 
 @pytest.mark.slow
-@settings(max_examples=8, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=5, suppress_health_check=[HealthCheck.too_slow])
 @given(st.integers(0, 2**32 - 1), st.integers(1, 2000))
 def test_the_cutting_into_blocks_does_not_change_a_bit(seed: int, longest: int) -> None:
     rng = np.random.default_rng(seed)
