@@ -1,5 +1,6 @@
 """Database of identifications: a SQLite file, or any other database that SQLAlchemy supports."""
 
+import contextlib
 import datetime
 import hashlib
 import re
@@ -272,7 +273,9 @@ def recorded_at(document: IdentificationDocument, file: Path) -> datetime.dateti
     """
     found = _STAMP.search(document.recording.path or "")
     if found is not None:
-        return datetime.datetime.strptime(found[1] + "+0000", "%Y%m%dT%H%M%S%z")
+        # A name that only looks like a time is none.
+        with contextlib.suppress(ValueError):
+            return datetime.datetime.strptime(found[1] + "+0000", "%Y%m%dT%H%M%S%z")
     return datetime.datetime.fromtimestamp(file.stat().st_mtime, datetime.UTC)
 
 

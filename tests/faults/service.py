@@ -7,6 +7,7 @@ result, which was announced once, and at most one entry in the history. Needs no
 """
 
 import argparse
+import datetime
 import json
 import multiprocessing
 import os
@@ -30,6 +31,7 @@ import zenoh
 
 from armident.configs import ArmidentError, DataError, SessionConfig, load_robot, load_session
 from armident.configs.schema.session import IdentificationOptions
+from armident.daq.capture.files import capture_stamp
 from armident.daq.capture.publisher import Publisher
 from armident.daq.recording import RecordingWriter, StreamLayout, read_recording, write_recording
 from armident.daq.streaming import Block, Keys, encode_event, open_session
@@ -64,10 +66,11 @@ def cell_of(folder: Path) -> SessionConfig:
 def capture(folder: Path, number: int) -> None:
     """Write and publish one recording; its first samples make it differ from the others."""
     session, base = cell_of(folder), read_recording(folder / "base" / "base.mcap")
-    name = f"{base.robot.name}-20260101T{number:06d}-000Z"
+    began = datetime.datetime(2026, 1, 1, tzinfo=datetime.UTC) + datetime.timedelta(seconds=number)
+    name = f"{base.robot.name}-{capture_stamp(began)}"
     joints = [joint.name for joint in base.robot.joints]
     layouts = [StreamLayout.of(stream, joints) for stream in base.streams.values()]
-    metadata = {"capture": name, "cell": session.cell, "started_utc": f"2026-01-01T00:00:00.{number:06d}+00:00"}
+    metadata = {"capture": name, "cell": session.cell, "started_utc": began.isoformat()}
     path = folder / f"{name}.mcap"
     with closing(Publisher(session, Keys(session.cell, base.robot.name), exclusive=False)) as publisher:
         with RecordingWriter(path, base.robot, session, base.sample_rate_hz, layouts, metadata) as writer:
@@ -85,6 +88,7 @@ def capture(folder: Path, number: int) -> None:
                 if int(stream.sync[rows][0]) < BLOCK_ROWS:
                     for values in raw.values():
                         values[0] += np.asarray(number % 100, values.dtype)
+                        values[1] += np.asarray(number // 100, values.dtype)
                 writer.append(stream.name, stream.sync[rows], stream.t_ns[rows], raw)
                 publisher.offer(Block(layout, sequence, stream.sync[rows], stream.t_ns[rows], raw, name))
                 counters[f"{stream.name}.rows"] = counters.get(f"{stream.name}.rows", 0) + len(stream.sync[rows])

@@ -191,8 +191,7 @@ def _judged(
         document = from_json(found.text, IdentificationDocument, str(path))
         arm = document.robot, found.facts["cell"]
         first = known or baselines.get(arm) or _first(history, *arm)
-        history.describe(found.facts)
-        history.add(document, History.began(found.facts, document, Path(found.path)))
+        refused = _entered(history, found, document)
         if not document.converged:
             raise DataError(f"the identification did not converge ({document.stop_reason})")
         if document.verdict == "unusable":
@@ -200,12 +199,31 @@ def _judged(
         baselines.setdefault(arm, first or document)
         drift = None if first is None else compare(first, document, false_alarms)
         if drift is None or first is None:
-            return Row(str(path), words=(f"first run of {_name(*arm)}: the baseline",), identification=found.path)
-        history.judge(document, first, drift)
+            words = (f"first run of {_name(*arm)}: the baseline", *refused)
+            return Row(str(path), words=words, identification=found.path)
+        refused = refused or _entered(history, found, document, (first, drift))
     except (ArmidentError, OSError, RuntimeError) as error:
         return Row(str(path), error=" ".join(str(error).split()))
     words = tuple(change_lines(drift, found.robot)) if drift.drifted else (drift.words,)
-    return Row(str(path), drift=drift, words=words, identification=found.path)
+    return Row(str(path), drift=drift, words=(*words, *refused), identification=found.path)
+
+
+def _entered(
+    history: History,
+    found: Identified,
+    document: IdentificationDocument,
+    comparison: tuple[IdentificationDocument, ParameterChangeTest] | None = None,
+) -> tuple[str, ...]:
+    """Enter a run, or its comparison, in the history; return the reason if the database refuses it."""
+    try:
+        if comparison is None:
+            history.describe(found.facts)
+            history.add(document, History.began(found.facts, document, Path(found.path)))
+        else:
+            history.judge(document, *comparison)
+    except ConfigError as error:
+        return (f"not in the history: {error}",)
+    return ()
 
 
 def _first(history: History, robot: str, cell: str | None) -> IdentificationDocument | None:

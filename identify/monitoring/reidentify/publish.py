@@ -1,6 +1,7 @@
 """Publisher of status and results on Zenoh, with the keys of the worker."""
 
 import json
+import logging
 import time
 from types import TracebackType
 from typing import Any, Self
@@ -10,6 +11,8 @@ import zenoh
 from armident.configs import ConfigError, RobotConfig, SessionConfig
 from armident.daq.streaming import Keys, open_session
 
+log = logging.getLogger(__name__)
+
 LINGER_S = 1.0
 """Time for which queries for a result are answered after it was published, s."""
 
@@ -17,7 +20,7 @@ LINGER_S = 1.0
 class StatusPublisher:
     """Publishes status and results of one job.
 
-    It takes the worker's role on Zenoh if no worker runs, and that of an observer otherwise.
+    It listens on the port of the worker if no worker runs, and on a free port otherwise.
 
     Parameters
     ----------
@@ -32,7 +35,7 @@ class StatusPublisher:
         try:
             self._session = open_session(session, "worker")
         except ConfigError:
-            self._session = open_session(session, "observer")
+            self._session = open_session(session, "worker", any_port=True)
         self._last: bytes | None = None
         self._queryable = self._session.declare_queryable(self._keys.identification, self._answer)
 
@@ -46,16 +49,23 @@ class StatusPublisher:
     def status(self, state: str, **more: Any) -> None:
         """Publish the state of the job, with further keys."""
         content = {"component": "reidentify", "state": state, **more}
-        self._session.put(self._keys.status, json.dumps(content).encode())
+        self._put(self._keys.status, json.dumps(content).encode())
 
     def result(self, text: str) -> None:
         """Publish an identification document and answer queries with it."""
         self._last = text.encode()
-        self._session.put(self._keys.identification, self._last)
+        self._put(self._keys.identification, self._last)
 
     def diagnosis(self, text: str) -> None:
         """Publish a diagnosis document."""
-        self._session.put(self._keys.diagnosis, text.encode())
+        self._put(self._keys.diagnosis, text.encode())
+
+    def _put(self, key: str, data: bytes) -> None:
+        """Publish a message; the job does not depend on it, because the result is in its file."""
+        try:
+            self._session.put(key, data, express=True)
+        except zenoh.ZError:
+            log.warning("zenoh: the session failed; %s was not published", key)
 
     def __enter__(self) -> Self:
         """Return the publisher."""

@@ -180,6 +180,15 @@ def test_a_recording_that_is_identified_again_gets_no_second_entry(url: str, tmp
     assert [run.document for run in history.runs()] == [first]
 
 
+def test_a_name_that_only_looks_like_a_time_is_none(tmp_path: Path) -> None:
+    document = result(0, TRUTH)
+    odd = document.recording.model_copy(update={"path": "arm-20260101T000061-000Z.mcap"})
+    file = tmp_path / "r.json"
+    file.touch()
+    found = recorded_at(document.model_copy(update={"recording": odd}), file)
+    assert found.timestamp() == pytest.approx(file.stat().st_mtime)
+
+
 def former(path: Path, documents: list[IdentificationDocument]) -> None:
     """A database as version 0.1 has left it: its tables, without a version, and a recording may be there twice."""
     engine = sa.create_engine(f"sqlite:///{path}")
