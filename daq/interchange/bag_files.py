@@ -62,7 +62,7 @@ class BagMessage(NamedTuple):
 
 
 def is_bag(path: Path) -> bool:
-    """Return True if a path has the name of a bag file, or is a folder; `bag_files` refuses folders without bags.
+    """Return True if a path has the name of a bag file, or is a folder.
 
     Parameters
     ----------

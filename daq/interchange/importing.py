@@ -8,13 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from armident.daq.interchange.sample_clock import gaps_and_counters
 from numpy.typing import NDArray
 
 from armident.configs import ConfigError, DataError, RobotConfig
 from armident.daq.interchange.bag_files import bag_files, is_bag
 from armident.daq.interchange.lerobot import data_files
 from armident.daq.interchange.rate_conversion import at_rate
+from armident.daq.interchange.sample_clock import gaps_and_counters
 from armident.daq.interchange.sampling import Sampled, sampled
 from armident.daq.interchange.si_checks import OMITTED, check_units, unit_of
 from armident.daq.interchange.table_columns import NAMES

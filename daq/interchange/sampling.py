@@ -3,12 +3,12 @@
 from dataclasses import dataclass, field
 
 import numpy as np
-from armident.daq.interchange.sample_clock import sample_numbers
 from numpy.typing import NDArray
 
 from armident.configs import DataError, RobotConfig
 from armident.daq.interchange.even_times import onto_even_times, usual_rate
 from armident.daq.interchange.resample import onto_even_clock
+from armident.daq.interchange.sample_clock import sample_numbers
 from armident.daq.interchange.table_files import Source
 from armident.daq.interchange.table_rows import Rows
 from armident.daq.interchange.time_stamps import EQUAL, clock_of, in_seconds, repeated_share

@@ -58,7 +58,7 @@ def test_a_folder_of_several_files_is_one_bag(tmp_path: Path, make: Callable[...
         metadata(tmp_path, files, ROWS)
     recording = import_recording(tmp_path, TX40)
     np.testing.assert_array_equal(recording.samples.raw["position"], Q)
-    assert "import_notes" not in recording.metadata
+    assert "source_remarks" not in recording.metadata
     assert recording.metadata["source"] == tmp_path.name
 
 
@@ -69,7 +69,7 @@ def test_a_file_that_is_not_there_is_a_gap_and_said(tmp_path: Path) -> None:
     metadata(tmp_path, files, ROWS)
     recording = import_recording(tmp_path, TX40)
     assert [(gap.first, gap.last) for gap in recording.gaps] == [(40, 79)]
-    remarks = recording.metadata["import_notes"]
+    remarks = recording.metadata["source_remarks"]
     assert "run_1.mcap, which metadata.yaml lists, is not there" in remarks
     assert "40 of 120 messages of /joint_states are missing" in remarks
 
@@ -101,7 +101,7 @@ def test_a_damaged_chunk_is_a_gap_and_said(tmp_path: Path) -> None:
         kept = recording.samples.sync if damaged else recording.samples.sync + ROWS - recording.samples.sync[-1] - 1
         np.testing.assert_array_equal(recording.samples.raw["position"], Q[kept])
         assert len(recording.gaps) == (damaged > 0)
-        remarks = recording.metadata["import_notes"]
+        remarks = recording.metadata["source_remarks"]
         assert f"the chunk at byte {at - 9} is damaged" in remarks
         assert f"{ROWS - kept.size} of {ROWS} messages of /joint_states are missing" in remarks
 
