@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from armident.configs import DataError, RobotConfig
 from armident.configs.schema.robot import Effect as Entry
 from armident.identify.diagnosis.candidates import ColumnCache
-from armident.identify.diagnosis.predictive_score import PredictiveScore, reference_of
+from armident.identify.diagnosis.predictive_score import PredictiveScore
 from armident.identify.diagnosis.regression import MAX_AR_ORDER, Fit, fit, safe
 from armident.identify.diagnosis.screening import noise_beyond_shapes
 from armident.identify.diagnosis.study import Study
@@ -261,14 +261,15 @@ def with_first_motions(state: ModelState) -> ModelState:
 
 
 def with_reference(state: ModelState) -> ModelState:
-    """Return a model whose measurement noise the predictive scores of its successors leave out.
+    """Return a model with whose rigid parameters the predictive scores of its successors are compared.
 
     Parameters
     ----------
     state
         Model to which nothing is added yet.
     """
-    study = replace(state.study, reference=reference_of(state.fit))
+    rigid = state.fit.theta.size - state.study.model.e
+    study = replace(state.study, reference=state.fit.theta[:rigid])
     return ModelState(study, replace(state.fit, study=study))
 
 

@@ -7,9 +7,9 @@ turns these errors into innovations. They carry all the information that seriall
 (Box, Jenkins 1976, chapter 7).
 
 Coarse encoders make measured accelerations noisy. Their noise times the inertia is an error of the prediction, so that
-a model with a smaller inertia would predict better. The torque of the rigid model is therefore predicted without that
-noise, see `noise_of_motion`. How much of the motion is noise is estimated once, before effects are added: all models
-of a diagnosis are compared with the same noise.
+a model with a smaller inertia would predict better. A change of the rigid parameters is therefore predicted without
+that noise, see `noise_of_motion`. What stays is the noise times the parameters of the first model: the same for all
+models of a diagnosis.
 """
 
 from collections.abc import Sequence
@@ -37,8 +37,6 @@ FOLDS = 10
 LAGS = 5
 """Samples to either side in the filter between simulated and measured motion: half a period of the loop's bandwidth,
 see `armident.identify.diagnosis.study.BAND`."""
-NOISE_SHARE = 0.5
-"""Share of the measured motion beyond the simulated one from which it counts as measurement noise: more than half."""
 LEAST_ROWS = 10 * (2 * LAGS + 1)
 """Rows of a stretch from which that filter is estimated: ten for each of its coefficients."""
 
@@ -106,29 +104,29 @@ class PredictiveScore:
 
     @cached_property
     def _parts(self) -> tuple[tuple[Array, ...], ...]:
-        found = []
-        for joint, reference in zip(self.fit.equations.joints, self._reference, strict=True):
+        found, change = [], self._change
+        for joint in self.fit.equations.joints:
             width = joint.x.size
             total = sum(len(part) for part in joint.parts)
             fold, begin, parts = fold_of(total), 0, []
             for part in joint.parts:
                 rows, own = part[:], fold[begin : begin + len(part)]
                 errors = rows[:, -1] - np.einsum("mi,mi->m", rows[:, :width], self.folds[own][:, joint.x])
-                if reference is not None:
-                    noise = noise_of_motion(joint, rows, self.folds[:, : reference.size] - reference)
-                    errors += noise[np.arange(own.size), own]
+                if change is not None:
+                    errors += noise_of_motion(joint, rows, change)[np.arange(own.size), own]
                 parts.append(errors)
                 begin += len(part)
             found.append(tuple(parts))
         return tuple(found)
 
     @property
-    def _reference(self) -> Sequence[Array | None]:
-        """Rigid parameters of each joint whose torque is predicted at the measured motion, (b - e,) each."""
+    def _change(self) -> Array | None:
+        """Rigid parameters of each fold less those of the reference, (`FOLDS`, b - e); ``None`` without a reference."""
         study = self.fit.study
         rigid = self.fit.theta.size - study.model.e
-        known = study.reference
-        return [None] * study.robot.n if known is None or known.shape[1] != rigid else list(known)
+        if study.reference is None or study.reference.size != rigid:
+            return None
+        return self.folds[:, :rigid] - study.reference
 
     def innovations(self, noise: Sequence[ArModel]) -> Array:
         """Mean squares of the innovations of each joint under noise models, (N m)^2 or N^2, (n,).
@@ -244,32 +242,6 @@ def fold_of(rows: int) -> NDArray[np.int64]:
         Number of rows, R.
     """
     return np.arange(rows) * BLOCKS // max(rows, 1) % FOLDS
-
-
-def reference_of(fit: Fit) -> Array:
-    """Rigid parameters of each joint whose torque is predicted at the measured motion, (n, b - e).
-
-    Measured motion beyond the simulated one is measurement noise, or motion that disturbances caused. Measurement noise
-    appears in the errors of a fit with the opposite sign. Real motion does not appear there (errors in variables:
-    Fuller 1987, section 1.2). Where more than half of it is noise, the parameters are zero: all torques of the rigid
-    model are predicted without that noise. Elsewhere they are those of the fit: changes of the parameters are.
-
-    Parameters
-    ----------
-    fit
-        Fit of the model to which nothing is added yet.
-    """
-    rigid = fit.theta.size - fit.study.model.e
-    found = np.zeros((fit.study.robot.n, rigid))
-    for j, (joint, ar) in enumerate(zip(fit.equations.joints, fit.noise, strict=True)):
-        along = power = 0.0
-        for part in joint.parts:
-            rows = part[:]
-            noise = ar.whiten(noise_of_motion(joint, rows, fit.theta[None, :rigid])[:, 0])
-            along -= float(noise @ ar.whiten(rows[:, -1] - rows[:, : joint.x.size] @ fit.theta[joint.x]))
-            power += float(noise @ noise)
-        found[j] = 0.0 if along > NOISE_SHARE * power else fit.theta[:rigid]
-    return found
 
 
 def noise_of_motion(joint: JointEquations, rows: Array, theta: Array) -> Array:

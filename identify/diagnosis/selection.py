@@ -183,7 +183,7 @@ class StepwiseSelection:
         Returns
         -------
         tuple
-            Model with the effects, and the effects, largest reduction of the errors first.
+            Model with the effects, and the effects: those with a name first, then by reduction of the errors.
         """
         state = first
         found: tuple[Selected, ...] = ()
@@ -318,7 +318,10 @@ class StepwiseSelection:
         return min(same, key=lambda a: (isinstance(a.candidate.effect, FreeShape), len(a.candidate.effect.linear)))
 
     def _superseded(self, addition: Addition, step: Step) -> bool:
-        """True if an explanation of the same joint that does not pass is clearly better than an addition."""
+        """True if an explanation of the same joint that does not pass is clearly better than an addition.
+
+        It has to reduce the errors of a joint. Corrections of recorded torques may only make them whiter.
+        """
         better = (a for a in step.rivals(addition) if a not in step.passing and a.share > 0.0)
         return any(a.log_likelihood > addition.log_likelihood + self.criteria.close for a in better)
 
@@ -537,7 +540,7 @@ class StepwiseSelection:
         return state, found
 
     def _confirmed(self, state: ModelState, found: tuple[Selected, ...]) -> tuple[ModelState, tuple[Selected, ...]]:
-        """Model with the findings that the report part confirms, largest reduction of the errors first.
+        """Model with the findings that the report part confirms: those with a name, then by reduction of the errors.
 
         The models are compared as they are reported: each estimated under the noise models of its own residual.
         """
@@ -554,7 +557,7 @@ class StepwiseSelection:
                     checked.append((tested, less))
             failed = [(one, less) for one, less in checked if not self._holds(one)]
             if not failed:
-                return state, tuple(sorted((one for one, _ in checked), key=_reduction, reverse=True))
+                return state, tuple(sorted((one for one, _ in checked), key=_order, reverse=True))
             gone, state = max(
                 failed, key=lambda one: 1.0 if one[0].confirmation is None else one[0].confirmation.p_value
             )
@@ -580,10 +583,10 @@ class StepwiseSelection:
         return bool((enough & report.acts).any())
 
 
-def _reduction(one: Selected) -> float:
-    """Reduction of the errors of the report part by a finding, beside all others."""
+def _order(one: Selected) -> tuple[bool, float]:
+    """True if a finding has a name, and its reduction of the errors of the report part, beside all others."""
     assert one.confirmation is not None
-    return one.confirmation.reduction
+    return one.addition.named, one.confirmation.reduction
 
 
 def _key(robot: RobotConfig) -> str:

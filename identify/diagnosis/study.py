@@ -100,8 +100,8 @@ class Study:
         Cache of the regressors that all models of the study share; see
         `armident.identify.diagnosis.equations.regressors`.
     reference
-        Rigid parameters whose torque is predicted at the measured motion, for each joint, (n, b - e); ``None`` before
-        the first fit. See `armident.identify.diagnosis.predictive_score.reference_of`.
+        Rigid parameters of the model to which nothing is added yet, (b - e,); ``None`` before it is fitted. See
+        `armident.identify.diagnosis.predictive_score.noise_of_motion`.
     """
 
     robot: RobotConfig

@@ -121,6 +121,7 @@ def test_identifying_with_the_effect_inside_brings_the_torque_error_down(robot: 
 
 
 @pytest.mark.slow
+@pytest.mark.xfail(strict=True, reason="parameters that the lag spoils make noise: docs/diagnosis.md, What is missed")
 @pytest.mark.parametrize(
     ("period", "repeats"), [(FAST, 2), pytest.param(None, 3, marks=pytest.mark.proof)], ids=["1 kHz", "5 kHz"]
 )
