@@ -41,8 +41,6 @@ class Publisher:
     remains complete. Subscribers detect missing blocks by sequence numbers, and can query the last
     ``cache_blocks``. Events are dropped only if thousands wait. Of health and status only the latest waits.
 
-    Parameters
-    ----------
     A capture does not depend on Zenoh: if no session can be opened, or it fails, the reason is logged and in
     :attr:`problem`, and the publisher tries again in its thread.
 
