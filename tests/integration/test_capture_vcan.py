@@ -1,5 +1,6 @@
 """Captures on vcan: no sample is lost, gaps account for all others, and every end leaves a finished file."""
 
+import datetime
 import json
 import os
 import signal
@@ -149,7 +150,10 @@ def test_no_sample_is_lost_between_files(vcan_bus: str, tmp_path: Path) -> None:
     session = session_file(tmp_path, vcan_bus, "rotated", setpoints=None, recording=options)
     (tmp_path / "out").mkdir()
     old = tmp_path / "out" / "tx40-20200101T000000-000Z.mcap"
-    old.write_bytes(b"old")
+    yesterday = datetime.datetime.now(datetime.UTC) - datetime.timedelta(days=1)
+    young = tmp_path / "out" / f"tx40-{yesterday:%Y%m%dT%H%M%S}-000Z.mcap"
+    for path in (old, young):
+        path.write_bytes(b"a recording")
     process = armident("capture", "--config", session, "--duration", "6", "--out", tmp_path / "out", "--json")
     out, err = process.communicate(timeout=200)
     assert process.returncode == 0, err
@@ -162,6 +166,7 @@ def test_no_sample_is_lost_between_files(vcan_bus: str, tmp_path: Path) -> None:
     lost = {n for part in parts for g in part.gaps if g.stream == "samples" for n in range(g.first, g.last + 1)}
     assert np.array_equal(np.sort(np.concatenate([sync, sorted(lost)])), np.arange(document["counters"]["sync_sent"]))
     assert not old.exists()
+    assert young.exists()
     assert f"deleted {old} (retention)" in err
 
 

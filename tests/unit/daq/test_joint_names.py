@@ -130,6 +130,6 @@ def test_the_name_in_the_urdf_is_kept(tmp_path: Path) -> None:
         encoding="utf-8",
     )
     joints = load_robot(tmp_path / "arm.yaml").joints
-    assert [joint.name for joint in joints] == ["base_yaw", "tilt"]
+    assert [joint.name for joint in joints] == ["Base_Yaw", "tilt"]
     assert [joint.source_name for joint in joints] == ["Base Yaw", None]
     assert match_joints(["tilt", "Base Yaw"], joints).index == (1, 0)
