@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from armident.configs import DataError, RobotConfig
 from armident.configs.schema.robot import Effect as Entry
 from armident.identify.diagnosis.candidates import ColumnCache
-from armident.identify.diagnosis.predictive_score import PredictiveScore
+from armident.identify.diagnosis.predictive_score import PredictiveScore, references_of
 from armident.identify.diagnosis.regression import MAX_AR_ORDER, Fit, fit, safe
 from armident.identify.diagnosis.screening import noise_beyond_shapes
 from armident.identify.diagnosis.study import Study
@@ -260,16 +260,15 @@ def with_first_motions(state: ModelState) -> ModelState:
     return ModelState(study, replace(state.fit, study=study))
 
 
-def with_reference(state: ModelState) -> ModelState:
-    """Return a model with whose rigid parameters the predictive scores of its successors are compared.
+def with_references(state: ModelState) -> ModelState:
+    """Return a model with whose rigid parameters its successors are compared at joints with much measurement noise.
 
     Parameters
     ----------
     state
         Model to which nothing is added yet.
     """
-    rigid = state.fit.theta.size - state.study.model.e
-    study = replace(state.study, reference=state.fit.theta[:rigid])
+    study = replace(state.study, references=references_of(state.fit))
     return ModelState(study, replace(state.fit, study=study))
 
 

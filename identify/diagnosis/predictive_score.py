@@ -7,9 +7,9 @@ turns these errors into innovations. They carry all the information that seriall
 (Box, Jenkins 1976, chapter 7).
 
 Coarse encoders make measured accelerations noisy. Their noise times the inertia is an error of the prediction, so that
-a model with a smaller inertia would predict better. A change of the rigid parameters is therefore predicted without
-that noise, see `noise_of_motion`. What stays is the noise times the parameters of the first model: the same for all
-models of a diagnosis.
+a model with a smaller inertia would predict better. At joints where `references_of` finds such noise, a change of the
+rigid parameters is predicted without it, see `noise_of_motion`. What stays is the noise times the parameters of the
+first model: the same for all models of a diagnosis.
 """
 
 from collections.abc import Sequence
@@ -37,6 +37,8 @@ FOLDS = 10
 LAGS = 5
 """Samples to either side in the filter between simulated and measured motion: half a period of the loop's bandwidth,
 see `armident.identify.diagnosis.study.BAND`."""
+NOISE_SHARE = 0.5
+"""Share of the torque beyond the simulated motion from which it counts as measurement noise: more than half."""
 LEAST_ROWS = 10 * (2 * LAGS + 1)
 """Rows of a stretch from which that filter is estimated: ten for each of its coefficients."""
 
@@ -104,8 +106,8 @@ class PredictiveScore:
 
     @cached_property
     def _parts(self) -> tuple[tuple[Array, ...], ...]:
-        found, change = [], self._change
-        for joint in self.fit.equations.joints:
+        found = []
+        for joint, change in zip(self.fit.equations.joints, self._changes, strict=True):
             width = joint.x.size
             total = sum(len(part) for part in joint.parts)
             fold, begin, parts = fold_of(total), 0, []
@@ -120,13 +122,12 @@ class PredictiveScore:
         return tuple(found)
 
     @property
-    def _change(self) -> Array | None:
-        """Rigid parameters of each fold less those of the reference, (`FOLDS`, b - e); ``None`` without a reference."""
+    def _changes(self) -> Sequence[Array | None]:
+        """Rigid parameters of each fold less the reference of a joint, (`FOLDS`, b - e); ``None`` without one."""
         study = self.fit.study
         rigid = self.fit.theta.size - study.model.e
-        if study.reference is None or study.reference.size != rigid:
-            return None
-        return self.folds[:, :rigid] - study.reference
+        references = study.references or (None,) * study.robot.n
+        return [None if r is None or r.size != rigid else self.folds[:, :rigid] - r for r in references]
 
     def innovations(self, noise: Sequence[ArModel]) -> Array:
         """Mean squares of the innovations of each joint under noise models, (N m)^2 or N^2, (n,).
@@ -242,6 +243,31 @@ def fold_of(rows: int) -> NDArray[np.int64]:
         Number of rows, R.
     """
     return np.arange(rows) * BLOCKS // max(rows, 1) % FOLDS
+
+
+def references_of(fit: Fit) -> tuple[Array | None, ...]:
+    """Rigid parameters of a fit, (b - e,), for each joint whose motion has much measurement noise; ``None`` for others.
+
+    Measured motion beyond the simulated one is measurement noise, or motion that disturbances caused. Measurement noise
+    appears in the errors of a fit with the opposite sign. Real motion does not appear there (errors in variables:
+    Fuller 1987, section 1.2).
+
+    Parameters
+    ----------
+    fit
+        Fit of the model to which nothing is added yet.
+    """
+    theta = fit.theta[: fit.theta.size - fit.study.model.e]
+    found: list[Array | None] = []
+    for joint, ar in zip(fit.equations.joints, fit.noise, strict=True):
+        along = power = 0.0
+        for part in joint.parts:
+            rows = part[:]
+            noise = ar.whiten(noise_of_motion(joint, rows, theta[None])[:, 0])
+            along -= float(noise @ ar.whiten(rows[:, -1] - rows[:, : joint.x.size] @ fit.theta[joint.x]))
+            power += float(noise @ noise)
+        found.append(theta if along > NOISE_SHARE * power else None)
+    return tuple(found)
 
 
 def noise_of_motion(joint: JointEquations, rows: Array, theta: Array) -> Array:

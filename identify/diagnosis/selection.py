@@ -33,7 +33,7 @@ from armident.identify.diagnosis.model_state import (
     with_entries,
     with_first_motions,
     with_own_noise,
-    with_reference,
+    with_references,
     with_report_part,
     without_entry,
 )
@@ -167,8 +167,8 @@ class StepwiseSelection:
         self.study = state.study
         if not self.study.sign_given:
             state = with_own_noise(with_transitions(state, self._state))
-        state = with_reference(with_first_motions(state))
-        self.study = replace(self.study, robot=state.robot, model=state.study.model, reference=state.study.reference)
+        state = with_references(with_first_motions(state))
+        self.study = replace(self.study, robot=state.robot, model=state.study.model, references=state.study.references)
         self._states[_key(state.robot)] = state
         return state
 

@@ -99,9 +99,9 @@ class Study:
     regressors
         Cache of the regressors that all models of the study share; see
         `armident.identify.diagnosis.equations.regressors`.
-    reference
-        Rigid parameters of the model to which nothing is added yet, (b - e,); ``None`` before it is fitted. See
-        `armident.identify.diagnosis.predictive_score.noise_of_motion`.
+    references
+        Rigid parameters of the model to which nothing is added yet, for each joint with much measurement noise; see
+        `armident.identify.diagnosis.predictive_score.references_of`. Empty before it is fitted.
     """
 
     robot: RobotConfig
@@ -120,7 +120,7 @@ class Study:
     warnings: tuple[str, ...] = ()
     sign_given: bool = True
     regressors: RegressorCache = field(default_factory=RegressorCache, repr=False, compare=False)
-    reference: Array | None = None
+    references: tuple[Array | None, ...] = ()
 
     @property
     def recorded(self) -> tuple[Entry, ...]:
