@@ -17,6 +17,7 @@ from armident.daq.capture.publisher import Publisher
 from armident.daq.recording import Recording, write_recording
 from armident.daq.streaming import Keys, open_session
 from armident.identify.document import IdentificationDocument, to_json
+from armident.identify.monitoring.recursive.block_order import LONGEST_HOLD_S, BlockOrder
 from armident.identify.monitoring.recursive.estimator import RecursiveEstimator
 from armident.identify.monitoring.recursive.replay import blocks_of
 from armident.identify.monitoring.recursive.saved_state import state_of
@@ -67,15 +68,25 @@ def until(condition: object, seconds: float = 60.0) -> None:
         time.sleep(0.05)
 
 
+def seen_by(publisher: Publisher, token: str) -> bool:
+    """True if the session of a publisher knows a liveliness token."""
+    assert publisher._session is not None
+    return any(reply.ok is not None for reply in publisher._session.liveliness().get(token, timeout=0.3))
+
+
 def test_the_live_stream_and_the_replay_give_the_same_bits(session: SessionConfig) -> None:
     recording = recorded()
     live = live_estimator(session, recording.robot, reference())
     blocks = sorted(published_blocks(recording), key=lambda block: int(block.sync[-1]))
     last = int(recording.samples.sync[-1])
     with watching(session, live) as watch, open_session(session, "worker") as observer:
-        publisher = Publisher(session, Keys(session.cell, recording.robot.name))
-        for block in blocks:
-            publisher.offer(block)
+        keys = Keys(session.cell, recording.robot.name)
+        publisher = Publisher(session, keys)
+        # A capture configures its drives before its first block: by then the sessions have found each other.
+        until(lambda: seen_by(publisher, keys.alive("watch")))
+        time.sleep(1.0)
+        for k, block in enumerate(blocks):
+            publisher.offer(replace(block, sequence=k))
             time.sleep(0.005)
         until(lambda: live.matcher.last_sync == last)
         time.sleep(0.5)
@@ -97,6 +108,17 @@ def test_the_live_stream_and_the_replay_give_the_same_bits(session: SessionConfi
     document = json.loads(bytes(replies[0].ok.payload))
     assert document["schema"] == "armident/recursive/1"
     assert [joint["joint"] for joint in document["joints"]] == [joint.name for joint in recording.robot.joints]
+
+
+def test_blocks_that_arrive_late_are_put_in_order_and_a_missing_one_is_given_up() -> None:
+    made = [replace(block, sequence=k) for k, block in zip(range(8), published_blocks(recorded()), strict=False)]
+    order = BlockOrder()
+    seen = [block.sequence for k in (2, 3, 0, 1, 3, 4, 6, 7) for block in order.add(made[k], 0.0)]
+    assert seen == [0, 1, 2, 3, 4]
+    assert not list(order.overdue(0.9 * LONGEST_HOLD_S))
+    assert [block.sequence for block in order.overdue(LONGEST_HOLD_S)] == [6, 7]
+    # Another capture begins anew; the late block of the earlier one is not held up by it.
+    assert [block.sequence for block in order.add(replace(made[0], capture="c2"), 2.0)] == [0]
 
 
 def test_blocks_of_strangers_end_no_watch(session: SessionConfig) -> None:

@@ -23,6 +23,7 @@ from armident.configs import ConfigError, DataError, RobotConfig, SessionConfig,
 from armident.daq.recording import read_recording
 from armident.daq.streaming import Keys, decode_block, open_session
 from armident.identify.document import IdentificationDocument, load_document
+from armident.identify.monitoring.recursive.block_order import BlockOrder
 from armident.identify.monitoring.recursive.estimator import RecursiveEstimator, RecursiveResult
 from armident.identify.monitoring.recursive.replay import blocks_of, has_reference
 from armident.identify.monitoring.recursive.report import document, friction_table, joint_states
@@ -273,15 +274,21 @@ class LiveWatch:
             self._session.put(self._keys.recursive, self._last)
             show(result)
 
-        watch = Watch(self.estimator, self._rate, publish)
+        watch, order = Watch(self.estimator, self._rate, publish), BlockOrder()
         began = saved = time.monotonic()
         while not stop.is_set() and (duration is None or time.monotonic() - began < duration):
             try:
-                watch.handle(decode_block(self._waiting.get(timeout=0.2)))
+                ready = order.add(decode_block(self._waiting.get(timeout=0.2)), time.monotonic())
             except queue.Empty:
-                pass
+                ready = order.overdue(time.monotonic())
             except DataError as error:
                 self._refuse(error)
+                continue
+            for block in ready:
+                try:
+                    watch.handle(block)
+                except DataError as error:
+                    self._refuse(error)
             if time.monotonic() - saved > SAVED_S:
                 saved = time.monotonic()
                 save()
