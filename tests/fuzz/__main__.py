@@ -15,7 +15,7 @@ import time
 from pathlib import Path
 
 from tests.fuzz.harness import Finding, Target, attempt
-from tests.fuzz.targets import TARGETS
+from tests.fuzz.targets import IMPORTERS, TARGETS
 
 STUCK_S = 60.0
 """A process that has not begun another input for so long is killed, s."""
@@ -29,17 +29,20 @@ FOUND = 3
 def main() -> int:
     """Fuzz the targets named on the command line; 1 if something was found."""
     parser = argparse.ArgumentParser(prog="python -m tests.fuzz", description=__doc__)
-    parser.add_argument("--target", action="append", choices=[*TARGETS, "all"], help="default: all")
+    parser.add_argument("--target", action="append", choices=[*TARGETS, "all", "importers"])
     parser.add_argument("--seconds", type=float, default=60.0, help="for each target")
+    parser.add_argument("--minutes", type=float, help="for all targets together, in place of --seconds")
     parser.add_argument("--seed", type=int, default=int(time.time()))
     parser.add_argument("--child", help=argparse.SUPPRESS)
     arguments = parser.parse_args()
-    wanted = arguments.target or ["all"]
+    wanted = [*(arguments.target or ["all"])]
+    wanted += IMPORTERS if "importers" in wanted else ()
     targets = [t for t in TARGETS.values() if t.name in wanted or "all" in wanted]
     if arguments.child is not None:
         return _child(targets[0], arguments.seconds, arguments.seed, Path(arguments.child))
     print(f"seed {arguments.seed}")
-    found = sum(_supervise(target, arguments.seconds, arguments.seed) for target in targets)
+    seconds = arguments.seconds if arguments.minutes is None else 60.0 * arguments.minutes / len(targets)
+    found = sum(_supervise(target, seconds, arguments.seed) for target in targets)
     return int(found > 0)
 
 
