@@ -13,10 +13,32 @@ from armident.identify.effects.recorded import of_recording
 from armident.identify.effects.registry import of_entry
 from armident.identify.effects.terms import arm_model, effect_terms
 from armident.identify.model_export.link_frames import LinkFrames, mdh_link_frames
+from armident.identify.model_export.source_urdf import SourceUrdf, source_for, source_frames, source_of
 from armident.identify.robot.arm import ArmModel
 from armident.identify.robot.chain import Floats
 from armident.identify.robot.consistent import ConsistentParameters, nearest_consistent
 from armident.identify.robot_model import RobotModel
+
+OF_DIAGNOSIS = (
+    "a diagnosis finds effects, not the parameters of the arm: armident identify RECORDING --config {0}/model.yaml, "
+    "then export its result with --robot {0}/model.yaml"
+)
+"""Next step where a diagnosis is to be exported."""
+
+IMPOSSIBLE = (
+    "look for the effect with armident diagnose RECORDING and identify with the model it writes, "
+    "or export the nearest physical arm with --nearest"
+)
+"""Next step where no physical arm has the parameters."""
+
+BALL_KG, BALL_RADIUS_M = 1e-3, 1e-2
+"""Mass and radius of a ball that every exported link contains, at the origin of its frame.
+
+Simulators refuse links without mass or extent. No link of an arm is smaller, and no recording shows a gram.
+"""
+
+SMALLEST_LINK = BALL_KG * np.diag([*np.full(3, BALL_RADIUS_M**2 / 5), 1.0])
+"""Pseudo-inertia of that ball: second moments of a uniform ball (kg m^2) and mass (kg)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,6 +147,11 @@ class ExportedEffect:
     units: dict[str, str]
     of_recording: bool
 
+    @property
+    def is_linear_spring(self) -> bool:
+        """True for a spring of constant positive stiffness ``ks`` that is relaxed at position zero."""
+        return self.effect == "joint_spring" and not self.law and self.parameters.get("ks", 0.0) > 0.0
+
 
 @dataclass(frozen=True, eq=False)
 class ExportedModel:
@@ -148,6 +175,8 @@ class ExportedModel:
         Frames of links and joints in the file.
     links, joints, couplings, effects
         The exported parameters by part of the arm; links in the frames of ``frames``.
+    source_urdf
+        URDF whose link frames these are; ``None``: modified Denavit-Hartenberg frames.
     """
 
     source: Path
@@ -162,6 +191,7 @@ class ExportedModel:
     joints: tuple[JointFriction, ...]
     couplings: tuple[JointCoupling, ...]
     effects: tuple[ExportedEffect, ...]
+    source_urdf: SourceUrdf | None = None
 
     @property
     def theta(self) -> Floats:
@@ -184,24 +214,48 @@ class ExportedModel:
             if how == "no":
                 found[name] = "no effect on the torques; the value is a choice"
             elif how == "group":
-                found[name] = f"acts only through {', '.join(groups)}; its share is a choice"
+                found[name] = "determined only together with others; its share is a choice"
             elif not all(essential.get(group, True) for group in groups):
-                found[name] = "below its uncertainty in these recordings (not essential)"
+                found[name] = "not essential: smaller than its uncertainty in these recordings"
         return found
 
-    def in_frames(self, frames: LinkFrames) -> "ExportedModel":
-        """Return the model with its links in other frames.
+    def position_limits(self, k: int) -> tuple[float, float] | None:
+        """Return lower and upper limit of joint k, rad or m; ``None`` for a joint that has none.
 
         Parameters
         ----------
-        frames
-            Frames of links and joints, (n,).
+        k
+            Index of the joint, from 0.
         """
+        limits = self.robot.joints[k].limits.position
+        return limits if np.isfinite(limits).all() and not self.frames.endless[k] else None
+
+    def in_frames_of(self, source: SourceUrdf) -> "ExportedModel":
+        """Return the model with links and joints in the frames and with the names of a URDF.
+
+        Parameters
+        ----------
+        source
+            URDF and chain.
+
+        Raises
+        ------
+        ConfigError
+            If the URDF cannot be read, or has another geometry than the configuration.
+        """
+        frames = source_frames(source, self.robot)
         joints = tuple(replace(j, name=name) for j, name in zip(self.joints, frames.joints, strict=True))
-        return replace(self, frames=frames, links=_bodies(self.arm, self.theta, frames), joints=joints)
+        links = _bodies(self.arm, self.theta, frames)
+        return replace(self, frames=frames, links=links, joints=joints, source_urdf=source)
 
 
-def load_exported_model(path: str | Path, robot: RobotConfig | str | Path | None = None) -> ExportedModel:
+def load_exported_model(
+    path: str | Path,
+    robot: RobotConfig | str | Path | None = None,
+    urdf: str | Path | None = None,
+    *,
+    nearest: bool = False,
+) -> ExportedModel:
     """Read an identification and compute the physically consistent arm.
 
     Parameters
@@ -211,21 +265,32 @@ def load_exported_model(path: str | Path, robot: RobotConfig | str | Path | None
     robot
         Configuration, or its path or shipped name, for example the ``model.yaml`` of a diagnosis; ``None``: that of
         the recording, else the shipped one of the document's name.
+    urdf
+        URDF that the geometry comes from, whose frames and names the file takes; ``None``: the one that the
+        configuration names, if it names one.
+    nearest
+        True to accept the nearest physical arm where the estimate differs significantly from every physical one.
 
     Raises
     ------
     ConfigError
-        If a file is missing, or the configuration has other parameters than the identification.
+        If a file is missing, or configuration or URDF do not belong to the identification.
     DataError
         If the identification is unusable, or no physical arm has these parameters.
     """
-    file = Path(path) / "identification.json" if Path(path).is_dir() else Path(path)
+    file = _document(Path(path))
     document = load_document(file, IdentificationDocument)
     config = robot if isinstance(robot, RobotConfig) else _robot(document, file, robot)
-    return exported_model(document, config, file)
+    source = source_of(robot) if isinstance(robot, str | Path) and urdf is None else None
+    if urdf is not None:
+        source = source_for(config, Path(urdf))
+    model = exported_model(document, config, file, nearest=nearest)
+    return model if source is None else model.in_frames_of(source)
 
 
-def exported_model(document: IdentificationDocument, robot: RobotConfig, source: Path) -> ExportedModel:
+def exported_model(
+    document: IdentificationDocument, robot: RobotConfig, source: Path, *, nearest: bool = False
+) -> ExportedModel:
     """Compute the physically consistent arm of an identification.
 
     Parameters
@@ -236,6 +301,8 @@ def exported_model(document: IdentificationDocument, robot: RobotConfig, source:
         Configuration of the robot.
     source
         File of the document, for messages.
+    nearest
+        As in `load_exported_model`.
 
     Raises
     ------
@@ -247,8 +314,12 @@ def exported_model(document: IdentificationDocument, robot: RobotConfig, source:
     robot = _with_smoothing(robot, document)
     arm = arm_model(robot)
     theta, covariance = _estimate(arm, document, source)
-    consistent = nearest_consistent(arm, theta, covariance)
-    _refuse_impossible(consistent, document, source)
+    consistent = nearest_consistent(arm, theta, covariance, SMALLEST_LINK)
+    if document.verdict == "unusable":
+        reason = document.reasons[0]
+        raise DataError(f"{source}: the identification is unusable: {reason.message}; next: {reason.next_step}")
+    if not consistent.compatible and not nearest:
+        raise DataError(f"{source}: {consistent.verdict}; next: {IMPOSSIBLE}")
     frames = mdh_link_frames(robot)
     values = arm.values(consistent.theta)
     return ExportedModel(
@@ -271,6 +342,17 @@ def exported_model(document: IdentificationDocument, robot: RobotConfig, source:
         ),
         effects=_effects(arm, consistent.theta),
     )
+
+
+def _document(path: Path) -> Path:
+    """Return the path of the identification; a diagnosis has no rigid parameters and is refused."""
+    if not path.is_dir():
+        if path.name == "diagnosis.json":
+            raise ConfigError(f"{path}: {OF_DIAGNOSIS.format(path.parent)}")
+        return path
+    if not (path / "identification.json").is_file() and (path / "diagnosis.json").is_file():
+        raise ConfigError(f"{path}: {OF_DIAGNOSIS.format(path)}")
+    return path / "identification.json"
 
 
 def _robot(document: IdentificationDocument, file: Path, given: str | Path | None) -> RobotConfig:
@@ -311,17 +393,6 @@ def _estimate(arm: ArmModel, document: IdentificationDocument, source: Path) -> 
     order = [names.index(name) for name in arm.base.names]
     theta = np.array([document.parameters[k].value for k in order])
     return theta, np.array(document.covariance)[np.ix_(order, order)]
-
-
-def _refuse_impossible(consistent: ConsistentParameters, document: IdentificationDocument, source: Path) -> None:
-    """Refuse an unusable identification, and one that no physical arm has."""
-    if document.verdict == "unusable":
-        reason = document.reasons[0]
-        raise DataError(f"{source}: the identification is unusable: {reason.message}; next: {reason.next_step}")
-    if not consistent.compatible:
-        raise DataError(
-            f"{source}: {consistent.verdict}; next: armident diagnose RECORDING, and identify with the model it writes"
-        )
 
 
 def _bodies(arm: ArmModel, theta: Floats, frames: LinkFrames) -> tuple[LinkBody, ...]:

@@ -7,7 +7,11 @@ from pathlib import Path
 from armident.configs import ConfigError
 from armident.identify.document import write_atomically
 from armident.identify.model_export.exported_model import ExportedModel
+from armident.identify.model_export.mjcf_writer import write_mjcf
+from armident.identify.model_export.pinocchio_writer import write_pinocchio
+from armident.identify.model_export.sdf_writer import write_sdf
 from armident.identify.model_export.sheet import LimitationSheet
+from armident.identify.model_export.urdf_writer import write_urdf
 
 
 @dataclass(frozen=True)
@@ -29,8 +33,30 @@ class Format:
     write: Callable[[ExportedModel, Path], tuple[list[Path], LimitationSheet]]
 
 
-FORMATS: dict[str, Format] = {}
+FORMATS: dict[str, Format] = {
+    "urdf": Format(".urdf", "URDF", write_urdf),
+    "mjcf": Format(".xml", "MJCF (MuJoCo)", write_mjcf),
+    "sdf": Format(".sdf", "SDFormat (Gazebo, Drake)", write_sdf),
+    "pinocchio": Format(".pinocchio.xml", "Pinocchio model", write_pinocchio),
+}
 """Formats by name."""
+
+
+def check_format(format_name: str) -> None:
+    """Refuse a format that does not exist.
+
+    Parameters
+    ----------
+    format_name
+        Name of the format.
+
+    Raises
+    ------
+    ConfigError
+        If there is no such format; names those that there are.
+    """
+    if format_name not in FORMATS:
+        raise ConfigError(f"--format: {format_name!r} is not one of {', '.join(FORMATS)}")
 
 
 def export_model(model: ExportedModel, format_name: str, out: Path) -> tuple[list[Path], LimitationSheet]:
@@ -57,12 +83,15 @@ def export_model(model: ExportedModel, format_name: str, out: Path) -> tuple[lis
     ConfigError
         If there is no such format.
     """
-    if format_name not in FORMATS:
-        raise ConfigError(f"--format: {format_name!r} is not one of {', '.join(FORMATS)}")
+    check_format(format_name)
     chosen = FORMATS[format_name]
     main = out / f"{model.robot.name}{chosen.suffix}" if out.is_dir() or not out.suffix else out
-    main.parent.mkdir(parents=True, exist_ok=True)
-    files, sheet = chosen.write(model, main)
-    page = main.with_name(f"{main.stem}_limits.md")
-    write_atomically(page, sheet.markdown(f"{model.robot.name} as {chosen.title}"))
+    try:
+        main.parent.mkdir(parents=True, exist_ok=True)
+        files, sheet = chosen.write(model, main)
+        stem = main.name.removesuffix(chosen.suffix).removesuffix(main.suffix)
+        page = main.with_name(f"{stem}_{format_name}_limits.md")
+        write_atomically(page, sheet.markdown(f"{model.robot.name} as {chosen.title}"))
+    except OSError as error:
+        raise ConfigError(f"{main}: cannot be written: {error.strerror or 'output error'}") from error
     return [*files, page], sheet

@@ -27,6 +27,8 @@ class LinkFrames:
         Modified Denavit-Hartenberg frame of each link in the frame of the link, homogeneous, (n, 4, 4).
     gravity
         Acceleration of gravity in the base link, m/s^2, (3,).
+    endless
+        True for joints that turn without end, (n,).
     """
 
     base: str
@@ -36,6 +38,7 @@ class LinkFrames:
     axes: Floats
     from_mdh: Floats
     gravity: Floats
+    endless: tuple[bool, ...]
 
 
 def mdh_link_frames(robot: RobotConfig) -> LinkFrames:
@@ -55,6 +58,7 @@ def mdh_link_frames(robot: RobotConfig) -> LinkFrames:
         axes=np.tile([0.0, 0.0, 1.0], (n, 1)),
         from_mdh=np.tile(np.eye(4), (n, 1, 1)),
         gravity=np.array(robot.gravity),
+        endless=tuple(j.type == "revolute" and not np.isfinite(j.limits.position).all() for j in robot.joints),
     )
 
 
