@@ -9,13 +9,13 @@ from armident.configs import RobotConfig
 from armident.identify.document import IdentificationDocument, RecordingReference, parameter
 from armident.identify.effects.terms import arm_model
 from armident.identify.model_export.exported_model import ExportedModel, exported_model
+from armident.identify.robot.arm import ArmModel
+from tests.pinocchio_oracle import random_parameters
 
 Floats = NDArray[np.float64]
 
 
-def identification_of(
-    robot: RobotConfig, theta: Floats, relative_std: float = 0.01, verdict: str = "trustworthy"
-) -> IdentificationDocument:
+def identification_of(robot: RobotConfig, theta: Floats, relative_std: float = 0.01) -> IdentificationDocument:
     """The identification that finds the standard parameters ``theta`` with a relative standard deviation."""
     model = arm_model(robot)
     base = model.base.regroup @ theta
@@ -26,7 +26,7 @@ def identification_of(
     ]
     return IdentificationDocument.model_validate(
         {
-            "verdict": verdict,
+            "verdict": "trustworthy",
             "robot": robot.name,
             "recording": RecordingReference(path=None, sha256="0" * 64, sample_rate_hz=1000.0, samples=1000),
             "method": "idim-ls",
@@ -47,6 +47,13 @@ def identification_of(
             "sign_smoothing": dict(zip([j.name for j in robot.joints], robot.sign_smoothing.tolist(), strict=True)),
         }
     )
+
+
+def random_theta(model: ArmModel, seed: int) -> Floats:
+    """Standard parameters of a random physical arm with friction, rotors and couplings."""
+    theta = random_parameters(model, np.random.default_rng(seed), friction=True)
+    theta[model.columns.coupling.ravel()] = np.tile([0.02, 0.4, 0.8], len(model.columns.coupling))
+    return theta
 
 
 def exported(robot: RobotConfig, theta: Floats) -> ExportedModel:

@@ -147,11 +147,6 @@ class ExportedEffect:
     units: dict[str, str]
     of_recording: bool
 
-    @property
-    def is_linear_spring(self) -> bool:
-        """True for a spring of constant positive stiffness ``ks`` that is relaxed at position zero."""
-        return self.effect == "joint_spring" and not self.law and self.parameters.get("ks", 0.0) > 0.0
-
 
 @dataclass(frozen=True, eq=False)
 class ExportedModel:
@@ -311,13 +306,13 @@ def exported_model(
     DataError
         If the identification is unusable, or no physical arm has these parameters.
     """
+    if document.verdict == "unusable":
+        reasons = "; ".join(f"{reason.message}; next: {reason.next_step}" for reason in document.reasons[:1])
+        raise DataError(f"{source}: the identification is unusable: {reasons}")
     robot = _with_smoothing(robot, document)
     arm = arm_model(robot)
     theta, covariance = _estimate(arm, document, source)
     consistent = nearest_consistent(arm, theta, covariance, SMALLEST_LINK)
-    if document.verdict == "unusable":
-        reason = document.reasons[0]
-        raise DataError(f"{source}: the identification is unusable: {reason.message}; next: {reason.next_step}")
     if not consistent.compatible and not nearest:
         raise DataError(f"{source}: {consistent.verdict}; next: {IMPOSSIBLE}")
     frames = mdh_link_frames(robot)

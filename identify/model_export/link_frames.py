@@ -25,6 +25,8 @@ class LinkFrames:
         Unit vector of each joint axis in the frame of its link, (n, 3).
     from_mdh
         Modified Denavit-Hartenberg frame of each link in the frame of the link, homogeneous, (n, 4, 4).
+    frame_0
+        Rotation of frame 0 of the robot configuration in the base link, (3, 3).
     gravity
         Acceleration of gravity in the base link, m/s^2, (3,).
     endless
@@ -37,6 +39,7 @@ class LinkFrames:
     placements: Floats
     axes: Floats
     from_mdh: Floats
+    frame_0: Floats
     gravity: Floats
     endless: tuple[bool, ...]
 
@@ -57,6 +60,7 @@ def mdh_link_frames(robot: RobotConfig) -> LinkFrames:
         placements=np.stack([mdh_transform(joint.mdh) for joint in robot.joints]),
         axes=np.tile([0.0, 0.0, 1.0], (n, 1)),
         from_mdh=np.tile(np.eye(4), (n, 1, 1)),
+        frame_0=np.eye(3),
         gravity=np.array(robot.gravity),
         endless=tuple(j.type == "revolute" and not np.isfinite(j.limits.position).all() for j in robot.joints),
     )

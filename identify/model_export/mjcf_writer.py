@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from armident.identify.model_export.exported_model import ExportedModel, JointCoupling, LinkBody
+from armident.identify.model_export.rigid_effects import SPRINGS, springs, with_rigid_effects
 from armident.identify.model_export.sheet import PARTS, LimitationSheet, limitation_sheet
 from armident.identify.model_export.xml_text import numbers, write_xml
 
@@ -36,11 +37,12 @@ def write_mjcf(model: ExportedModel, out: Path) -> tuple[list[Path], LimitationS
     sheet : LimitationSheet
         Limits of the format.
     """
+    model, effects = with_rigid_effects(model)
     root = ET.Element("mujoco", model=model.robot.name)
     ET.SubElement(root, "compiler", angle="radian", autolimits="true", inertiafromgeom="false")
     ET.SubElement(root, "option", gravity=numbers(model.frames.gravity))
     parent = ET.SubElement(ET.SubElement(root, "worldbody"), "body", name=model.frames.base)
-    springs = {effect.joint: effect for effect in model.effects if effect.is_linear_spring}
+    stiffness = springs(model)
     own = {name: [getattr(joint, name) for joint in model.joints] for name in ("rotor_inertia", "viscous", "coulomb")}
     tendons = ET.Element("tendon")
     held = all([_add_tendons(tendons, coupling, own, model) for coupling in model.couplings])
@@ -50,16 +52,16 @@ def write_mjcf(model: ExportedModel, out: Path) -> tuple[list[Path], LimitationS
         element.set("armature", numbers(own["rotor_inertia"][k]))
         element.set("damping", numbers(own["viscous"][k]))
         element.set("frictionloss", numbers(own["coulomb"][k]))
-        if k in springs:
-            element.set("stiffness", numbers(springs[k].parameters["ks"]))
+        if k in stiffness:
+            element.set("stiffness", numbers(stiffness[k]))
             element.set("springref", "0")
         parent.insert(0, element)
     if len(tendons):
         root.append(tendons)
     root.append(_actuators(model))
     write_xml(root, out)
-    holds = (*PARTS, "gravity", *(("couplings",) if held else ()))
-    return [out], limitation_sheet(model, "mjcf", holds, effects=list(springs.values()), remarks=REMARKS)
+    holds = (*PARTS, "gravity", SPRINGS, *(("couplings",) if held else ()))
+    return [out], limitation_sheet(model, "mjcf", holds, effects=effects, remarks=REMARKS)
 
 
 def _add_body(parent: ET.Element, body: LinkBody, model: ExportedModel, k: int) -> ET.Element:

@@ -6,11 +6,12 @@ from pathlib import Path
 import numpy as np
 
 from armident.identify.model_export.exported_model import ExportedModel, LinkBody
+from armident.identify.model_export.rigid_effects import SPRINGS, springs, with_rigid_effects
 from armident.identify.model_export.sheet import LimitationSheet, limitation_sheet
 from armident.identify.model_export.xml_text import numbers, roll_pitch_yaw, write_xml
 from armident.identify.robot.chain import Floats
 
-HOLDS = ("viscous friction", "Coulomb friction")
+HOLDS = ("viscous friction", "Coulomb friction", SPRINGS)
 
 VERSION = "1.7"
 """First version of SDFormat with ``relative_to``."""
@@ -33,19 +34,20 @@ def write_sdf(model: ExportedModel, out: Path) -> tuple[list[Path], LimitationSh
     sheet : LimitationSheet
         Limits of the format.
     """
+    model, effects = with_rigid_effects(model)
     root = ET.Element("sdf", version=VERSION)
     arm = ET.SubElement(root, "model", name=model.robot.name)
     ET.SubElement(arm, "link", name=model.frames.base)
     _joint(arm, "world_fixed", "fixed", "world", model.frames.base)
     parent = model.frames.base
-    springs = {effect.joint: effect for effect in model.effects if effect.is_linear_spring}
+    stiffness = springs(model)
     for k, body in enumerate(model.links):
         _add_link(arm, body, parent, model.frames.placements[k])
-        _add_joint(arm, model, k, parent, springs[k].parameters["ks"] if k in springs else 0.0)
+        _add_joint(arm, model, k, parent, stiffness.get(k, 0.0))
         parent = body.name
     write_xml(root, out)
     remarks = ("the base is fixed to the world; meshes are not copied",)
-    return [out], limitation_sheet(model, "sdf", HOLDS, effects=list(springs.values()), remarks=remarks)
+    return [out], limitation_sheet(model, "sdf", HOLDS, effects=effects, remarks=remarks)
 
 
 def _add_link(arm: ET.Element, body: LinkBody, parent: str, placement: Floats) -> None:

@@ -1,7 +1,8 @@
 """Limits of an exported file: what its format cannot hold, and which parameters the data did not determine."""
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -105,7 +106,7 @@ def limitation_sheet(
     format_name: str,
     holds: Collection[str],
     *,
-    effects: Collection[ExportedEffect] = (),
+    effects: Mapping[int, str] = MappingProxyType({}),
     remarks: Collection[str] = (),
 ) -> LimitationSheet:
     """Return the sheet of a file.
@@ -117,9 +118,10 @@ def limitation_sheet(
     format_name
         Name of the format.
     holds
-        Parts that the file holds: those of `PARTS`, ``couplings`` and ``gravity``. Every file holds the links.
+        Parts that the file holds: those of `PARTS`, ``couplings``, ``gravity`` and ``springs``; every file holds the
+        links.
     effects
-        Effects that the file holds.
+        Part that an effect is held as, by index of the effect: an element of ``holds`` where the file holds it.
     remarks
         Further sentences for the user.
     """
@@ -141,9 +143,11 @@ def limitation_sheet(
         held.append(text)
     else:
         omitted.append(Omission(text, "Set it in the program that reads the file."))
-    for effect in model.effects:
-        if effect in effects:
-            held.append(effect_in_words(model, effect))
+    for k, effect in enumerate(model.effects):
+        if effects.get(k) in holds:
+            held.append(f"{effect_in_words(model, effect)} (in: {effects[k]})")
+        elif effects.get(k) in (*PARTS, "couplings", "gravity"):
+            continue  # listed above as that part
         elif effect.of_recording:
             omitted.append(
                 Omission(effect_in_words(model, effect), "It corrects recordings and is no part of the arm.")

@@ -113,6 +113,7 @@ def source_frames(source: SourceUrdf, robot: RobotConfig) -> LinkFrames:
         placements=np.asarray(np.linalg.solve(before, absolute), dtype=np.float64),
         axes=np.stack([joint.axis for joint in joints]),
         from_mdh=np.asarray(np.linalg.solve(absolute, chain.frames), dtype=np.float64),
+        frame_0=chain.base[:3, :3],
         gravity=chain.base[:3, :3] @ np.array(robot.gravity),
         endless=tuple(joint.type == "continuous" for joint in joints),
     )

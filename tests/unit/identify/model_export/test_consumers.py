@@ -14,8 +14,7 @@ from armident.identify.effects.terms import arm_model
 from armident.identify.model_export.exported_model import ExportedModel
 from armident.identify.model_export.formats import export_model
 from armident.identify.model_export.source_urdf import source_of
-from tests.model_exports import exported, random_motion, relative_error, rigid_torque
-from tests.pinocchio_oracle import random_parameters
+from tests.model_exports import exported, random_motion, random_theta, relative_error, rigid_torque
 from tests.urdf_chains import configuration, random_urdf
 
 Floats = NDArray[np.float64]
@@ -33,10 +32,9 @@ ARMS = ("tx40", "panda", "emps", "urdf", "urdf_right_angles")
 @pytest.fixture(params=ARMS)
 def model(request: pytest.FixtureRequest, tmp_path: Path) -> ExportedModel:
     """An arm with random parameters on a tilted base; two come from a URDF, with a prismatic joint and skew axes."""
-    rng = np.random.default_rng(5)
     if not request.param.startswith("urdf"):
         robot = load_robot(request.param).model_copy(update={"gravity": TILTED})
-        return exported(robot, random_parameters(arm_model(robot), rng, friction=True))
+        return exported(robot, random_theta(arm_model(robot), 5))
     urdf = tmp_path / "arm.urdf"
     urdf.write_text(random_urdf(np.random.default_rng(11), 5, right_angles=request.param != "urdf"))
     config = tmp_path / "arm.yaml"
@@ -45,7 +43,7 @@ def model(request: pytest.FixtureRequest, tmp_path: Path) -> ExportedModel:
     assert {joint.type for joint in robot.joints} == {"revolute", "prismatic"}
     source = source_of(config)
     assert source is not None
-    return exported(robot, random_parameters(arm_model(robot), rng, friction=True)).in_frames_of(source)
+    return exported(robot, random_theta(arm_model(robot), 5)).in_frames_of(source)
 
 
 @pytest.fixture
