@@ -190,8 +190,9 @@ def _couplings(model: ExportedModel) -> Iterator[str]:
 def _about_estimate(model: ExportedModel) -> Iterator[str]:
     """Return remarks on the estimate: its verdict, and its distance from a physical arm."""
     if model.document.verdict is not None:
-        reasons = "".join(f"; {reason.message}" for reason in model.document.reasons)
-        yield f"verdict of the identification: {model.document.verdict}{reasons}"
+        reasons = [reason.message for reason in model.document.reasons]
+        more = f" (and {len(reasons) - 1} more in {model.source.name})" if len(reasons) > 1 else ""
+        yield f"verdict of the identification: {': '.join([model.document.verdict, *reasons[:1]])}{more}"
     yield f"physical consistency: {model.consistent.verdict}"
     moved = np.abs(model.consistent.shifts)
     worst = int(np.argmax(moved))

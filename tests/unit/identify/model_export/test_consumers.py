@@ -13,7 +13,7 @@ from armident.configs import load_robot
 from armident.identify.effects.terms import arm_model
 from armident.identify.model_export.exported_model import ExportedModel
 from armident.identify.model_export.formats import export_model
-from armident.identify.model_export.source_urdf import source_of
+from armident.identify.model_export.source_urdf import source_for, source_of
 from tests.model_exports import exported, random_motion, random_theta, relative_error, rigid_torque
 from tests.urdf_chains import configuration, random_urdf
 
@@ -49,6 +49,26 @@ def model(request: pytest.FixtureRequest, tmp_path: Path) -> ExportedModel:
 @pytest.fixture
 def motion(model: ExportedModel) -> Motion:
     return random_motion(model.robot, np.random.default_rng(7))
+
+
+@pytest.mark.parametrize("right_angles", [True, False])
+@pytest.mark.parametrize("seed", range(8))
+def test_a_urdf_with_another_base_takes_the_inertias_of_an_arm_without_urdf(
+    seed: int, right_angles: bool, tmp_path: Path
+) -> None:
+    rng, urdf, config = np.random.default_rng(seed), tmp_path / "arm.urdf", tmp_path / "arm.yaml"
+    text = random_urdf(rng, 4, right_angles)
+    urdf.write_text(text)
+    config.write_text(configuration(urdf, 4, np.array(TILTED)))
+    robot = load_robot(config)
+    on_table = '<link name="table"/><joint name="bolts" type="fixed"><parent link="table"/><child link="base"/>'
+    urdf.write_text(text.replace("</robot>", f'{on_table}<origin xyz="0.3 -0.2 0.7" rpy="0.4 -1 2"/></joint></robot>'))
+    model = exported(robot, random_theta(arm_model(robot), seed)).in_frames_of(source_for(robot, urdf))
+    assert model.frames.base == "table"
+    arm = pin.buildModelFromUrdf(str(written(model, "urdf", tmp_path)))
+    arm.gravity.linear = model.frames.gravity
+    motion = random_motion(robot, rng)
+    assert relative_error(pinocchio_torque(arm, motion), rigid_torque(model, motion)) < TOLERANCE
 
 
 def written(model: ExportedModel, format_name: str, folder: Path) -> Path:
