@@ -11,13 +11,16 @@ import pinocchio as pin
 import pytest
 from numpy.typing import NDArray
 
+import armident
 from armident.configs import ConfigError, DataError, RobotConfig, load_robot
 from armident.configs.schema.robot import Effect
 from armident.daq.cli import application
+from armident.daq.recording import write_recording
 from armident.identify.document import VerdictReason, to_json
 from armident.identify.effects.terms import arm_model
 from armident.identify.model_export.exported_model import ExportedModel, exported_model, load_exported_model
 from armident.identify.model_export.formats import FORMATS, export_model
+from tests.fixtures import arms
 from tests.model_exports import exported, identification_of, random_motion, random_theta, relative_error, rigid_torque
 
 Floats = NDArray[np.float64]
@@ -304,3 +307,16 @@ def test_the_folder_of_a_diagnosis_is_refused_with_the_next_step(
     (tmp_path / "diagnosis.json").write_text("{}")
     assert run("export-model", tmp_path, "--format", "urdf") == 2
     assert f"armident identify RECORDING --config {tmp_path}/model.yaml" in capsys.readouterr().err
+
+
+def test_an_identification_in_memory_is_exported(tmp_path: Path) -> None:
+    recording = arms.recording("emps", "emps_excitation", 1)
+    result = armident.identify(recording, method="idim-ls")
+    model, page = result.export(tmp_path, "mjcf")
+    body = ET.parse(model).getroot().find("worldbody/body/body/inertial")
+    assert body is not None
+    assert float(body.get("mass", "")) == pytest.approx(result.parameters["m1"].value, rel=1e-6)
+    assert page.name == "emps_mjcf_limits.md"
+    result.save(tmp_path)
+    write_recording(recording, tmp_path / "emps.mcap")
+    assert load_exported_model(tmp_path).links[0].mass == pytest.approx(result.parameters["m1"].value, rel=1e-6)
