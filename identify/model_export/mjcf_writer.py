@@ -37,7 +37,7 @@ def write_mjcf(model: ExportedModel, out: Path) -> tuple[list[Path], LimitationS
     sheet : LimitationSheet
         Limits of the format.
     """
-    model, effects = with_rigid_effects(model)
+    model, parts = with_rigid_effects(model)
     root = ET.Element("mujoco", model=model.robot.name)
     ET.SubElement(root, "compiler", angle="radian", autolimits="true", inertiafromgeom="false")
     ET.SubElement(root, "option", gravity=numbers(model.frames.gravity))
@@ -61,7 +61,7 @@ def write_mjcf(model: ExportedModel, out: Path) -> tuple[list[Path], LimitationS
     root.append(_actuators(model))
     write_xml(root, out)
     holds = (*PARTS, "gravity", SPRINGS, *(("couplings",) if held else ()))
-    return [out], limitation_sheet(model, "mjcf", holds, effects=effects, remarks=REMARKS)
+    return [out], limitation_sheet(model, "mjcf", holds, parts=parts, remarks=REMARKS)
 
 
 def _add_body(parent: ET.Element, body: LinkBody, model: ExportedModel, k: int) -> ET.Element:

@@ -45,7 +45,7 @@ def write_pinocchio(model: ExportedModel, out: Path) -> tuple[list[Path], Limita
     except ImportError as error:
         raise ConfigError("--format pinocchio: Pinocchio is not installed: pip install pin") from error
     pin: Any = pinocchio
-    model, effects = with_rigid_effects(model)
+    model, parts = with_rigid_effects(model)
     with TemporaryDirectory() as folder:
         # Pinocchio writes files only; written here, the archive is complete or absent.
         archive = Path(folder) / out.name
@@ -56,7 +56,7 @@ def write_pinocchio(model: ExportedModel, out: Path) -> tuple[list[Path], Limita
         f"{pin.__version__} or newer",
         "rnea and crba use the rotor inertia (armature); friction and damping are stored, and added by the caller",
     )
-    return [out], limitation_sheet(model, "pinocchio", HOLDS, effects=effects, remarks=remarks)
+    return [out], limitation_sheet(model, "pinocchio", HOLDS, parts=parts, remarks=remarks)
 
 
 def _pinocchio_model(model: ExportedModel, pin: Any) -> Any:

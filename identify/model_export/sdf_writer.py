@@ -34,7 +34,7 @@ def write_sdf(model: ExportedModel, out: Path) -> tuple[list[Path], LimitationSh
     sheet : LimitationSheet
         Limits of the format.
     """
-    model, effects = with_rigid_effects(model)
+    model, parts = with_rigid_effects(model)
     root = ET.Element("sdf", version=VERSION)
     arm = ET.SubElement(root, "model", name=model.robot.name)
     ET.SubElement(arm, "link", name=model.frames.base)
@@ -47,7 +47,7 @@ def write_sdf(model: ExportedModel, out: Path) -> tuple[list[Path], LimitationSh
         parent = body.name
     write_xml(root, out)
     remarks = ("the base is fixed to the world; meshes are not copied",)
-    return [out], limitation_sheet(model, "sdf", HOLDS, effects=effects, remarks=remarks)
+    return [out], limitation_sheet(model, "sdf", HOLDS, parts=parts, remarks=remarks)
 
 
 def _add_link(arm: ET.Element, body: LinkBody, parent: str, placement: Floats) -> None:

@@ -106,7 +106,8 @@ def limitation_sheet(
     format_name: str,
     holds: Collection[str],
     *,
-    effects: Mapping[int, str] = MappingProxyType({}),
+    effects: Collection[ExportedEffect] = (),
+    parts: Mapping[int, str] = MappingProxyType({}),
     remarks: Collection[str] = (),
 ) -> LimitationSheet:
     """Return the sheet of a file.
@@ -121,7 +122,9 @@ def limitation_sheet(
         Parts that the file holds: those of `PARTS`, ``couplings``, ``gravity`` and ``springs``; every file holds the
         links.
     effects
-        Part that an effect is held as, by index of the effect: an element of ``holds`` where the file holds it.
+        Effects that the file holds as such.
+    parts
+        Part of the arm that another effect was added to, by index of the effect; ``holds`` says if the file holds it.
     remarks
         Further sentences for the user.
     """
@@ -144,9 +147,11 @@ def limitation_sheet(
     else:
         omitted.append(Omission(text, "Set it in the program that reads the file."))
     for k, effect in enumerate(model.effects):
-        if effects.get(k) in holds:
-            held.append(f"{effect_in_words(model, effect)} (in: {effects[k]})")
-        elif effects.get(k) in (*PARTS, "couplings", "gravity"):
+        if effect in effects:
+            held.append(effect_in_words(model, effect))
+        elif parts.get(k) in holds:
+            held.append(f"{effect_in_words(model, effect)} (in: {parts[k]})")
+        elif parts.get(k) in (*PARTS, "couplings", "gravity"):
             continue  # listed above as that part
         elif effect.of_recording:
             omitted.append(

@@ -37,13 +37,13 @@ def write_urdf(model: ExportedModel, out: Path) -> tuple[list[Path], LimitationS
     sheet : LimitationSheet
         Limits of the format.
     """
-    model, effects = with_rigid_effects(model)
+    model, parts = with_rigid_effects(model)
     if model.source_urdf is None:
         root, remarks = _new(model), ["no meshes: the geometry comes from Denavit-Hartenberg parameters"]
     else:
         root, remarks = _copy(model, model.source_urdf, out)
     write_xml(root, out)
-    return [out], limitation_sheet(model, "urdf", HOLDS, effects=effects, remarks=remarks)
+    return [out], limitation_sheet(model, "urdf", HOLDS, parts=parts, remarks=remarks)
 
 
 def _new(model: ExportedModel) -> ET.Element:
