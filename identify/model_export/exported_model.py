@@ -172,6 +172,8 @@ class ExportedModel:
         The exported parameters by part of the arm; links in the frames of ``frames``.
     source_urdf
         URDF whose link frames these are; ``None``: modified Denavit-Hartenberg frames.
+    configuration
+        Origin of the robot configuration in words; empty: in memory.
     """
 
     source: Path
@@ -187,6 +189,7 @@ class ExportedModel:
     couplings: tuple[JointCoupling, ...]
     effects: tuple[ExportedEffect, ...]
     source_urdf: SourceUrdf | None = None
+    configuration: str = ""
 
     @property
     def theta(self) -> Floats:
@@ -275,11 +278,11 @@ def load_exported_model(
     """
     file = _document(Path(path))
     document = load_document(file, IdentificationDocument)
-    config = robot if isinstance(robot, RobotConfig) else _robot(document, file, robot)
+    config, origin = (robot, "") if isinstance(robot, RobotConfig) else _robot(document, file, robot)
     source = source_of(robot) if isinstance(robot, str | Path) and urdf is None else None
     if urdf is not None:
         source = source_for(config, Path(urdf))
-    model = exported_model(document, config, file, nearest=nearest)
+    model = replace(exported_model(document, config, file, nearest=nearest), configuration=origin)
     return model if source is None else model.in_frames_of(source)
 
 
@@ -350,16 +353,16 @@ def _document(path: Path) -> Path:
     return path / "identification.json"
 
 
-def _robot(document: IdentificationDocument, file: Path, given: str | Path | None) -> RobotConfig:
-    """Return the configuration that was given, that of the recording, or the shipped one."""
+def _robot(document: IdentificationDocument, file: Path, given: str | Path | None) -> tuple[RobotConfig, str]:
+    """Return the configuration that was given, that of the recording, or the shipped one; and its origin in words."""
     if given is not None:
-        return load_robot(given)
+        return load_robot(given), str(given)
     recorded = document.recording.path
     for candidate in () if recorded is None else (Path(recorded), file.parent / recorded):
-        if candidate.is_file():
-            return read_recording(candidate).robot
+        if candidate.is_file() and (recording := read_recording(candidate)).sha256 == document.recording.sha256:
+            return recording.robot, f"that of the recording {candidate}"
     try:
-        return load_robot(document.robot)
+        return load_robot(document.robot), f"the shipped one of the name {document.robot}; the recording is not here"
     except ConfigError as error:
         raise ConfigError(
             f"{file}: the configuration of robot {document.robot} is unknown (its recording {recorded} is not here): "

@@ -43,6 +43,14 @@ class LinkFrames:
     gravity: Floats
     endless: tuple[bool, ...]
 
+    @property
+    def free_base(self) -> str:
+        """Name of the base link for formats in which ``world`` is the world itself."""
+        free = (
+            name for name in (self.base, "base_link", "mount_link", "arm_base") if name not in ("world", *self.links)
+        )
+        return next(free)
+
 
 def mdh_link_frames(robot: RobotConfig) -> LinkFrames:
     """Return the modified Denavit-Hartenberg frames of a robot configuration as link frames.
@@ -53,9 +61,10 @@ def mdh_link_frames(robot: RobotConfig) -> LinkFrames:
         Configuration, n joints. A link is named after its joint.
     """
     n = robot.n
+    links = tuple(f"{joint.name}_link" for joint in robot.joints)
     return LinkFrames(
-        base="base_link",
-        links=tuple(f"{joint.name}_link" for joint in robot.joints),
+        base="base_link" if "base_link" not in links else "mount_link",
+        links=links,
         joints=tuple(joint.source_name or joint.name for joint in robot.joints),
         placements=np.stack([mdh_transform(joint.mdh) for joint in robot.joints]),
         axes=np.tile([0.0, 0.0, 1.0], (n, 1)),

@@ -14,7 +14,8 @@ RADIUS_M = 0.02
 """Radius of the capsules that show links without meshes, m."""
 
 REMARKS = (
-    "couplings are fixed tendons over both joints; a part of the armature, damping or friction of each joint is there",
+    "couplings are fixed tendons over both joints, with a part of the armature and damping of each joint; "
+    "MuJoCo 3.3.1 or newer reads them",
     "the input of each actuator is the torque that the drive reports: the actuator subtracts the offset",
     "capsules show the links; they have no mass and no contacts, and meshes of a URDF are not copied",
 )
@@ -41,7 +42,7 @@ def write_mjcf(model: ExportedModel, out: Path) -> tuple[list[Path], LimitationS
     root = ET.Element("mujoco", model=model.robot.name)
     ET.SubElement(root, "compiler", angle="radian", autolimits="true", inertiafromgeom="false")
     ET.SubElement(root, "option", gravity=numbers(model.frames.gravity))
-    parent = ET.SubElement(ET.SubElement(root, "worldbody"), "body", name=model.frames.base)
+    parent = ET.SubElement(ET.SubElement(root, "worldbody"), "body", name=model.frames.free_base)
     stiffness = springs(model)
     own = {name: [getattr(joint, name) for joint in model.joints] for name in ("rotor_inertia", "viscous", "coulomb")}
     tendons = ET.Element("tendon")
@@ -69,9 +70,10 @@ def _add_body(parent: ET.Element, body: LinkBody, model: ExportedModel, k: int) 
     placement = model.frames.placements[k]
     axes = np.concatenate([placement[:3, 0], placement[:3, 1]])
     element = ET.SubElement(parent, "body", name=body.name, pos=numbers(placement[:3, 3]), xyaxes=numbers(axes))
-    c = body.central_inertia
-    six = [c[0, 0], c[1, 1], c[2, 2], c[0, 1], c[0, 2], c[1, 2]]
-    ET.SubElement(element, "inertial", pos=numbers(body.centre), mass=numbers(body.mass), fullinertia=numbers(six))
+    # Principal axes: MuJoCo's own decomposition of a full inertia is exact to 1e-7 only in older versions.
+    moments, principal = np.linalg.eigh(body.central_inertia)
+    inertial = {"pos": numbers(body.centre), "mass": numbers(body.mass), "diaginertia": numbers(moments)}
+    ET.SubElement(element, "inertial", inertial, xyaxes=numbers(principal[:, :2].T.ravel()))
     end = model.frames.placements[k + 1][:3, 3] if k + 1 < len(model.links) else body.centre
     if np.linalg.norm(end) > RADIUS_M:
         shape = {"type": "capsule", "size": numbers(RADIUS_M), "fromto": numbers(np.concatenate([np.zeros(3), end]))}

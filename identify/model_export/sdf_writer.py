@@ -37,9 +37,9 @@ def write_sdf(model: ExportedModel, out: Path) -> tuple[list[Path], LimitationSh
     model, parts = with_rigid_effects(model)
     root = ET.Element("sdf", version=VERSION)
     arm = ET.SubElement(root, "model", name=model.robot.name)
-    ET.SubElement(arm, "link", name=model.frames.base)
-    _joint(arm, "world_fixed", "fixed", "world", model.frames.base)
-    parent = model.frames.base
+    parent = model.frames.free_base
+    ET.SubElement(arm, "link", name=parent)
+    _joint(arm, f"{parent}_to_world", "fixed", "world", parent)
     stiffness = springs(model)
     for k, body in enumerate(model.links):
         _add_link(arm, body, parent, model.frames.placements[k])
@@ -67,7 +67,9 @@ def _add_joint(arm: ET.Element, model: ExportedModel, k: int, parent: str, stiff
     """Add joint k, whose frame is that of its link."""
     joint, limits = model.joints[k], model.robot.joints[k].limits
     kind = "continuous" if model.frames.endless[k] else joint.type
-    axis = ET.SubElement(_joint(arm, joint.name, kind, parent, model.links[k].name), "axis")
+    # Links and joints share their names in SDF.
+    name = f"{joint.name}_joint" if joint.name in (model.frames.free_base, *model.frames.links) else joint.name
+    axis = ET.SubElement(_joint(arm, name, kind, parent, model.links[k].name), "axis")
     _text(axis, "xyz", model.frames.axes[k])
     bounds = dict(zip(("lower", "upper"), model.position_limits(k) or (), strict=False))
     element = ET.SubElement(axis, "limit")

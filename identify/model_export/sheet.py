@@ -193,7 +193,11 @@ def _couplings(model: ExportedModel) -> Iterator[str]:
 
 
 def _about_estimate(model: ExportedModel) -> Iterator[str]:
-    """Return remarks on the estimate: its verdict, and its distance from a physical arm."""
+    """Return remarks on the geometry, the verdict of the estimate, and its distance from a physical arm."""
+    if model.configuration:
+        yield f"robot configuration: {model.configuration}"
+    if model.source_urdf is None:
+        yield "links have the Denavit-Hartenberg frames of the configuration; --urdf FILE takes those of a URDF"
     if model.document.verdict is not None:
         reasons = [reason.message for reason in model.document.reasons]
         more = f" (and {len(reasons) - 1} more in {model.source.name})" if len(reasons) > 1 else ""

@@ -39,7 +39,7 @@ def write_urdf(model: ExportedModel, out: Path) -> tuple[list[Path], LimitationS
     """
     model, parts = with_rigid_effects(model)
     if model.source_urdf is None:
-        root, remarks = _new(model), ["no meshes: the geometry comes from Denavit-Hartenberg parameters"]
+        root, remarks = _new(model), ["there are no meshes"]
     else:
         root, remarks = _copy(model, model.source_urdf, out)
     write_xml(root, out)

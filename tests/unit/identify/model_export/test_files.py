@@ -320,3 +320,29 @@ def test_an_identification_in_memory_is_exported(tmp_path: Path) -> None:
     result.save(tmp_path)
     write_recording(recording, tmp_path / "emps.mcap")
     assert load_exported_model(tmp_path).links[0].mass == pytest.approx(result.parameters["m1"].value, rel=1e-6)
+
+
+def test_a_recording_that_has_been_replaced_gives_no_configuration(tmp_path: Path) -> None:
+    robot = load_robot("emps").model_copy(update={"name": "my_axis"})
+    document = identification_of(robot, random_theta(arm_model(robot), 2))
+    used = document.recording.model_copy(update={"path": "emps.mcap"})
+    (tmp_path / "identification.json").write_text(to_json(document.model_copy(update={"recording": used})))
+    write_recording(arms.recording("emps", "emps_excitation", 1), tmp_path / "emps.mcap")
+    with pytest.raises(ConfigError, match="configuration of robot my_axis is unknown"):
+        load_exported_model(tmp_path)
+
+
+def test_names_that_a_format_reserves_are_changed(arm: tuple[Path, RobotConfig, Floats]) -> None:
+    folder = arm[0]
+    (folder / "lift_arm.urdf").write_text(ARM.replace('name="Elbow"', 'name="fore"'))
+    model = load_exported_model(folder, folder / "arm.yaml")
+    sdf = read(model, "sdf", folder / "out").find("model")
+    assert sdf is not None
+    names = [str(element.get("name")) for element in sdf]
+    assert len(set(names)) == len(names)
+    assert "world" not in names
+    assert "fore_joint" in names
+    mujoco = pytest.importorskip("mujoco")
+    loaded = mujoco.MjModel.from_xml_path(str(export_model(model, "mjcf", folder / "out")[0][0]))
+    assert [loaded.joint(k).name for k in range(3)] == ["Lift", "Shoulder", "fore"]
+    assert loaded.jnt_limited.tolist() == [1, 1, 0]
