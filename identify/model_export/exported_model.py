@@ -18,6 +18,7 @@ from armident.identify.robot.arm import ArmModel
 from armident.identify.robot.chain import Floats
 from armident.identify.robot.consistent import ConsistentParameters, nearest_consistent
 from armident.identify.robot_model import RobotModel
+from armident.identify.saved_model import configuration_of
 
 OF_DIAGNOSIS = (
     "a diagnosis finds effects, not the parameters of the arm: armident identify RECORDING --config {0}/model.yaml, "
@@ -264,7 +265,7 @@ def load_exported_model(
         ``identification.json``, or a folder that contains it.
     robot
         Configuration, or its path or shipped name, for example the ``model.yaml`` of a diagnosis; ``None``: that of
-        the recording, else the shipped one of the document's name.
+        the document, else that of the recording, else the shipped one of the document's name.
     urdf
         URDF that the geometry comes from, whose frames and names the file takes; ``None``: the one that the
         configuration names, if it names one.
@@ -356,9 +357,12 @@ def _document(path: Path) -> Path:
 
 
 def _robot(document: IdentificationDocument, file: Path, given: str | Path | None) -> RobotConfig:
-    """Return the configuration that was given, that of the recording, or the shipped one."""
+    """Return the configuration that was given, that of the document, that of the recording, or the shipped one."""
     if given is not None:
         return load_robot(given)
+    kept = configuration_of(document, file)
+    if kept is not None:
+        return kept
     recorded = document.recording.path
     for candidate in () if recorded is None else (Path(recorded), file.parent / recorded):
         if candidate.is_file():
