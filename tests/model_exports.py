@@ -10,6 +10,7 @@ from armident.identify.document import IdentificationDocument, RecordingReferenc
 from armident.identify.effects.terms import arm_model
 from armident.identify.model_export.exported_model import ExportedModel, exported_model
 from armident.identify.robot.arm import ArmModel
+from armident.identify.saved_model import model_of
 from tests.pinocchio_oracle import random_parameters
 
 Floats = NDArray[np.float64]
@@ -28,6 +29,7 @@ def identification_of(robot: RobotConfig, theta: Floats, relative_std: float = 0
         {
             "verdict": "trustworthy",
             "robot": robot.name,
+            "configuration": robot.model_dump(mode="json", by_alias=True),
             "recording": RecordingReference(path=None, sha256="0" * 64, sample_rate_hz=1000.0, samples=1000),
             "method": "idim-ls",
             "options": {},
@@ -56,9 +58,10 @@ def random_theta(model: ArmModel, seed: int) -> Floats:
     return theta
 
 
-def exported(robot: RobotConfig, theta: Floats) -> ExportedModel:
+def exported(robot: RobotConfig, theta: Floats, *, nearest: bool = False) -> ExportedModel:
     """The exported model of an arm with the standard parameters ``theta``."""
-    return exported_model(identification_of(robot, theta), robot, Path("identification.json"))
+    saved = model_of(identification_of(robot, theta), Path("identification.json"), robot)
+    return exported_model(saved, nearest=nearest)
 
 
 def random_motion(robot: RobotConfig, rng: np.random.Generator, samples: int = 100) -> tuple[Floats, Floats, Floats]:

@@ -13,9 +13,12 @@ from armident.identify.model_export.xml_text import numbers, write_xml
 RADIUS_M = 0.02
 """Radius of the capsules that show links without meshes, m."""
 
-REMARKS = (
+TENDONS = (
     "couplings are fixed tendons over both joints, with a part of the armature and damping of each joint; "
-    "MuJoCo 3.3.1 or newer reads them",
+    "MuJoCo 3.3.1 or newer reads them"
+)
+
+REMARKS = (
     "the input of each actuator is the torque that the drive reports: the actuator subtracts the offset",
     "capsules show the links; they have no mass and no contacts, and meshes of a URDF are not copied",
 )
@@ -62,7 +65,8 @@ def write_mjcf(model: ExportedModel, out: Path) -> tuple[list[Path], LimitationS
     root.append(_actuators(model))
     write_xml(root, out)
     holds = (*PARTS, "gravity", SPRINGS, *(("couplings",) if held else ()))
-    return [out], limitation_sheet(model, "mjcf", holds, parts=parts, remarks=REMARKS)
+    remarks = ((TENDONS,) if len(tendons) else ()) + REMARKS
+    return [out], limitation_sheet(model, "mjcf", holds, parts=parts, remarks=remarks)
 
 
 def _add_body(parent: ET.Element, body: LinkBody, model: ExportedModel, k: int) -> ET.Element:

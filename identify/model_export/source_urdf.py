@@ -133,7 +133,7 @@ def _frame_0(source: SourceUrdf, joints: tuple[UrdfJoint, ...], robot: RobotConf
         If there is no such frame: the arms differ.
     """
     names = ", ".join(joint.name for joint in joints)
-    hint = "give the URDF of this arm, or the configuration that names it with --robot"
+    hint = "give the URDF of this arm, or the configuration that names it with --config"
     if [MOVING[joint.type] for joint in joints] != [joint.type for joint in robot.joints]:
         raise ConfigError(f"{source.file}: its chain has the joints {names}; {robot.name} has {robot.n} others: {hint}")
     chain = mdh_of(joints, source.file)

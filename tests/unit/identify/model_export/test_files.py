@@ -15,11 +15,11 @@ import armident
 from armident.configs import ConfigError, DataError, RobotConfig, load_robot
 from armident.configs.schema.robot import Effect
 from armident.daq.cli import application
-from armident.daq.recording import write_recording
 from armident.identify.document import VerdictReason, to_json
 from armident.identify.effects.terms import arm_model
-from armident.identify.model_export.exported_model import ExportedModel, exported_model, load_exported_model
+from armident.identify.model_export.exported_model import ExportedModel, load_exported_model
 from armident.identify.model_export.formats import FORMATS, export_model
+from armident.identify.model_export.source_urdf import SourceUrdf
 from tests.fixtures import arms
 from tests.model_exports import exported, identification_of, random_motion, random_theta, relative_error, rigid_torque
 
@@ -230,10 +230,9 @@ def test_an_impossible_arm_is_refused_unless_the_nearest_one_is_wanted(tmp_path:
     arm = arm_model(robot)
     theta = random_theta(arm, 2)
     theta[arm.names.index("fv3")] = -1.0
-    document = identification_of(robot, theta)
     with pytest.raises(DataError, match=r"fv3 changes most.*armident diagnose.*--nearest"):
-        exported_model(document, robot, tmp_path)
-    nearest = exported_model(document, robot, tmp_path, nearest=True)
+        exported(robot, theta)
+    nearest = exported(robot, theta, nearest=True)
     assert nearest.joints[2].viscous >= 0.0
     _, sheet = export_model(nearest, "urdf", tmp_path)
     assert any("differ from the estimate by up to" in remark and "fv3" in remark for remark in sheet.remarks)
@@ -244,15 +243,9 @@ def test_an_unusable_identification_is_refused(tmp_path: Path) -> None:
     theta = random_theta(arm_model(robot), 2)
     reason = VerdictReason(level="unusable", kind="fit", joint=None, message="Nothing moves", next_step="move the arm")
     document = identification_of(robot, theta).model_copy(update={"verdict": "unusable", "reasons": [reason]})
-    with pytest.raises(DataError, match="unusable: Nothing moves; next: move the arm"):
-        exported_model(document, robot, tmp_path)
-
-
-def test_a_configuration_with_other_parameters_is_refused(tmp_path: Path) -> None:
-    theta = random_theta(arm_model(load_robot("tx40")), 2)
-    document = identification_of(load_robot("tx40"), theta)
-    with pytest.raises(ConfigError, match="fva2"):
-        exported_model(document, tx40_with(Effect(effect="asymmetric_viscous_friction", joint="joint_2")), tmp_path)
+    (tmp_path / "identification.json").write_text(to_json(document))
+    with pytest.raises(DataError, match=r"unusable: Nothing moves. Next: move the arm"):
+        load_exported_model(tmp_path)
 
 
 def run(*words: object) -> int:
@@ -268,7 +261,7 @@ def test_the_command_prints_one_document(
     arm: tuple[Path, RobotConfig, Floats], capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = arm[0]
-    words = ("export-model", folder, "--robot", folder / "arm.yaml", "--format", "mjcf")
+    words = ("export-model", folder, "--config", folder / "arm.yaml", "--format", "mjcf")
     assert run(*words, "--out", folder / "arm.xml", "--json") == 0
     document = json.loads(capsys.readouterr().out)
     assert document["files"] == [str(folder / "arm.xml"), str(folder / "arm_mjcf_limits.md")]
@@ -281,10 +274,9 @@ def test_the_command_prints_one_document(
     ("words", "code", "message"),
     [
         (("--format", "stl"), 2, f"--format: 'stl' is not one of {', '.join(FORMATS)}"),
-        (("--format", "urdf"), 2, "the configuration of robot lift_arm is unknown"),
-        (("--format", "urdf", "--robot", "tx40"), 2, "other parameters than the configuration of tx40"),
-        (("--format", "urdf", "--robot", "{folder}/arm.yaml", "--urdf", "none.urdf"), 2, "none.urdf: no such file"),
-        (("--format", "urdf", "--robot", "{folder}/arm.yaml", "--out", "/proc/x/y.urdf"), 2, "cannot be written"),
+        (("--format", "urdf", "--config", "tx40"), 3, "the model is of robot 'lift_arm', the configuration of 'tx40'"),
+        (("--format", "urdf", "--config", "{folder}/arm.yaml", "--urdf", "none.urdf"), 2, "none.urdf: no such file"),
+        (("--format", "urdf", "--config", "{folder}/arm.yaml", "--out", "/proc/x/y.urdf"), 2, "cannot be written"),
     ],
 )
 def test_a_wrong_request_is_one_line(
@@ -301,14 +293,6 @@ def test_a_wrong_request_is_one_line(
     assert err.count("\n") == 1
 
 
-def test_the_folder_of_a_diagnosis_is_refused_with_the_next_step(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / "diagnosis.json").write_text("{}")
-    assert run("export-model", tmp_path, "--format", "urdf") == 2
-    assert f"armident identify RECORDING --config {tmp_path}/model.yaml" in capsys.readouterr().err
-
-
 def test_an_identification_in_memory_is_exported(tmp_path: Path) -> None:
     recording = arms.recording("emps", "emps_excitation", 1)
     result = armident.identify(recording, method="idim-ls")
@@ -318,24 +302,16 @@ def test_an_identification_in_memory_is_exported(tmp_path: Path) -> None:
     assert float(body.get("mass", "")) == pytest.approx(result.parameters["m1"].value, rel=1e-6)
     assert page.name == "emps_mjcf_limits.md"
     result.save(tmp_path)
-    write_recording(recording, tmp_path / "emps.mcap")
     assert load_exported_model(tmp_path).links[0].mass == pytest.approx(result.parameters["m1"].value, rel=1e-6)
 
 
-def test_a_recording_that_has_been_replaced_gives_no_configuration(tmp_path: Path) -> None:
-    robot = load_robot("emps").model_copy(update={"name": "my_axis"})
-    document = identification_of(robot, random_theta(arm_model(robot), 2))
-    used = document.recording.model_copy(update={"path": "emps.mcap"})
-    (tmp_path / "identification.json").write_text(to_json(document.model_copy(update={"recording": used})))
-    write_recording(arms.recording("emps", "emps_excitation", 1), tmp_path / "emps.mcap")
-    with pytest.raises(ConfigError, match="configuration of robot my_axis is unknown"):
-        load_exported_model(tmp_path)
-
-
 def test_names_that_a_format_reserves_are_changed(arm: tuple[Path, RobotConfig, Floats]) -> None:
-    folder = arm[0]
+    folder, _, theta = arm
     (folder / "lift_arm.urdf").write_text(ARM.replace('name="Elbow"', 'name="fore"'))
-    model = load_exported_model(folder, folder / "arm.yaml")
+    with pytest.raises(DataError, match="its joints are Lift, Shoulder, Elbow, other names"):
+        load_exported_model(folder, folder / "arm.yaml")
+    robot = load_robot(folder / "arm.yaml")
+    model = exported(robot, theta).in_frames_of(SourceUrdf(folder / "lift_arm.urdf", None, "fore"))
     sdf = read(model, "sdf", folder / "out").find("model")
     assert sdf is not None
     names = [str(element.get("name")) for element in sdf]
