@@ -238,6 +238,15 @@ def test_an_impossible_arm_is_refused_unless_the_nearest_one_is_wanted(tmp_path:
     assert any("differ from the estimate by up to" in remark and "fv3" in remark for remark in sheet.remarks)
 
 
+def test_a_coupling_larger_than_what_it_couples_is_refused() -> None:
+    robot = load_robot("tx40")
+    arm = arm_model(robot)
+    theta = random_theta(arm, 2)
+    theta[arm.names.index("iam6")] = 5.0
+    with pytest.raises(DataError, match=r"coupling m6 is larger .* mass matrix is not positive definite at \d+ %"):
+        exported(robot, theta)
+
+
 def test_an_unusable_identification_is_refused(tmp_path: Path) -> None:
     robot = load_robot("emps")
     theta = random_theta(arm_model(robot), 2)
