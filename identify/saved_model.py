@@ -140,6 +140,8 @@ def model_of(
         )
     smoothing = document.sign_smoothing
     if smoothing is not None:
+        if set(smoothing) != {joint.name for joint in config.joints}:
+            raise DataError(f"{path}: its joints are {', '.join(smoothing)}, other names than in the configuration")
         config = with_numbers(config, [smoothing[joint.name] for joint in config.joints])
     return SavedModel(config, document, path)
 

@@ -9,13 +9,14 @@ from armident.configs import RobotConfig
 from armident.identify.document import IdentificationDocument, RecordingReference, parameter
 from armident.identify.effects.terms import arm_model
 from armident.identify.model_export.exported_model import ExportedModel, exported_model
+from armident.identify.robot.arm import ArmModel
+from armident.identify.saved_model import model_of
+from tests.pinocchio_oracle import random_parameters
 
 Floats = NDArray[np.float64]
 
 
-def identification_of(
-    robot: RobotConfig, theta: Floats, relative_std: float = 0.01, verdict: str = "trustworthy"
-) -> IdentificationDocument:
+def identification_of(robot: RobotConfig, theta: Floats, relative_std: float = 0.01) -> IdentificationDocument:
     """The identification that finds the standard parameters ``theta`` with a relative standard deviation."""
     model = arm_model(robot)
     base = model.base.regroup @ theta
@@ -26,8 +27,9 @@ def identification_of(
     ]
     return IdentificationDocument.model_validate(
         {
-            "verdict": verdict,
+            "verdict": "trustworthy",
             "robot": robot.name,
+            "configuration": robot.model_dump(mode="json", by_alias=True),
             "recording": RecordingReference(path=None, sha256="0" * 64, sample_rate_hz=1000.0, samples=1000),
             "method": "idim-ls",
             "options": {},
@@ -49,9 +51,17 @@ def identification_of(
     )
 
 
-def exported(robot: RobotConfig, theta: Floats) -> ExportedModel:
+def random_theta(model: ArmModel, seed: int) -> Floats:
+    """Standard parameters of a random physical arm with friction, rotors and couplings."""
+    theta = random_parameters(model, np.random.default_rng(seed), friction=True)
+    theta[model.columns.coupling.ravel()] = np.tile([0.02, 0.4, 0.8], len(model.columns.coupling))
+    return theta
+
+
+def exported(robot: RobotConfig, theta: Floats, *, nearest: bool = False) -> ExportedModel:
     """The exported model of an arm with the standard parameters ``theta``."""
-    return exported_model(identification_of(robot, theta), robot, Path("identification.json"))
+    saved = model_of(identification_of(robot, theta), Path("identification.json"), robot)
+    return exported_model(saved, nearest=nearest)
 
 
 def random_motion(robot: RobotConfig, rng: np.random.Generator, samples: int = 100) -> tuple[Floats, Floats, Floats]:
