@@ -9,7 +9,10 @@ from scipy import signal
 from armident.configs import DataError, RobotConfig
 from armident.identify.document import IdentificationDocument
 from armident.identify.effects.terms import arm_model
+from armident.identify.identification.criteria import IdentificationCriteria
 from armident.identify.identification.equations import LS_CUTOFF
+from armident.identify.identification.excitation_check import workspace_postures
+from armident.identify.identification.physics_check import impossible_values
 
 FREQUENCIES = 4096
 """Number of frequencies of a noise spectrum."""
@@ -65,6 +68,40 @@ def previous_estimate(document: IdentificationDocument, robot: RobotConfig, wher
     cutoff = min(LS_CUTOFF * robot.bandwidth_hz, rate / 2) if robot.bandwidth_hz is not None else rate / 2
     noise = [_deviation_below(cutoff, rate, joint["variance"], joint["coefficients"]) for joint in found["joints"]]
     return PreviousEstimate(np.array([values[name] for name in model.base.names]), np.array(noise))
+
+
+def require_physical(document: IdentificationDocument, robot: RobotConfig, where: str) -> None:
+    """Refuse parameters that no arm has: they would predict wrong torques.
+
+    Parameters
+    ----------
+    document
+        The identification, as accepted by `previous_estimate`.
+    robot
+        Configuration of the robot.
+    where
+        Source of the document, for messages.
+
+    Raises
+    ------
+    DataError
+        If the identification calls itself unusable, or friction, rotor inertias or mass matrix are impossible by more
+        than their uncertainty; the message gives the reason.
+    """
+    without = "Next: identify the arm from a better recording, or design without --known"
+    if document.verdict == "unusable":
+        reason = next((r.message for r in document.reasons if r.level == "unusable"), "no reason given")
+        raise DataError(f"{where}: its verdict is unusable ({reason}). {without}")
+    model = arm_model(robot)
+    values = {p.name: p.value for p in document.parameters}
+    order = [[p.name for p in document.parameters].index(name) for name in model.base.names]
+    theta = np.array([values[name] for name in model.base.names])
+    covariance = np.asarray(document.covariance, dtype=np.float64)[np.ix_(order, order)]
+    postures = workspace_postures(robot, np.zeros((1, robot.n)))
+    faults = impossible_values(model, postures, theta, covariance, IdentificationCriteria())
+    if faults:
+        nearest = "take the nearest possible parameters (armident identify RECORDING --physical)"
+        raise DataError(f"{where}: no arm has these parameters: {'; '.join(faults)}. {without}, or {nearest}")
 
 
 def _deviation_below(cutoff_hz: float, rate_hz: float, variance: float, coefficients: list[float]) -> float:
