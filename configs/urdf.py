@@ -1,7 +1,7 @@
 """Geometry of a robot from URDF: the chain from base to tip as modified Denavit-Hartenberg parameters.
 
-Only origins, axes, types and limits of the joints are read. Masses, meshes and transmissions are ignored, because the
-dynamics are identified.
+Only origins, axes, types and limits of the joints are read. Meshes and transmissions are ignored, and so are masses,
+because the dynamics are identified; `armident.configs.urdf_inertials` reads them for the virtual arm.
 """
 
 import re
@@ -119,9 +119,7 @@ def geometry_from_urdf(given: UrdfGeometry, where: Path) -> dict[str, Any]:
     ConfigError
         If the URDF is wrong or not a serial chain; names file and element.
     """
-    file = where.resolve().parent / given.urdf.file
-    if not is_file(file):
-        raise ConfigError(f"{where}: urdf.file: no such file {given.urdf.file} (looked for {file})")
+    file = urdf_file(given, where)
     joints = read_chain(file, given.urdf.base, given.urdf.tip)
     chain = mdh_of(joints, file)
     names = joint_names([joint.name for joint in joints], file)
@@ -135,6 +133,27 @@ def geometry_from_urdf(given: UrdfGeometry, where: Path) -> dict[str, Any]:
         plain.append({"name": name, "type": MOVING[joint.type], "mdh": mdh.model_dump(), "limits": limits} | settings)
     gravity = chain.base[:3, :3].T @ np.array(given.gravity)
     return {"joints": plain, "gravity": [float(g) for g in np.where(np.abs(gravity) < 1e-14, 0.0, gravity)]}
+
+
+def urdf_file(given: UrdfGeometry, where: Path) -> Path:
+    """Path of the URDF of a robot configuration.
+
+    Parameters
+    ----------
+    given
+        Keys of the configuration.
+    where
+        Path of the configuration.
+
+    Raises
+    ------
+    ConfigError
+        If there is no such file.
+    """
+    file = where.resolve().parent / given.urdf.file
+    if not is_file(file):
+        raise ConfigError(f"{where}: urdf.file: no such file {given.urdf.file} (looked for {file})")
+    return file
 
 
 def _additions(
