@@ -17,6 +17,7 @@ from armident.configs.schema.trajectory import Trajectory
 from armident.configs.suspected_units import suspected_units
 from armident.configs.urdf import UrdfGeometry, geometry_from_urdf, urdf_file
 from armident.configs.urdf_inertials import UrdfInertials, read_inertials
+from armident.configs.urdf_shapes import UrdfShapes, read_shapes
 from armident.configs.yaml_loader import is_file, read_yaml
 
 HERE = Path(__file__).parent
@@ -126,6 +127,29 @@ def load_inertials(name: str | Path) -> UrdfInertials | None:
     path = config_path(name)
     given = _urdf_geometry(_read_mapping(_read_text(path), str(path)), path)
     return None if given is None else read_inertials(urdf_file(given, path), given.urdf.base, given.urdf.tip)
+
+
+def load_shapes(name: str | Path) -> UrdfShapes | None:
+    """Load the shapes of the links of a robot from the URDF of its configuration.
+
+    Parameters
+    ----------
+    name
+        A path, or the name of a shipped file (see `config_path`).
+
+    Returns
+    -------
+    UrdfShapes or None
+        ``None`` if the configuration names no URDF.
+
+    Raises
+    ------
+    ConfigError
+        If a file is missing or wrong; names file and element.
+    """
+    path = config_path(name)
+    given = _urdf_geometry(_read_mapping(_read_text(path), str(path)), path)
+    return None if given is None else read_shapes(urdf_file(given, path), given.urdf.base, given.urdf.tip)
 
 
 def _urdf_geometry(data: dict[str, Any], path: Path) -> UrdfGeometry | None:

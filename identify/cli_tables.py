@@ -236,6 +236,20 @@ def diagnosis_table(document: DiagnosisDocument) -> None:
     )
 
 
+def time_left(elapsed_s: float, share: float) -> str:
+    """Return the time left at a constant rate, in words.
+
+    Parameters
+    ----------
+    elapsed_s
+        Time since the beginning, s.
+    share
+        Share done, above 0 to 1.
+    """
+    seconds = round(elapsed_s * (1.0 - share) / share)
+    return f"{seconds} s" if seconds < 120 else f"{seconds // 60} min"
+
+
 def _plain_lines(what: str, begin: float) -> Report:
     """Print lines on stderr: one per stage, and one for every further fifth of the work."""
     last: tuple[str, int] | None = None
@@ -244,7 +258,8 @@ def _plain_lines(what: str, begin: float) -> Report:
         nonlocal last
         now = stage, int(5 * share)
         if now != last and time.monotonic() - begin > SHOW_AFTER_S:
-            print(f"{what}: {stage} ({100 * share:.0f} %)", file=sys.stderr, flush=True)
+            left = f", {time_left(time.monotonic() - begin, share)} left" if share > 0.0 else ""
+            print(f"{what}: {stage} ({100 * share:.0f} %{left})", file=sys.stderr, flush=True)
             last = now
 
     return show

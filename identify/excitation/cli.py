@@ -15,12 +15,14 @@ from armident.identify.excitation.design import (
     Design,
     Shape,
     design_trajectory,
+    excesses,
     predict_precision,
     with_objective,
 )
 from armident.identify.excitation.objective import EffectObjective
 from armident.identify.excitation.plot import check_name, draw
-from armident.identify.excitation.previous_estimate import PreviousEstimate, previous_estimate
+from armident.identify.excitation.previous_estimate import PreviousEstimate, physical_estimate
+from armident.identify.excitation.safety import SafetyModel, check_safety, safety_model
 
 SHAPES: tuple[Shape, ...] = ("moves", "fourier")
 """Values of ``--shape``."""
@@ -80,9 +82,10 @@ def trajectory_command(options: TrajectoryOptions) -> None:
     Raises
     ------
     ConfigError
-        If an option is wrong, or a trajectory to check exceeds the limits (of torque, too, if parameters are known).
+        If an option is wrong, no trajectory keeps all limits, or a trajectory to check exceeds one: of motion, of
+        torque if masses are known, or of distance.
     DataError
-        If ``known`` is of another robot or model.
+        If ``known`` is of another robot or model, or is not physical.
     """
     robot, out, look_at = load_robot(options.config), options.out, options.look_at
     shape = _checked_shape(options)
@@ -93,11 +96,11 @@ def trajectory_command(options: TrajectoryOptions) -> None:
     prior = None
     if options.known is not None:
         document = load_document(options.known, IdentificationDocument)
-        prior = previous_estimate(document, robot, str(options.known))
-    theta = None if prior is None else prior.theta
-    aim = with_objective(robot, options.wanted, options.joint, options.against, theta)
+        prior = physical_estimate(document, robot, str(options.known))
+    safety = safety_model(robot, options.config, prior, str(options.known))
+    aim = with_objective(robot, options.wanted, options.joint, options.against, safety.theta)
     if look_at is not None:
-        design = _looked_at(robot, look_at, prior, aim)
+        design = _looked_at(robot, look_at, prior, aim, safety)
     else:
         with progress("trajectory") as report:
             design = design_trajectory(
@@ -106,10 +109,11 @@ def trajectory_command(options: TrajectoryOptions) -> None:
                 options.seed,
                 noise=None if prior is None else prior.noise,
                 evaluations=options.evaluations,
-                theta=theta,
+                theta=safety.theta,
                 aim=aim,
                 shape=shape,
                 harmonics=options.harmonics,
+                collision=safety.collision,
                 progress=lambda share: report("searching", share),
             )
     if out is not None:
@@ -121,8 +125,13 @@ def trajectory_command(options: TrajectoryOptions) -> None:
     draw(robot, design, picture, f"{robot.name}, {summary}")
     print(summary)
     print(f"picture: {picture}")
+    checks = check_safety(robot, design, safety)
+    for line in checks.checked:
+        print(f"checked: {line}")
+    for line in checks.unchecked:
+        print(f"not checked: {line}")
     if look_at is not None:
-        _refuse_torque(robot, design, name)
+        _refuse_excesses(robot, design, safety, name)
 
 
 def _checked_shape(options: TrajectoryOptions) -> Shape:
@@ -137,12 +146,14 @@ def _checked_shape(options: TrajectoryOptions) -> Shape:
     return shape
 
 
-def _looked_at(robot: RobotConfig, path: Path, prior: PreviousEstimate | None, aim: EffectObjective | None) -> Design:
+def _looked_at(
+    robot: RobotConfig, path: Path, prior: PreviousEstimate | None, aim: EffectObjective | None, safety: SafetyModel
+) -> Design:
     trajectory = load_trajectory(path)
     trajectory.check(robot, str(path))
     noise = _assumed(robot) if prior is None else prior.noise
-    theta = None if prior is None else prior.theta
-    return predict_precision(arm_model(robot), trajectory, noise, theta=theta, aim=aim)
+    model, bodies = arm_model(robot), safety.collision
+    return predict_precision(model, trajectory, noise, theta=safety.theta, aim=aim, collision=bodies)
 
 
 def _print_precision(robot: RobotConfig, design: Design, prior: PreviousEstimate | None) -> None:
@@ -164,12 +175,9 @@ def _assumed(robot: RobotConfig) -> np.ndarray[tuple[int], np.dtype[np.float64]]
     return ASSUMED_NOISE * np.array([joint.limits.torque for joint in robot.joints])
 
 
-def _refuse_torque(robot: RobotConfig, design: Design, name: str) -> None:
-    """Raise ConfigError where a trajectory needs more torque than allowed; the plot is written before."""
-    if design.torque is None:
-        return
-    for joint, peak in zip(robot.joints, np.abs(design.torque).max(axis=0), strict=True):
-        if peak > joint.limits.torque:
-            raise ConfigError(
-                f"{name}: {joint.name} needs a torque of {peak:.1f}, allowed is {joint.limits.torque:.1f}"
-            )
+def _refuse_excesses(robot: RobotConfig, design: Design, safety: SafetyModel, name: str) -> None:
+    """Raise ConfigError where a trajectory exceeds torque limits or touches something; the plot is written before."""
+    found = excesses(robot, design, safety.collision)
+    if found:
+        next_step = "Next: design another one with --out FILE, or correct limits.torque and collision of the robot"
+        raise ConfigError(f"{name}: needs {'; '.join(found)}. {next_step}")

@@ -179,10 +179,10 @@ class CollisionModel:
         """Smallest distance of all pairs at one posture (B, 4, 4), m, and its pair."""
         result, request, shapes = coal.DistanceResult(), self._request, self._shapes
         places = [coal.Transform3s(frame[:3, :3], frame[:3, 3]) for frame in frames]
-        best, pair = np.inf, 0
+        best, pair = float(np.inf), 0
         for number, (a, b) in enumerate(self._pairs):
             result.clear()
-            distance = coal.distance(shapes[a], places[a], shapes[b], places[b], request, result)
+            distance = float(coal.distance(shapes[a], places[a], shapes[b], places[b], request, result))
             if distance < best:
                 best, pair = distance, number
         return best, pair

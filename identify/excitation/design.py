@@ -32,6 +32,7 @@ from armident.identify.excitation.point_to_point import (
     PointToPointSearch,
     Rank,
     equations_of,
+    predicted_torque,
     sample_trajectory,
     slow_share,
 )
@@ -141,7 +142,9 @@ def design_trajectory(
     sigma = np.array([limit.torque for limit in limits]) if noise is None else np.asarray(noise, dtype=np.float64)
     if sigma.shape != (robot.n,) or not (sigma > 0.0).all():
         raise ConfigError(f"noise: expected {robot.n} positive numbers for {robot.name}")
-    search = PointToPointSearch(robot, model, duration, sigma, margin, theta, aim, np.random.default_rng(seed), collision)
+    search = PointToPointSearch(
+        robot, model, duration, sigma, margin, theta, aim, np.random.default_rng(seed), collision
+    )
     if shape == "fourier":
         trajectory, rank = _search(FourierSearch(search, harmonics), evaluations, progress)
     elif harmonics is not None:
@@ -152,10 +155,12 @@ def design_trajectory(
     found = predict_precision(
         model, trajectory, sigma, known_noise=noise is not None, theta=theta, aim=aim, collision=collision
     )
-    if rank.violation > 0.0:
-        excess = "; ".join(excesses(robot, found, collision, margin))
+    # The search samples torques more coarsely: those of a candidate that kept its share are compared with the limits.
+    excess = excesses(robot, found, collision, margin if rank.violation > 0.0 else 1.0)
+    if excess:
         raise ConfigError(
-            f"no trajectory found that keeps all limits: the best of {evaluations + 1} candidates has {excess}. "
+            f"no trajectory found that keeps all limits: the best of {evaluations + 1} candidates has "
+            f"{'; '.join(excess)}. "
             "Next: more --evaluations, another --seed, a longer --duration, or narrower limits.position"
         )
     return found
@@ -195,7 +200,16 @@ class _Candidates(Protocol[C]):
 
     def neighbour(self, candidate: C) -> C: ...
 
-    def rank(self, candidate: C, best: Rank) -> Rank: ...
+    def rank(self, candidate: C, best: Rank) -> Rank:
+        """Return the rank of a candidate.
+
+        Parameters
+        ----------
+        candidate
+            The candidate.
+        best
+            Rank that it must beat.
+        """
 
     def trajectory(self, candidate: C) -> Trajectory: ...
 
@@ -288,7 +302,7 @@ def predict_precision(
     """
     period = PERIOD
     q, qd, qdd = sample_trajectory(trajectory, period)
-    torque = None if theta is None else model.inverse_dynamics(theta, q, qd, qdd)
+    torque = None if theta is None else predicted_torque(model, theta, q, qd, qdd, period)
     x = model.base_regressor(q, qd, qdd, dt=period)
     keep = max(1, round(0.5 / (cutoff_hz * period)))
     sections = butter(4, 2.0 * cutoff_hz * period, output="sos")

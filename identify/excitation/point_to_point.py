@@ -208,7 +208,7 @@ class PointToPointSearch:
         far = np.linalg.norm((postures - home) / (self.high - self.low), axis=1)
         for posture in postures[np.argsort(far)]:
             if collision.shortfall(posture[None]) == 0.0:
-                return np.round(posture, 4)
+                return np.asarray(np.round(posture, 4))
         closest = collision.closest(home[None])
         raise ConfigError(
             f"collision: none of {HOMES} postures keeps a clearance of {collision.clearance:g} m; at zero: {closest}. "
@@ -275,7 +275,7 @@ class PointToPointSearch:
         q, qd, qdd = sample_trajectory(trajectory, period)
         violation = 0.0
         if self.theta is not None:
-            torque = np.abs(self.model.inverse_dynamics(self.theta, q, qd, qdd))
+            torque = np.abs(predicted_torque(self.model, self.theta, q, qd, qdd, period))
             violation = max(0.0, float((torque / self.torque).max()) - 1.0)
         if violation > best.violation:
             return Rank(violation, np.inf)
@@ -344,6 +344,26 @@ def equations_of(
     if model.terms:
         x = np.concatenate([x, decimation(model.term_regressor(motion))], axis=2)
     return weighted_rows(x, sigma), decimation, sigma
+
+
+def predicted_torque(model: ArmModel, theta: ArrayLike, q: Floats, qd: Floats, qdd: Floats, period: float) -> Floats:
+    """Return the joint torques along a motion with those of the model's terms, (N, n), N m or N.
+
+    Parameters
+    ----------
+    model
+        Model of the robot.
+    theta
+        Standard (p,) or base parameters (b,), SI.
+    q, qd, qdd
+        Positions, velocities and accelerations (N, n), rad or m, s.
+    period
+        Sampling period, s.
+    """
+    torque = model.inverse_dynamics(theta, q, qd, qdd)
+    if model.terms:
+        torque += model.term_torque(model.anchored(theta).motion(q, qd, qdd, period), np.asarray(theta)[-model.e :])
+    return torque
 
 
 def sample_trajectory(trajectory: Trajectory, period: float) -> tuple[Floats, Floats, Floats]:

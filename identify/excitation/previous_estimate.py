@@ -1,6 +1,6 @@
 """Parameters and noise of an earlier identification, for the design of the next experiment."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -70,13 +70,15 @@ def previous_estimate(document: IdentificationDocument, robot: RobotConfig, wher
     return PreviousEstimate(np.array([values[name] for name in model.base.names]), np.array(noise))
 
 
-def require_physical(document: IdentificationDocument, robot: RobotConfig, where: str) -> None:
-    """Refuse parameters that no arm has: they would predict wrong torques.
+def physical_estimate(document: IdentificationDocument, robot: RobotConfig, where: str) -> PreviousEstimate:
+    """Return the estimate of `previous_estimate` with parameters that an arm can have: others predict wrong torques.
+
+    Where the document has the nearest physically consistent parameters, they are taken.
 
     Parameters
     ----------
     document
-        The identification, as accepted by `previous_estimate`.
+        The identification.
     robot
         Configuration of the robot.
     where
@@ -85,23 +87,26 @@ def require_physical(document: IdentificationDocument, robot: RobotConfig, where
     Raises
     ------
     DataError
-        If the identification calls itself unusable, or friction, rotor inertias or mass matrix are impossible by more
-        than their uncertainty; the message gives the reason.
+        As `previous_estimate`; or if the identification calls itself unusable, or friction, rotor inertias or mass
+        matrix are impossible by more than their uncertainty.
     """
+    found = previous_estimate(document, robot, where)
     without = "Next: identify the arm from a better recording, or design without --known"
     if document.verdict == "unusable":
         reason = next((r.message for r in document.reasons if r.level == "unusable"), "no reason given")
         raise DataError(f"{where}: its verdict is unusable ({reason}). {without}")
-    model = arm_model(robot)
-    values = {p.name: p.value for p in document.parameters}
-    order = [[p.name for p in document.parameters].index(name) for name in model.base.names]
-    theta = np.array([values[name] for name in model.base.names])
+    model, names = arm_model(robot), [p.name for p in document.parameters]
+    if document.physical is not None:
+        consistent = {base["name"]: base["value"] for base in document.physical["base"]}
+        return replace(found, theta=np.array([consistent[name] for name in model.base.names]))
+    order = [names.index(name) for name in model.base.names]
     covariance = np.asarray(document.covariance, dtype=np.float64)[np.ix_(order, order)]
     postures = workspace_postures(robot, np.zeros((1, robot.n)))
-    faults = impossible_values(model, postures, theta, covariance, IdentificationCriteria())
+    faults = impossible_values(model, postures, found.theta, covariance, IdentificationCriteria())
     if faults:
         nearest = "take the nearest possible parameters (armident identify RECORDING --physical)"
         raise DataError(f"{where}: no arm has these parameters: {'; '.join(faults)}. {without}, or {nearest}")
+    return found
 
 
 def _deviation_below(cutoff_hz: float, rate_hz: float, variance: float, coefficients: list[float]) -> float:
