@@ -157,7 +157,7 @@ def link_placements(joints: tuple[UrdfJoint, ...], names: list[str], chain: MdhC
         Their modified Denavit-Hartenberg parameters.
     """
     moved = zip(names, chain.frames, joints, strict=True)
-    base: dict[str, NDArray[np.float64]] = {BASE: np.linalg.inv(chain.base)}
+    base: dict[str, NDArray[np.float64]] = {BASE: np.asarray(np.linalg.inv(chain.base))}
     return base | {name: np.asarray(np.linalg.solve(frame, joint.placement)) for name, frame, joint in moved}
 
 
