@@ -38,8 +38,10 @@ from armident.identify.identification.result import Identification as Estimation
 from armident.identify.identification.verdict import Reason
 from armident.identify.monitoring.change_test import ParameterChangeTest
 from armident.identify.monitoring.change_test import compare as test_parameter_change
+from armident.identify.prediction import TorquePrediction, predict_recording
 from armident.identify.regression.equations import MAX_AR_ORDER
 from armident.identify.report.files import robot_yaml
+from armident.identify.saved_model import load_model, model_of
 from armident.identify.setup.check import check_setup
 from armident.identify.setup.result import SetupCheck
 from armident.identify.signals.differentiate import NvrRule
@@ -577,6 +579,54 @@ def compare(
     False
     """
     return ChangeTest(test_parameter_change(_document(baseline), _document(now), false_alarm_rate))
+
+
+def predict(
+    recording: Recorded,
+    model: Identification | str | Path,
+    robot: Robot | None = None,
+    *,
+    progress: Progress | None = None,
+) -> TorquePrediction:
+    """Predict the torques of a recording with an identified model.
+
+    Parameters
+    ----------
+    recording
+        A recording, or the path of one; best one that the model was not identified from.
+    model
+        An identification, or the path of ``identification.json``, ``diagnosis.json``, or the folder of one.
+    robot
+        Configuration of the model, or the path or shipped name of one; by default that of the result.
+    progress
+        Called with the name of a stage and the share done, 0 to 1.
+
+    Returns
+    -------
+    TorquePrediction
+        Measured and predicted torques (M, n), N m or N, and the ``document`` with the errors.
+
+    Raises
+    ------
+    ConfigError
+        If a file does not exist.
+    DataError
+        If the model is unusable, or the recording is of another robot or too short.
+
+    Examples
+    --------
+    >>> import armident
+    >>> seen, unseen = (armident.simulate_recording("emps", name, seed=1) for name in ("emps_1", "emps_2"))
+    >>> armident.predict(unseen, armident.identify(seen, method="idim-ls")).document.held_out
+    True
+    """
+    (read,) = _read(recording)
+    config = None if robot is None else _robot(robot, ())
+    if isinstance(model, Identification):
+        loaded = model_of(model.document, Path("(in memory)"), config)
+    else:
+        loaded = load_model(Path(model), config, default=read.robot, progress=progress)
+    return predict_recording(read, loaded, progress)
 
 
 @dataclass(frozen=True, repr=False)

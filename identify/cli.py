@@ -1,4 +1,4 @@
-"""Commands of this package: identify, check, diagnose, effects, history, trajectory, worker, reproduce, suite."""
+"""Commands of this package: identification, checks, diagnosis, use of models, history, trajectories, suite."""
 
 import os
 from pathlib import Path
@@ -147,6 +147,57 @@ def diagnose(
 
     chosen = {"false_alarm_rate": false_alarms, "material": material, "time_limit_s": time_limit}
     code = diagnose_command(recordings, config, validate, baseline, chosen, out, as_json=json)
+    if code:
+        raise typer.Exit(code)
+
+
+def predict(
+    recording: Annotated[Path, typer.Argument(help="Recording (.mcap), best one that the model has not seen.")],
+    model: Annotated[Path, typer.Option("--model", help="identification.json, diagnosis.json, or the folder of one.")],
+    config: Annotated[
+        Path | None, typer.Option("--config", help="Robot configuration. [default: that of the model]")
+    ] = None,
+    out: OutDirectory = None,
+    json: Json = False,
+) -> None:
+    """Predict the torques of a recording with an identified model, and report its error in total and by joint.
+
+    Says if the recording is held out, or one that the model was identified from. Writes prediction.json, torques.csv
+    and report.html. Exit code 4 if the model explains the torques no better than none.
+
+    Example: armident predict tuesday.mcap --model monday.identification
+    """
+    from armident.identify.commands import predict_command
+
+    code = predict_command(recording, model, config, out, as_json=json)
+    if code:
+        raise typer.Exit(code)
+
+
+def compare(
+    baseline: Annotated[Path, typer.Argument(help="The earlier identification.json, or its folder.")],
+    now: Annotated[Path, typer.Argument(help="The later identification.json, or its folder.")],
+    common: Annotated[
+        bool, typer.Option("--common", help="Compare the parameters that both have, if their models differ.")
+    ] = False,
+    false_alarms: Annotated[
+        float, typer.Option(min=1e-12, max=0.5, help="Probability of the verdict changed without a change.")
+    ] = 1e-4,
+    out: Annotated[
+        Path | None, typer.Option("--out", help="Folder for the results. [default: comparison, beside the later one]")
+    ] = None,
+    json: Json = False,
+) -> None:
+    """Compare two identified models of a robot joint by joint, with intervals, and test for a change.
+
+    Writes comparison.json and report.html with a plot. Exit code 4 if they differ significantly, 3 if they cannot be
+    compared.
+
+    Example: armident compare monday.identification tuesday.identification
+    """
+    from armident.identify.commands import compare_command
+
+    code = compare_command(baseline, now, out, false_alarms, common=common, as_json=json)
     if code:
         raise typer.Exit(code)
 

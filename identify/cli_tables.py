@@ -4,6 +4,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numba.core import event
@@ -16,6 +17,9 @@ from armident.configs import RobotConfig
 from armident.identify.document import DiagnosisDocument, IdentificationDocument
 from armident.identify.effects.terms import arm_model
 from armident.identify.setup.result import SetupCheck
+
+if TYPE_CHECKING:
+    from armident.identify.prediction import PredictionDocument
 
 SHOW_AFTER_S = 2.0
 """Duration after which progress is shown, s."""
@@ -248,6 +252,20 @@ def time_left(elapsed_s: float, share: float) -> str:
     """
     seconds = round(elapsed_s * (1.0 - share) / share)
     return f"{seconds} s" if seconds < 120 else f"{seconds // 60} min"
+
+
+def prediction_table(document: "PredictionDocument") -> None:
+    """Print the error of a model on a recording, in total and by joint."""
+    console = Console()
+    console.print(document.sentence, highlight=False, soft_wrap=True)
+    table = Table(title=f"{document.robot}: torque errors by joint", title_justify="left")
+    for heading in ("joint", "error %", "own data %", "error rms", "torque rms", "unit"):
+        table.add_column(heading, justify="left" if heading in ("joint", "unit") else "right", no_wrap=True)
+    for name, error in document.relative_error_pct_by_joint.items():
+        own = document.identification_error_pct_by_joint.get(name)
+        row = [name, f"{error:.2f}", "" if own is None else f"{own:.2f}"]
+        table.add_row(*row, f"{document.error_rms[name]:.4g}", f"{document.torque_rms[name]:.4g}", document.units[name])
+    console.print(table)
 
 
 def _plain_lines(what: str, begin: float) -> Report:

@@ -107,6 +107,7 @@ class IdentificationDocument(Document):
     """Content of ``identification.json``: estimated parameters, their covariance, the data, method and diagnostics.
 
     ``verdict`` with its ``reasons`` states if the parameters can be used, by the limits in ``criteria``; it is null in
+    documents of former versions. ``configuration`` is the robot configuration that the parameters belong to, null in
     documents of former versions. ``torque_delay_samples`` has two numbers per joint: the number of samples by which the
     torque leads the position, and its standard deviation. A drive that reports the torque that it holds until the next
     sample has a lead of 0.5. ``sign_smoothing`` is ``g`` of each joint's ``sign(qd) -> (2/pi) atan(g qd)``, s/rad or
@@ -143,6 +144,7 @@ class IdentificationDocument(Document):
     sign_smoothing: dict[str, float] | None = None
     criteria: dict[str, float] | None = None
     residual_statistics: list[ResidualStatistics] | None = None
+    configuration: dict[str, Any] | None = None
 
 
 class Alternative(Document):
@@ -372,7 +374,7 @@ def identification_document(
     recordings
         Recordings that they come from.
     robot
-        Configuration of the robot.
+        Configuration of the robot, which the document keeps.
     notes
         Messages of the conversion; they precede the estimator's warnings.
     """
@@ -432,6 +434,7 @@ def identification_document(
         sign_smoothing=dict(zip(joints, (float(g) for g in result.sign_smoothing), strict=True)),
         criteria=plain(result.criteria),
         residual_statistics=[ResidualStatistics(**plain(each)) for each in result.residual_statistics] or None,
+        configuration=robot.model_dump(mode="json", by_alias=True),
     )
 
 
@@ -550,13 +553,40 @@ def load_document(path: Path, kind: type[T]) -> T:
     DataError
         If the file cannot be read or is not such a document.
     """
+    return from_json(_text(path), kind, str(path))
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Return the JSON object of a file, for instance to find out the schema of a document.
+
+    Parameters
+    ----------
+    path
+        JSON file.
+
+    Raises
+    ------
+    ConfigError
+        If there is no such file.
+    DataError
+        If the file cannot be read or is no JSON object.
+    """
     try:
-        text = path.read_text(encoding="utf-8")
+        found = json.loads(_text(path))
+    except json.JSONDecodeError as error:
+        raise DataError(f"{path}: line {error.lineno}: not valid JSON: {error.msg}") from error
+    if not isinstance(found, dict):
+        raise DataError(f"{path}: expected a JSON object")
+    return found
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8")
     except FileNotFoundError as error:
         raise ConfigError(f"{path}: no such file") from error
     except (OSError, UnicodeDecodeError) as error:
         raise DataError(f"{path}: cannot be read: {error}") from error
-    return from_json(text, kind, str(path))
 
 
 def write_atomically(path: Path, text: str) -> None:
