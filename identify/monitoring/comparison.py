@@ -11,6 +11,7 @@ from pydantic import Field
 from armident.configs import DataError
 from armident.identify.document import Document, IdentificationDocument, Parameter, RecordingReference
 from armident.identify.monitoring.change_test import FALSE_ALARMS, ParameterChangeTest, compare
+from armident.identify.print_table import print_table
 from armident.identify.report.glossary import identification_entries
 from armident.identify.report.page import BAND, MODEL, MUTED, RESIDUAL, figure, render
 
@@ -291,7 +292,7 @@ def comparison_table(document: ComparisonDocument) -> None:
             )
             mark = "changed" if p.changed else ""
             table.add_row(joint if k == 0 else "", p.name, *values, f"{p.p_value:.2g}", p.unit, mark)
-    console.print(table)
+    print_table(table, console)
     if hidden:
         print(f"{hidden} parameters that are not essential and have not changed are in the report")
 
