@@ -165,7 +165,7 @@ class CollisionModel:
                 k += STRIDE
             else:
                 k = self._next(travel, k, distance - self.clearance)
-        return missing / q.shape[0]
+        return float(missing / q.shape[0])
 
     def _motion(self, q: Array) -> tuple[Array, Array]:
         """Frames of all bodies (N, B, 4, 4), and a bound of the distance (N,) that any of their points has covered."""

@@ -381,6 +381,36 @@ def base_entry(name: str) -> Entry | None:
     return own or next((known[start] for start in ("ia", "fv", "fc") if name.startswith(start)), None)
 
 
+def in_words(name: str) -> str:
+    """Return the meaning of a base parameter in a few words, with its link, joint or coupling; empty if unknown.
+
+    Parameters
+    ----------
+    name
+        As in ``identification.json``.
+
+    Examples
+    --------
+    >>> in_words("my5r")
+    'first moment of mass of link 5 along y, grouped'
+    >>> in_words("fv3")
+    'viscous friction, joint 3'
+    """
+    entry, match = base_entry(name), _NAME.match(name)
+    if entry is None:
+        return ""
+    phrase = re.split("[:;,.]", entry.text)[0]
+    phrase = phrase.removesuffix(" of its frame")
+    phrase = phrase if phrase.startswith("Coulomb") else phrase[0].lower() + phrase[1:]
+    if match is None:
+        return phrase
+    if "the link" in phrase:
+        phrase = phrase.replace("the link", f"link {match[2]}", 1)
+    else:
+        phrase += f", coupling {match[2]}" if match[2].startswith("m") else f", joint {match[2]}"
+    return f"{phrase}, grouped" if match[3] else phrase
+
+
 def base_entries(names: Iterable[str]) -> list[Entry]:
     """Return the entries that explain a list of base parameters, each once, in the order of the glossary."""
     found = {entry.name: entry for entry in map(base_entry, names) if entry is not None}
