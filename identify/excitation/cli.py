@@ -22,7 +22,8 @@ from armident.identify.excitation.design import (
 from armident.identify.excitation.objective import EffectObjective
 from armident.identify.excitation.plot import check_name, draw
 from armident.identify.excitation.previous_estimate import PreviousEstimate, physical_estimate
-from armident.identify.excitation.safety import SafetyModel, check_safety, safety_model
+from armident.identify.excitation.safety import SafetyChecks, SafetyModel, check_safety, safety_model
+from armident.identify.robot.chain import Floats
 
 SHAPES: tuple[Shape, ...] = ("moves", "fourier")
 """Values of ``--shape``."""
@@ -71,19 +72,69 @@ class TrajectoryOptions:
     look_at: Path | None = None
 
 
-def trajectory_command(options: TrajectoryOptions) -> None:
-    """Carry out ``armident trajectory``.
+@dataclass(frozen=True, eq=False)
+class CheckedTrajectory:
+    """Result of ``armident trajectory``.
+
+    Parameters
+    ----------
+    robot
+        Configuration of the robot.
+    path
+        File of the trajectory.
+    design
+        Trajectory with its predicted precision.
+    std
+        Predicted standard deviations of the base parameters (b,), SI.
+    prior
+        Earlier estimate; ``None``: the standard deviations are those of an assumed noise.
+    safety
+        Masses and bodies.
+    checks
+        Properties that were checked, and those that were not.
+    excess
+        Limits that an existing trajectory exceeds.
+    """
+
+    robot: RobotConfig
+    path: Path
+    design: Design
+    std: Floats
+    prior: PreviousEstimate | None
+    safety: SafetyModel
+    checks: SafetyChecks
+    excess: tuple[str, ...]
+
+    def refuse_excess(self) -> None:
+        """Refuse a trajectory that exceeds limits of torque or distance.
+
+        Raises
+        ------
+        ConfigError
+            Names each excess and the next step.
+        """
+        if self.excess:
+            next_step = "Next: design another one with --out FILE, or correct limits.torque and collision of the robot"
+            raise ConfigError(f"{self.path}: needs {'; '.join(self.excess)}. {next_step}")
+
+
+def trajectory_command(options: TrajectoryOptions) -> CheckedTrajectory:
+    """Carry out ``armident trajectory`` but for its report.
 
     Parameters
     ----------
     options
         As given by the user.
 
+    Returns
+    -------
+    CheckedTrajectory
+        A trajectory to check may exceed limits of torque, if masses are known, and of distance.
+
     Raises
     ------
     ConfigError
-        If an option is wrong, no trajectory keeps all limits, or a trajectory to check exceeds one: of motion, of
-        torque if masses are known, or of distance.
+        If an option is wrong, no trajectory keeps all limits, or a trajectory to check exceeds the limits of motion.
     DataError
         If ``known`` is of another robot or model, or is not physical.
     """
@@ -102,26 +153,13 @@ def trajectory_command(options: TrajectoryOptions) -> None:
     if look_at is not None:
         design = _looked_at(robot, look_at, prior, aim, safety)
     else:
-        with progress("trajectory") as report:
-            design = design_trajectory(
-                robot,
-                options.duration,
-                options.seed,
-                noise=None if prior is None else prior.noise,
-                evaluations=options.evaluations,
-                theta=safety.theta,
-                aim=aim,
-                shape=shape,
-                harmonics=options.harmonics,
-                collision=safety.collision,
-                progress=lambda share: report("searching", share),
-            )
+        design = _designed(robot, options, shape, prior, aim, safety)
     if out is not None:
         content = design.trajectory.model_dump(mode="json", by_alias=True, exclude_defaults=True)
         write_atomically(out, yaml.safe_dump(content, sort_keys=False))
-    _print_precision(robot, design, prior)
-    name = str(out or look_at)
-    summary = f"{name}: {design.trajectory.duration:.2f} s, condition number {design.condition:.0f}"
+    std = _print_precision(robot, design, prior)
+    path = out or look_at or Path()
+    summary = f"{path}: {design.trajectory.duration:.2f} s, condition number {design.condition:.0f}"
     draw(robot, design, picture, f"{robot.name}, {summary}")
     print(summary)
     print(f"picture: {picture}")
@@ -130,8 +168,33 @@ def trajectory_command(options: TrajectoryOptions) -> None:
         print(f"checked: {line}")
     for line in checks.unchecked:
         print(f"not checked: {line}")
-    if look_at is not None:
-        _refuse_excesses(robot, design, safety, name)
+    excess = tuple(excesses(robot, design, safety.collision))
+    return CheckedTrajectory(robot, path, design, std, prior, safety, checks, excess)
+
+
+def _designed(
+    robot: RobotConfig,
+    options: TrajectoryOptions,
+    shape: Shape,
+    prior: PreviousEstimate | None,
+    aim: EffectObjective | None,
+    safety: SafetyModel,
+) -> Design:
+    """Search a trajectory and show the progress."""
+    with progress("trajectory") as report:
+        return design_trajectory(
+            robot,
+            options.duration,
+            options.seed,
+            noise=None if prior is None else prior.noise,
+            evaluations=options.evaluations,
+            theta=safety.theta,
+            aim=aim,
+            shape=shape,
+            harmonics=options.harmonics,
+            collision=safety.collision,
+            progress=lambda share: report("searching", share),
+        )
 
 
 def _checked_shape(options: TrajectoryOptions) -> Shape:
@@ -156,8 +219,8 @@ def _looked_at(
     return predict_precision(model, trajectory, noise, theta=safety.theta, aim=aim, collision=bodies)
 
 
-def _print_precision(robot: RobotConfig, design: Design, prior: PreviousEstimate | None) -> None:
-    """Print the predicted standard deviations."""
+def _print_precision(robot: RobotConfig, design: Design, prior: PreviousEstimate | None) -> Floats:
+    """Print and return the predicted standard deviations (b,), SI."""
     std = design.std
     if prior is None or std is None:
         model = arm_model(robot)
@@ -169,15 +232,8 @@ def _print_precision(robot: RobotConfig, design: Design, prior: PreviousEstimate
         design_table(robot, prior.theta, std)
     if design.wanted is not None:
         wanted_table(design.wanted)
+    return std
 
 
-def _assumed(robot: RobotConfig) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+def _assumed(robot: RobotConfig) -> Floats:
     return ASSUMED_NOISE * np.array([joint.limits.torque for joint in robot.joints])
-
-
-def _refuse_excesses(robot: RobotConfig, design: Design, safety: SafetyModel, name: str) -> None:
-    """Raise ConfigError where a trajectory exceeds torque limits or touches something; the plot is written before."""
-    found = excesses(robot, design, safety.collision)
-    if found:
-        next_step = "Next: design another one with --out FILE, or correct limits.torque and collision of the robot"
-        raise ConfigError(f"{name}: needs {'; '.join(found)}. {next_step}")

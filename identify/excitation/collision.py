@@ -146,6 +146,17 @@ class CollisionModel:
         one, two = (self._bodies[b].name for b in self._pairs[pair])
         return ClosestApproach(float(best), one, two, sample)
 
+    def profile(self, q: Array) -> Array:
+        """Return the smallest distance of all pairs at each posture, m, (N,).
+
+        Parameters
+        ----------
+        q
+            Postures (N, n), rad or m.
+        """
+        frames, _ = self._motion(q)
+        return np.array([self._distance(frame)[0] for frame in frames])
+
     def shortfall(self, q: Array) -> float:
         """Return the mean distance by which a motion misses the clearance, m; 0 where it keeps it.
 

@@ -180,4 +180,4 @@ def _continued(t: Array) -> Array:
     steps = np.diff(t, prepend=t[0])
     typical = float(np.median(steps[1:])) if t.size > 1 else 0.0
     continued: Array = np.cumsum(np.where(steps <= 0, typical, steps))
-    return continued - continued[0]
+    return np.asarray(continued - continued[0])
