@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import get_args
 
-from armident.identify.document import DiagnosisDocument, IdentificationDocument, Verdict, write_atomically
+from armident.identify.document import DiagnosisDocument, Finding, IdentificationDocument, Verdict, write_atomically
 from armident.identify.effects.effect import Effect
 from armident.identify.effects.registry import catalogue
 from armident.identify.effects.tables import KNOTS
@@ -409,6 +409,22 @@ def in_words(name: str) -> str:
     else:
         phrase += f", coupling {match[2]}" if match[2].startswith("m") else f", joint {match[2]}"
     return f"{phrase}, grouped" if match[3] else phrase
+
+
+def meaning_of(name: str, finding: Finding) -> str:
+    """Return the meaning of a parameter of a finding, as a sentence; empty if unknown.
+
+    Parameters
+    ----------
+    name
+        Parameter of the finding.
+    finding
+        A finding of a diagnosis.
+    """
+    effects = catalogue()
+    effect = effects.get(f"{finding.effect}/{finding.law}" if finding.law else finding.effect)
+    entries = [] if effect is None else [entry for entry in effect_entries(effect) if entry.name == name]
+    return entries[0].text if entries else in_words(name)
 
 
 def base_entries(names: Iterable[str]) -> list[Entry]:

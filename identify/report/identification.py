@@ -12,7 +12,7 @@ from armident.daq.recording import Recording
 from armident.identify.document import IdentificationDocument
 from armident.identify.identification.result import Identification
 from armident.identify.report.glossary import identification_entries
-from armident.identify.report.page import BAND, MEASURED, MODEL, MUTED, RESIDUAL, figure, render
+from armident.identify.report.page import BAND, CONFIGURED, INK, MEASURED, MODEL, MUTED, RESIDUAL, figure, render
 from armident.identify.report.plots import Plot, Series, plots_html
 
 Array = NDArray[np.float64]
@@ -83,7 +83,9 @@ def recorded(recording: Recording) -> dict[str, Any]:
     }
 
 
-def torque_plots(t: Array, measured: Array, predicted: Array, joints: list[str], units: list[str]) -> Markup:
+def torque_plots(
+    t: Array, measured: Array, predicted: Array, joints: list[str], units: list[str], before: Array | None = None
+) -> Markup:
     """Return plots of measured and predicted torque and their difference, one per joint, with common zoom.
 
     Parameters
@@ -94,21 +96,34 @@ def torque_plots(t: Array, measured: Array, predicted: Array, joints: list[str],
         Torques (M, n), N m or N.
     joints, units
         Name and unit of each joint.
+    before
+        Torques (M, n) of another model for comparison, the one as configured.
     """
-    t = t - t[0]
     breaks = np.flatnonzero(np.diff(t) <= 0)
-    measured, predicted = measured.copy(), predicted.copy()
-    measured[breaks], predicted[breaks] = np.nan, np.nan
+    measured = measured.copy()
+    measured[breaks] = np.nan
     t = _continued(t)
     plots = []
     for j, (name, unit) in enumerate(zip(joints, units, strict=True)):
-        curves = (
+        curves: tuple[Series, ...] = (
             Series("measured", measured[:, j], MEASURED, 2.2),
-            Series("model", predicted[:, j], MODEL),
+            Series("model", _broken(predicted[:, j], breaks), MODEL),
             Series("difference", measured[:, j] - predicted[:, j], RESIDUAL, 1.0),
         )
+        if before is not None:
+            curves += (
+                Series("model as configured", _broken(before[:, j], breaks), INK, 0.8),
+                Series("difference as configured", measured[:, j] - before[:, j], CONFIGURED, 0.8),
+            )
         plots.append(Plot(name, unit, t, curves))
     return plots_html(plots)
+
+
+def _broken(values: Array, breaks: NDArray[np.intp]) -> Array:
+    """Values (M,) with NaN where an experiment ends."""
+    values = values.copy()
+    values[breaks] = np.nan
+    return values
 
 
 def _autocorrelation_figure(values: Array, bounds: Array, joints: list[str]) -> str:

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 logging.getLogger("matplotlib.font_manager").setLevel(logging.ERROR)
 
 INK, MUTED, MEASURED, MODEL, RESIDUAL, BAND = "#1d2733", "#6b7785", "#b3bac4", "#c2410c", "#2f6f9f", "#dfe8f1"
+CONFIGURED = "#8fb4d1"
 STYLE: Any = {
     "font.family": "sans-serif",
     "font.size": 9,

@@ -55,7 +55,7 @@ def trajectory_report(found: CheckedTrajectory) -> str:
 def _motion(robot: RobotConfig, design: Design) -> dict[str, Markup]:
     """Return the plots of positions, velocities, accelerations and torques of all joints, by quantity."""
     q, qd, qdd = sample_trajectory(design.trajectory, PERIOD)
-    time = np.arange(len(q))[::MOTION_EVERY] * PERIOD
+    time = np.arange(0, len(q), MOTION_EVERY, dtype=np.float64) * PERIOD
     quantities = {"position": ("", q), "velocity": ("/s", qd), "acceleration": ("/s²", qdd)}
     if design.torque is not None:
         quantities = {"torque": ("", design.torque)} | quantities
@@ -77,7 +77,7 @@ def _distance(found: CheckedTrajectory) -> Markup | None:
     if found.design.closest is None:
         return None
     q = found.design.trajectory.sample(PERIOD)[::DISTANCE_EVERY]
-    time = np.arange(len(q)) * PERIOD * DISTANCE_EVERY
+    time = np.arange(len(q), dtype=np.float64) * PERIOD * DISTANCE_EVERY
     collision = found.safety.collision
     curve = Series("smallest distance", collision.profile(q), RESIDUAL)
     return plots_html([Plot("distance between bodies", "m", time, (curve,), (("clearance", collision.clearance),))])
