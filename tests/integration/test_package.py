@@ -15,6 +15,7 @@ import pytest
 from packaging.requirements import Requirement
 
 from armident.extras import EXTRAS
+from tests.fixtures.store import shared
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]  # the loops are compiled once, 30 s on an idle core
 
@@ -38,10 +39,10 @@ class Built:
             return archive.namelist()
 
 
-@pytest.fixture(scope="module")
-def built(tmp_path_factory: pytest.TempPathFactory) -> Built:
-    """Source distribution of a copy of the checkout, so that no earlier build is in it, and the wheel built from it."""
-    out, source = tmp_path_factory.mktemp("release"), tmp_path_factory.mktemp("source")
+@shared
+def _built(out: Path) -> Built:
+    """Build a source distribution of a copy of the checkout, so that no earlier build is in it, and its wheel."""
+    source = out / "source"
     for name in _git("ls-files", "--cached", "--others", "--exclude-standard"):
         if os.path.lexists(REPOSITORY / name):
             (source / name).parent.mkdir(parents=True, exist_ok=True)
@@ -56,6 +57,14 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Built:
     )
     (wheel,) = out.glob("*.whl")
     return Built(archive, wheel)
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory: pytest.TempPathFactory) -> Built:
+    """Source distribution and the wheel built from it, once for all test processes."""
+    # The parent of the folders of all processes of this run.
+    out = tmp_path_factory.getbasetemp()
+    return _built((out.parent if "PYTEST_XDIST_WORKER" in os.environ else out) / "release")
 
 
 @pytest.fixture(scope="module")
