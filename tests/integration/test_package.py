@@ -1,7 +1,9 @@
 """Source distribution and wheel: complete, with one top-level name, and usable without extras."""
 
+import json
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import tarfile
@@ -14,7 +16,9 @@ import numpy as np
 import pytest
 from packaging.requirements import Requirement
 
+from armident.configs import config_path
 from armident.extras import EXTRAS
+from tests.fixtures.processes import armident
 from tests.fixtures.store import shared
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]  # the loops are compiled once, 30 s on an idle core
@@ -157,6 +161,22 @@ def test_the_loops_of_the_wheel_match_frames_as_those_of_numba_do(base: Path, tm
     assert mode == "ahead of time"
     here = subprocess.run([sys.executable, script], capture_output=True, text=True, check=True, timeout=120)
     assert here.stdout.strip() == f"by numba: {digest}"
+
+
+@pytest.mark.vcan
+@pytest.mark.proof
+def test_the_base_captures_six_axes_at_5_khz_without_a_loss(base: Path, vcan_bus: str, tmp_path: Path) -> None:
+    session = tmp_path / "cell.yaml"
+    session.write_text(config_path("tx40_cell.yaml").read_text().replace("vcan0", vcan_bus))
+    robot = armident("robot", "--config", session)
+    assert robot.stdout is not None
+    assert "ready" in robot.stdout.readline()
+    done = _run([str(base / "armident"), "capture", "--config", str(session), "--json"], tmp_path)
+    robot.send_signal(signal.SIGTERM)
+    robot.communicate(timeout=60)
+    assert done.returncode == 0, done.stderr
+    counters = json.loads(done.stdout)["counters"]
+    assert counters["samples.rows"] == counters["samples.expected"] == counters["sync_sent"] > 40_000
 
 
 def test_a_wheel_holds_armident_and_nothing_else_at_top_level(wheel: list[str]) -> None:
