@@ -4,6 +4,7 @@ import math
 import re
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from decimal import Decimal, InvalidOperation
 from itertools import pairwise
@@ -92,6 +93,50 @@ def read_chain(file: Path, base: str | None = None, tip: str | None = None) -> t
     return tuple(chain)
 
 
+def serial_tips(file: Path, base: str | None = None) -> dict[str, tuple[str, ...]]:
+    """Names of the moving joints to each link at which a serial chain can end: ends of branches, and their forks.
+
+    Parameters
+    ----------
+    file
+        Path of the URDF.
+    base
+        First link of the chains; ``None``: the root of the tree.
+
+    Raises
+    ------
+    ConfigError
+        If the file is not a URDF or not a tree. Chains that cannot be identified are left out.
+    """
+    tree = _read_tree(file)
+    found: dict[str, tuple[str, ...]] = {}
+    base = tree.root() if base is None else tree.known(base, "urdf.base")
+    todo: list[str] = [base]
+    for link in todo:
+        ways = [element for element in tree.below.get(link, []) if tree.moves(element)]
+        todo += [_end(element, "child") for element in ways]
+        if len(ways) != 1 and link != base:
+            with suppress(ConfigError):
+                found[link] = tuple(joint.name for joint in read_chain(file, base, link))
+    return found
+
+
+def robot_name(file: Path) -> str:
+    """Name of the robot in a URDF, as it is written there; empty if it has none.
+
+    Parameters
+    ----------
+    file
+        Path of the URDF.
+
+    Raises
+    ------
+    ConfigError
+        If the file is not a URDF or not a tree.
+    """
+    return _read_tree(file).name
+
+
 @dataclass(frozen=True)
 class _Tree:
     """Joint elements by child link (``above``) and by parent link (``below``)."""
@@ -100,6 +145,7 @@ class _Tree:
     links: frozenset[str]
     above: Mapping[str, ET.Element]
     below: Mapping[str, list[ET.Element]]
+    name: str = ""
 
     def known(self, link: str, key: str) -> str:
         """Return the name of a link that the file contains.
@@ -161,7 +207,7 @@ class _Tree:
         """Joints from base to the last that moves."""
         link = base
         while True:
-            ways = [element for element in self.below.get(link, []) if self._moves(element)]
+            ways = [element for element in self.below.get(link, []) if self.moves(element)]
             if not ways:
                 return
             self._refuse_branch(link, ways)
@@ -170,7 +216,7 @@ class _Tree:
 
     def _refuse_branch(self, link: str, joints: list[ET.Element]) -> None:
         """Refuse a second moving joint or subtree at a link; the first one given is the chain's."""
-        others = [element for element in joints[1:] if self._moves(element)]
+        others = [element for element in joints[1:] if self.moves(element)]
         if others:
             names = " and ".join(repr(element.get("name")) for element in [joints[0], *others])
             raise ConfigError(
@@ -178,10 +224,16 @@ class _Tree:
                 "(urdf.base and urdf.tip choose a part)"
             )
 
-    def _moves(self, element: ET.Element) -> bool:
-        """Return True if this joint or any joint after it moves."""
+    def moves(self, element: ET.Element) -> bool:
+        """Return True if this joint or any joint after it moves.
+
+        Parameters
+        ----------
+        element
+            Element of the joint.
+        """
         return self.type_of(element) != "fixed" or any(
-            self._moves(after) for after in self.below.get(_end(element, "child"), [])
+            self.moves(after) for after in self.below.get(_end(element, "child"), [])
         )
 
     def type_of(self, element: ET.Element) -> str:
@@ -357,7 +409,7 @@ def _read_tree(file: Path) -> _Tree:
             )
         above[child] = element
         below.setdefault(_end(element, "parent"), []).append(element)
-    tree = _Tree(file, links, above, below)
+    tree = _Tree(file, links, above, below, root.get("name", ""))
     reached = [tree.root()]
     for link in reached:
         reached += [_end(element, "child") for element in below.get(link, [])]

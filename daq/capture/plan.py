@@ -109,8 +109,8 @@ def load_plan(
     ConfigError
         If the configuration is invalid, the trajectory exceeds the limits of the robot, or a bus is overloaded.
     """
-    session = load_session(config)
-    robot = load_robot(session.robot)
+    session = load_session(config, "capture")
+    robot = load_robot(session.robot, "capture")
     check_fits(session, str(config))
     if sniff_s is not None:
         if not listen_only:

@@ -84,7 +84,7 @@ def trajectory_command(options: TrajectoryOptions) -> None:
     DataError
         If ``known`` is of another robot or model.
     """
-    robot, out, look_at = load_robot(options.config), options.out, options.look_at
+    robot, out, look_at = load_robot(options.config, "trajectory"), options.out, options.look_at
     shape = _checked_shape(options)
     picture = options.picture
     if picture is None:

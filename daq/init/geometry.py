@@ -1,0 +1,167 @@
+"""Geometry of an arm from a URDF or from the library of robots, as the beginning of a robot configuration."""
+
+import os.path
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from armident.configs import ArmidentError, ConfigError, RobotConfig, config_path, load_robot
+from armident.configs.schema.robot import Mdh
+from armident.configs.urdf import UrdfGeometry, UrdfSource, geometry_from_urdf
+from armident.configs.urdf_tree import robot_name, serial_tips
+from armident.configs.yaml_loader import is_file, read_yaml
+
+UPRIGHT = (0.0, 0.0, -9.81)
+"""Acceleration of gravity in the frame of an upright base, m/s^2."""
+
+
+@dataclass(frozen=True)
+class Geometry:
+    """Geometry of an arm.
+
+    Parameters
+    ----------
+    source
+        Name of the source, for the user.
+    content
+        Keys of the robot configuration; ``joints`` has an entry for every joint, with its ``name``.
+    robot
+        The robot that these keys make.
+    notes
+        Sentences on what was assumed.
+    """
+
+    source: str
+    content: dict[str, Any]
+    robot: RobotConfig
+    notes: tuple[str, ...] = ()
+
+
+def from_library(name: str) -> Geometry:
+    """Geometry of a robot of the library, or of another configuration.
+
+    Parameters
+    ----------
+    name
+        Name of a robot in ``configs/robots``, or a path.
+
+    Raises
+    ------
+    ConfigError
+        If there is no such robot.
+    """
+    path = config_path(name, listed=("robots",))
+    robot = load_robot(path, "import")
+    content = read_yaml(path.read_text(encoding="utf-8"), str(path))
+    if "urdf" in content:
+        raise ConfigError(f"{path}: takes its geometry from a URDF; give that: armident init {content['urdf']['file']}")
+    return Geometry(path.name, content, robot)
+
+
+def from_urdf(
+    file: Path,
+    out: Path,
+    base: str | None = None,
+    tip: str | None = None,
+    fits: Callable[[RobotConfig], object] | None = None,
+) -> Geometry:
+    """Geometry of a URDF.
+
+    Parameters
+    ----------
+    file
+        The URDF.
+    out
+        Folder of the robot configuration, which refers to the URDF.
+    base, tip
+        First and last link of the chain. ``None``: the root; the end of the only chain, or of the one that ``fits``.
+    fits
+        Function that raises if a robot is not the recorded one; decides between several chains.
+
+    Raises
+    ------
+    ConfigError
+        If the URDF is wrong, or several chains remain; lists them.
+    """
+    if not is_file(file):
+        raise ConfigError(f"{file}: no such file")
+    if tip is not None:
+        return _of_chain(file, out, base, tip)
+    tips = serial_tips(file, base)
+    if len(tips) < 2:
+        # One chain; or none, of which the reader of the chain names the reason.
+        return _of_chain(file, out, base, next(iter(tips)) if _forks(file, base) and tips else None)
+    chains = [_of_chain(file, out, base, one) for one in tips]
+    chosen = [one for one in chains if fits is not None and _is_fit(one.robot, fits)]
+    if len(chosen) != 1:
+        listed = "; ".join(f"--tip {one} ({', '.join(joints)})" for one, joints in tips.items())
+        why = "and the recording fits none of them" if fits is not None and not chosen else "of which one is identified"
+        raise ConfigError(f"{file}: has several chains, {why}: {listed}")
+    return chosen[0]
+
+
+def _forks(file: Path, base: str | None) -> bool:
+    """Return True if the chain is the part before a fork: the joints beyond it, as of a gripper, belong to its load."""
+    try:
+        _of_chain(file, Path(), base, None)
+    except ConfigError:
+        return True
+    return False
+
+
+def _is_fit(robot: RobotConfig, fits: Callable[[RobotConfig], object]) -> bool:
+    try:
+        fits(robot)
+    except ArmidentError:
+        return False
+    return True
+
+
+def _of_chain(file: Path, out: Path, base: str | None, tip: str | None) -> Geometry:
+    part = UrdfSource(file=str(file.resolve()), base=base, tip=tip)
+    made = geometry_from_urdf(UrdfGeometry(urdf=part), out / "robot.yaml")
+    urdf = {"file": os.path.relpath(part.file, out.resolve()), **part.model_dump(exclude={"file"}, exclude_none=True)}
+    name = identifier(robot_name(file) or file.stem)
+    robot = RobotConfig.model_validate({"schema": "armident/robot/1", "name": name, **made})
+    content = {
+        "schema": "armident/robot/1",
+        "name": name,
+        "urdf": urdf,
+        "joints": [{"name": joint.source_name or joint.name} for joint in robot.joints],
+    }
+    notes = (f"chain up to link {tip}; what moves beyond it counts as its load",) if tip is not None else ()
+    return Geometry(file.name, content, robot, notes)
+
+
+def of_rows(source: str, name: str, rows: list[tuple[str, str, Mdh]]) -> Geometry:
+    """Geometry of modified Denavit-Hartenberg rows.
+
+    Parameters
+    ----------
+    source
+        Name of the source, for the user.
+    name
+        Name of the robot.
+    rows
+        Name, type and parameters of each joint, base to tip.
+    """
+    content = {
+        "schema": "armident/robot/1",
+        "name": name,
+        "joints": [{"name": joint, "type": kind, "mdh": mdh.model_dump()} for joint, kind, mdh in rows],
+    }
+    return Geometry(source, content, RobotConfig.model_validate(content))
+
+
+def identifier(text: str) -> str:
+    """Name of a robot or cell: lower-case letters, digits and underscores, beginning with a letter.
+
+    Parameters
+    ----------
+    text
+        Any text.
+    """
+    plain = re.sub(r"[^a-z0-9]+", "_", text.lower()).strip("_")[:60]
+    return plain if plain and plain[0].isalpha() else f"arm_{plain}".rstrip("_")

@@ -1,0 +1,272 @@
+"""``armident init``: robot and session from a URDF and a recording, and configurations with blanks."""
+
+from importlib.metadata import EntryPoint
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from typer.testing import CliRunner, Result
+
+from armident.configs import ConfigError, load_robot, load_session
+from armident.configs.blanks import MARK
+from armident.daq.cli import GROUP, application
+from armident.daq.interchange.exporting import export_recording
+from armident.daq.recording import read_recording, write_recording
+from tests.fixtures import arms
+
+COMMANDS = {
+    "init": "armident.daq.init.cli:init",
+    "import": "armident.daq.commands:import_",
+    "identify": "armident.identify.cli:identify",
+    "trajectory": "armident.identify.cli:trajectory",
+}
+
+
+def run(*words: str) -> Result:
+    app = application(words, [EntryPoint(name, value, GROUP) for name, value in COMMANDS.items()])
+    return CliRunner().invoke(app, list(words))
+
+
+def urdf_of(robot: str, names: list[str], file: Path, limits: bool = True) -> Path:
+    """Write the geometry of a shipped robot as a URDF, each joint behind a fixed one; joints may have no limits."""
+    parts = ['<link name="l0"/>']
+    for k, joint in enumerate(load_robot(robot).joints):
+        m, low_high = joint.mdh, joint.limits.position
+        limit = (
+            f'<limit lower="{low_high[0]}" upper="{low_high[1]}" velocity="{joint.limits.velocity}" '
+            f'effort="{joint.limits.torque}"/>'
+        )
+        parts += [
+            f'<link name="s{k}"/><joint name="f{k}" type="fixed"><parent link="l{k}"/><child link="s{k}"/>'
+            f'<origin rpy="{m.alpha} 0 0" xyz="{m.d} 0 0"/></joint>',
+            f'<link name="l{k + 1}"/><joint name="{names[k]}" type="revolute"><parent link="s{k}"/>'
+            f'<child link="l{k + 1}"/><origin rpy="0 0 {m.theta}" xyz="0 0 {m.r}"/><axis xyz="0 0 1"/>'
+            f"{limit if limits else ''}</joint>",
+        ]
+    file.write_text(f'<robot name="My Arm">{"".join(parts)}</robot>')
+    return file
+
+
+AXES = [f"axis-{k}" for k in range(1, 7)]
+
+
+@pytest.fixture
+def arm(tmp_path: Path) -> Path:
+    return urdf_of("tx40", AXES, tmp_path / "arm.urdf")
+
+
+def table(path: Path, *, rate: float = 500.0, unit: float = 1.0, time: float = 1.0, effort: str = "tau") -> Path:
+    """Write a motion of 4 s of the arm in other units; torques are a tenth of the limits."""
+    robot = load_robot("tx40")
+    t = np.arange(round(4 * rate)) / rate
+    phase = np.arange(6)
+    q = 0.6 * np.sin(2 * np.pi * t[:, None] + phase)
+    tau = 0.1 * np.array([joint.limits.torque for joint in robot.joints]) * np.cos(2 * np.pi * t[:, None] + phase)
+    names = ["t", *(f"q{k}" for k in range(1, 7)), *(f"{effort}{k}" for k in range(1, 7))]
+    values = np.column_stack([t / time, q / unit, tau])
+    path.write_text("\n".join([",".join(names), *(",".join(f"{x:.9g}" for x in row) for row in values)]) + "\n")
+    return path
+
+
+@pytest.mark.slow
+def test_urdf_and_csv_become_a_model_without_an_edit(tmp_path: Path, arm: Path) -> None:
+    recorded = arms.recording("tx40", "tx40_excitation", 1, period=arms.FAST)
+    export_recording(recorded, tmp_path / "data.csv")
+    made = run("init", str(arm), "--recording", str(tmp_path / "data.csv"), "--out", str(tmp_path / "cell"))
+    assert made.exit_code == 0, made.output
+    assert "1000 Hz, 8.1" in made.output
+    assert " s, torques, with reference" in made.output
+    lines = [line.strip() for line in made.output.splitlines()]
+    commands = [line.split()[1:] for line in lines[lines.index("next:") + 1 :]]
+    assert [words[0] for words in commands] == ["import", "check", "identify"]
+    assert run(*commands[0]).exit_code == 0
+    found = run(*commands[2], "--method", "idim-ls", "--json", "--out", str(tmp_path / "model"))
+    document = yaml.safe_load(found.stdout)
+    expected = arms.identified("tx40", "tx40_excitation", 1, "idim-ls").document
+    values = {p["name"]: p["value"] for p in document["parameters"]}
+    # The same arm, without its coupling of joints 5 and 6, at a fifth of the rate: joint 2 is not affected.
+    for name in ("mx2r", "fc2", "fv2"):
+        assert values[name] == pytest.approx(next(p.value for p in expected.parameters if p.name == name), rel=0.02)
+
+
+def test_limits_of_the_urdf_stay_and_others_are_those_reached(tmp_path: Path, arm: Path) -> None:
+    made = run("init", str(arm), "--recording", str(table(tmp_path / "d.csv")), "--out", str(tmp_path))
+    assert made.exit_code == 0, made.output
+    robot = load_robot(tmp_path / "robot.yaml", "trajectory")
+    tx40 = load_robot("tx40")
+    for joint, known in zip(robot.joints, tx40.joints, strict=True):
+        assert joint.limits.position == pytest.approx(known.limits.position)
+        assert joint.limits.torque == known.limits.torque
+        assert joint.limits.acceleration == pytest.approx(0.6 * (2 * np.pi) ** 2, rel=0.02)
+    bare = urdf_of("tx40", AXES, tmp_path / "bare.urdf", limits=False)
+    assert run("init", str(bare), "--recording", str(tmp_path / "d.csv"), "--out", str(tmp_path / "b")).exit_code == 0
+    limits = load_robot(tmp_path / "b" / "robot.yaml", "trajectory").joints[1].limits
+    assert limits.position == pytest.approx((-0.6, 0.6), rel=1e-3)
+    assert limits.velocity == pytest.approx(0.6 * 2 * np.pi, rel=0.01)
+    assert limits.torque == pytest.approx(0.1 * tx40.joints[1].limits.torque, rel=0.01)
+
+
+@pytest.mark.parametrize(
+    ("changes", "options"),
+    [
+        ({}, ""),
+        ({"unit": np.pi / 180}, " --units position=deg"),
+        ({"time": 1e-3}, " --time-unit ms"),
+        ({"time": 1e-6, "unit": np.pi / 180}, " --units position=deg --time-unit us"),
+    ],
+)
+def test_units_are_found_by_magnitude_and_the_import_gets_them(
+    tmp_path: Path, arm: Path, changes: dict[str, float], options: str
+) -> None:
+    path = table(tmp_path / "d.csv", **changes)  # type: ignore[arg-type]
+    made = run("init", str(arm), "--recording", str(path), "--out", str(tmp_path))
+    assert made.exit_code == 0, made.output
+    command = next(line.split()[1:] for line in made.output.splitlines() if line.startswith("  armident import"))
+    assert f"robot.yaml{options} --out" in " ".join(command)
+    assert run(*command).exit_code == 0
+    q = read_recording(tmp_path / "d.mcap").samples.si("position")
+    assert np.abs(q).max() == pytest.approx(0.6, rel=1e-3)
+    assert load_session(tmp_path / "session.yaml", "").sync.period_us == 2000
+
+
+def test_jittering_times_are_resampled(tmp_path: Path, arm: Path) -> None:
+    path = table(tmp_path / "d.csv")
+    rng = np.random.default_rng(0)
+    lines = path.read_text().splitlines()
+    rows = [line.split(",") for line in lines[1:]]
+    late = [f"{float(row[0]) + rng.uniform(0, 8e-4):.6f}" for row in rows]
+    path.write_text("\n".join([lines[0], *(",".join([t, *row[1:]]) for t, row in zip(late, rows, strict=True))]) + "\n")
+    made = run("init", str(arm), "--recording", str(path), "--out", str(tmp_path))
+    assert made.exit_code == 0, made.output
+    assert " --resample 500 " in made.output
+
+
+def test_every_blank_is_listed_once_and_asked_for_when_needed(tmp_path: Path, arm: Path) -> None:
+    path = table(tmp_path / "d.csv", effort="current")
+    made = run("init", str(arm), "--recording", str(path), "--out", str(tmp_path))
+    assert made.exit_code == 0, made.output
+    for key in ("joints[].drive.gain", "joints[].drive.rated", "drives[].node_id", "drives[].eds", "bus.bitrate"):
+        assert made.output.count(f": {key}") == 1
+    assert "joints[].drive.gain of all joints, for identify, capture, robot" in made.output
+    imported = run("import", str(path), "--config", str(tmp_path / "robot.yaml"), "--out", str(tmp_path / "d.mcap"))
+    assert imported.exit_code == 0, imported.output
+    # The recording has the blanks of its robot, and the configuration has them, too.
+    for config in ([], ["--config", str(tmp_path / "robot.yaml")]):
+        refused = run("identify", str(tmp_path / "d.mcap"), *config)
+        assert refused.exit_code == 2
+        assert "drive.gain of axis-1, axis-2, axis-3, axis-4, axis-5, axis-6 (torque constant" in refused.stderr
+        assert "rated" not in refused.stderr
+    with pytest.raises(ConfigError, match=r"drives\[\]\.node_id of axis_1.*joints\[\]\.drive\.counts_per_unit"):
+        load_session(tmp_path / "session.yaml", "capture")
+    assert load_session(tmp_path / "session.yaml", "command").cell == "my_arm_cell"
+    with pytest.raises(ConfigError, match=r"bus\.bitrate"):
+        load_session(tmp_path / "session.yaml")
+
+
+def test_a_filled_in_configuration_has_no_blanks(tmp_path: Path, arm: Path) -> None:
+    cell = ["--channel", "can0", "--bitrate", "1000000", "--node-ids", "1,2,3,4,5,6", "--eds", "eds/cia402_servo.eds"]
+    path = table(tmp_path / "d.csv")
+    assert run("init", str(arm), "--recording", str(path), "--out", str(tmp_path), *cell).exit_code == 0
+    file = tmp_path / "robot.yaml"
+    text = file.read_text().replace(f"rated: {MARK}", "rated: 2.0").replace(f"unit: {MARK}", "unit: 65536")
+    file.write_text(text)
+    session = load_session(tmp_path / "session.yaml", "capture")
+    assert session.blanks == ()
+    assert "blanks" not in session.model_dump()
+    assert load_robot(file).joints[0].drive.counts_per_unit == 65536
+
+
+def test_a_mark_in_a_list_makes_the_list_blank_and_unknown_keys_are_always_needed(tmp_path: Path) -> None:
+    content: dict[str, Any] = yaml.safe_load(
+        (Path(load_robot.__code__.co_filename).parent / "robots/emps.yaml").read_text()
+    )
+    content["joints"][0]["limits"]["position"] = [MARK, 0.3]
+    (tmp_path / "a.yaml").write_text(yaml.safe_dump(content))
+    assert load_robot(tmp_path / "a.yaml", "identify").blanks == ("joints[joint_1].limits.position",)
+    with pytest.raises(ConfigError, match=r"limits\.position of joint_1 \(\[low, high\]"):
+        load_robot(tmp_path / "a.yaml", "trajectory")
+    content["bandwidth_hz"] = MARK
+    (tmp_path / "b.yaml").write_text(yaml.safe_dump(content))
+    with pytest.raises(ConfigError, match="bandwidth_hz"):
+        load_robot(tmp_path / "b.yaml", "identify")
+
+
+def test_existing_files_are_kept(tmp_path: Path, arm: Path) -> None:
+    assert run("init", str(arm), "--out", str(tmp_path)).exit_code == 0
+    again = run("init", str(arm), "--out", str(tmp_path))
+    assert again.exit_code == 2
+    assert "exists already; --overwrite" in again.stderr
+    assert run("init", str(arm), "--out", str(tmp_path), "--overwrite").exit_code == 0
+
+
+def test_without_a_recording_limits_are_blank(tmp_path: Path, arm: Path) -> None:
+    made = run("init", str(arm), "--out", str(tmp_path))
+    assert "joints[].limits.acceleration of all joints, for trajectory, robot" in made.output
+    refused = run("trajectory", "--config", str(tmp_path / "robot.yaml"), "--out", str(tmp_path / "t.yaml"))
+    assert refused.exit_code == 2
+    assert "joints[].limits.acceleration of axis-1" in refused.stderr
+
+
+def test_no_source_and_two_sources_are_refused(tmp_path: Path, arm: Path) -> None:
+    assert "expected one source" in run("init", "--out", str(tmp_path)).stderr
+    assert "a URDF and --robot" in run("init", str(arm), "--robot", "tx40", "--out", str(tmp_path)).stderr
+
+
+def test_a_robot_of_the_library_keeps_what_it_knows(tmp_path: Path) -> None:
+    made = run("init", "--robot", "tx40", "--out", str(tmp_path))
+    assert made.exit_code == 0, made.output
+    assert load_robot(tmp_path / "robot.yaml") == load_robot("tx40")
+
+
+FORK = """<robot name="arm"><link name="a"/><link name="b"/><link name="c"/><link name="d"/><link name="e"/>
+<joint name="j1" type="revolute"><parent link="a"/><child link="b"/><axis xyz="0 0 1"/></joint>
+<joint name="j2" type="revolute"><parent link="b"/><child link="c"/><axis xyz="0 1 0"/><origin xyz="0 0 .3"/></joint>
+<joint name="f1" type="prismatic"><parent link="c"/><child link="d"/><axis xyz="0 1 0"/></joint>
+<joint name="f2" type="prismatic"><parent link="c"/><child link="e"/><axis xyz="0 -1 0"/></joint></robot>"""
+
+
+def test_a_gripper_ends_the_chain_and_is_named(tmp_path: Path) -> None:
+    (tmp_path / "arm.urdf").write_text(FORK)
+    made = run("init", str(tmp_path / "arm.urdf"), "--out", str(tmp_path))
+    assert made.exit_code == 0, made.output
+    assert "2 joints (j1, j2)" in made.output
+    assert "chain up to link c" in made.output
+    assert load_robot(tmp_path / "robot.yaml", "identify").n == 2
+
+
+def test_of_two_arms_the_recorded_one_is_taken(tmp_path: Path) -> None:
+    (tmp_path / "arms.urdf").write_text(
+        '<robot name="two"><link name="a"/>'
+        + "".join(
+            f'<link name="{s}1"/><link name="{s}2"/>'
+            f'<joint name="{s}_j1" type="revolute"><parent link="a"/><child link="{s}1"/><axis xyz="0 0 1"/></joint>'
+            f'<joint name="{s}_j2" type="revolute"><parent link="{s}1"/><child link="{s}2"/><axis xyz="0 1 0"/></joint>'
+            for s in ("left", "right")
+        )
+        + "</robot>"
+    )
+    refused = run("init", str(tmp_path / "arms.urdf"), "--out", str(tmp_path / "x"))
+    assert refused.exit_code == 2
+    assert "--tip left2 (left_j1, left_j2); --tip right2 (right_j1, right_j2)" in refused.stderr
+    names = [f"right_j{k}/{q}" for q in ("position", "effort") for k in (1, 2)]
+    t = np.arange(1000) / 500
+    rows = np.column_stack([t, np.sin(t), np.cos(t), np.cos(t), np.sin(t)])
+    lines = [",".join(["t", *names]), *(",".join(f"{x:.6f}" for x in row) for row in rows)]
+    (tmp_path / "d.csv").write_text("\n".join(lines))
+    made = run(
+        "init", str(tmp_path / "arms.urdf"), "--recording", str(tmp_path / "d.csv"), "--out", str(tmp_path / "y")
+    )
+    assert made.exit_code == 0, made.output
+    assert [joint.name for joint in load_robot(tmp_path / "y/robot.yaml", "identify").joints] == [
+        "right_j1",
+        "right_j2",
+    ]
+
+
+def test_a_recording_keeps_the_blanks_of_its_robot(tmp_path: Path) -> None:
+    recorded = arms.recording("emps", "emps_1", 0)
+    robot = recorded.robot.model_copy(update={"blanks": ("joints[joint_1].drive.rated",)})
+    write_recording(type(recorded)(**{**vars(recorded), "robot": robot}), tmp_path / "a.mcap")
+    assert read_recording(tmp_path / "a.mcap").robot.blanks == ("joints[joint_1].drive.rated",)
