@@ -100,6 +100,22 @@ def load_robot(name: str | Path, command: str | None = None) -> RobotConfig:
     return robot
 
 
+def is_session(path: Path) -> bool:
+    """Return True if a configuration file is that of a session by its schema.
+
+    Parameters
+    ----------
+    path
+        Path of the file.
+
+    Raises
+    ------
+    ConfigError
+        If the file cannot be read.
+    """
+    return str(_read_mapping(_read_text(path), str(path)).get("schema", "")).startswith("armident/session/")
+
+
 def _robot(path: Path) -> RobotConfig:
     """Robot of a file, which may have blanks."""
     data = _marked(path)

@@ -2,7 +2,7 @@
 
 import logging
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -197,18 +197,27 @@ def export(
 
 
 def doctor(
-    config: Annotated[str, typer.Option("--config", help="Session configuration.")] = "tx40_cell.yaml",
+    config: Annotated[
+        str, typer.Option("--config", help="Session configuration; a robot configuration for other commands.")
+    ] = "tx40_cell.yaml",
     as_json: Annotated[bool, typer.Option("--json", help="Print the checks as JSON.")] = False,
+    command: Annotated[
+        Literal["capture", "import", "identify", "trajectory", "robot"],
+        typer.Option("--for", help="Command in mind: capture, import, identify, trajectory or robot."),
+    ] = "capture",
 ) -> None:
-    """Check session and machine before a capture: configuration, bus, clock, disk, Zenoh.
+    """Check what a command needs; before a capture: configuration, bus, clock, disk, Zenoh.
 
-    Nothing is sent to the bus. The exit code is 2 if a capture would not run, and 0 if there are only warnings.
+    For other commands, everything that is missing in the configuration is named with the way to find it. Nothing is
+    sent to the bus. The exit code is 2 if the command would not run, and 0 if there are only warnings.
 
     Example: armident doctor --config cell.yaml
+
+    Before an identification: armident doctor --for identify --config robot.yaml
     """
     from armident.daq.doctor import doctor as run
 
-    run(config, as_json)
+    run(config, as_json, command)
 
 
 def recover(

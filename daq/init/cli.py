@@ -1,5 +1,6 @@
 """Options of ``armident init``; the work is imported when the command runs."""
 
+import sys
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -14,6 +15,16 @@ def init(
     ] = None,
     robot: Annotated[
         str | None, typer.Option("--robot", help="Robot of the library instead of a URDF: ur5e, ...")
+    ] = None,
+    dh: Annotated[
+        Path | None, typer.Option("--dh", help="Table of Denavit-Hartenberg parameters instead: theta, d, a, alpha.")
+    ] = None,
+    convention: Annotated[
+        Literal["classical", "modified"] | None,
+        typer.Option("--convention", help="Of that table. [default: modified with a column r, else classical]"),
+    ] = None,
+    axes: Annotated[
+        int | None, typer.Option("--axes", help="Number of joints, if the geometry is not known yet.", min=1)
     ] = None,
     base: Annotated[str | None, typer.Option("--base", help="First link of the chain. [default: the root]")] = None,
     tip: Annotated[str | None, typer.Option("--tip", help="Last link of the chain. [default: its end]")] = None,
@@ -42,6 +53,9 @@ def init(
     rate: Annotated[
         float | None, typer.Option("--rate", help="Its sampling rate, Hz. [default: by its times]", min=0.001)
     ] = None,
+    gravity: Annotated[
+        str, typer.Option("--gravity", help="Gravity in the frame of the base, X,Y,Z in m/s^2. [default: 0,0,-9.81]")
+    ] = "",
     cell: Annotated[str | None, typer.Option("--cell", help="Name of the cell. [default: that of the robot]")] = None,
     channel: Annotated[str | None, typer.Option("--channel", help="CAN interface of the drives, such as can0.")] = None,
     bitrate: Annotated[
@@ -53,10 +67,11 @@ def init(
     eds: Annotated[str | None, typer.Option("--eds", help="Electronic data sheet of the drives.")] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace files that exist.")] = False,
 ) -> None:
-    """Write the configuration of an arm and of its cell, from a URDF or a robot of the library, and a recording.
+    """Write the configuration of an arm and of its cell, from what is known of it and a recording.
 
-    What is not known yet is marked FILL_IN, with the way to find it. All blanks are listed at the end; a command asks
-    only for those that it needs.
+    Sources of the geometry: a URDF, a robot of the library, a table of Denavit-Hartenberg parameters. Without any,
+    questions are asked on a terminal. What is not known yet is marked FILL_IN, with the way to find it. All blanks are
+    listed at the end; a command asks only for those that it needs.
 
     Example: armident init arm.urdf --recording data.csv --out my_arm
     """
@@ -64,10 +79,16 @@ def init(
     from armident.daq.init.command import InitOptions, run_init
     from armident.daq.interchange.text_files import pairs_of
 
-    try:
-        nodes = [int(word) for word in node_ids.split(",") if word.strip()]
-    except ValueError as error:
-        raise ConfigError(f"--node-ids: expected whole numbers, NUMBER,NUMBER,...; found {node_ids!r}") from error
+    def numbers(option: str, text: str) -> list[float]:
+        try:
+            return [float(word) for word in text.split(",") if word.strip()]
+        except ValueError as error:
+            raise ConfigError(f"{option}: expected numbers, NUMBER,NUMBER,...; found {text!r}") from error
+
+    nodes = [int(number) for number in numbers("--node-ids", node_ids)]
+    down = numbers("--gravity", gravity)
+    if len(down) not in (0, 3):
+        raise ConfigError(f"--gravity: expected X,Y,Z, found {gravity!r}")
     stated = {
         "names": pairs_of("--map", names),
         "joints": [word.strip() for word in joints.split(",") if word.strip()],
@@ -83,13 +104,24 @@ def init(
         out=out,
         urdf=urdf,
         robot=robot,
+        dh=dh,
+        axes=axes,
+        convention=convention,
         base=base,
         tip=tip,
         recording=recording,
         stated=stated,
         name=name,
         signal=signal,
+        gravity=(down[0], down[1], down[2]) if down else None,
         cell={key: value for key, value in of_cell.items() if value is not None},
         overwrite=overwrite,
     )
+    if urdf is None and robot is None and dh is None and axes is None and sys.stdin.isatty():
+        from armident.daq.init.questionnaire import questionnaire
+
+        def ask(question: str, default: str) -> str:
+            return str(typer.prompt(question, default=default, show_default=bool(default)))
+
+        options = questionnaire(options, ask, print)
     print(run_init(options))

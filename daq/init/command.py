@@ -8,8 +8,9 @@ from typing import Any
 
 from armident.configs import ConfigError, RobotConfig, load_robot, load_session
 from armident.configs.blanks import MARK, NEEDS, grouped, pattern
+from armident.daq.init.dh_table import Convention, from_dh_table
 from armident.daq.init.files import CellFacts, robot_content, session_content
-from armident.daq.init.geometry import Geometry, from_library, from_urdf
+from armident.daq.init.geometry import Geometry, from_library, from_urdf, of_axes
 from armident.daq.init.recorded import RecordedFacts, examine
 from armident.daq.init.yaml_text import Noted, yaml_text
 from armident.daq.interchange.bus_log import SUFFIXES
@@ -25,8 +26,11 @@ class InitOptions:
     ----------
     out
         Folder of the files.
-    urdf, robot
-        Source of the geometry: a URDF, or a robot of the library.
+    urdf, robot, dh, axes
+        Source of the geometry: a URDF, a robot of the library, a table of Denavit-Hartenberg parameters, or only the
+        number of joints.
+    convention
+        Convention of the table; ``None``: by its columns.
     base, tip
         First and last link of the chain in the URDF.
     recording
@@ -37,6 +41,8 @@ class InitOptions:
         Name of the robot; ``None``: that of the source.
     signal
         Kind of effort that the drives report; ``None``: that of the recording.
+    gravity
+        Acceleration of gravity in the frame of the base, m/s^2; ``None``: that of an upright base.
     cell
         Facts of the cell, such as ``channel``.
     overwrite
@@ -46,12 +52,16 @@ class InitOptions:
     out: Path
     urdf: Path | None = None
     robot: str | None = None
+    dh: Path | None = None
+    axes: int | None = None
+    convention: Convention | None = None
     base: str | None = None
     tip: str | None = None
     recording: Path | None = None
     stated: Mapping[str, Any] = field(default_factory=dict)
     name: str | None = None
     signal: str | None = None
+    gravity: tuple[float, float, float] | None = None
     cell: Mapping[str, Any] = field(default_factory=dict)
     overwrite: bool = False
 
@@ -83,7 +93,7 @@ def run_init(options: InitOptions) -> str:
         )
     geometry = _geometry(options)
     facts = None if options.recording is None else examine(options.recording, geometry.robot, options.stated)
-    robot = robot_content(geometry, facts, options.signal)
+    robot = robot_content(geometry, facts, options.signal, options.gravity)
     robot["name"] = options.name or robot["name"]
     signal = _signal(robot)
     cell = CellFacts(**{"cell": f"{robot['name']}_cell", **options.cell})
@@ -96,15 +106,19 @@ def run_init(options: InitOptions) -> str:
 
 
 def _geometry(options: InitOptions) -> Geometry:
-    sources = {"a URDF": options.urdf, "--robot": options.robot}
+    sources = {"a URDF": options.urdf, "--robot": options.robot, "--dh": options.dh, "--axes": options.axes}
     given = [name for name, source in sources.items() if source is not None]
     if len(given) != 1:
         raise ConfigError(
             f"expected one source of the geometry, found {' and '.join(given) or 'none'}: armident init ARM.urdf, "
-            "or --robot NAME of the library"
+            "--robot NAME of the library, --dh TABLE.csv, or --axes N with the geometry left blank"
         )
     if options.robot is not None:
         return from_library(options.robot)
+    if options.dh is not None:
+        return from_dh_table(options.dh, options.convention)
+    if options.axes is not None:
+        return of_axes(options.axes)
     assert options.urdf is not None
     return from_urdf(options.urdf, options.out, options.base, options.tip, _fits(options))
 

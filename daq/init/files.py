@@ -37,7 +37,12 @@ class CellFacts:
     eds: str | None = None
 
 
-def robot_content(geometry: Geometry, facts: RecordedFacts | None, signal: str | None = None) -> dict[str, Any]:
+def robot_content(
+    geometry: Geometry,
+    facts: RecordedFacts | None,
+    signal: str | None = None,
+    gravity: tuple[float, float, float] | None = None,
+) -> dict[str, Any]:
     """Return the content of ``robot.yaml``.
 
     Parameters
@@ -48,12 +53,16 @@ def robot_content(geometry: Geometry, facts: RecordedFacts | None, signal: str |
         Facts of a recording; ``None``: there is none.
     signal
         Kind of effort that the drives report; ``None``: that of the recording, else of the geometry, else ``torque``.
+    gravity
+        Acceleration of gravity in the frame of the base, m/s^2; ``None``: that of the geometry, else that of an upright
+        base.
     """
     robot = geometry.robot
     content = dict(geometry.content)
-    content["gravity"] = content.get("gravity") or Noted(
-        list(UPRIGHT), "assumed: base upright on the floor; m/s^2 in the frame of the base"
-    )
+    if gravity is not None:
+        content["gravity"] = list(gravity)
+    elif "gravity" not in content:
+        content["gravity"] = Noted(list(UPRIGHT), "assumed: base upright; m/s^2 in the frame of the base")
     hinted: set[str] = set()
     content["joints"] = [
         _joint(entry, robot, k, facts, signal or (facts.signal if facts is not None else None), hinted)
@@ -73,7 +82,7 @@ def _joint(
 ) -> Any:
     """Return one entry of ``joints``."""
     joint = robot.joints[k]
-    made = dict(entry)
+    made = {key: _blank(f"joints[].{key}", hinted) if value == MARK else value for key, value in entry.items()}
     reached = completed(joint.limits, facts, k) if facts is not None else {}
     if joint.limits.missing():
         own = dict(made.get("limits", {}))

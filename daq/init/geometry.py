@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from armident.configs import ArmidentError, ConfigError, RobotConfig, config_path, load_robot
+from armident.configs.blanks import MARK, without_marks
 from armident.configs.schema.robot import Mdh
 from armident.configs.urdf import UrdfGeometry, UrdfSource, geometry_from_urdf
 from armident.configs.urdf_tree import robot_name, serial_tips
@@ -153,6 +154,30 @@ def of_rows(source: str, name: str, rows: list[tuple[str, str, Mdh]]) -> Geometr
         "joints": [{"name": joint, "type": kind, "mdh": mdh.model_dump()} for joint, kind, mdh in rows],
     }
     return Geometry(source, content, RobotConfig.model_validate(content))
+
+
+def of_axes(count: int) -> Geometry:
+    """Geometry that is not known yet: joints with blank parameters.
+
+    Parameters
+    ----------
+    count
+        Number of joints.
+
+    Raises
+    ------
+    ConfigError
+        If there is none.
+    """
+    if count < 1:
+        raise ConfigError(f"--axes: expected the number of joints, found {count}")
+    content = {
+        "schema": "armident/robot/1",
+        "name": "arm",
+        "joints": [{"name": f"joint_{k}", "type": "revolute", "mdh": MARK} for k in range(1, count + 1)],
+    }
+    robot, blanks = without_marks(content)
+    return Geometry("a number of joints", content, RobotConfig.model_validate({**robot, "blanks": blanks}))
 
 
 def identifier(text: str) -> str:

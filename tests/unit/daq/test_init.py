@@ -1,5 +1,7 @@
 """``armident init``: robot and session from a URDF and a recording, and configurations with blanks."""
 
+import re
+from dataclasses import replace
 from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import Any
@@ -10,13 +12,17 @@ import yaml
 from typer.testing import CliRunner, Result
 
 from armident.configs import ConfigError, load_robot, load_session
-from armident.configs.blanks import MARK
+from armident.configs.blanks import MARK, pattern
 from armident.daq.cli import GROUP, application
+from armident.daq.init.command import InitOptions, run_init
+from armident.daq.init.questionnaire import questionnaire
 from armident.daq.interchange.exporting import export_recording
 from armident.daq.recording import read_recording, write_recording
 from tests.fixtures import arms
+from tests.unit.configs.test_urdf import transform
 
 COMMANDS = {
+    "doctor": "armident.daq.commands:doctor",
     "init": "armident.daq.init.cli:init",
     "import": "armident.daq.commands:import_",
     "identify": "armident.identify.cli:identify",
@@ -270,3 +276,126 @@ def test_a_recording_keeps_the_blanks_of_its_robot(tmp_path: Path) -> None:
     robot = recorded.robot.model_copy(update={"blanks": ("joints[joint_1].drive.rated",)})
     write_recording(type(recorded)(**{**vars(recorded), "robot": robot}), tmp_path / "a.mcap")
     assert read_recording(tmp_path / "a.mcap").robot.blanks == ("joints[joint_1].drive.rated",)
+
+
+def test_doctor_names_what_the_command_in_mind_lacks(tmp_path: Path, arm: Path) -> None:
+    path = table(tmp_path / "d.csv", effort="current")
+    assert run("init", str(arm), "--recording", str(path), "--out", str(tmp_path)).exit_code == 0
+    robot, session = str(tmp_path / "robot.yaml"), str(tmp_path / "session.yaml")
+    found = {command: run("doctor", "--for", command, "--config", robot) for command in ("import", "identify", "robot")}
+    assert {command: one.exit_code for command, one in found.items()} == {"import": 0, "identify": 2, "robot": 2}
+    assert "failed   blank: joints[].drive.gain of axis-1" in found["identify"].stdout
+    assert "not needed yet: joints[].drive.rated, joints[].drive.counts_per_unit" in found["identify"].stdout
+    assert "identify would not run: blank" in found["identify"].stderr
+    assert found["robot"].stdout.count("failed   blank") == 3
+    capture = run("doctor", "--config", session)
+    assert capture.exit_code == 2
+    assert capture.stdout.count("failed   blank") == 7
+    assert run("doctor", "--for", "trajectory", "--config", robot).exit_code == 0
+    assert run("doctor", "--for", "identify", "--config", session).exit_code == 2
+
+
+UR5E = """joint; theta [rad]; d [mm]; a [mm]; alpha
+pan; 0; 162.5; 0; pi/2
+lift; 0; 0; -425; 0
+elbow; 0; 0; -392.2; 0
+wrist_1; 0; 133.3; 0; pi/2
+wrist_2; 0; 99.7; 0; -pi/2
+wrist_3; 0; 99.6; 0; 0
+"""
+PANDA = """# a and d in m, angles in degrees
+a,d,alpha,theta
+0,0.333,0,0
+0,0,-90,0
+0,0.316,90,0
+0.0825,0,90,0
+-0.0825,0.384,-90,0
+0,0,90,0
+0.088,0,90,0
+"""
+EMPS = "type,alpha,d,theta,r\nprismatic,0,0,0,0\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "name", "options", "said"),
+    [
+        (UR5E, "ur5e", [], "classical parameters"),
+        (UR5E.replace("pi/2", "\u03c0/2").replace("theta", "\u03b8"), "ur5e", [], "classical parameters"),
+        (PANDA, "panda", ["--convention", "modified"], "angles are in degrees by their magnitude"),
+        (EMPS, "emps", [], "modified parameters"),
+    ],
+)
+def test_a_table_of_parameters_gives_the_geometry(
+    tmp_path: Path, text: str, name: str, options: list[str], said: str
+) -> None:
+    (tmp_path / "arm.csv").write_text(text)
+    made = run("init", "--dh", str(tmp_path / "arm.csv"), *options, "--out", str(tmp_path))
+    assert made.exit_code == 0, made.output
+    assert f"note: {said}" in made.output
+    found, shipped = load_robot(tmp_path / "robot.yaml", "identify"), load_robot(name)
+    zero = np.linspace(-1.0, 1.0, shipped.n)
+    # The last frame of a classical table is the flange; only its place on the last axis may differ.
+    flange = np.linalg.inv(transform(shipped, zero)) @ transform(found, zero)
+    for q in np.random.default_rng(0).uniform(-2, 2, (5, shipped.n)):
+        assert transform(found, q) == pytest.approx(transform(shipped, q) @ flange, abs=1e-9)
+    assert [joint.type for joint in found.joints] == [joint.type for joint in shipped.joints]
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("theta,d,a\n0,0,0\n", "no column alpha; found theta, d, a"),
+        ("theta,d,a,alpha\n0,0,0\n", "line 2: 3 values, the header has 4"),
+        ("theta,d,a,alpha\n0,0,0,north\n", "line 2, column alpha: .*north"),
+        ("theta,d,a [inch],alpha\n0,0,0,0\n", "unknown unit; expected rad, deg, m or mm"),
+        ("theta,d,a,alpha,type\n0,0,0,0,screw\n", "type 'screw'; expected revolute or prismatic"),
+        ("", "expected a header line"),
+    ],
+)
+def test_a_wrong_table_is_one_line(tmp_path: Path, text: str, said: str) -> None:
+    (tmp_path / "arm.csv").write_text(text)
+    refused = run("init", "--dh", str(tmp_path / "arm.csv"), "--out", str(tmp_path))
+    assert refused.exit_code == 2
+    assert re.search(said, refused.stderr)
+    assert len(refused.stderr.splitlines()) == 1
+
+
+def test_the_geometry_may_be_blank_until_it_is_needed(tmp_path: Path) -> None:
+    path = table(tmp_path / "d.csv")
+    assert run("init", "--axes", "6", "--recording", str(path), "--out", str(tmp_path)).exit_code == 0
+    config = str(tmp_path / "robot.yaml")
+    assert run("import", str(path), "--config", config, "--out", str(tmp_path / "d.mcap")).exit_code == 0
+    refused = run("identify", str(tmp_path / "d.mcap"), "--config", config)
+    assert refused.exit_code == 2
+    assert "joints[].mdh of joint_1, joint_2, joint_3, joint_4, joint_5, joint_6 (modified" in refused.stderr
+
+
+def test_answers_on_a_terminal_are_the_options(tmp_path: Path, arm: Path) -> None:
+    asked: list[str] = []
+    said: list[str] = []
+    answers = iter([str(arm), "", "curr", "on the moon", "ceiling", "yes", "can0", "fast", "500000", "1,2,3,4,5,6", "",
+                    str(tmp_path / "cell")])  # fmt: skip
+
+    def ask(question: str, default: str) -> str:
+        asked.append(question)
+        return next(answers) or default
+
+    options = questionnaire(InitOptions(Path()), ask, said.append)
+    assert said[-1] == "expected one of floor, ceiling, wall"
+    assert asked[-1] == "Folder of the files"
+    run_init(options)
+    robot = load_robot(tmp_path / "cell" / "robot.yaml", "")
+    assert robot.gravity == (0.0, 0.0, 9.81)
+    assert {joint.drive.signal for joint in robot.joints} == {"current"}
+    session = load_session(tmp_path / "cell" / "session.yaml", "")
+    assert (session.bus.channel, session.bus.bitrate) == ("can0", 500000)
+    assert [drive.node_id for drive in session.drives] == [1, 2, 3, 4, 5, 6]
+    assert {key.rpartition(".")[2] for key in session.blanks} == {"eds", "period_us"}
+
+
+def test_answers_left_empty_are_blanks(tmp_path: Path) -> None:
+    options = questionnaire(InitOptions(Path()), lambda _, default: default, lambda _: None)
+    assert (options.axes, options.out) == (6, Path("arm"))
+    run_init(replace(options, out=tmp_path))
+    blanks = {pattern(key) for key in load_session(tmp_path / "session.yaml", "").blanks}
+    assert blanks == {"bus.channel", "bus.bitrate", "sync.period_us", "drives[].node_id", "drives[].eds"}
