@@ -72,8 +72,8 @@ NEEDS: dict[str, Need] = {
     "sync.period_us": Need(_LINES, "SYNC period, us: object 1006h of the master, or the rate wanted"),
     "drives[].node_id": Need(
         (*_DRIVES, "bus-load"),
-        "CANopen node id of the joint's drive: its switches or commissioning tool; "
-        "armident capture --listen-only --sniff 5 lists the nodes",
+        "CANopen node id of the joint's drive: its switches or commissioning tool; heartbeats on the bus have the "
+        "identifier 700h plus node id",
         lambda k: k + 1,
     ),
     "drives[].eds": Need(

@@ -33,6 +33,9 @@ def init(
         Literal["torque", "current", "voltage"] | None,
         typer.Option("--signal", help="Effort that the drives report. [default: that of the recording, or torque]"),
     ] = None,
+    torque_sensors: Annotated[
+        bool, typer.Option("--torque-sensors", help="Efforts are measured behind the gears: a model without rotors.")
+    ] = False,
     names: Annotated[
         str, typer.Option("--map", help="Names in the recording: position=qm,torque=tau_J; demand=- omits it.")
     ] = "",
@@ -43,6 +46,9 @@ def init(
         bool, typer.Option("--by-position", help="Take joints of other names in the order of the recording.")
     ] = False,
     topic: Annotated[str | None, typer.Option("--topic", help="Topic of joint states in a bag.")] = None,
+    effort: Annotated[
+        Path | None, typer.Option("--effort", help="Second CSV file of the recording, one effort column per joint.")
+    ] = None,
     motor_side: Annotated[bool, typer.Option("--motor-side", help="Recorded values are those of the motors.")] = False,
     units: Annotated[
         str, typer.Option("--units", help="Units of the recording: position=deg,torque=mnm. [default: by magnitude]")
@@ -90,6 +96,7 @@ def init(
     if len(down) not in (0, 3):
         raise ConfigError(f"--gravity: expected X,Y,Z, found {gravity!r}")
     stated = {
+        "effort": effort,
         "names": pairs_of("--map", names),
         "joints": [word.strip() for word in joints.split(",") if word.strip()],
         "by_position": by_position,
@@ -113,6 +120,7 @@ def init(
         stated=stated,
         name=name,
         signal=signal,
+        link_torques=torque_sensors,
         gravity=(down[0], down[1], down[2]) if down else None,
         cell={key: value for key, value in of_cell.items() if value is not None},
         overwrite=overwrite,

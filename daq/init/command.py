@@ -41,6 +41,8 @@ class InitOptions:
         Name of the robot; ``None``: that of the source.
     signal
         Kind of effort that the drives report; ``None``: that of the recording.
+    link_torques
+        True if efforts are measured behind the gears.
     gravity
         Acceleration of gravity in the frame of the base, m/s^2; ``None``: that of an upright base.
     cell
@@ -61,6 +63,7 @@ class InitOptions:
     stated: Mapping[str, Any] = field(default_factory=dict)
     name: str | None = None
     signal: str | None = None
+    link_torques: bool = False
     gravity: tuple[float, float, float] | None = None
     cell: Mapping[str, Any] = field(default_factory=dict)
     overwrite: bool = False
@@ -93,7 +96,7 @@ def run_init(options: InitOptions) -> str:
         )
     geometry = _geometry(options)
     facts = None if options.recording is None else examine(options.recording, geometry.robot, options.stated)
-    robot = robot_content(geometry, facts, options.signal, options.gravity)
+    robot = robot_content(geometry, facts, options.signal, options.gravity, options.link_torques)
     robot["name"] = options.name or robot["name"]
     signal = _signal(robot)
     cell = CellFacts(**{"cell": f"{robot['name']}_cell", **options.cell})
@@ -129,7 +132,9 @@ def _fits(options: InitOptions) -> Any:
     if path is None or is_recording(path):
         return None
     chosen = {
-        key: options.stated[key] for key in ("names", "topic", "joints", "by_position") if options.stated.get(key)
+        key: options.stated[key]
+        for key in ("effort", "names", "topic", "joints", "by_position")
+        if options.stated.get(key)
     }
 
     def fits(robot: RobotConfig) -> None:

@@ -22,7 +22,7 @@ from armident.daq.interchange.text_files import encoding_of
 Convention = Literal["classical", "modified"]
 
 NAMES = ("theta", "d", "a", "alpha")
-"""Columns of a table; ``alpha, d, theta, r`` (Khalil) are modified parameters: ``d`` stands for ``a``, ``r`` for ``d``."""
+"""Columns of a table; ``alpha, d, theta, r`` are modified parameters: ``d`` stands for ``a``, and ``r`` for ``d``."""
 
 _GREEK = {"\u03b8": "theta", "\u03b1": "alpha", "\u03c0": "pi", "\u00b0": "", "\u2212": "-"}
 """Words for Greek letters, nothing for the sign of degrees, and a hyphen for the minus of typesetting."""

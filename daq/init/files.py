@@ -42,6 +42,7 @@ def robot_content(
     facts: RecordedFacts | None,
     signal: str | None = None,
     gravity: tuple[float, float, float] | None = None,
+    link_torques: bool = False,
 ) -> dict[str, Any]:
     """Return the content of ``robot.yaml``.
 
@@ -56,6 +57,8 @@ def robot_content(
     gravity
         Acceleration of gravity in the frame of the base, m/s^2; ``None``: that of the geometry, else that of an upright
         base.
+    link_torques
+        ``True`` if efforts are measured behind the gears, by torque sensors: rotors are then no part of the model.
     """
     robot = geometry.robot
     content = dict(geometry.content)
@@ -68,6 +71,9 @@ def robot_content(
         _joint(entry, robot, k, facts, signal or (facts.signal if facts is not None else None), hinted)
         for k, entry in enumerate(geometry.content["joints"])
     ]
+    if link_torques:
+        for entry in content["joints"]:
+            (entry.value if isinstance(entry, Noted) else entry)["rotor_inertia"] = False
     if robot.transmission is None:
         identity = [[float(i == j) for j in range(robot.n)] for i in range(robot.n)]
         content["transmission"] = Noted(
@@ -96,8 +102,9 @@ def _joint(
         made["limits"] = own
     known = entry.get("drive", {})
     if signal is not None and known.get("signal", "current") != signal:
-        known = {}
-    drive: dict[str, Any] = {"signal": signal or known.get("signal", "torque"), **known}
+        # Scales of another effort do not hold; the encoder is the same.
+        known = {key: value for key, value in known.items() if key == "counts_per_unit"}
+    drive: dict[str, Any] = {**known, "signal": signal or known.get("signal", "torque")}
     if drive["signal"] != "torque" and "gain" not in known:
         drive["gain"] = _blank("joints[].drive.gain", hinted)
     for key in ("rated", "counts_per_unit"):

@@ -18,6 +18,10 @@ UPRIGHT = (0.0, 0.0, -9.81)
 """Acceleration of gravity in the frame of an upright base, m/s^2."""
 
 
+URDF_SUFFIXES = (".urdf", ".xml", ".xacro")
+"""Suffixes of URDF files; a xacro file is refused with the command that expands it."""
+
+
 @dataclass(frozen=True)
 class Geometry:
     """Geometry of an arm.
@@ -88,6 +92,11 @@ def from_urdf(
     """
     if not is_file(file):
         raise ConfigError(f"{file}: no such file")
+    if file.suffix.lower() not in URDF_SUFFIXES:
+        raise ConfigError(
+            f"{file}: expected a URDF ({', '.join(URDF_SUFFIXES)}); --recording gives a recording, --dh a table of "
+            "parameters, --robot a robot of the library"
+        )
     if tip is not None:
         return _of_chain(file, out, base, tip)
     tips = serial_tips(file, base)

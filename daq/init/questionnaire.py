@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from armident.daq.init.command import InitOptions
-from armident.daq.init.geometry import identifier
+from armident.daq.init.geometry import URDF_SUFFIXES, identifier
 
 Ask = Callable[[str, str], str]
 """Function that shows a question with its default and returns the answer."""
@@ -37,8 +37,10 @@ def questionnaire(options: InitOptions, ask: Ask, tell: Callable[[str], None]) -
     recording = ask("Recording of the arm (CSV, MAT, NPZ, Parquet, bag); empty: none", "")
     changes: dict[str, Any] = {"recording": Path(recording) if recording else None}
     if not recording:
-        changes["signal"] = _choice(ask, tell, "Effort that the drives report: torque, current or voltage", "torque",
-                                    ("torque", "current", "voltage"))  # fmt: skip
+        question = "Effort that the drives report: torque, current or voltage"
+        changes["signal"] = _choice(ask, tell, question, "torque", ("torque", "current", "voltage"))
+    sensors = _choice(ask, tell, "Torque sensors behind the gears: yes or no", "no", ("no", "yes"))
+    changes["link_torques"] = sensors == "yes"
     mount = _choice(ask, tell, "Mounting of the base: floor, ceiling or wall", "floor", tuple(_POSTURES))
     gravity = _POSTURES[mount]
     if gravity is None:
@@ -56,7 +58,7 @@ def _source(source: str, ask: Ask) -> dict[str, Any]:
         return {"axes": _number(ask, "Number of joints", "6")}
     if suffix in (".csv", ".txt", ".tsv"):
         return {"dh": Path(source)}
-    return {"urdf": Path(source)} if suffix in (".urdf", ".xml", ".xacro") else {"robot": source}
+    return {"urdf": Path(source)} if suffix in URDF_SUFFIXES else {"robot": source}
 
 
 def _number(ask: Ask, question: str, default: str) -> int:

@@ -373,8 +373,9 @@ def test_the_geometry_may_be_blank_until_it_is_needed(tmp_path: Path) -> None:
 def test_answers_on_a_terminal_are_the_options(tmp_path: Path, arm: Path) -> None:
     asked: list[str] = []
     said: list[str] = []
-    answers = iter([str(arm), "", "curr", "on the moon", "ceiling", "yes", "can0", "fast", "500000", "1,2,3,4,5,6", "",
-                    str(tmp_path / "cell")])  # fmt: skip
+    of_arm = [str(arm), "", "curr", "yes", "on the moon", "ceiling"]
+    of_cell = ["yes", "can0", "fast", "500000", "1,2,3,4,5,6", ""]
+    answers = iter([*of_arm, *of_cell, str(tmp_path / "cell")])
 
     def ask(question: str, default: str) -> str:
         asked.append(question)
@@ -386,7 +387,7 @@ def test_answers_on_a_terminal_are_the_options(tmp_path: Path, arm: Path) -> Non
     run_init(options)
     robot = load_robot(tmp_path / "cell" / "robot.yaml", "")
     assert robot.gravity == (0.0, 0.0, 9.81)
-    assert {joint.drive.signal for joint in robot.joints} == {"current"}
+    assert {(joint.drive.signal, joint.rotor_inertia) for joint in robot.joints} == {("current", False)}
     session = load_session(tmp_path / "cell" / "session.yaml", "")
     assert (session.bus.channel, session.bus.bitrate) == ("can0", 500000)
     assert [drive.node_id for drive in session.drives] == [1, 2, 3, 4, 5, 6]
@@ -399,3 +400,33 @@ def test_answers_left_empty_are_blanks(tmp_path: Path) -> None:
     run_init(replace(options, out=tmp_path))
     blanks = {pattern(key) for key in load_session(tmp_path / "session.yaml", "").blanks}
     assert blanks == {"bus.channel", "bus.bitrate", "sync.period_us", "drives[].node_id", "drives[].eds"}
+
+
+LIFT = """<robot name="lift"><link name="a"/><link name="b"/><link name="c"/>
+<joint name="lift" type="prismatic"><parent link="a"/><child link="b"/><axis xyz="0 0 1"/>
+<limit lower="0" upper="0.8" velocity="0.5" effort="900"/></joint>
+<joint name="turn" type="revolute"><parent link="b"/><child link="c"/><axis xyz="0 1 0"/><origin xyz="0 0 .3"/>
+<limit lower="-3" upper="3" velocity="3" effort="60"/></joint></robot>"""
+
+
+def test_a_lift_in_millimetres_beside_a_joint_in_degrees(tmp_path: Path) -> None:
+    (tmp_path / "lift.urdf").write_text(LIFT)
+    t = np.arange(2000) / 1000
+    rows = np.column_stack([t, 400 + 300 * np.sin(3 * t), 90 * np.cos(3 * t), 2e5 * np.cos(t), 4e4 * np.sin(t)])
+    names = "t,lift/position,turn/position,lift/effort,turn/effort"
+    (tmp_path / "d.csv").write_text("\n".join([names, *(",".join(f"{x:.6f}" for x in row) for row in rows)]))
+    made = run("init", str(tmp_path / "lift.urdf"), "--recording", str(tmp_path / "d.csv"), "--out", str(tmp_path))
+    assert made.exit_code == 0, made.output
+    assert "--units 'position=deg|mm,torque=mnm'" in made.output
+    robot = load_robot(tmp_path / "robot.yaml", "trajectory")
+    assert [joint.type for joint in robot.joints] == ["prismatic", "revolute"]
+    assert robot.joints[0].limits.acceleration == pytest.approx(0.3 * 9, rel=0.02)
+    assert robot.joints[1].limits.acceleration == pytest.approx(np.pi / 2 * 9, rel=0.02)
+
+
+@pytest.mark.parametrize("units", ["position=grad", "speed=deg", "position"])
+def test_a_unit_that_is_none_is_one_line(tmp_path: Path, units: str) -> None:
+    path = table(tmp_path / "d.csv")
+    refused = run("import", str(path), "--config", "tx40", "--units", units, "--out", str(tmp_path / "d.mcap"))
+    assert refused.exit_code == 2
+    assert "--units: " in refused.stderr
