@@ -33,8 +33,8 @@ class Need:
     placeholder: Callable[[int], Any] | None = None
 
 
-_MOTION = ("trajectory", "robot")
-_DRIVES = ("capture", "robot", LOG)
+_MOTION = ("trajectory",)
+_DRIVES = ("capture", LOG)
 _LINES = ("capture", "robot", "bus-load")
 _NO_GEOMETRY = {"alpha": 0.0, "d": 0.0, "theta": 0.0, "r": 0.0}
 _OWN = "nameplate or manual of the arm"
@@ -71,13 +71,13 @@ NEEDS: dict[str, Need] = {
     "bus.bitrate": Need(_LINES, "bit/s: setting of the drives; null on a virtual bus"),
     "sync.period_us": Need(_LINES, "SYNC period, us: object 1006h of the master, or the rate wanted"),
     "drives[].node_id": Need(
-        (*_DRIVES, "bus-load"),
+        (*_DRIVES, "robot", "bus-load"),
         "CANopen node id of the joint's drive: its switches or commissioning tool; heartbeats on the bus have the "
         "identifier 700h plus node id",
         lambda k: k + 1,
     ),
     "drives[].eds": Need(
-        _DRIVES,
+        (*_DRIVES, "robot"),
         "electronic data sheet (.eds) of the drive, from its maker; eds/cia402_servo.eds for the virtual arm",
         lambda _: "eds/cia402_servo.eds",
     ),

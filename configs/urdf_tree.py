@@ -121,6 +121,50 @@ def serial_tips(file: Path, base: str | None = None) -> dict[str, tuple[str, ...
     return found
 
 
+def moving_links(file: Path, base: str | None, tip: str) -> list[tuple[str, str]]:
+    """Links before and after each moving joint of a chain, base to tip.
+
+    Parameters
+    ----------
+    file
+        Path of the URDF.
+    base, tip
+        First and last link of the chain; ``base`` ``None``: the root of the tree.
+
+    Raises
+    ------
+    ConfigError
+        If the file is not a URDF, or the base does not move the tip.
+    """
+    tree = _read_tree(file)
+    path = tree.path_to(tree.root() if base is None else base, tree.known(tip, "urdf.tip"))
+    return [(_end(element, "parent"), _end(element, "child")) for element in path if tree.type_of(element) != "fixed"]
+
+
+def orientation(file: Path, link: str) -> Floats:
+    """Rotation of a link in the root of a URDF with all joints at zero, shape (3, 3).
+
+    Parameters
+    ----------
+    file
+        Path of the URDF.
+    link
+        Name of the link.
+
+    Raises
+    ------
+    ConfigError
+        If the file is not a URDF, or has no such link.
+    """
+    tree = _read_tree(file)
+    turned = np.eye(3)
+    element = tree.above.get(tree.known(link, "urdf.base"))
+    while element is not None:
+        turned = tree.origin(element)[:3, :3] @ turned
+        element = tree.above.get(_end(element, "parent"))
+    return turned
+
+
 def robot_name(file: Path) -> str:
     """Name of the robot in a URDF, as it is written there; empty if it has none.
 

@@ -87,7 +87,7 @@ def checks_for(config: str | Path, command: Command) -> list[Check]:
     missing = (*needed(of_session, command), *robot.blanks_for(command))
     checks = [Check("configuration", "ok", f"{config}: robot {robot.name}, {robot.n} joints")]
     checks += [Check("blank", "failed", line) for line in listed(missing)]
-    if command in ("trajectory", "robot") and not missing:
+    if command == "trajectory" and not missing:
         try:
             robot.check_movable(str(path))
         except ConfigError as error:

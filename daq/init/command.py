@@ -1,7 +1,7 @@
 """The command ``armident init``: writes robot and session, and says what was found, assumed, and is still missing."""
 
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -13,8 +13,11 @@ from armident.daq.init.files import CellFacts, robot_content, session_content
 from armident.daq.init.geometry import Geometry, from_library, from_urdf, of_axes
 from armident.daq.init.recorded import RecordedFacts, examine
 from armident.daq.init.yaml_text import Noted, yaml_text
+from armident.daq.interchange.bag_files import is_bag
 from armident.daq.interchange.bus_log import SUFFIXES
 from armident.daq.interchange.importing import read_rows
+from armident.daq.interchange.table_files import read_table
+from armident.daq.interchange.table_rows import complete_rows
 from armident.daq.recording import is_recording
 
 
@@ -126,21 +129,17 @@ def _geometry(options: InitOptions) -> Geometry:
     return from_urdf(options.urdf, options.out, options.base, options.tip, _fits(options))
 
 
-def _fits(options: InitOptions) -> Any:
-    """Return a function that raises for a robot that is not the recorded one; ``None`` without a table of joints."""
+def _fits(options: InitOptions) -> Callable[[RobotConfig], object] | None:
+    """Return a function that raises for a robot that is not the recorded one; ``None`` without names of joints."""
     path = options.recording
-    if path is None or is_recording(path):
+    if path is None or is_recording(path) or options.stated.get("effort"):
         return None
-    chosen = {
-        key: options.stated[key]
-        for key in ("effort", "names", "topic", "joints", "by_position")
-        if options.stated.get(key)
-    }
-
-    def fits(robot: RobotConfig) -> None:
-        read_rows(path, robot, **chosen)
-
-    return fits
+    chosen = {key: options.stated[key] for key in ("joints", "by_position") if options.stated.get(key)}
+    names = dict(options.stated.get("names") or {})
+    if is_bag(path):
+        return lambda robot: read_rows(path, robot, names=names, topic=options.stated.get("topic"), **chosen)
+    table = read_table(path)
+    return lambda robot: complete_rows(table, robot, names, **chosen)
 
 
 def _signal(robot: Mapping[str, Any]) -> str:

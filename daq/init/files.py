@@ -7,7 +7,7 @@ from typing import Any
 from armident.configs.blanks import MARK, NEEDS
 from armident.configs.schema.robot import RobotConfig
 from armident.daq.init.geometry import UPRIGHT, Geometry
-from armident.daq.init.recorded import RecordedFacts, completed
+from armident.daq.init.recorded import RecordedFacts, moved
 from armident.daq.init.yaml_text import Noted
 
 SYNC_US = (100, 1_000_000)
@@ -89,16 +89,13 @@ def _joint(
     """Return one entry of ``joints``."""
     joint = robot.joints[k]
     made = {key: _blank(f"joints[].{key}", hinted) if value == MARK else value for key, value in entry.items()}
-    reached = completed(joint.limits, facts, k) if facts is not None else {}
     if joint.limits.missing():
         own = dict(made.get("limits", {}))
         for key in joint.limits.missing():
-            if key in reached:
-                own[key] = Noted(
-                    reached[key], _once(hinted, key, "reached in the recording; the arm's own limit is better")
-                )
-            else:
-                own[key] = _blank(f"joints[].limits.{key}", hinted)
+            own[key] = _blank(f"joints[].limits.{key}", hinted)
+        if "acceleration" in own and facts is not None and moved(facts, robot)[k]:
+            note = "reached in the recording; the arm's own limit is higher"
+            own["acceleration"] = Noted(float(f"{facts.acceleration[k]:.3g}"), _once(hinted, note, note))
         made["limits"] = own
     known = entry.get("drive", {})
     if signal is not None and known.get("signal", "current") != signal:
@@ -181,6 +178,7 @@ def session_content(robot: RobotConfig, signal: str, facts: RecordedFacts | None
         "samples": {"tpdo": 1, "every": 1, "objects": ["position", measured, "status"]},
         "demand": {"tpdo": 2, "every": 5, "objects": ["demand"]},
     }
+    motion = "for a capture that moves the arm: setpoints: {rpdo: 1, every: 5, trajectory: trajectory.yaml}"
     return {
         "schema": "armident/session/1",
         "cell": cell.cell,
@@ -188,5 +186,5 @@ def session_content(robot: RobotConfig, signal: str, facts: RecordedFacts | None
         "bus": bus,
         "sync": sync,
         "drives": drives,
-        "streams": streams,
+        "streams": Noted(streams, motion),
     }

@@ -7,11 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from armident.configs import ArmidentError, ConfigError, RobotConfig, config_path, load_robot
 from armident.configs.blanks import MARK, without_marks
 from armident.configs.schema.robot import Mdh
 from armident.configs.urdf import UrdfGeometry, UrdfSource, geometry_from_urdf
-from armident.configs.urdf_tree import robot_name, serial_tips
+from armident.configs.urdf_tree import moving_links, orientation, robot_name, serial_tips
 from armident.configs.yaml_loader import is_file, read_yaml
 
 UPRIGHT = (0.0, 0.0, -9.81)
@@ -100,49 +102,78 @@ def from_urdf(
     if tip is not None:
         return _of_chain(file, out, base, tip)
     tips = serial_tips(file, base)
-    if len(tips) < 2:
-        # One chain; or none, of which the reader of the chain names the reason.
-        return _of_chain(file, out, base, next(iter(tips)) if _forks(file, base) and tips else None)
-    chains = [_of_chain(file, out, base, one) for one in tips]
-    chosen = [one for one in chains if fits is not None and _is_fit(one.robot, fits)]
-    if len(chosen) != 1:
-        listed = "; ".join(f"--tip {one} ({', '.join(joints)})" for one, joints in tips.items())
-        why = "and the recording fits none of them" if fits is not None and not chosen else "of which one is identified"
-        raise ConfigError(f"{file}: has several chains, {why}: {listed}")
-    return chosen[0]
+    if not tips:
+        # The reader of the chain names the reason.
+        return _of_chain(file, out, base, None)
+    chains = [(base, one) for one in tips]
+    fitting = chains if fits is None else [chain for chain in chains if _is_fit(_of_chain(file, out, *chain), fits)]
+    if fits is not None and not fitting:
+        fitting = _longest_parts(file, out, base, list(tips), fits)
+    if len(fitting) == 1:
+        return _chosen(file, out, *fitting[0])
+    if len(chains) == 1:
+        return _chosen(file, out, *chains[0])
+    listed = "; ".join(f"--tip {one} ({', '.join(joints)})" for one, joints in tips.items())
+    why = "and the recording fits none of them" if not fitting else "of which one is identified"
+    raise ConfigError(f"{file}: has several chains, {why}: {listed}")
 
 
-def _forks(file: Path, base: str | None) -> bool:
-    """Return True if the chain is the part before a fork: the joints beyond it, as of a gripper, belong to its load."""
+def _chosen(file: Path, out: Path, base: str | None, tip: str) -> Geometry:
+    """Geometry of a chain; without its ends in the configuration where the file has no other chain."""
     try:
-        _of_chain(file, Path(), base, None)
+        whole = _of_chain(file, out, None, None)
     except ConfigError:
-        return True
-    return False
+        whole = None
+    part = _of_chain(file, out, base, tip)
+    return whole if whole is not None and whole.content["joints"] == part.content["joints"] else part
 
 
-def _is_fit(robot: RobotConfig, fits: Callable[[RobotConfig], object]) -> bool:
+def _longest_parts(
+    file: Path, out: Path, base: str | None, tips: list[str], fits: Callable[[RobotConfig], object]
+) -> list[tuple[str | None, str]]:
+    """Ends of the longest parts of chains whose joints are the recorded ones; several if that does not decide."""
+    links = [moving_links(file, base, tip) for tip in tips]
+    for length in range(max(map(len, links)) - 1, 0, -1):
+        parts = {
+            (chain[first][0], chain[first + length - 1][1])
+            for chain in links
+            for first in range(len(chain) - length + 1)
+        }
+        found = sorted(part for part in parts if _is_fit(_of_chain(file, out, *part), fits))
+        if found:
+            return list(found)
+    return []
+
+
+def _is_fit(geometry: Geometry, fits: Callable[[RobotConfig], object]) -> bool:
     try:
-        fits(robot)
+        fits(geometry.robot)
     except ArmidentError:
         return False
     return True
 
 
 def _of_chain(file: Path, out: Path, base: str | None, tip: str | None) -> Geometry:
-    part = UrdfSource(file=str(file.resolve()), base=base, tip=tip)
+    part_file = file.resolve()
+    part = UrdfSource(file=str(part_file), base=base, tip=tip)
     made = geometry_from_urdf(UrdfGeometry(urdf=part), out / "robot.yaml")
     urdf = {"file": os.path.relpath(part.file, out.resolve()), **part.model_dump(exclude={"file"}, exclude_none=True)}
     name = identifier(robot_name(file) or file.stem)
     robot = RobotConfig.model_validate({"schema": "armident/robot/1", "name": name, **made})
-    content = {
+    content: dict[str, Any] = {
         "schema": "armident/robot/1",
         "name": name,
         "urdf": urdf,
         "joints": [{"name": joint.source_name or joint.name} for joint in robot.joints],
     }
-    notes = (f"chain up to link {tip}; what moves beyond it counts as its load",) if tip is not None else ()
-    return Geometry(file.name, content, robot, notes)
+    ends = " ".join(f"{word} link {link}" for word, link in (("from", base), ("up to", tip)) if link is not None)
+    if base is not None:
+        down = orientation(part_file, base).T @ UPRIGHT
+        content["gravity"] = [float(f"{g:.9g}") + 0.0 for g in np.where(np.abs(down) < 1e-9, 0.0, down)]
+    notes = [f"chain {ends}; what moves beyond it counts as its load"] if ends else []
+    if base is not None:
+        notes.append(f"gravity is that of an upright root of the URDF with the joints before link {base} at zero")
+    return Geometry(file.name, content, robot, tuple(notes))
 
 
 def of_rows(source: str, name: str, rows: list[tuple[str, str, Mdh]]) -> Geometry:

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from scipy.signal import savgol_filter
 
 from armident.configs import DataError, RobotConfig
-from armident.configs.schema.limits import Limits
 from armident.daq.interchange.even_times import usual_rate
 from armident.daq.interchange.importing import import_recording, read_rows
 from armident.daq.interchange.stated_units import in_si, suspected
@@ -25,6 +24,9 @@ SMOOTHED_S = 0.1
 
 LARGEST_SHARE = 0.999
 """Quantile that counts as the largest velocity or acceleration: the rest may be noise."""
+
+REST_SHARE = 0.01
+"""Share of the widest range of motion up to which a joint is at rest, as in `armident.identify`."""
 
 Floats = NDArray[np.float64]
 
@@ -208,24 +210,17 @@ def _as_options(options: Mapping[str, Any]) -> dict[str, str]:
     return made
 
 
-def completed(known: Limits, facts: RecordedFacts, joint: int) -> dict[str, Any]:
-    """Limits of a joint that are not known, from what the recording reached; those that it does not tell are absent.
+def moved(facts: RecordedFacts, robot: RobotConfig) -> NDArray[np.bool_]:
+    """Mask (n,) of the joints that moved: over 1 % of the widest range of joints of their type.
 
     Parameters
     ----------
-    known
-        Limits that are known.
     facts
         Facts of the recording.
-    joint
-        Number of the joint.
+    robot
+        The robot, for the types of its joints.
     """
-    reached: dict[str, Any] = {
-        "position": [float(f"{end:.4g}") for end in facts.position[joint]],
-        "velocity": float(f"{facts.velocity[joint]:.3g}"),
-        "acceleration": float(f"{facts.acceleration[joint]:.3g}"),
-    }
-    if facts.signal == "torque":
-        reached["torque"] = float(f"{facts.effort[joint]:.3g}")
-    moved = {key: value for key, value in reached.items() if value and (key != "position" or value[0] < value[1])}
-    return {key: moved[key] for key in known.missing() if key in moved}
+    ranges = facts.position[:, 1] - facts.position[:, 0]
+    revolute = np.array([joint.type == "revolute" for joint in robot.joints])
+    widest = np.array([ranges[revolute == one].max() for one in revolute])
+    return np.asarray((ranges > REST_SHARE * widest) & (ranges > 0.0), dtype=np.bool_)
