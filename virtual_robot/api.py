@@ -57,7 +57,7 @@ def simulate_recording(
     """
     from armident.virtual_robot.offline import simulate_recording as simulate
 
-    config = robot if isinstance(robot, RobotConfig) else load_robot(robot)
+    config = robot if isinstance(robot, RobotConfig) else load_robot(robot, "robot")
     reference = trajectory if isinstance(trajectory, Trajectory) else load_trajectory(trajectory)
     hidden = scenario if isinstance(scenario, Scenario) or scenario is None else load_scenario(scenario)
     return simulate(config, reference, seed, noise, hidden, period, velocity_feedback=velocity_feedback)

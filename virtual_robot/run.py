@@ -64,8 +64,8 @@ def run_robot(
     BusDown
         If the bus goes down.
     """
-    session = load_session(config)
-    robot = load_robot(session.robot)
+    session = load_session(config, "robot")
+    robot = load_robot(session.robot, "robot")
     hidden = load_scenario(scenario) if scenario is not None else None
     oddities = drive_oddities(hidden, robot, str(scenario))
     if replay is not None:
@@ -118,8 +118,8 @@ def record_robot(
     """
     if out.exists():
         raise ConfigError(f"{out}: the file exists already")
-    session = load_session(config)
-    robot = load_robot(session.robot)
+    session = load_session(config, "robot")
+    robot = load_robot(session.robot, "robot")
     setpoints = session.setpoints
     if setpoints is None:
         raise ConfigError(f"{config}: setpoints: --to-file needs them for the motion of the arm")
