@@ -155,7 +155,9 @@ def record_robot(
     hidden = None if scenario is None else load_scenario(scenario)
     if hidden is not None and hidden.drives:
         raise ConfigError(f"{scenario}: drives: --to-file has no bus, on which drives could be odd")
-    times: dict[str, Any] = {} if setpoints is None else {"setpoint_every": setpoints.every, "settle": setpoints.settle_s}
+    times: dict[str, Any] = {}
+    if setpoints is not None:
+        times = {"setpoint_every": setpoints.every, "settle": setpoints.settle_s}
     recording = simulate_recording(
         robot, motion, seed, noise, hidden, session.sync_period,
         velocity_feedback=velocity_feedback, parameters=twin.parameters, **times,
