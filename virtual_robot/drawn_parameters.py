@@ -79,12 +79,25 @@ def draw_bodies(robot: RobotConfig, seed: int) -> dict[str, float]:
         com, second = random_body(rng, size, float(mass[j]))
         standard |= _standard(j + 1, float(mass[j]), 0.5 * end + 0.5 * com, second)
     limits = np.array([joint.limits.torque for joint in robot.joints])
-    load = torque_scale(robot, standard)
-    rise = np.array([min(j.limits.acceleration, RISE_PER_S * j.limits.velocity) for j in robot.joints])
-    # Rotors add to the inertia about as much as the links do.
-    share = float(((2.0 * load.inertia * rise + load.gravity) / limits).max())
+    share = float((needed_torque(robot, standard) / limits).max())
     factor = TORQUE_SHARE / share if share > 0.0 else 1.0
     return {name: value * factor for name, value in standard.items()}
+
+
+def needed_torque(robot: RobotConfig, standard: Mapping[str, float]) -> Floats:
+    """Torque for gravity and a large acceleration, N m or N, shape (n,).
+
+    Parameters
+    ----------
+    robot
+        Robot with limits of position, velocity and acceleration.
+    standard
+        Inertial parameters of the links by name; others do not count.
+    """
+    load = torque_scale(robot, {name: value for name, value in standard.items() if not name.startswith("ia")})
+    rise = np.array([min(j.limits.acceleration, RISE_PER_S * j.limits.velocity) for j in robot.joints])
+    # Rotors add to the inertia about as much as the links do.
+    return np.asarray(2.0 * load.inertia * rise + load.gravity)
 
 
 def _next_origin(robot: RobotConfig, j: int) -> Floats:

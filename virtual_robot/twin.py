@@ -1,7 +1,7 @@
 """Virtual arm of any configuration: what the robot and the session leave open is assumed, and said."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,7 @@ from armident.configs import RobotConfig, SessionConfig, Trajectory, config_path
 from armident.configs.loading import load_inertials
 from armident.configs.yaml_loader import read_yaml
 from armident.virtual_robot.arm_parameters import ArmParameters, arm_parameters
-from armident.virtual_robot.drawn_parameters import TORQUE_SHARE, torque_scale
+from armident.virtual_robot.drawn_parameters import TORQUE_SHARE, needed_torque
 from armident.virtual_robot.offline import effort_of
 from armident.virtual_robot.plausible_motion import plausible_trajectory
 
@@ -40,6 +40,8 @@ class Twin:
 
     Parameters
     ----------
+    source
+        Configuration of the robot.
     session, robot
         The session, and the robot with everything that a drive needs.
     parameters
@@ -50,11 +52,22 @@ class Twin:
         Motion for a session without set points; ``None``: the session has its own.
     """
 
+    source: Path
     session: SessionConfig
     robot: RobotConfig
     parameters: ArmParameters
     assumed: tuple[str, ...]
     trajectory: Trajectory | None
+
+    def with_session(self, session: SessionConfig) -> "Twin":
+        """Return the same arm in another session.
+
+        Parameters
+        ----------
+        session
+            The session.
+        """
+        return replace(self, session=session)
 
 
 @dataclass(frozen=True)
@@ -111,7 +124,26 @@ def load_twin(config: Path, choice: ParameterChoice = STANDARD) -> Twin:
     trajectory = None
     if session.setpoints is None and session.sync.role == "producer":
         trajectory = plausible_trajectory(robot, choice.seed)
-    return Twin(session, robot, parameters, assumed, trajectory)
+    return Twin(path, session, robot, parameters, assumed, trajectory)
+
+
+def at_period(session: SessionConfig, period_us: int) -> SessionConfig:
+    """Session at another SYNC period, with all streams and set points on every SYNC.
+
+    Parameters
+    ----------
+    session
+        The session.
+    period_us
+        SYNC period, us.
+    """
+    return session.model_copy(
+        update={
+            "sync": session.sync.model_copy(update={"period_us": period_us}),
+            "streams": {name: s.model_copy(update={"every": 1}) for name, s in session.streams.items()},
+            "setpoints": session.setpoints and session.setpoints.model_copy(update={"every": 1}),
+        }
+    )
 
 
 def _is_robot(path: Path) -> bool:
@@ -183,14 +215,14 @@ def _with_drives(robot: RobotConfig, parameters: ArmParameters) -> tuple[RobotCo
         identity = tuple(tuple(float(i == j) for j in range(robot.n)) for i in range(robot.n))
         robot = robot.model_copy(update={"transmission": identity})
         remarks.append("transmission: the identity, counts and signals are those of the joints")
-    scale = torque_scale(robot, parameters.standard).torque if _lacks_torque(robot) else np.zeros(robot.n)
+    needed = needed_torque(robot, parameters.standard) if _lacks_torque(robot) else np.zeros(robot.n)
     ratio = np.abs(np.diag(robot.transmission_matrix))
     joints = []
     for j, joint in enumerate(robot.joints):
         drive, limits, values = joint.drive, joint.limits, {}
         if "torque" in limits.missing():
-            limits = limits.model_copy(update={"torque": _three_digits(scale[j] / TORQUE_SHARE)})
-            assumed.setdefault("limits.torque", []).append(f"{joint.name} {limits.torque:g}")
+            limits = limits.model_copy(update={"torque": float(needed[j]) / TORQUE_SHARE})
+            assumed.setdefault("limits.torque", []).append(f"{joint.name} {limits.torque:.3g}")
         geared = float(ratio[j]) or 1.0
         if drive.counts_per_unit is None:
             counts = COUNTS_PER_TURN if joint.type == "revolute" else COUNTS_PER_METRE
@@ -259,7 +291,7 @@ def write_twin(twin: Twin, folder: Path) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     robot, session = folder / "robot.yaml", twin.session.model_dump(mode="json", by_alias=True)
     head = ["For a virtual arm. Assumed, to be measured before a real arm is moved:", *twin.assumed]
-    _write(robot, twin.robot.model_dump(mode="json", by_alias=True, exclude_none=True), head)
+    _write(robot, _robot_content(twin), head)
     session["robot"] = robot.name
     if twin.trajectory is not None:
         file = folder / "trajectory.yaml"
@@ -269,6 +301,19 @@ def write_twin(twin: Twin, folder: Path) -> Path:
     path = folder / "cell.yaml"
     _write(path, session, [f"Session of the virtual arm of {twin.robot.name}."])
     return path
+
+
+def _robot_content(twin: Twin) -> dict[str, Any]:
+    """Content of the robot's file; a URDF stays the source of geometry and masses."""
+    content = twin.robot.model_dump(mode="json", by_alias=True, exclude_none=True)
+    source = read_yaml(twin.source.read_text(encoding="utf-8"), str(twin.source))
+    if not isinstance(source, dict) or "urdf" not in source:
+        return content
+    file = (twin.source.resolve().parent / source["urdf"]["file"]).resolve()
+    joints = [{key: joint[key] for key in ("name", "limits", "drive", "rotor_inertia")} for joint in content["joints"]]
+    own = {"urdf": {**source["urdf"], "file": str(file)}, "joints": joints}
+    gravity = {"gravity": source["gravity"]} if "gravity" in source else {}
+    return {key: value for key, value in content.items() if key not in ("joints", "gravity")} | own | gravity
 
 
 def _setpoint_interval(session: SessionConfig) -> int:

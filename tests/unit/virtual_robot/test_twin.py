@@ -63,6 +63,9 @@ def test_an_arm_without_torque_limits_gets_some(panda: RobotConfig) -> None:
     for key in ("velocity", "acceleration", "torque"):
         assert f"limits.{key}: joint_1 " in text
     assert "transmission: the identity" in text
+    again, same, _ = complete(robot)
+    assert again == robot
+    assert same.standard == pytest.approx(parameters.standard), "the assumed limits are those of the same masses"
     gravity = torque_scale(robot, parameters.standard).gravity
     assert (gravity < [joint.limits.torque for joint in robot.joints]).all()
 
@@ -247,6 +250,7 @@ def test_the_written_configuration_is_that_of_the_arm(tmp_path: Path) -> None:
     again = load_twin(tmp_path / "twin" / "cell.yaml")
     assert again.assumed == ()
     assert again.trajectory is None
+    assert again.parameters.standard == pytest.approx(twin.parameters.standard)
 
 
 def test_a_robot_file_is_enough_for_a_recording(tmp_path: Path) -> None:
