@@ -245,6 +245,8 @@ class IdentificationDocument(Document):
         Limits of the verdict.
     residual_statistics
         Statistics of the residuals for later comparison; null in documents of former versions.
+    configuration
+        Robot configuration that the parameters belong to; null in documents of former versions.
     """
 
     schema_: Literal["armident/identification/1"] = Field("armident/identification/1", alias="schema")
@@ -276,6 +278,7 @@ class IdentificationDocument(Document):
     sign_smoothing: dict[str, float] | None = None
     criteria: dict[str, float] | None = None
     residual_statistics: list[ResidualStatistics] | None = None
+    configuration: dict[str, Any] | None = None
 
 
 class Alternative(Document):
@@ -648,7 +651,7 @@ def identification_document(
     recordings
         Recordings that they come from.
     robot
-        Configuration of the robot.
+        Configuration of the robot, which the document keeps.
     notes
         Messages of the conversion; they precede the estimator's warnings.
     """
@@ -708,6 +711,7 @@ def identification_document(
         sign_smoothing=dict(zip(joints, (float(g) for g in result.sign_smoothing), strict=True)),
         criteria=plain(result.criteria),
         residual_statistics=[ResidualStatistics(**plain(each)) for each in result.residual_statistics] or None,
+        configuration=robot.model_dump(mode="json", by_alias=True),
     )
 
 
@@ -826,13 +830,40 @@ def load_document(path: Path, kind: type[T]) -> T:
     DataError
         If the file cannot be read or is not such a document.
     """
+    return from_json(_text(path), kind, str(path))
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Return the JSON object of a file, for instance to find out the schema of a document.
+
+    Parameters
+    ----------
+    path
+        JSON file.
+
+    Raises
+    ------
+    ConfigError
+        If there is no such file.
+    DataError
+        If the file cannot be read or is no JSON object.
+    """
     try:
-        text = path.read_text(encoding="utf-8")
+        found = json.loads(_text(path))
+    except json.JSONDecodeError as error:
+        raise DataError(f"{path}: line {error.lineno}: not valid JSON: {error.msg}") from error
+    if not isinstance(found, dict):
+        raise DataError(f"{path}: expected a JSON object")
+    return found
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8")
     except FileNotFoundError as error:
         raise ConfigError(f"{path}: no such file") from error
     except (OSError, UnicodeDecodeError) as error:
         raise DataError(f"{path}: cannot be read: {error}") from error
-    return from_json(text, kind, str(path))
 
 
 def write_atomically(path: Path, text: str) -> None:
