@@ -13,10 +13,11 @@ from armident.identify.effects.registry import of_entry
 from armident.identify.effects.terms import effect_terms
 from armident.identify.identification.excitation_check import workspace_postures
 from armident.identify.model_export.link_frames import LinkFrames, mdh_link_frames
-from armident.identify.model_export.source_urdf import SourceUrdf, source_for, source_frames, source_of
+from armident.identify.model_export.source_urdf import SourceUrdf, known_bodies, source_for, source_frames, source_of
 from armident.identify.robot.arm import ArmModel
 from armident.identify.robot.chain import Floats
 from armident.identify.robot.consistent import ConsistentParameters, nearest_consistent
+from armident.identify.robot.known_bodies import nearest_to_known
 from armident.identify.robot_model import RobotModel
 from armident.identify.saved_model import SavedModel, load_model
 
@@ -169,6 +170,8 @@ class ExportedModel:
         URDF whose link frames these are; ``None``: modified Denavit-Hartenberg frames.
     configuration
         Path or name of the robot configuration that was given; empty: that of the document.
+    choice
+        Rule for the parameters that torques leave open, in words.
     """
 
     source: Path
@@ -185,6 +188,7 @@ class ExportedModel:
     effects: tuple[ExportedEffect, ...]
     source_urdf: SourceUrdf | None = None
     configuration: str = ""
+    choice: str = "the lightest physical arm"
 
     @property
     def theta(self) -> Floats:
@@ -238,8 +242,15 @@ class ExportedModel:
         """
         frames = source_frames(source, self.robot)
         joints = tuple(replace(j, name=name) for j, name in zip(self.joints, frames.joints, strict=True))
-        links = _bodies(self.arm, self.theta, frames)
-        return replace(self, frames=frames, links=links, joints=joints, source_urdf=source)
+        moved = replace(self, frames=frames, joints=joints, source_urdf=source)
+        known = known_bodies(source, self.arm, frames)
+        if known is not None:
+            theta = nearest_to_known(self.arm, self.theta, known, SMALLEST_LINK)
+            ia = self.arm.values(theta).ia.tolist()
+            joints = tuple(replace(j, rotor_inertia=rotor) for j, rotor in zip(joints, ia, strict=True))
+            choice = f"the physical arm nearest to the masses in {source.file.name}"
+            moved = replace(moved, consistent=replace(self.consistent, theta=theta), joints=joints, choice=choice)
+        return replace(moved, links=_bodies(self.arm, moved.theta, frames))
 
 
 def load_exported_model(
