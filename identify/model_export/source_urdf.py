@@ -141,14 +141,12 @@ def known_bodies(source: SourceUrdf, arm: ArmModel, frames: LinkFrames) -> Float
     Returns
     -------
     ndarray or None
-        ``None`` if a link has no mass, or moments of inertia that no body has.
-
-    Raises
-    ------
-    ConfigError
-        If a mass is not a number or negative; names the link.
+        ``None`` if a link has no mass, or one that no body has.
     """
-    given = read_inertials(source.file, source.base, source.tip)
+    try:
+        given = read_inertials(source.file, source.base, source.tip)
+    except ConfigError:
+        return None
     if given.massless or given.impossible:
         return None
     joints = read_chain(source.file, source.base, source.tip)

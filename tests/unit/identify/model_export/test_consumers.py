@@ -1,5 +1,6 @@
 """Exported models in the programs that read them: their inverse dynamics are those of our model."""
 
+import re
 import xml.etree.ElementTree as ET
 from pathlib import Path
 from typing import Any
@@ -73,6 +74,18 @@ def test_masses_that_torques_leave_open_are_those_of_the_urdf(right_angles: bool
     masses = pin.buildModelFromUrdf(str(urdf)).inertias
     assert [link.mass for link in model.links] == pytest.approx([body.mass for body in list(masses)[1:]], rel=1e-3)
     assert [link.mass for link in lightest.links] != pytest.approx([link.mass for link in model.links], rel=0.1)
+    assert model.choice == "the physical arm nearest to the masses in arm.urdf"
+
+
+@pytest.mark.parametrize("mass", ["0", "-1", "heavy"])
+def test_masses_that_no_body_has_are_not_taken(mass: str, tmp_path: Path) -> None:
+    urdf, config = tmp_path / "arm.urdf", tmp_path / "arm.yaml"
+    text = random_urdf(np.random.default_rng(11), 3, right_angles=True)
+    urdf.write_text(re.sub(r'(<link name="link_2"><inertial><mass value=)"[^"]*"', rf'\1"{mass}"', text))
+    config.write_text(configuration(urdf, 3, np.array(TILTED)))
+    robot = load_robot(config)
+    model = exported(robot, random_theta(arm_model(robot), 1)).in_frames_of(SourceUrdf(urdf))
+    assert model.choice == "the lightest physical arm"
 
 
 @pytest.mark.parametrize("right_angles", [True, False])
