@@ -840,7 +840,7 @@ def _read(recordings: Recorded | Sequence[Recorded]) -> tuple[Recording, ...]:
 def _robot(robot: Robot | None, recordings: Sequence[Recording]) -> RobotConfig:
     if robot is None:
         return recordings[0].robot
-    return robot if isinstance(robot, RobotConfig) else load_robot(robot)
+    return robot if isinstance(robot, RobotConfig) else load_robot(robot, "identify")
 
 
 def _document(given: Identification | IdentificationDocument | str | Path) -> IdentificationDocument:

@@ -4,7 +4,7 @@ import inspect
 import re
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, GetJsonSchemaHandler
+from pydantic import BaseModel, ConfigDict, GetJsonSchemaHandler, SerializerFunctionWrapHandler, model_serializer
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema
 
@@ -32,6 +32,26 @@ class FrozenModel(DescribedModel):
     """Immutable configuration object that refuses unknown keys, infinities and NaN."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class WithBlanks(FrozenModel):
+    """Configuration whose file may have keys without a value yet (`armident.configs.blanks`).
+
+    Parameters
+    ----------
+    blanks
+        Keys that are marked as blank in the file; their values here are defaults or placeholders.
+    """
+
+    blanks: tuple[str, ...] = ()
+
+    @model_serializer(mode="wrap")
+    def _without_empty_blanks(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Leave out an empty list: recordings and hashes of complete configurations are as without this key."""
+        content: dict[str, Any] = handler(self)
+        if not self.blanks:
+            content.pop("blanks", None)
+        return content
 
 
 def split_docstring(docstring: str) -> tuple[str, dict[str, str]]:
