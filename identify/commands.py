@@ -195,7 +195,7 @@ def predict_command(path: Path, model: Path, config: Path | None, out: Path | No
 
     with progress(f"predict {path.name}") as report:
         recording = read_recording(path)
-        robot = None if config is None else load_robot(config)
+        robot = None if config is None else load_robot(config, "identify")
         loaded = load_model(model, robot, default=recording.robot, progress=report)
         found = predict_recording(recording, loaded, report)
     document, folder = found.document, out or _beside(path, "prediction")

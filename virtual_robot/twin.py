@@ -110,11 +110,11 @@ def load_twin(config: Path, choice: ParameterChoice = STANDARD) -> Twin:
     """
     path = config_path(config)
     if _is_robot(path):
-        robot, session = load_robot(path), None
+        robot, session = load_robot(path, "robot"), None
     else:
-        session = load_session(path)
+        session = load_session(path, "robot")
         path = session.robot
-        robot = load_robot(path)
+        robot = load_robot(path, "robot")
     inertials = None if choice.draw_masses else load_inertials(path)
     robot, parameters, assumed = complete(robot, model=choice.model, inertials=inertials, seed=choice.seed)
     if session is None:
@@ -229,7 +229,7 @@ def _with_drives(robot: RobotConfig, parameters: ArmParameters) -> tuple[RobotCo
             values["counts_per_unit"] = float(round(counts / geared))
             assumed.setdefault("drive.counts_per_unit", []).append(f"{joint.name} {values['counts_per_unit']:.0f}")
         most = limits.torque / (geared * abs(drive.gain))
-        if "rated" not in drive.model_fields_set:
+        if "rated" not in drive.model_fields_set or f"joints[{joint.name}].drive.rated" in robot.blanks:
             values["rated"] = _three_digits(RATED_SHARE * most)
             assumed.setdefault("drive.rated", []).append(f"{joint.name} {values['rated']:g}")
         elif most > BUS_RANGE * drive.rated:
@@ -238,7 +238,8 @@ def _with_drives(robot: RobotConfig, parameters: ArmParameters) -> tuple[RobotCo
                 "torque limit needs; larger signals are clipped"
             )
         joints.append(joint.model_copy(update={"limits": limits, "drive": drive.model_copy(update=values)}))
-    return robot.model_copy(update={"joints": tuple(joints)}), (*remarks, *_sentences(assumed))
+    # Every value that the arm needs is there now, so that its recordings have no blanks.
+    return robot.model_copy(update={"joints": tuple(joints), "blanks": ()}), (*remarks, *_sentences(assumed))
 
 
 def _lacks_torque(robot: RobotConfig) -> bool:

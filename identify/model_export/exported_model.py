@@ -284,7 +284,7 @@ def load_exported_model(
     DataError
         If the identification is unusable or of another configuration, or no physical arm has these parameters.
     """
-    given = load_robot(robot) if isinstance(robot, str | Path) else robot
+    given = load_robot(robot, "identify") if isinstance(robot, str | Path) else robot
     saved = load_model(Path(path), given, progress=progress)
     source = source_of(robot) if isinstance(robot, str | Path) and urdf is None else None
     if urdf is not None:

@@ -51,7 +51,7 @@ def simulate(
         raise ConfigError(f"--out {out}: expected a name that ends in .mcap or .npz")
     if out.exists():
         raise ConfigError(f"--out {out}: the file exists already")
-    robot, reference = None if config is None else load_robot(config), load_trajectory(trajectory)
+    robot, reference = None if config is None else load_robot(config, "identify"), load_trajectory(trajectory)
     if model is not None:
         from armident.identify.saved_model import load_model
         from armident.identify.simulated_recording import simulate_model

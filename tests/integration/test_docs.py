@@ -90,7 +90,10 @@ def test_the_blocks_of_a_page_run(page: Path, tmp_path: Path) -> None:
         "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}",
         "REPOSITORY": str(REPOSITORY),
     }
-    scripts = [["bash", "-c", TRAP + "\n".join((*blocks.commands, "true"))], [sys.executable, "-c", "\n\n".join(blocks.python)]]
+    scripts = [
+        ["bash", "-c", TRAP + "\n".join((*blocks.commands, "true"))],
+        [sys.executable, "-c", "\n\n".join(blocks.python)],
+    ]
     for script in scripts:
         done = subprocess.run(
             script, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False, timeout=PAGE_S
