@@ -354,6 +354,8 @@ def test_a_table_of_parameters_gives_the_geometry(
         ("theta,d,a,alpha\n0,0,0\n", "line 2: 3 values, the header has 4"),
         ("theta,d,a,alpha\n0,0,0,north\n", "line 2, column alpha: .*north"),
         ("theta,d,a [inch],alpha\n0,0,0,0\n", "unknown unit; expected rad, deg, m or mm"),
+        ("theta,d,a,alpha\n0,0,1e9,0\n", "lengths: 1e\\+09 is beyond every arm"),
+        ("name,theta,d,a,alpha\nx,0,0,1,0\nX,0,0,1,0\n", "joint names differ only in case"),
         ("theta,d,a,alpha,type\n0,0,0,0,screw\n", "type 'screw'; expected revolute or prismatic"),
         ("", "expected a header line"),
     ],
