@@ -16,7 +16,9 @@ from armident.configs.schema.session import RENAMED, DriveNode, SessionConfig
 from armident.configs.schema.suite import SuiteConfig
 from armident.configs.schema.trajectory import Trajectory
 from armident.configs.suspected_units import suspected_units
-from armident.configs.urdf import UrdfGeometry, geometry_from_urdf
+from armident.configs.urdf import UrdfGeometry, geometry_from_urdf, urdf_file
+from armident.configs.urdf_inertials import UrdfInertials, read_inertials
+from armident.configs.urdf_shapes import UrdfShapes, read_shapes
 from armident.configs.yaml_loader import is_file, read_yaml
 
 HERE = Path(__file__).parent
@@ -120,10 +122,10 @@ def _robot(path: Path) -> RobotConfig:
     """Robot of a file, which may have blanks."""
     data = _marked(path)
     file_keys = data.keys()
-    if "urdf" in data:
-        concerned = {key: data[key] for key in UrdfGeometry.model_fields if key in data}
-        geometry = geometry_from_urdf(_checked(concerned, UrdfGeometry, str(path)), path)
-        data = {key: value for key, value in data.items() if key not in concerned} | geometry
+    given = _urdf_geometry(data, path)
+    if given is not None:
+        geometry = geometry_from_urdf(given, path)
+        data = {key: value for key, value in data.items() if key not in UrdfGeometry.model_fields} | geometry
     robot = _checked(data, RobotConfig, str(path))
     suspected = suspected_units(robot, geometry="urdf" not in file_keys)
     if suspected:
@@ -147,6 +149,59 @@ def checked_robot(data: dict[str, Any], where: str) -> RobotConfig:
         If the content is wrong; names ``where``, key and expected value.
     """
     return _checked(data, RobotConfig, where)
+
+
+def load_inertials(name: str | Path) -> UrdfInertials | None:
+    """Load the masses of a robot from the URDF of its configuration.
+
+    Parameters
+    ----------
+    name
+        A path, or the name of a shipped file (see `config_path`).
+
+    Returns
+    -------
+    UrdfInertials or None
+        ``None`` if the configuration names no URDF.
+
+    Raises
+    ------
+    ConfigError
+        If a file is missing or wrong; names file and element.
+    """
+    path = config_path(name)
+    given = _urdf_geometry(_marked(path), path)
+    return None if given is None else read_inertials(urdf_file(given, path), given.urdf.base, given.urdf.tip)
+
+
+def load_shapes(name: str | Path) -> UrdfShapes | None:
+    """Load the shapes of the links of a robot from the URDF of its configuration.
+
+    Parameters
+    ----------
+    name
+        A path, or the name of a shipped file (see `config_path`).
+
+    Returns
+    -------
+    UrdfShapes or None
+        ``None`` if the configuration names no URDF.
+
+    Raises
+    ------
+    ConfigError
+        If a file is missing or wrong; names file and element.
+    """
+    path = config_path(name)
+    given = _urdf_geometry(_marked(path), path)
+    return None if given is None else read_shapes(urdf_file(given, path), given.urdf.base, given.urdf.tip)
+
+
+def _urdf_geometry(data: dict[str, Any], path: Path) -> UrdfGeometry | None:
+    """Keys of a robot configuration that are combined with its URDF; ``None`` if it names none."""
+    if "urdf" not in data:
+        return None
+    return _checked({key: data[key] for key in UrdfGeometry.model_fields if key in data}, UrdfGeometry, str(path))
 
 
 def _marked(path: Path) -> dict[str, Any]:

@@ -220,6 +220,35 @@ def doctor(
     run(config, as_json, command)
 
 
+def service(
+    action: Annotated[str, typer.Argument(help="install.")],
+    cell: Annotated[str, typer.Argument(help="Name of the cell, whose session is /etc/armident/CELL.yaml.")],
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Print what is to be done, and change nothing.")] = False,
+    root: Annotated[
+        Path, typer.Option("--root", help="Root folder of the system, for system images.", file_okay=False, exists=True)
+    ] = Path("/"),
+    executable: Annotated[
+        Path | None,
+        typer.Option(
+            "--executable", help="Path of armident in the units. [default: this one; in an image that in /opt/armident]"
+        ),
+    ] = None,
+) -> None:
+    """Install the services of a cell on a machine with systemd: user, folders, permissions and units.
+
+    What is there already is left alone; a second run does nothing. No service is enabled or started.
+
+    Example: armident service install line3 --dry-run
+    """
+    from armident.configs import ConfigError
+    from armident.daq.service import install
+
+    if action != "install":
+        raise ConfigError(f"no action {action!r}; expected: armident service install CELL")
+    for line in install(cell, root, executable, dry_run):
+        print(line)
+
+
 def recover(
     recordings: Annotated[list[Path], typer.Argument(help="Recordings that were not finished.")],
     as_json: Annotated[bool, typer.Option("--json", help="Print the results as JSON.")] = False,

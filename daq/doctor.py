@@ -9,6 +9,7 @@ import subprocess
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
+from importlib.metadata import version
 from pathlib import Path
 from typing import Literal
 
@@ -33,6 +34,7 @@ from armident.drivers.can.socketcan import RECEIVE_BUFFER, RawSocket
 from armident.drivers.can.timestamps import has_hardware_timestamps
 from armident.drivers.canopen.bus_load import check_fits
 from armident.drivers.canopen.eds import read_eds
+from armident.drivers.compiled import MODE, require_compiled
 from armident.drivers.vcan.interfaces import NETWORK, have_socketcan, is_up
 
 Verdict = Literal["ok", "warning", "failed"]
@@ -114,16 +116,16 @@ def run_checks(config: str | Path) -> list[Check]:
         robot = load_robot(session.robot, "")
         blanks = (*needed(session.blanks, "capture"), *robot.blanks_for("capture"))
     except ArmidentError as error:
-        return [Check("configuration", "failed", str(error)), _clock()]
+        return [Check("configuration", "failed", str(error)), _installation(), _clock()]
     if blanks:
-        return [*(Check("blank", "failed", line) for line in listed(blanks)), _clock()]
+        return [*(Check("blank", "failed", line) for line in listed(blanks)), _installation(), _clock()]
     try:
         captured_streams(session, robot)
         if session.setpoints is not None:
             trajectory = load_trajectory(session.setpoints.trajectory)
             trajectory.check(robot, str(session.setpoints.trajectory))
     except ArmidentError as error:
-        return [Check("configuration", "failed", str(error)), *_data_sheets(session), _clock()]
+        return [Check("configuration", "failed", str(error)), *_data_sheets(session), _installation(), _clock()]
     checks = [Check("configuration", "ok", f"{config}: cell {session.cell}, robot {robot.name}")]
     foreign = session.sync.role == "consumer" and not session.sync.counter
     phase = unknown_phase(session) if foreign else None
@@ -132,7 +134,7 @@ def run_checks(config: str | Path) -> list[Check]:
     checks += [*_data_sheets(session), _bus_load(session, config)]
     for bus in session.all_buses:
         checks += _interface(bus)
-    checks.append(_clock())
+    checks += [_installation(), _clock()]
     checks += [*_disk(session, robot), _zenoh(session)]
     return checks
 
@@ -245,6 +247,15 @@ def _receive_buffer(bus: Bus) -> Check:
         f"the kernel gives {given / 1e6:.1f} of {RECEIVE_BUFFER / 1e6:.1f} MB: frames may be dropped while the machine "
         f"is busy. Give the capture CAP_NET_ADMIN, or: sudo sysctl net.core.rmem_max={RECEIVE_BUFFER}",
     )
+
+
+def _installation() -> Check:
+    """Check that the loops that handle every frame are compiled."""
+    try:
+        require_compiled()
+    except ConfigError as error:
+        return Check("installation", "failed", str(error))
+    return Check("installation", "ok", f"armident {version('armident')}, loops of the bus compiled {MODE}")
 
 
 def _clock() -> Check:

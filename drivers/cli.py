@@ -47,7 +47,7 @@ def bus_load(
         virtual = bus.bitrate is None
         kind = "CAN FD" if bus.fd else "classic"
         table = Table(title=f"{bus.channel} ({kind}), SYNC every {session.sync.period_us} us")
-        table.add_column("message")
+        table.add_column("message", no_wrap=True)
         for heading in ("frames/s", "typical", "worst case"):
             table.add_column(heading, justify="right")
 

@@ -9,6 +9,7 @@ from pydantic import Field, model_validator
 from armident.configs.blanks import check_filled, needed
 from armident.configs.errors import ConfigError
 from armident.configs.schema.base import FrozenModel, WithBlanks
+from armident.configs.schema.collision import BASE, Collision
 from armident.configs.schema.limits import Limits, Positive, endless
 
 __all__ = [
@@ -250,6 +251,8 @@ class RobotConfig(WithBlanks):
         Start values of the iterative methods, by parameter name, SI.
     preprocessing
         Filters of a published IDIM-LS fit, with a sharp ``sign(qd)``; ``None``: filters from the bandwidth.
+    collision
+        Bodies of the arm and of its cell, which designed trajectories keep apart.
     blanks
         Keys that the file marks as blank.
     """
@@ -269,6 +272,7 @@ class RobotConfig(WithBlanks):
     preprocessing: Preprocessing | None = Field(
         None, description="filters of a published IDIM-LS fit, with a sharp sign(qd); None: from the bandwidth"
     )
+    collision: Collision | None = None
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
@@ -292,6 +296,9 @@ class RobotConfig(WithBlanks):
             for name in (effect.joint, effect.other):
                 if name is not None and name not in names:
                     raise ValueError(f"effects: no joint named {name!r}; joints are {', '.join(names)}")
+        for capsule in () if self.collision is None else self.collision.capsules:
+            if capsule.link not in (BASE, *names):
+                raise ValueError(f"collision: no link {capsule.link!r}; links are {', '.join((BASE, *names))}")
         threshold = self.friction.velocity_threshold
         if threshold is not None and len(threshold) != n:
             raise ValueError(f"friction.velocity_threshold: expected {n} numbers")

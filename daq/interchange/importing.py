@@ -30,6 +30,8 @@ NOTES = "source_remarks"
 """Key of the metadata with everything that an import left out or assumed."""
 
 
+# Numbers of other tools may overflow; the checks refuse what comes of them.
+@np.errstate(over="ignore", invalid="ignore", divide="ignore")
 def import_recording(
     path: Path,
     robot: RobotConfig | None,
