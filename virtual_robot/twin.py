@@ -169,7 +169,8 @@ def complete(robot: RobotConfig, **choice: Any) -> tuple[RobotConfig, ArmParamet
     robot, limits = with_limits(robot)
     parameters = arm_parameters(robot, **choice)
     robot, drives = _with_drives(robot, parameters)
-    return robot, parameters, (*limits, *drives)
+    # Values that the file leaves blank are assumed now.
+    return robot.model_copy(update={"blanks": ()}), parameters, (*limits, *drives)
 
 
 def with_limits(robot: RobotConfig) -> tuple[RobotConfig, tuple[str, ...]]:
