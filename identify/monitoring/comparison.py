@@ -3,13 +3,12 @@
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
-from pydantic import Field
 
 from armident.configs import DataError
-from armident.identify.document import Document, IdentificationDocument, Parameter, RecordingReference
+from armident.identify.document import IdentificationDocument, Parameter
+from armident.identify.model_documents import ComparedModel, ComparedParameter, ComparisonDocument
 from armident.identify.monitoring.change_test import FALSE_ALARMS, ParameterChangeTest, compare
 from armident.identify.report.glossary import identification_entries
 from armident.identify.report.page import BAND, MODEL, MUTED, RESIDUAL, figure, render
@@ -19,76 +18,6 @@ LEVEL_95 = 1.959964
 
 SHOWN_PER_ROW = 18
 """Most parameters in one row of the plot: their names stay readable."""
-
-
-class ComparedModel(Document):
-    """One of the two identifications."""
-
-    path: str
-    method: str
-    recording: RecordingReference
-    relative_error_pct: float
-
-
-class ComparedParameter(Document):
-    """One parameter in both identifications, SI.
-
-    ``std_of_difference`` is that of ``now - before``, ``p_value`` the probability of such a difference without a change
-    (Holm), ``joint`` the joint or coupling that it belongs to.
-    """
-
-    name: str
-    joint: str
-    unit: str
-    before: float
-    before_std: float
-    now: float
-    now_std: float
-    std_of_difference: float
-    p_value: float
-    changed: bool
-    essential: bool
-
-
-class ComparisonDocument(Document):
-    """Content of ``comparison.json``: the change test of two identifications of one robot.
-
-    ``left_out`` are parameters that only one of them has; they are not compared. ``changed_groups`` are friction or
-    masses of a joint that changed together, ``changed_residuals`` changes of structure, in words.
-    """
-
-    schema_: Literal["armident/comparison/1"] = Field("armident/comparison/1", alias="schema")
-    robot: str
-    verdict: Literal["changed", "unchanged"]
-    baseline: ComparedModel
-    now: ComparedModel
-    parameters: list[ComparedParameter]
-    changed_groups: list[str]
-    changed_residuals: list[str]
-    chi_square: float
-    degrees: int
-    p_value: float
-    false_alarm_rate: float
-    left_out: list[str]
-    warnings: list[str]
-
-    @property
-    def by_joint(self) -> dict[str, list[ComparedParameter]]:
-        """Parameters by joint or coupling, in the order of the document."""
-        found: dict[str, list[ComparedParameter]] = {}
-        for each in self.parameters:
-            found.setdefault(each.joint, []).append(each)
-        return found
-
-    @property
-    def sentence(self) -> str:
-        """Verdict in one sentence."""
-        test = f"chi-square {self.chi_square:.1f} of {self.degrees} degrees of freedom, p = {self.p_value:.2g}"
-        names = [each.name for each in self.parameters if each.changed]
-        parts = [*names, *self.changed_groups, *self.changed_residuals] or ["no single parameter significantly"]
-        if self.verdict == "changed":
-            return f"{self.robot} has changed: {', '.join(parts)} ({test})"
-        return f"{self.robot} has not changed significantly ({test})"
 
 
 def compare_models(

@@ -128,6 +128,20 @@ def test_a_model_that_cannot_be_used_is_refused_in_one_line(
         load_model(tmp_path)
 
 
+@pytest.mark.parametrize("words", [("predict", "two.mcap", "--model", "one"), ("compare", "one", "two")])
+def test_results_that_cannot_be_written_are_one_line(folder: Path, tmp_path: Path, words: tuple[str, ...]) -> None:
+    (tmp_path / "file").write_text("")
+    given = [word if word in ("predict", "compare", "--model") else folder / word for word in words]
+    result = call(*given, "--out", tmp_path / "file")
+    assert result.exit_code == 2
+    assert "file: cannot be written: " in result.stderr
+
+
+def test_a_recording_is_no_model(folder: Path) -> None:
+    with pytest.raises(DataError, match=r"one\.mcap: not a JSON document"):
+        load_model(folder / "one.mcap")
+
+
 def test_a_configuration_is_no_model(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="no identified parameters: run `armident identify RECORDING"):
         load_model(tmp_path / "model.yaml")
