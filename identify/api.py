@@ -50,6 +50,7 @@ from armident.identify.tables import EffectTable, ParameterTable, Table
 if TYPE_CHECKING:
     from armident.identify.diagnosis.diagnose import Diagnosis as DiagnosisResult
     from armident.identify.excitation.design import Design as DesignResult
+    from armident.identify.excitation.safety import SafetyChecks
 
 Array = NDArray[np.float64]
 Progress = Callable[[str, float], None]
@@ -676,10 +677,13 @@ class Design:
         The robot it is for.
     result
         Trajectory, condition number, predicted standard deviations and torques.
+    checks
+        Properties that were checked, with the results (``checked``), and those that were not (``unchecked``).
     """
 
     robot: RobotConfig
     result: "DesignResult"
+    checks: "SafetyChecks"
 
     @property
     def trajectory(self) -> Trajectory:
@@ -736,6 +740,9 @@ def design_trajectory(
 ) -> Design:
     """Design an exciting trajectory within the limits of a robot (thesis section 2.3.5).
 
+    It keeps the bodies of ``collision`` in the configuration apart. Torques stay within their limits if ``known`` or
+    the URDF of the robot has masses.
+
     Parameters
     ----------
     robot
@@ -769,7 +776,9 @@ def design_trajectory(
     Raises
     ------
     ConfigError
-        If the robot cannot make a single move in that time, or an option is wrong.
+        If the robot cannot make a single move in that time, an option is wrong, or no trajectory keeps all limits.
+    DataError
+        If ``known`` is of another robot or model, or is not physical.
 
     Examples
     --------
@@ -780,24 +789,26 @@ def design_trajectory(
     """
     from armident.identify.excitation.design import design_trajectory as run
     from armident.identify.excitation.design import with_objective
-    from armident.identify.excitation.previous_estimate import previous_estimate
+    from armident.identify.excitation.previous_estimate import physical_estimate
+    from armident.identify.excitation.safety import check_safety, safety_model
 
     config = _robot(robot, ())
-    earlier = None if known is None else previous_estimate(_document(known), config, "known")
-    theta = None if earlier is None else earlier.theta
+    earlier = None if known is None else physical_estimate(_document(known), config, "known")
+    safety = safety_model(config, None if isinstance(robot, RobotConfig) else robot, earlier, "known")
     found = run(
         config,
         duration,
         seed,
         noise=None if earlier is None else earlier.noise,
         evaluations=evaluations,
-        theta=theta,
-        aim=with_objective(config, effect, joint, against, theta),
+        theta=safety.theta,
+        aim=with_objective(config, effect, joint, against, safety.theta),
         shape=shape,
         harmonics=harmonics,
+        collision=safety.collision,
         progress=None if progress is None else lambda share: progress("search", share),
     )
-    return Design(config, found)
+    return Design(config, found, check_safety(config, found, safety))
 
 
 def effects() -> EffectTable:
@@ -829,7 +840,7 @@ def _read(recordings: Recorded | Sequence[Recorded]) -> tuple[Recording, ...]:
 def _robot(robot: Robot | None, recordings: Sequence[Recording]) -> RobotConfig:
     if robot is None:
         return recordings[0].robot
-    return robot if isinstance(robot, RobotConfig) else load_robot(robot)
+    return robot if isinstance(robot, RobotConfig) else load_robot(robot, "identify")
 
 
 def _document(given: Identification | IdentificationDocument | str | Path) -> IdentificationDocument:

@@ -256,7 +256,8 @@ def trajectory(
     known: Annotated[
         Path | None,
         typer.Option(
-            help="identification.json of the robot: keeps torques within limits, predicts standard deviations."
+            help="identification.json of the robot: keeps torques within limits, predicts standard deviations. "
+            "[default: masses of the URDF]"
         ),
     ] = None,
     evaluations: Annotated[int, typer.Option(min=1, help="Number of candidates to try.")] = 2000,
@@ -276,17 +277,21 @@ def trajectory(
         Path | None,
         typer.Option(help="Check and plot an existing trajectory instead, and predict its standard deviations."),
     ] = None,
+    report: Annotated[Path | None, typer.Option(help="Report (.html). [default: beside the trajectory]")] = None,
 ) -> None:
     """Design an exciting trajectory inside the limits of a robot, for the base parameters or for one effect.
 
-    Plots positions, velocities, accelerations and torques against their limits, and prints the predicted standard
-    deviation of every base parameter.
+    Keeps the bodies of collision in the robot configuration apart. Plots positions, velocities, accelerations and
+    torques against their limits, prints the predicted standard deviation of every base parameter, and lists what was
+    checked and what was not.
 
     Example: armident trajectory --config configs/tx40.yaml --out excitation.yaml --known identification.json
     """
+    from armident.identify.document import write_atomically
     from armident.identify.excitation.cli import TrajectoryOptions, trajectory_command
+    from armident.identify.report.trajectory import trajectory_report
 
-    trajectory_command(
+    found = trajectory_command(
         TrajectoryOptions(
             config=config,
             out=out,
@@ -303,6 +308,10 @@ def trajectory(
             look_at=look_at,
         )
     )
+    page = report or found.path.with_suffix(".html")
+    write_atomically(page, trajectory_report(found))
+    print(f"report: {page}")
+    found.refuse_excess()
 
 
 def reproduce(

@@ -11,6 +11,7 @@ from armident.identify.document import IdentificationDocument
 from armident.identify.effects.recorded import of_recording
 from armident.identify.effects.registry import of_entry
 from armident.identify.effects.terms import effect_terms
+from armident.identify.identification.excitation_check import workspace_postures
 from armident.identify.model_export.link_frames import LinkFrames, mdh_link_frames
 from armident.identify.model_export.source_urdf import SourceUrdf, source_for, source_frames, source_of
 from armident.identify.robot.arm import ArmModel
@@ -297,12 +298,13 @@ def exported_model(saved: SavedModel, *, nearest: bool = False) -> ExportedModel
     Raises
     ------
     DataError
-        If no physical arm has these parameters.
+        If no physical arm has these parameters, or couplings make its inertia negative.
     """
     arm, robot, theta, covariance = saved.arm, saved.robot, saved.theta, saved.covariance
     consistent = nearest_consistent(arm, theta, covariance, SMALLEST_LINK)
     if not consistent.compatible and not nearest:
         raise DataError(f"{saved.path}: {consistent.verdict}; next: {IMPOSSIBLE}")
+    _refuse_negative_inertia(arm, consistent.theta, saved.path)
     frames = mdh_link_frames(robot)
     values = arm.values(consistent.theta)
     return ExportedModel(
@@ -325,6 +327,19 @@ def exported_model(saved: SavedModel, *, nearest: bool = False) -> ExportedModel
         ),
         effects=_effects(arm, consistent.theta),
     )
+
+
+def _refuse_negative_inertia(arm: ArmModel, theta: Floats, source: Path) -> None:
+    """Refuse couplings that are larger than the rotor inertias and links which they couple."""
+    turns = np.full((2, arm.n), np.pi) * [[-1.0], [1.0]]
+    smallest = np.linalg.eigvalsh(arm.mass_matrix(theta, workspace_postures(arm.robot, turns)))[:, 0]
+    if smallest.min() <= 0.0:
+        names = ", ".join(coupling.name for coupling in arm.robot.couplings)
+        raise DataError(
+            f"{source}: the inertia of coupling {names} is larger than those that it couples: the mass matrix is not "
+            f"positive definite at {100 * np.mean(smallest <= 0.0):.0f} % of the postures; next: record a motion with "
+            "more acceleration of both joints, or identify without the coupling"
+        )
 
 
 def _bodies(arm: ArmModel, theta: Floats, frames: LinkFrames) -> tuple[LinkBody, ...]:

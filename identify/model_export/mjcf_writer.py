@@ -1,17 +1,21 @@
 """MJCF, the format of MuJoCo: bodies, friction, rotor inertias, couplings (as tendons), offsets, springs, gravity."""
 
 import xml.etree.ElementTree as ET
+from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from armident.identify.model_export.exported_model import ExportedModel, JointCoupling, LinkBody
 from armident.identify.model_export.rigid_effects import SPRINGS, springs, with_rigid_effects
-from armident.identify.model_export.sheet import PARTS, LimitationSheet, limitation_sheet
+from armident.identify.model_export.sheet import PARTS, LimitationSheet, Omission, limitation_sheet
 from armident.identify.model_export.xml_text import numbers, write_xml
 
 RADIUS_M = 0.02
 """Radius of the capsules that show links without meshes, m."""
+
+HOLDS = (*PARTS, "couplings", "gravity", SPRINGS)
 
 TENDONS = (
     "couplings are fixed tendons over both joints, with a part of the armature and damping of each joint; "
@@ -49,7 +53,7 @@ def write_mjcf(model: ExportedModel, out: Path) -> tuple[list[Path], LimitationS
     stiffness = springs(model)
     own = {name: [getattr(joint, name) for joint in model.joints] for name in ("rotor_inertia", "viscous", "coulomb")}
     tendons = ET.Element("tendon")
-    held = all([_add_tendons(tendons, coupling, own, model) for coupling in model.couplings])
+    omitted = [part for coupling in model.couplings for part in _add_tendons(tendons, coupling, own, model)]
     for k, body in enumerate(model.links):
         parent = _add_body(parent, body, model, k)
         element = _joint(model, k)
@@ -64,9 +68,9 @@ def write_mjcf(model: ExportedModel, out: Path) -> tuple[list[Path], LimitationS
         root.append(tendons)
     root.append(_actuators(model))
     write_xml(root, out)
-    holds = (*PARTS, "gravity", SPRINGS, *(("couplings",) if held else ()))
     remarks = ((TENDONS,) if len(tendons) else ()) + REMARKS
-    return [out], limitation_sheet(model, "mjcf", holds, parts=parts, remarks=remarks)
+    sheet = limitation_sheet(model, "mjcf", HOLDS, parts=parts, remarks=remarks)
+    return [out], replace(sheet, omitted=(*sheet.omitted, *omitted))
 
 
 def _add_body(parent: ET.Element, body: LinkBody, model: ExportedModel, k: int) -> ET.Element:
@@ -110,17 +114,20 @@ def _actuators(model: ExportedModel) -> ET.Element:
 
 def _add_tendons(
     tendons: ET.Element, coupling: JointCoupling, own: dict[str, list[float]], model: ExportedModel
-) -> bool:
-    """Add the tendons of a coupling and take their share from the joints; return False if one is impossible."""
+) -> Iterator[Omission]:
+    """Add the tendons of a coupling and take their share from the joints; return the parts that are impossible."""
     i, j = coupling.joints
-    possible = True
-    for key, attribute, shared in (
-        ("rotor_inertia", "armature", coupling.inertia),
-        ("viscous", "damping", coupling.viscous),
+    for part, key, attribute, shared in (
+        ("inertia", "rotor_inertia", "armature", coupling.inertia),
+        ("viscous friction", "viscous", "damping", coupling.viscous),
     ):
         share = _tendon(own[key][i], own[key][j], shared)
         if share is None:
-            possible = False
+            names = f"{model.joints[i].name} and {model.joints[j].name}"
+            yield Omission(
+                f"{part} of coupling {coupling.name}: {shared:.4g}",
+                f"It is larger than that of {names} themselves, which no tendon has.",
+            )
             continue
         coefficient, strength = share
         own[key][i] -= strength * coefficient**2
@@ -128,7 +135,6 @@ def _add_tendons(
         _add_tendon(tendons, f"{coupling.name}_{attribute}", model, (i, j), (coefficient, 1.0), {attribute: strength})
     loss = {"frictionloss": coupling.coulomb}
     _add_tendon(tendons, f"{coupling.name}_frictionloss", model, (i, j), (1.0, 1.0), loss)
-    return possible
 
 
 def _tendon(first: float, second: float, shared: float) -> tuple[float, float] | None:

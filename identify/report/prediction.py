@@ -4,7 +4,7 @@ from armident.configs import RobotConfig
 from armident.identify.document import IdentificationDocument
 from armident.identify.prediction import TorquePrediction
 from armident.identify.report.glossary import identification_entries
-from armident.identify.report.identification import torque_figure
+from armident.identify.report.identification import torque_plots
 from armident.identify.report.page import render
 
 
@@ -26,6 +26,6 @@ def prediction_report(prediction: TorquePrediction, robot: RobotConfig, identifi
         "prediction.html",
         document=document,
         robot=robot,
-        torques=torque_figure(prediction.t, prediction.measured, prediction.predicted, joints, units),
+        torques=torque_plots(prediction.t, prediction.measured, prediction.predicted, joints, units),
         glossary=identification_entries(identified),
     )

@@ -14,11 +14,18 @@ from armident.identify.effects.terms import arm_model
 from armident.identify.model_export.exported_model import ExportedModel
 from armident.identify.model_export.formats import export_model
 from armident.identify.model_export.source_urdf import source_for, source_of
-from tests.model_exports import exported, random_motion, random_theta, relative_error, rigid_torque
+from tests.model_exports import (
+    Motion,
+    exported,
+    mujoco_torque,
+    random_motion,
+    random_theta,
+    relative_error,
+    rigid_torque,
+)
 from tests.urdf_chains import configuration, random_urdf
 
 Floats = NDArray[np.float64]
-Motion = tuple[Floats, Floats, Floats]
 
 TOLERANCE = 1e-9
 """Largest difference of inverse dynamics, relative to the torque: rounding, not modelling."""
@@ -82,20 +89,6 @@ def pinocchio_torque(arm: Any, motion: Motion) -> Floats:
     data, rows = arm.createData(), []
     for q, qd, qdd in zip(*motion, strict=True):
         rows.append(pin.rnea(arm, data, pin.integrate(arm, pin.neutral(arm), q), qd, qdd))
-    return np.array(rows)
-
-
-def mujoco_torque(file: Path, motion: Motion, gravity: Floats | None = None) -> Floats:
-    """Inverse dynamics (N, n) by MuJoCo, without limits and Coulomb friction, which are constraints there."""
-    mujoco = pytest.importorskip("mujoco")
-    arm = mujoco.MjModel.from_xml_path(str(file))
-    arm.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
-    if gravity is not None:
-        arm.opt.gravity[:] = gravity
-    data, rows = mujoco.MjData(arm), []
-    for data.qpos[:], data.qvel[:], data.qacc[:] in zip(*motion, strict=True):
-        mujoco.mj_inverse(arm, data)
-        rows.append(data.qfrc_inverse.copy())
     return np.array(rows)
 
 

@@ -21,7 +21,15 @@ from armident.identify.model_export.exported_model import ExportedModel, load_ex
 from armident.identify.model_export.formats import FORMATS, export_model
 from armident.identify.model_export.source_urdf import SourceUrdf
 from tests.fixtures import arms
-from tests.model_exports import exported, identification_of, random_motion, random_theta, relative_error, rigid_torque
+from tests.model_exports import (
+    exported,
+    identification_of,
+    mujoco_torque,
+    random_motion,
+    random_theta,
+    relative_error,
+    rigid_torque,
+)
 
 Floats = NDArray[np.float64]
 
@@ -152,7 +160,6 @@ def with_effects(robot: RobotConfig, *values: float) -> ExportedModel:
 
 
 def test_mujoco_has_springs_couplings_rotors_and_a_tilted_base_of_the_effects(tmp_path: Path) -> None:
-    mujoco = pytest.importorskip("mujoco")
     model = with_effects(
         tx40_with(
             Effect(effect="joint_spring", joint="joint_2"),
@@ -164,16 +171,10 @@ def test_mujoco_has_springs_couplings_rotors_and_a_tilted_base_of_the_effects(tm
     )
     files, sheet = export_model(model, "mjcf", tmp_path)
     assert not [o for o in sheet.omitted if "coupling of joint_3" in o.part or "spring" in o.part]
-    loaded = mujoco.MjModel.from_xml_path(str(files[0]))
-    loaded.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
-    motion, data = random_motion(model.robot, np.random.default_rng(4)), mujoco.MjData(loaded)
-    found = []
-    for data.qpos[:], data.qvel[:], data.qacc[:] in zip(*motion, strict=True):
-        mujoco.mj_inverse(loaded, data)
-        found.append(data.qfrc_inverse.copy())
+    motion = random_motion(model.robot, np.random.default_rng(4))
     smooth = np.array([0.0 if name.startswith(("fc", "off")) else 1.0 for name in model.arm.names])
     expected = model.model.inverse_dynamics(model.theta * smooth, *motion, dt=1e-3)
-    assert relative_error(np.array(found), expected) < 1e-9
+    assert relative_error(mujoco_torque(files[0], motion), expected) < 1e-9
 
 
 def test_mujoco_accelerates_as_our_model_under_the_torque_that_a_drive_reports(tmp_path: Path) -> None:
@@ -195,6 +196,23 @@ def test_mujoco_accelerates_as_our_model_under_the_torque_that_a_drive_reports(t
     assert relative_error(np.array(found), expected) < 1e-9
     assert loaded.dof_frictionloss == pytest.approx([joint.coulomb for joint in model.joints])
     assert loaded.tendon_frictionloss.max() == pytest.approx(model.couplings[0].coulomb)
+
+
+def test_a_coupling_that_no_tendon_has_is_named_on_the_sheet(tmp_path: Path) -> None:
+    robot = load_robot("tx40")
+    arm = arm_model(robot)
+    theta = random_theta(arm, 2)
+    theta[[arm.names.index(name) for name in ("fv5", "fv6", "fvm6")]] = 1.0, 1.0, 2.0
+    model = exported(robot, theta)
+    root = read(model, "mjcf", tmp_path)
+    assert [tendon.get("name") for tendon in root.iter("fixed")] == ["m6_armature", "m6_frictionloss"]
+    assert "viscous friction of coupling m6: 2. It is larger" in (tmp_path / "tx40_mjcf_limits.md").read_text()
+    theta[arm.names.index("fv5")] = 9.0
+    model = exported(robot, theta)
+    files, sheet = export_model(model, "mjcf", tmp_path)
+    motion = random_motion(robot, np.random.default_rng(4))
+    assert not sheet.omitted
+    assert relative_error(mujoco_torque(files[0], motion), rigid_torque(model, motion, "ia", "fv")) < 1e-9
 
 
 def test_the_sheet_names_all_that_a_format_cannot_hold(tmp_path: Path) -> None:
@@ -236,6 +254,15 @@ def test_an_impossible_arm_is_refused_unless_the_nearest_one_is_wanted(tmp_path:
     assert nearest.joints[2].viscous >= 0.0
     _, sheet = export_model(nearest, "urdf", tmp_path)
     assert any("differ from the estimate by up to" in remark and "fv3" in remark for remark in sheet.remarks)
+
+
+def test_a_coupling_larger_than_what_it_couples_is_refused() -> None:
+    robot = load_robot("tx40")
+    arm = arm_model(robot)
+    theta = random_theta(arm, 2)
+    theta[arm.names.index("iam6")] = 5.0
+    with pytest.raises(DataError, match=r"coupling m6 is larger .* mass matrix is not positive definite at \d+ %"):
+        exported(robot, theta)
 
 
 def test_an_unusable_identification_is_refused(tmp_path: Path) -> None:
