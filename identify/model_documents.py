@@ -13,9 +13,38 @@ ALL_PCT = 100.0
 class PredictionDocument(Document):
     """Content of ``prediction.json``: error of an identified model on a recording.
 
-    ``held_out`` is false if the model was identified from this recording. ``relative_error_pct`` is
-    ``||y - X theta|| / ||y||`` on torques low-passed at twice the closed-loop bandwidth; ``identification_error_pct``
-    is that of the model on its own data. ``error_rms`` and ``torque_rms`` are in the ``units`` of each joint.
+    Torques are low-passed as in the identification, at twice the closed-loop bandwidth.
+
+    Parameters
+    ----------
+    schema_
+        Key ``schema``: version of the document.
+    robot
+        Name of the robot.
+    model
+        File of the model.
+    method
+        Method of its identification.
+    recording
+        Recording whose torques are predicted.
+    held_out
+        False if the model was identified from this recording.
+    relative_error_pct, relative_error_pct_by_joint
+        ``||y - X theta|| / ||y||``, percent, in total and by joint.
+    identification_error_pct, identification_error_pct_by_joint
+        The same of the model on its own data.
+    error_rms, torque_rms
+        Root mean square of the error and of the measured torque by joint, each in its unit.
+    units
+        Unit of the torque by joint: N m or N.
+    samples
+        Number of instants after the decimation.
+    rate_hz
+        Rate of these instants, Hz.
+    warnings
+        Remarks: motion beyond that of the identification, mistakes of the set-up.
+    versions
+        Versions of Python and libraries.
     """
 
     schema_: Literal["armident/prediction/1"] = Field("armident/prediction/1", alias="schema")
@@ -53,7 +82,19 @@ class PredictionDocument(Document):
 
 
 class ComparedModel(Document):
-    """One of the two identifications."""
+    """One of the two identifications.
+
+    Parameters
+    ----------
+    path
+        File of the identification.
+    method
+        Method of the identification.
+    recording
+        Recording that it was identified from.
+    relative_error_pct
+        Relative torque error on its own data, percent.
+    """
 
     path: str
     method: str
@@ -64,8 +105,26 @@ class ComparedModel(Document):
 class ComparedParameter(Document):
     """One parameter in both identifications, SI.
 
-    ``std_of_difference`` is that of ``now - before``, ``p_value`` the probability of such a difference without a change
-    (Holm), ``joint`` the joint or coupling that it belongs to.
+    Parameters
+    ----------
+    name
+        Name of the parameter.
+    joint
+        Joint or coupling that it belongs to.
+    unit
+        Unit of the values and standard deviations.
+    before, now
+        Earlier and later value.
+    before_std, now_std
+        Their standard deviations.
+    std_of_difference
+        Standard deviation of ``now - before``.
+    p_value
+        Probability of such a difference without a change, corrected for all parameters and groups (Holm).
+    changed
+        True if the difference is significant.
+    essential
+        True if the parameter is essential in one of them.
     """
 
     name: str
@@ -84,8 +143,30 @@ class ComparedParameter(Document):
 class ComparisonDocument(Document):
     """Content of ``comparison.json``: the change test of two identifications of one robot.
 
-    ``left_out`` are parameters that only one of them has; they are not compared. ``changed_groups`` are friction or
-    masses of a joint that changed together, ``changed_residuals`` changes of structure, in words.
+    Parameters
+    ----------
+    schema_
+        Key ``schema``: version of the document.
+    robot
+        Name of the robot.
+    verdict
+        Result of all tests together.
+    baseline, now
+        The earlier and the later identification.
+    parameters
+        Parameters that both have, joint by joint.
+    changed_groups
+        Friction or masses of a joint that changed together.
+    changed_residuals
+        Changes of the residuals, in words.
+    chi_square, degrees, p_value
+        Test of all parameters together: statistic, degrees of freedom, and probability without a change.
+    false_alarm_rate
+        Probability of the verdict ``changed`` without a change.
+    left_out
+        Parameters that only one of them has, or that are other combinations; they are not compared.
+    warnings
+        Limits of the comparison.
     """
 
     schema_: Literal["armident/comparison/1"] = Field("armident/comparison/1", alias="schema")

@@ -179,10 +179,6 @@ def test_a_changed_parameter_is_named_with_exit_code_4(folder: Path, tmp_path: P
     result = call("compare", folder / "one", tmp_path / "two.json", "--out", tmp_path)
     assert result.exit_code == 4
     assert f"{document.robot} has changed: {first.name}" in result.stdout
-    (line,) = [line for line in result.stdout.splitlines() if line.strip().startswith(f"{first.name} ")]
-    assert "± " in line
-    assert "changed, p = " in line
-    assert "…" not in result.stdout
     page = (tmp_path / "report.html").read_text()
     assert "http" not in page.replace("http-equiv", "").replace("http://www.w3.org", "")
     assert page.index("has changed") < page.index("<table>")
@@ -226,6 +222,20 @@ def test_a_simulated_model_is_identified_again(folder: Path, tmp_path: Path) -> 
     assert again.relative_error_pct < 1.0
 
 
+def test_the_virtual_arm_takes_the_masses_of_a_model(folder: Path, tmp_path: Path) -> None:
+    armident.identify(folder / "one.mcap", method="idim-ls", physical=True).save(tmp_path / "model")
+    words = ("simulate", "--model", str(tmp_path / "model"), "--trajectory", "emps_2.yaml", "--rate", "1000")
+    for physics, more in (("virtual", ("--noise", "0")), ("identified", ())):
+        out = tmp_path / f"{physics}.mcap"
+        assert call(*words, "--physics", physics, "--out", out, *more).exit_code == 0
+    virtual, identified = (
+        armident.identify(tmp_path / f"{physics}.mcap", method="idim-ls", derivatives="irwsm").theta
+        for physics in ("virtual", "identified")
+    )
+    # The same parameters in two engines and two control loops.
+    assert virtual == pytest.approx(identified, rel=0.05)
+
+
 def test_the_virtual_arm_is_simulated_with_its_hidden_effect(tmp_path: Path) -> None:
     words = ["simulate", "--config", "emps.yaml", "--trajectory", "emps_1.yaml", "--seed", "3"]
     assert call(*words, "--out", tmp_path / "a.npz").exit_code == 0
@@ -241,7 +251,8 @@ def test_the_virtual_arm_is_simulated_with_its_hidden_effect(tmp_path: Path) -> 
     [
         (["--out", "x.csv", "--config", "emps.yaml"], "ends in .mcap or .npz"),
         (["--out", "x.npz"], "--config: give the robot"),
-        (["--out", "x.npz", "--model", "m.json", "--seed", "1"], "belong to the virtual arm"),
+        (["--out", "x.npz", "--model", "m.json", "--seed", "1"], "belong to --physics virtual"),
+        (["--out", "x.npz", "--config", "emps.yaml", "--physics", "identified"], "by --model"),
         (["--out", "x.npz", "--config", "emps.yaml", "--trajectory", "tx40_1.yaml"], "emps"),
     ],
 )

@@ -57,7 +57,7 @@ def test_shipped_schema_is_the_one_of_the_code(name: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "kind", [*SCHEMA_FILES.values(), RobotConfig, SessionConfig, Trajectory, Scenario, SuiteConfig]
+    "kind", [*schema_files().values(), RobotConfig, SessionConfig, Trajectory, Scenario, SuiteConfig]
 )
 def test_every_field_of_a_schema_is_described(kind: type[DescribedModel]) -> None:
     schema = kind.model_json_schema(by_alias=True)
