@@ -10,7 +10,6 @@ from armident.configs import DataError
 from armident.identify.document import IdentificationDocument, Parameter
 from armident.identify.model_documents import ComparedModel, ComparedParameter, ComparisonDocument
 from armident.identify.monitoring.change_test import FALSE_ALARMS, ParameterChangeTest, compare
-from armident.identify.print_table import print_table
 from armident.identify.report.glossary import identification_entries
 from armident.identify.report.page import BAND, MODEL, MUTED, RESIDUAL, figure, render
 
@@ -196,34 +195,37 @@ def comparison_report(document: ComparisonDocument, glossary_of: IdentificationD
 def comparison_table(document: ComparisonDocument) -> None:
     """Print the verdict of a comparison, and the essential and the changed parameters with 95 % intervals by joint."""
     from rich.console import Console
-    from rich.table import Table
 
     console = Console()
     colour = "red" if document.verdict == "changed" else "green"
     console.print(f"verdict: {document.verdict}", style=f"bold {colour}", highlight=False)
     console.print(f"{document.sentence}.", highlight=False, soft_wrap=True, markup=False)
-    table = Table(title=f"{document.robot}: parameters with 95 % intervals", title_justify="left")
-    for heading in ("joint", "parameter", "before", "now", "difference", "p", "unit", ""):
-        left = heading in ("joint", "parameter", "unit", "")
-        table.add_column(heading, justify="left" if left else "right", no_wrap=True)
-    hidden = 0
+    rows = {p.name: _row(p) for p in document.parameters if p.essential or p.changed}
+    # Lines of plain text: a table that does not fit into the terminal would break names.
+    head = ("parameter", "before", "now", "difference", "unit")
+    widths = [max(len(row[k]) for row in (head, *rows.values())) for k in range(len(head))]
+
+    def line(cells: Sequence[str]) -> str:
+        middle = [cell.rjust(width) for cell, width in zip(cells[1:-1], widths[1:-1], strict=True)]
+        return "  ".join([cells[0].ljust(widths[0]), *middle, cells[-1]])
+
+    print(f"parameters with 95 % intervals\n  {line(head)}")
     for joint, parameters in document.by_joint.items():
-        shown = [p for p in parameters if p.essential or p.changed]
-        hidden += len(parameters) - len(shown)
-        for k, p in enumerate(shown):
-            values = (
-                f"{value:.4g} ± {LEVEL_95 * std:.2g}"
-                for value, std in (
-                    (p.before, p.before_std),
-                    (p.now, p.now_std),
-                    (p.now - p.before, p.std_of_difference),
-                )
-            )
-            mark = "changed" if p.changed else ""
-            table.add_row(joint if k == 0 else "", p.name, *values, f"{p.p_value:.2g}", p.unit, mark)
-    print_table(table, console)
+        shown = [p for p in parameters if p.name in rows]
+        if shown:
+            print(joint)
+        for p in shown:
+            print(f"  {line(rows[p.name])}{f'  changed, p = {p.p_value:.2g}' if p.changed else ''}")
+    hidden = len(document.parameters) - len(rows)
     if hidden:
         print(f"{hidden} parameters that are not essential and have not changed are in the report")
+
+
+def _row(p: ComparedParameter) -> tuple[str, str, str, str, str]:
+    """Return name, both values and their difference with 95 % intervals, and unit."""
+    values = ((p.before, p.before_std), (p.now, p.now_std), (p.now - p.before, p.std_of_difference))
+    before, now, difference = (f"{value:.4g} ± {LEVEL_95 * std:.2g}" for value, std in values)
+    return p.name, before, now, difference, p.unit
 
 
 def _picture(document: ComparisonDocument) -> str:
