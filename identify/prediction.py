@@ -17,6 +17,7 @@ from armident.identify.effects.recorded import put_right
 from armident.identify.experiment import Experiment
 from armident.identify.identification.api import experiments_of
 from armident.identify.identification.equations import equations, least_rows, published_equations
+from armident.identify.identification.from_recording import NO_REFERENCE
 from armident.identify.identification.judgement import Notes
 from armident.identify.identification.options import Options
 from armident.identify.identification.pipeline import (
@@ -109,6 +110,8 @@ def predict_recording(
         signals, blocks = _equations(model, experiments, options)
     if not any(block.t.size for block in blocks):
         raise DataError(f"{recording.path}: too short to predict: the filters leave no sample. Next: record longer")
+    # A prediction needs no reference.
+    remarks = [remark for remark in remarks if remark != NO_REFERENCE]
     document = _document(recording, model, blocks, [*remarks, *_beyond(signals, model), *notes.warnings])
     show("done", 1.0)
     theta, covariance = model.theta, model.covariance

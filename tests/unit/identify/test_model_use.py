@@ -270,3 +270,15 @@ def test_contradictory_options_of_a_simulation_are_one_line(
     assert expected in result.stderr
     assert result.stderr.count("\n") == 1
     assert not (tmp_path / "x.npz").exists()
+
+
+def test_the_measured_emps_is_predicted_with_the_published_errors(shared_data: Path) -> None:
+    """Janot, Gautier, Brunot 2019: the fit has an error of 4.0834 %, and of 5.9824 % on the recording with pulses."""
+    files = [shared_data / "emps" / name for name in ("DATA_EMPS.mat", "DATA_EMPS_PULSES.mat")]
+    if not all(file.is_file() for file in files):
+        pytest.skip("no recordings of the EMPS in the measured data")
+    seen, pulses = (armident.import_recording(file, "emps") for file in files)
+    found = armident.predict(pulses, armident.identify(seen, method="idim-ls")).document
+    assert found.held_out
+    assert round(found.identification_error_pct, 4) == 4.0834
+    assert round(found.relative_error_pct, 4) == 5.9824
