@@ -3,15 +3,18 @@
 import re
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from armident.configs import DataError
 from armident.identify.document import IdentificationDocument, Parameter
+from armident.identify.effects.terms import terms_of
 from armident.identify.model_documents import ComparedModel, ComparedParameter, ComparisonDocument
 from armident.identify.monitoring.change_test import FALSE_ALARMS, ParameterChangeTest, compare
 from armident.identify.report.glossary import identification_entries
 from armident.identify.report.page import BAND, MODEL, MUTED, RESIDUAL, figure, render
+from armident.identify.saved_model import configuration_of
 
 LEVEL_95 = 1.959964
 """Half width of a 95 % interval of a normal distribution, standard deviations."""
@@ -44,7 +47,7 @@ def compare_models(
         If they are of different robots or models, or cannot confirm or exclude a change.
     """
     (first, first_path), (second, second_path) = baseline, now
-    left_out = _different(first, second)
+    left_out = _different(baseline, now)
     if left_out and first.robot == second.robot:
         if not common:
             raise DataError(
@@ -56,10 +59,20 @@ def compare_models(
     return _document(result, (first, first_path), (second, second_path), left_out)
 
 
-def _different(first: IdentificationDocument, second: IdentificationDocument) -> list[str]:
-    """Return the names of the parameters that are not the same combination of standard parameters in both."""
-    one, other = ({p.name: p.formula or p.name for p in document.parameters} for document in (first, second))
+def _different(baseline: tuple[IdentificationDocument, Path], now: tuple[IdentificationDocument, Path]) -> list[str]:
+    """Return the names of the parameters that do not mean the same in both."""
+    one, other = _meanings(*baseline), _meanings(*now)
+    if baseline[0].configuration is None or now[0].configuration is None:
+        # A document of a former version does not say which curve an effect has.
+        one, other = ({name: meaning[0] for name, meaning in each.items()} for each in (one, other))
     return sorted(name for name in one.keys() | other.keys() if one.get(name) != other.get(name))
+
+
+def _meanings(document: IdentificationDocument, path: Path) -> dict[str, Any]:
+    """Return for each parameter what it groups; for one of an effect, the law and its nonlinear parameters, too."""
+    robot = configuration_of(document, path)
+    terms = {} if robot is None else {n: (t.effect.key, t.place, t.shapes) for t in terms_of(robot) for n in t.names}
+    return {p.name: (p.formula or p.name, terms.get(p.name)) for p in document.parameters}
 
 
 def _restricted(document: IdentificationDocument, without: Sequence[str]) -> IdentificationDocument:

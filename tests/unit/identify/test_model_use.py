@@ -204,6 +204,19 @@ def test_models_with_other_parameters_are_refused_or_compared_on_the_common_ones
     assert "without" in found["warnings"][0]
 
 
+def test_an_effect_of_another_shape_is_another_parameter(folder: Path, tmp_path: Path) -> None:
+    robot = armident.load_robot("emps")
+    for name, velocity in (("one", 0.02), ("two", 0.04)):
+        stribeck = {"effect": "stribeck_friction", "joint": "joint_1", "parameters": {"velocity": velocity}}
+        shaped = type(robot).model_validate({**robot.model_dump(by_alias=True), "effects": [stribeck]})
+        armident.identify(folder / f"{name}.mcap", shaped, method="idim-ls").save(tmp_path / name)
+    refused = call("compare", tmp_path / "one", tmp_path / "two")
+    assert refused.exit_code == 3
+    assert "(fst1)" in refused.stderr
+    found = call("compare", tmp_path / "one", tmp_path / "two", "--common", "--json")
+    assert json.loads(found.stdout)["left_out"] == ["fst1"]
+
+
 def test_models_of_one_recording_carry_a_warning(folder: Path, tmp_path: Path) -> None:
     result = call("compare", folder / "one", folder / "one", "--out", tmp_path, "--json")
     assert any("same recording" in line for line in json.loads(result.stdout)["warnings"])
