@@ -239,8 +239,7 @@ def _with_drives(robot: RobotConfig, parameters: ArmParameters) -> tuple[RobotCo
                 "torque limit needs; larger signals are clipped"
             )
         joints.append(joint.model_copy(update={"limits": limits, "drive": drive.model_copy(update=values)}))
-    # Every value that the arm needs is there now, so that its recordings have no blanks.
-    return robot.model_copy(update={"joints": tuple(joints), "blanks": ()}), (*remarks, *_sentences(assumed))
+    return robot.model_copy(update={"joints": tuple(joints)}), (*remarks, *_sentences(assumed))
 
 
 def _lacks_torque(robot: RobotConfig) -> bool:
