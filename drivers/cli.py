@@ -30,7 +30,7 @@ def bus_load(
     from armident.configs import ConfigError, load_session
     from armident.drivers.canopen.bus_load import bus_loads, check_fits
 
-    session = load_session(config)
+    session = load_session(config, "bus-load")
     if data_bitrate is not None and bitrate is None:
         raise ConfigError("--data-bitrate: needs --bitrate")
     if bitrate is not None:

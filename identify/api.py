@@ -182,6 +182,44 @@ class Identification(_Result):
         write_atomically(document, to_json(self.document))
         return document, self.report(Path(folder) / "report.html")
 
+    def export(
+        self, path: str | Path, format: str, *, urdf: str | Path | None = None, nearest: bool = False
+    ) -> tuple[Path, ...]:
+        """Write the model for a simulator or a controller, with a page of what the format cannot hold.
+
+        Parameters
+        ----------
+        path
+            File, or folder in which the file is named after the robot.
+        format
+            ``urdf``, ``mjcf``, ``sdf``, ``pinocchio``, or another format that ``armident export-model --help`` lists.
+        urdf
+            URDF of the arm, whose link frames and names the file takes.
+        nearest
+            True to accept the nearest physical arm where the estimate differs significantly from every physical one.
+
+        Returns
+        -------
+        tuple of Path
+            Files written, the model first, the page of its limits last.
+
+        Raises
+        ------
+        ConfigError
+            If there is no such format, or the URDF is of another arm.
+        DataError
+            If the identification is unusable, or no physical arm has these parameters.
+        """
+        from armident.identify.model_export.exported_model import exported_model
+        from armident.identify.model_export.formats import export_model
+        from armident.identify.model_export.source_urdf import source_for
+
+        saved = model_of(self.document, Path("identification.json"), self.robot)
+        model = exported_model(saved, nearest=nearest)
+        if urdf is not None:
+            model = model.in_frames_of(source_for(self.robot, Path(urdf)))
+        return tuple(export_model(model, format, Path(path))[0])
+
     def _html(self) -> str:
         from armident.identify.report.identification import identification_report
 
@@ -802,7 +840,7 @@ def _read(recordings: Recorded | Sequence[Recorded]) -> tuple[Recording, ...]:
 def _robot(robot: Robot | None, recordings: Sequence[Recording]) -> RobotConfig:
     if robot is None:
         return recordings[0].robot
-    return robot if isinstance(robot, RobotConfig) else load_robot(robot)
+    return robot if isinstance(robot, RobotConfig) else load_robot(robot, "identify")
 
 
 def _document(given: Identification | IdentificationDocument | str | Path) -> IdentificationDocument:

@@ -126,7 +126,7 @@ def model_of(
     if document.verdict == "unusable":
         reason = document.reasons[0]
         raise DataError(f"{path}: the model is unusable: {reason.message}. Next: {reason.next_step}")
-    config = robot or _configuration(document, path) or default
+    config = robot or configuration_of(document, path) or default
     if config is None:
         raise ConfigError(f"{path}: written by a former version, without the robot: add --config ROBOT")
     if config.name != document.robot:
@@ -140,6 +140,8 @@ def model_of(
         )
     smoothing = document.sign_smoothing
     if smoothing is not None:
+        if set(smoothing) != {joint.name for joint in config.joints}:
+            raise DataError(f"{path}: its joints are {', '.join(smoothing)}, other names than in the configuration")
         config = with_numbers(config, [smoothing[joint.name] for joint in config.joints])
     return SavedModel(config, document, path)
 
@@ -159,7 +161,21 @@ def _file(path: Path) -> Path:
     raise ConfigError(f"{path}: the folder has neither identification.json nor diagnosis.json")
 
 
-def _configuration(document: IdentificationDocument, path: Path) -> RobotConfig | None:
+def configuration_of(document: IdentificationDocument, path: Path) -> RobotConfig | None:
+    """Return the robot configuration that an identification keeps; ``None`` in documents of former versions.
+
+    Parameters
+    ----------
+    document
+        The identification.
+    path
+        Its file, for messages.
+
+    Raises
+    ------
+    DataError
+        If it is no robot configuration.
+    """
     if document.configuration is None:
         return None
     try:

@@ -138,7 +138,7 @@ def trajectory_command(options: TrajectoryOptions) -> CheckedTrajectory:
     DataError
         If ``known`` is of another robot or model, or is not physical.
     """
-    robot, out, look_at = load_robot(options.config), options.out, options.look_at
+    robot, out, look_at = load_robot(options.config, "trajectory"), options.out, options.look_at
     shape = _checked_shape(options)
     picture = options.picture
     if picture is None:

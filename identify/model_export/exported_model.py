@@ -1,29 +1,24 @@
 """An identified model with physically consistent link parameters, as the writers of all formats take it."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from armident.configs import ConfigError, DataError, RobotConfig, load_robot
-from armident.daq.recording import read_recording
-from armident.identify.document import IdentificationDocument, load_document
+from armident.configs import DataError, RobotConfig, load_robot
+from armident.identify.document import IdentificationDocument
 from armident.identify.effects.recorded import of_recording
 from armident.identify.effects.registry import of_entry
-from armident.identify.effects.terms import arm_model, effect_terms
+from armident.identify.effects.terms import effect_terms
+from armident.identify.identification.excitation_check import workspace_postures
 from armident.identify.model_export.link_frames import LinkFrames, mdh_link_frames
 from armident.identify.model_export.source_urdf import SourceUrdf, source_for, source_frames, source_of
 from armident.identify.robot.arm import ArmModel
 from armident.identify.robot.chain import Floats
 from armident.identify.robot.consistent import ConsistentParameters, nearest_consistent
 from armident.identify.robot_model import RobotModel
-
-OF_DIAGNOSIS = (
-    "a diagnosis finds effects, not the parameters of the arm: armident identify RECORDING --config {0}/model.yaml, "
-    "then export its result with --robot {0}/model.yaml"
-)
-"""Next step where a diagnosis is to be exported."""
+from armident.identify.saved_model import SavedModel, load_model
 
 IMPOSSIBLE = (
     "look for the effect with armident diagnose RECORDING and identify with the model it writes, "
@@ -147,11 +142,6 @@ class ExportedEffect:
     units: dict[str, str]
     of_recording: bool
 
-    @property
-    def is_linear_spring(self) -> bool:
-        """True for a spring of constant positive stiffness ``ks`` that is relaxed at position zero."""
-        return self.effect == "joint_spring" and not self.law and self.parameters.get("ks", 0.0) > 0.0
-
 
 @dataclass(frozen=True, eq=False)
 class ExportedModel:
@@ -177,6 +167,8 @@ class ExportedModel:
         The exported parameters by part of the arm; links in the frames of ``frames``.
     source_urdf
         URDF whose link frames these are; ``None``: modified Denavit-Hartenberg frames.
+    configuration
+        Path or name of the robot configuration that was given; empty: that of the document.
     """
 
     source: Path
@@ -192,6 +184,7 @@ class ExportedModel:
     couplings: tuple[JointCoupling, ...]
     effects: tuple[ExportedEffect, ...]
     source_urdf: SourceUrdf | None = None
+    configuration: str = ""
 
     @property
     def theta(self) -> Floats:
@@ -255,77 +248,69 @@ def load_exported_model(
     urdf: str | Path | None = None,
     *,
     nearest: bool = False,
+    progress: Callable[[str, float], None] | None = None,
 ) -> ExportedModel:
     """Read an identification and compute the physically consistent arm.
 
     Parameters
     ----------
     path
-        ``identification.json``, or a folder that contains it.
+        ``identification.json``, ``diagnosis.json``, or the folder of one of them. The structure that a diagnosis found
+        is identified from its recordings (`armident.identify.saved_model.load_model`).
     robot
-        Configuration, or its path or shipped name, for example the ``model.yaml`` of a diagnosis; ``None``: that of
-        the recording, else the shipped one of the document's name.
+        Configuration, or its path or shipped name; ``None``: that of the document.
     urdf
         URDF that the geometry comes from, whose frames and names the file takes; ``None``: the one that the
         configuration names, if it names one.
     nearest
         True to accept the nearest physical arm where the estimate differs significantly from every physical one.
+    progress
+        Called with the name of a stage and the share done, 0 to 1, while a diagnosed structure is identified.
 
     Raises
     ------
     ConfigError
-        If a file is missing, or configuration or URDF do not belong to the identification.
+        If a file is missing, there is no configuration, or the URDF is of another arm.
     DataError
-        If the identification is unusable, or no physical arm has these parameters.
+        If the identification is unusable or of another configuration, or no physical arm has these parameters.
     """
-    file = _document(Path(path))
-    document = load_document(file, IdentificationDocument)
-    config = robot if isinstance(robot, RobotConfig) else _robot(document, file, robot)
+    given = load_robot(robot) if isinstance(robot, str | Path) else robot
+    saved = load_model(Path(path), given, progress=progress)
     source = source_of(robot) if isinstance(robot, str | Path) and urdf is None else None
     if urdf is not None:
-        source = source_for(config, Path(urdf))
-    model = exported_model(document, config, file, nearest=nearest)
+        source = source_for(saved.robot, Path(urdf))
+    model = exported_model(saved, nearest=nearest)
+    if isinstance(robot, str | Path):
+        model = replace(model, configuration=str(robot))
     return model if source is None else model.in_frames_of(source)
 
 
-def exported_model(
-    document: IdentificationDocument, robot: RobotConfig, source: Path, *, nearest: bool = False
-) -> ExportedModel:
+def exported_model(saved: SavedModel, *, nearest: bool = False) -> ExportedModel:
     """Compute the physically consistent arm of an identification.
 
     Parameters
     ----------
-    document
-        The identification.
-    robot
-        Configuration of the robot.
-    source
-        File of the document, for messages.
+    saved
+        The identified model.
     nearest
         As in `load_exported_model`.
 
     Raises
     ------
-    ConfigError
-        If the configuration has other parameters than the identification.
     DataError
-        If the identification is unusable, or no physical arm has these parameters.
+        If no physical arm has these parameters, or couplings make its inertia negative.
     """
-    robot = _with_smoothing(robot, document)
-    arm = arm_model(robot)
-    theta, covariance = _estimate(arm, document, source)
+    arm, robot, theta, covariance = saved.arm, saved.robot, saved.theta, saved.covariance
     consistent = nearest_consistent(arm, theta, covariance, SMALLEST_LINK)
-    if document.verdict == "unusable":
-        reason = document.reasons[0]
-        raise DataError(f"{source}: the identification is unusable: {reason.message}; next: {reason.next_step}")
     if not consistent.compatible and not nearest:
-        raise DataError(f"{source}: {consistent.verdict}; next: {IMPOSSIBLE}")
+        raise DataError(f"{saved.path}: {consistent.verdict}; next: {IMPOSSIBLE}")
+    _refuse_negative_inertia(arm, consistent.theta, saved.path)
     frames = mdh_link_frames(robot)
     values = arm.values(consistent.theta)
     return ExportedModel(
-        source=source,
+        source=saved.path,
         robot=robot,
-        document=document,
+        document=saved.document,
         arm=arm,
         theta_base=theta,
         std=np.sqrt(np.diag(covariance)),
@@ -344,55 +329,17 @@ def exported_model(
     )
 
 
-def _document(path: Path) -> Path:
-    """Return the path of the identification; a diagnosis has no rigid parameters and is refused."""
-    if not path.is_dir():
-        if path.name == "diagnosis.json":
-            raise ConfigError(f"{path}: {OF_DIAGNOSIS.format(path.parent)}")
-        return path
-    if not (path / "identification.json").is_file() and (path / "diagnosis.json").is_file():
-        raise ConfigError(f"{path}: {OF_DIAGNOSIS.format(path)}")
-    return path / "identification.json"
-
-
-def _robot(document: IdentificationDocument, file: Path, given: str | Path | None) -> RobotConfig:
-    """Return the configuration that was given, that of the recording, or the shipped one."""
-    if given is not None:
-        return load_robot(given)
-    recorded = document.recording.path
-    for candidate in () if recorded is None else (Path(recorded), file.parent / recorded):
-        if candidate.is_file():
-            return read_recording(candidate).robot
-    try:
-        return load_robot(document.robot)
-    except ConfigError as error:
-        raise ConfigError(
-            f"{file}: the configuration of robot {document.robot} is unknown (its recording {recorded} is not here): "
-            "give it with --robot ROBOT.yaml"
-        ) from error
-
-
-def _with_smoothing(robot: RobotConfig, document: IdentificationDocument) -> RobotConfig:
-    """Return the configuration with the smoothed signs of the identification."""
-    found = document.sign_smoothing
-    if found is None or set(found) != {joint.name for joint in robot.joints}:
-        return robot
-    smoothing = tuple(found[joint.name] for joint in robot.joints)
-    return robot.model_copy(update={"friction": robot.friction.model_copy(update={"sign_smoothing": smoothing})})
-
-
-def _estimate(arm: ArmModel, document: IdentificationDocument, source: Path) -> tuple[Floats, Floats]:
-    """Return base parameters (b,) and covariance (b, b) in the order of the model."""
-    names = [p.name for p in document.parameters]
-    if set(names) != set(arm.base.names):
-        odd = sorted(set(names) ^ set(arm.base.names))
-        raise ConfigError(
-            f"{source}: other parameters than the configuration of {arm.robot.name} ({', '.join(odd[:5])}): "
-            "give the configuration that was identified with --robot, or identify with this one"
+def _refuse_negative_inertia(arm: ArmModel, theta: Floats, source: Path) -> None:
+    """Refuse couplings that are larger than the rotor inertias and links which they couple."""
+    turns = np.full((2, arm.n), np.pi) * [[-1.0], [1.0]]
+    smallest = np.linalg.eigvalsh(arm.mass_matrix(theta, workspace_postures(arm.robot, turns)))[:, 0]
+    if smallest.min() <= 0.0:
+        names = ", ".join(coupling.name for coupling in arm.robot.couplings)
+        raise DataError(
+            f"{source}: the inertia of coupling {names} is larger than those that it couples: the mass matrix is not "
+            f"positive definite at {100 * np.mean(smallest <= 0.0):.0f} % of the postures; next: record a motion with "
+            "more acceleration of both joints, or identify without the coupling"
         )
-    order = [names.index(name) for name in arm.base.names]
-    theta = np.array([document.parameters[k].value for k in order])
-    return theta, np.array(document.covariance)[np.ix_(order, order)]
 
 
 def _bodies(arm: ArmModel, theta: Floats, frames: LinkFrames) -> tuple[LinkBody, ...]:

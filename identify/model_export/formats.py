@@ -6,7 +6,10 @@ from pathlib import Path
 
 from armident.configs import ConfigError
 from armident.identify.document import write_atomically
+from armident.identify.model_export.code_writer import write_c, write_python
+from armident.identify.model_export.csv_writer import write_csv
 from armident.identify.model_export.exported_model import ExportedModel
+from armident.identify.model_export.fmu_writer import write_fmu
 from armident.identify.model_export.mjcf_writer import write_mjcf
 from armident.identify.model_export.pinocchio_writer import write_pinocchio
 from armident.identify.model_export.sdf_writer import write_sdf
@@ -37,6 +40,10 @@ FORMATS: dict[str, Format] = {
     "urdf": Format(".urdf", "URDF", write_urdf),
     "mjcf": Format(".xml", "MJCF (MuJoCo)", write_mjcf),
     "sdf": Format(".sdf", "SDFormat (Gazebo, Drake)", write_sdf),
+    "python": Format(".py", "Python module", write_python),
+    "c": Format(".c", "C source", write_c),
+    "csv": Format(".csv", "table of parameters", write_csv),
+    "fmu": Format(".fmu", "FMU (FMI 2.0 for Co-Simulation)", write_fmu),
     "pinocchio": Format(".pinocchio.xml", "Pinocchio model", write_pinocchio),
 }
 """Formats by name."""

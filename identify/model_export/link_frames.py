@@ -25,6 +25,8 @@ class LinkFrames:
         Unit vector of each joint axis in the frame of its link, (n, 3).
     from_mdh
         Modified Denavit-Hartenberg frame of each link in the frame of the link, homogeneous, (n, 4, 4).
+    frame_0
+        Rotation of frame 0 of the robot configuration in the base link, (3, 3).
     gravity
         Acceleration of gravity in the base link, m/s^2, (3,).
     endless
@@ -37,8 +39,17 @@ class LinkFrames:
     placements: Floats
     axes: Floats
     from_mdh: Floats
+    frame_0: Floats
     gravity: Floats
     endless: tuple[bool, ...]
+
+    @property
+    def free_base(self) -> str:
+        """Name of the base link for formats in which ``world`` is the world itself."""
+        free = (
+            name for name in (self.base, "base_link", "mount_link", "arm_base") if name not in ("world", *self.links)
+        )
+        return next(free)
 
 
 def mdh_link_frames(robot: RobotConfig) -> LinkFrames:
@@ -50,13 +61,15 @@ def mdh_link_frames(robot: RobotConfig) -> LinkFrames:
         Configuration, n joints. A link is named after its joint.
     """
     n = robot.n
+    links = tuple(f"{joint.name}_link" for joint in robot.joints)
     return LinkFrames(
-        base="base_link",
-        links=tuple(f"{joint.name}_link" for joint in robot.joints),
+        base="base_link" if "base_link" not in links else "mount_link",
+        links=links,
         joints=tuple(joint.source_name or joint.name for joint in robot.joints),
         placements=np.stack([mdh_transform(joint.mdh) for joint in robot.joints]),
         axes=np.tile([0.0, 0.0, 1.0], (n, 1)),
         from_mdh=np.tile(np.eye(4), (n, 1, 1)),
+        frame_0=np.eye(3),
         gravity=np.array(robot.gravity),
         endless=tuple(j.type == "revolute" and not np.isfinite(j.limits.position).all() for j in robot.joints),
     )

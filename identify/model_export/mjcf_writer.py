@@ -1,19 +1,28 @@
 """MJCF, the format of MuJoCo: bodies, friction, rotor inertias, couplings (as tendons), offsets, springs, gravity."""
 
 import xml.etree.ElementTree as ET
+from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from armident.identify.model_export.exported_model import ExportedModel, JointCoupling, LinkBody
-from armident.identify.model_export.sheet import PARTS, LimitationSheet, limitation_sheet
+from armident.identify.model_export.rigid_effects import SPRINGS, springs, with_rigid_effects
+from armident.identify.model_export.sheet import PARTS, LimitationSheet, Omission, limitation_sheet
 from armident.identify.model_export.xml_text import numbers, write_xml
 
 RADIUS_M = 0.02
 """Radius of the capsules that show links without meshes, m."""
 
+HOLDS = (*PARTS, "couplings", "gravity", SPRINGS)
+
+TENDONS = (
+    "couplings are fixed tendons over both joints, with a part of the armature and damping of each joint; "
+    "MuJoCo 3.3.1 or newer reads them"
+)
+
 REMARKS = (
-    "couplings are fixed tendons over both joints; a part of the armature, damping or friction of each joint is there",
     "the input of each actuator is the torque that the drive reports: the actuator subtracts the offset",
     "capsules show the links; they have no mass and no contacts, and meshes of a URDF are not copied",
 )
@@ -36,30 +45,32 @@ def write_mjcf(model: ExportedModel, out: Path) -> tuple[list[Path], LimitationS
     sheet : LimitationSheet
         Limits of the format.
     """
+    model, parts = with_rigid_effects(model)
     root = ET.Element("mujoco", model=model.robot.name)
     ET.SubElement(root, "compiler", angle="radian", autolimits="true", inertiafromgeom="false")
     ET.SubElement(root, "option", gravity=numbers(model.frames.gravity))
-    parent = ET.SubElement(ET.SubElement(root, "worldbody"), "body", name=model.frames.base)
-    springs = {effect.joint: effect for effect in model.effects if effect.is_linear_spring}
+    parent = ET.SubElement(ET.SubElement(root, "worldbody"), "body", name=model.frames.free_base)
+    stiffness = springs(model)
     own = {name: [getattr(joint, name) for joint in model.joints] for name in ("rotor_inertia", "viscous", "coulomb")}
     tendons = ET.Element("tendon")
-    held = all([_add_tendons(tendons, coupling, own, model) for coupling in model.couplings])
+    omitted = [part for coupling in model.couplings for part in _add_tendons(tendons, coupling, own, model)]
     for k, body in enumerate(model.links):
         parent = _add_body(parent, body, model, k)
         element = _joint(model, k)
         element.set("armature", numbers(own["rotor_inertia"][k]))
         element.set("damping", numbers(own["viscous"][k]))
         element.set("frictionloss", numbers(own["coulomb"][k]))
-        if k in springs:
-            element.set("stiffness", numbers(springs[k].parameters["ks"]))
+        if k in stiffness:
+            element.set("stiffness", numbers(stiffness[k]))
             element.set("springref", "0")
         parent.insert(0, element)
     if len(tendons):
         root.append(tendons)
     root.append(_actuators(model))
     write_xml(root, out)
-    holds = (*PARTS, "gravity", *(("couplings",) if held else ()))
-    return [out], limitation_sheet(model, "mjcf", holds, effects=list(springs.values()), remarks=REMARKS)
+    remarks = ((TENDONS,) if len(tendons) else ()) + REMARKS
+    sheet = limitation_sheet(model, "mjcf", HOLDS, parts=parts, remarks=remarks)
+    return [out], replace(sheet, omitted=(*sheet.omitted, *omitted))
 
 
 def _add_body(parent: ET.Element, body: LinkBody, model: ExportedModel, k: int) -> ET.Element:
@@ -67,9 +78,10 @@ def _add_body(parent: ET.Element, body: LinkBody, model: ExportedModel, k: int) 
     placement = model.frames.placements[k]
     axes = np.concatenate([placement[:3, 0], placement[:3, 1]])
     element = ET.SubElement(parent, "body", name=body.name, pos=numbers(placement[:3, 3]), xyaxes=numbers(axes))
-    c = body.central_inertia
-    six = [c[0, 0], c[1, 1], c[2, 2], c[0, 1], c[0, 2], c[1, 2]]
-    ET.SubElement(element, "inertial", pos=numbers(body.centre), mass=numbers(body.mass), fullinertia=numbers(six))
+    # Principal axes: MuJoCo's own decomposition of a full inertia is exact to 1e-7 only in older versions.
+    moments, principal = np.linalg.eigh(body.central_inertia)
+    inertial = {"pos": numbers(body.centre), "mass": numbers(body.mass), "diaginertia": numbers(moments)}
+    ET.SubElement(element, "inertial", inertial, xyaxes=numbers(principal[:, :2].T.ravel()))
     end = model.frames.placements[k + 1][:3, 3] if k + 1 < len(model.links) else body.centre
     if np.linalg.norm(end) > RADIUS_M:
         shape = {"type": "capsule", "size": numbers(RADIUS_M), "fromto": numbers(np.concatenate([np.zeros(3), end]))}
@@ -102,17 +114,20 @@ def _actuators(model: ExportedModel) -> ET.Element:
 
 def _add_tendons(
     tendons: ET.Element, coupling: JointCoupling, own: dict[str, list[float]], model: ExportedModel
-) -> bool:
-    """Add the tendons of a coupling and take their share from the joints; return False if one is impossible."""
+) -> Iterator[Omission]:
+    """Add the tendons of a coupling and take their share from the joints; return the parts that are impossible."""
     i, j = coupling.joints
-    possible = True
-    for key, attribute, shared in (
-        ("rotor_inertia", "armature", coupling.inertia),
-        ("viscous", "damping", coupling.viscous),
+    for part, key, attribute, shared in (
+        ("inertia", "rotor_inertia", "armature", coupling.inertia),
+        ("viscous friction", "viscous", "damping", coupling.viscous),
     ):
         share = _tendon(own[key][i], own[key][j], shared)
         if share is None:
-            possible = False
+            names = f"{model.joints[i].name} and {model.joints[j].name}"
+            yield Omission(
+                f"{part} of coupling {coupling.name}: {shared:.4g}",
+                f"It is larger than that of {names} themselves, which no tendon has.",
+            )
             continue
         coefficient, strength = share
         own[key][i] -= strength * coefficient**2
@@ -120,7 +135,6 @@ def _add_tendons(
         _add_tendon(tendons, f"{coupling.name}_{attribute}", model, (i, j), (coefficient, 1.0), {attribute: strength})
     loss = {"frictionloss": coupling.coulomb}
     _add_tendon(tendons, f"{coupling.name}_frictionloss", model, (i, j), (1.0, 1.0), loss)
-    return possible
 
 
 def _tendon(first: float, second: float, shared: float) -> tuple[float, float] | None:

@@ -1,12 +1,15 @@
 """XML archive of a Pinocchio model, with rotor inertias, friction, limits and gravity."""
 
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 
 from armident.configs import ConfigError
+from armident.identify.document import write_atomically
 from armident.identify.model_export.exported_model import ExportedModel
+from armident.identify.model_export.rigid_effects import with_rigid_effects
 from armident.identify.model_export.sheet import LimitationSheet, limitation_sheet
 
 HOLDS = ("rotor inertia", "viscous friction", "Coulomb friction", "gravity")
@@ -42,13 +45,18 @@ def write_pinocchio(model: ExportedModel, out: Path) -> tuple[list[Path], Limita
     except ImportError as error:
         raise ConfigError("--format pinocchio: Pinocchio is not installed: pip install pin") from error
     pin: Any = pinocchio
-    _pinocchio_model(model, pin).saveToXML(str(out), TAG)
+    model, parts = with_rigid_effects(model)
+    with TemporaryDirectory() as folder:
+        # Pinocchio writes files only; written here, the archive is complete or absent.
+        archive = Path(folder) / out.name
+        _pinocchio_model(model, pin).saveToXML(str(archive), TAG)
+        write_atomically(out, archive.read_text(encoding="utf-8"))
     remarks = (
         f'model = pinocchio.Model(); model.loadFromXML("{out.name}", "{TAG}") reads it with Pinocchio '
         f"{pin.__version__} or newer",
         "rnea and crba use the rotor inertia (armature); friction and damping are stored, and added by the caller",
     )
-    return [out], limitation_sheet(model, "pinocchio", HOLDS, remarks=remarks)
+    return [out], limitation_sheet(model, "pinocchio", HOLDS, parts=parts, remarks=remarks)
 
 
 def _pinocchio_model(model: ExportedModel, pin: Any) -> Any:

@@ -6,11 +6,12 @@ from pathlib import Path
 import numpy as np
 
 from armident.identify.model_export.exported_model import ExportedModel, LinkBody
+from armident.identify.model_export.rigid_effects import SPRINGS, springs, with_rigid_effects
 from armident.identify.model_export.sheet import LimitationSheet, limitation_sheet
 from armident.identify.model_export.xml_text import numbers, roll_pitch_yaw, write_xml
 from armident.identify.robot.chain import Floats
 
-HOLDS = ("viscous friction", "Coulomb friction")
+HOLDS = ("viscous friction", "Coulomb friction", SPRINGS)
 
 VERSION = "1.7"
 """First version of SDFormat with ``relative_to``."""
@@ -33,19 +34,20 @@ def write_sdf(model: ExportedModel, out: Path) -> tuple[list[Path], LimitationSh
     sheet : LimitationSheet
         Limits of the format.
     """
+    model, parts = with_rigid_effects(model)
     root = ET.Element("sdf", version=VERSION)
     arm = ET.SubElement(root, "model", name=model.robot.name)
-    ET.SubElement(arm, "link", name=model.frames.base)
-    _joint(arm, "world_fixed", "fixed", "world", model.frames.base)
-    parent = model.frames.base
-    springs = {effect.joint: effect for effect in model.effects if effect.is_linear_spring}
+    parent = model.frames.free_base
+    ET.SubElement(arm, "link", name=parent)
+    _joint(arm, f"{parent}_to_world", "fixed", "world", parent)
+    stiffness = springs(model)
     for k, body in enumerate(model.links):
         _add_link(arm, body, parent, model.frames.placements[k])
-        _add_joint(arm, model, k, parent, springs[k].parameters["ks"] if k in springs else 0.0)
+        _add_joint(arm, model, k, parent, stiffness.get(k, 0.0))
         parent = body.name
     write_xml(root, out)
     remarks = ("the base is fixed to the world; meshes are not copied",)
-    return [out], limitation_sheet(model, "sdf", HOLDS, effects=list(springs.values()), remarks=remarks)
+    return [out], limitation_sheet(model, "sdf", HOLDS, parts=parts, remarks=remarks)
 
 
 def _add_link(arm: ET.Element, body: LinkBody, parent: str, placement: Floats) -> None:
@@ -65,7 +67,9 @@ def _add_joint(arm: ET.Element, model: ExportedModel, k: int, parent: str, stiff
     """Add joint k, whose frame is that of its link."""
     joint, limits = model.joints[k], model.robot.joints[k].limits
     kind = "continuous" if model.frames.endless[k] else joint.type
-    axis = ET.SubElement(_joint(arm, joint.name, kind, parent, model.links[k].name), "axis")
+    # Links and joints share their names in SDF.
+    name = f"{joint.name}_joint" if joint.name in (model.frames.free_base, *model.frames.links) else joint.name
+    axis = ET.SubElement(_joint(arm, name, kind, parent, model.links[k].name), "axis")
     _text(axis, "xyz", model.frames.axes[k])
     bounds = dict(zip(("lower", "upper"), model.position_limits(k) or (), strict=False))
     element = ET.SubElement(axis, "limit")

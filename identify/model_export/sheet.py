@@ -1,7 +1,8 @@
 """Limits of an exported file: what its format cannot hold, and which parameters the data did not determine."""
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -106,6 +107,7 @@ def limitation_sheet(
     holds: Collection[str],
     *,
     effects: Collection[ExportedEffect] = (),
+    parts: Mapping[int, str] = MappingProxyType({}),
     remarks: Collection[str] = (),
 ) -> LimitationSheet:
     """Return the sheet of a file.
@@ -117,9 +119,12 @@ def limitation_sheet(
     format_name
         Name of the format.
     holds
-        Parts that the file holds: those of `PARTS`, ``couplings`` and ``gravity``. Every file holds the links.
+        Parts that the file holds: those of `PARTS`, ``couplings``, ``gravity`` and ``springs``; every file holds the
+        links.
     effects
-        Effects that the file holds.
+        Effects that the file holds as such.
+    parts
+        Part of the arm that another effect was added to, by index of the effect; ``holds`` says if the file holds it.
     remarks
         Further sentences for the user.
     """
@@ -141,9 +146,13 @@ def limitation_sheet(
         held.append(text)
     else:
         omitted.append(Omission(text, "Set it in the program that reads the file."))
-    for effect in model.effects:
+    for k, effect in enumerate(model.effects):
         if effect in effects:
             held.append(effect_in_words(model, effect))
+        elif parts.get(k) in holds:
+            held.append(f"{effect_in_words(model, effect)} (in: {parts[k]})")
+        elif parts.get(k) in (*PARTS, "couplings", "gravity"):
+            continue  # listed above as that part
         elif effect.of_recording:
             omitted.append(
                 Omission(effect_in_words(model, effect), "It corrects recordings and is no part of the arm.")
@@ -184,10 +193,15 @@ def _couplings(model: ExportedModel) -> Iterator[str]:
 
 
 def _about_estimate(model: ExportedModel) -> Iterator[str]:
-    """Return remarks on the estimate: its verdict, and its distance from a physical arm."""
+    """Return remarks on the geometry, the verdict of the estimate, and its distance from a physical arm."""
+    if model.configuration:
+        yield f"robot configuration: {model.configuration}"
+    if model.source_urdf is None:
+        yield "links have the Denavit-Hartenberg frames of the configuration; --urdf FILE takes those of a URDF"
     if model.document.verdict is not None:
-        reasons = "".join(f"; {reason.message}" for reason in model.document.reasons)
-        yield f"verdict of the identification: {model.document.verdict}{reasons}"
+        reasons = [reason.message for reason in model.document.reasons]
+        more = f" (and {len(reasons) - 1} more in {model.source.name})" if len(reasons) > 1 else ""
+        yield f"verdict of the identification: {': '.join([model.document.verdict, *reasons[:1]])}{more}"
     yield f"physical consistency: {model.consistent.verdict}"
     moved = np.abs(model.consistent.shifts)
     worst = int(np.argmax(moved))

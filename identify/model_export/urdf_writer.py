@@ -11,6 +11,7 @@ import numpy as np
 from armident.configs.schema.limits import WRITTEN_NO_LIMIT
 from armident.configs.urdf_origin import rotation, rotation_of_quaternion, rounded_angle
 from armident.identify.model_export.exported_model import ExportedModel, JointFriction, LinkBody
+from armident.identify.model_export.rigid_effects import with_rigid_effects
 from armident.identify.model_export.sheet import LimitationSheet, limitation_sheet
 from armident.identify.model_export.source_urdf import SourceUrdf
 from armident.identify.model_export.xml_text import numbers, roll_pitch_yaw, write_xml
@@ -36,12 +37,13 @@ def write_urdf(model: ExportedModel, out: Path) -> tuple[list[Path], LimitationS
     sheet : LimitationSheet
         Limits of the format.
     """
+    model, parts = with_rigid_effects(model)
     if model.source_urdf is None:
-        root, remarks = _new(model), ["no meshes: the geometry comes from Denavit-Hartenberg parameters"]
+        root, remarks = _new(model), ["there are no meshes"]
     else:
         root, remarks = _copy(model, model.source_urdf, out)
     write_xml(root, out)
-    return [out], limitation_sheet(model, "urdf", HOLDS, remarks=remarks)
+    return [out], limitation_sheet(model, "urdf", HOLDS, parts=parts, remarks=remarks)
 
 
 def _new(model: ExportedModel) -> ET.Element:

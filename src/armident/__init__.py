@@ -64,7 +64,15 @@ def __getattr__(name: str) -> Any:
         return importlib.import_module("armident.identify")
     if name not in _MODULES:
         raise AttributeError(f"module 'armident' has no attribute {name!r}")
-    value = getattr(importlib.import_module(_MODULES[name]), name)
+    try:
+        value = getattr(importlib.import_module(_MODULES[name]), name)
+    except ImportError as error:
+        from armident.extras import install_line, needed_extra
+
+        extra = needed_extra(error, _MODULES[name])
+        if extra is None:
+            raise
+        raise ImportError(install_line(f"armident.{name}", [extra]), name=error.name) from error
     globals()[name] = value
     return value
 

@@ -13,13 +13,19 @@ from armident.configs import load_robot
 from armident.identify.effects.terms import arm_model
 from armident.identify.model_export.exported_model import ExportedModel
 from armident.identify.model_export.formats import export_model
-from armident.identify.model_export.source_urdf import source_of
-from tests.model_exports import exported, random_motion, relative_error, rigid_torque
-from tests.pinocchio_oracle import random_parameters
+from armident.identify.model_export.source_urdf import source_for, source_of
+from tests.model_exports import (
+    Motion,
+    exported,
+    mujoco_torque,
+    random_motion,
+    random_theta,
+    relative_error,
+    rigid_torque,
+)
 from tests.urdf_chains import configuration, random_urdf
 
 Floats = NDArray[np.float64]
-Motion = tuple[Floats, Floats, Floats]
 
 TOLERANCE = 1e-9
 """Largest difference of inverse dynamics, relative to the torque: rounding, not modelling."""
@@ -33,10 +39,9 @@ ARMS = ("tx40", "panda", "emps", "urdf", "urdf_right_angles")
 @pytest.fixture(params=ARMS)
 def model(request: pytest.FixtureRequest, tmp_path: Path) -> ExportedModel:
     """An arm with random parameters on a tilted base; two come from a URDF, with a prismatic joint and skew axes."""
-    rng = np.random.default_rng(5)
     if not request.param.startswith("urdf"):
         robot = load_robot(request.param).model_copy(update={"gravity": TILTED})
-        return exported(robot, random_parameters(arm_model(robot), rng, friction=True))
+        return exported(robot, random_theta(arm_model(robot), 5))
     urdf = tmp_path / "arm.urdf"
     urdf.write_text(random_urdf(np.random.default_rng(11), 5, right_angles=request.param != "urdf"))
     config = tmp_path / "arm.yaml"
@@ -45,12 +50,32 @@ def model(request: pytest.FixtureRequest, tmp_path: Path) -> ExportedModel:
     assert {joint.type for joint in robot.joints} == {"revolute", "prismatic"}
     source = source_of(config)
     assert source is not None
-    return exported(robot, random_parameters(arm_model(robot), rng, friction=True)).in_frames_of(source)
+    return exported(robot, random_theta(arm_model(robot), 5)).in_frames_of(source)
 
 
 @pytest.fixture
 def motion(model: ExportedModel) -> Motion:
     return random_motion(model.robot, np.random.default_rng(7))
+
+
+@pytest.mark.parametrize("right_angles", [True, False])
+@pytest.mark.parametrize("seed", range(8))
+def test_a_urdf_with_another_base_takes_the_inertias_of_an_arm_without_urdf(
+    seed: int, right_angles: bool, tmp_path: Path
+) -> None:
+    rng, urdf, config = np.random.default_rng(seed), tmp_path / "arm.urdf", tmp_path / "arm.yaml"
+    text = random_urdf(rng, 4, right_angles)
+    urdf.write_text(text)
+    config.write_text(configuration(urdf, 4, np.array(TILTED)))
+    robot = load_robot(config)
+    on_table = '<link name="table"/><joint name="bolts" type="fixed"><parent link="table"/><child link="base"/>'
+    urdf.write_text(text.replace("</robot>", f'{on_table}<origin xyz="0.3 -0.2 0.7" rpy="0.4 -1 2"/></joint></robot>'))
+    model = exported(robot, random_theta(arm_model(robot), seed)).in_frames_of(source_for(robot, urdf))
+    assert model.frames.base == "table"
+    arm = pin.buildModelFromUrdf(str(written(model, "urdf", tmp_path)))
+    arm.gravity.linear = model.frames.gravity
+    motion = random_motion(robot, rng)
+    assert relative_error(pinocchio_torque(arm, motion), rigid_torque(model, motion)) < TOLERANCE
 
 
 def written(model: ExportedModel, format_name: str, folder: Path) -> Path:
@@ -64,20 +89,6 @@ def pinocchio_torque(arm: Any, motion: Motion) -> Floats:
     data, rows = arm.createData(), []
     for q, qd, qdd in zip(*motion, strict=True):
         rows.append(pin.rnea(arm, data, pin.integrate(arm, pin.neutral(arm), q), qd, qdd))
-    return np.array(rows)
-
-
-def mujoco_torque(file: Path, motion: Motion, gravity: Floats | None = None) -> Floats:
-    """Inverse dynamics (N, n) by MuJoCo, without limits and Coulomb friction, which are constraints there."""
-    mujoco = pytest.importorskip("mujoco")
-    arm = mujoco.MjModel.from_xml_path(str(file))
-    arm.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
-    if gravity is not None:
-        arm.opt.gravity[:] = gravity
-    data, rows = mujoco.MjData(arm), []
-    for data.qpos[:], data.qvel[:], data.qacc[:] in zip(*motion, strict=True):
-        mujoco.mj_inverse(arm, data)
-        rows.append(data.qfrc_inverse.copy())
     return np.array(rows)
 
 
