@@ -8,6 +8,7 @@ import numpy as np
 
 from armident.configs import RobotConfig
 from armident.configs.loading import load_inertials, load_shapes
+from armident.configs.urdf_inertials import UrdfInertials
 from armident.identify.effects.terms import arm_model
 from armident.identify.excitation.collision import CollisionModel
 from armident.identify.excitation.design import PERIOD, Design
@@ -84,16 +85,20 @@ def safety_model(
     )
     if prior is not None:
         return SafetyModel(collision, prior.theta, prior_name, tuple(remarks))
-    theta = None if source is None else _theta_of_urdf(robot, source)
-    if theta is not None:
+    found = None if source is None else load_inertials(source)
+    theta = None if found is None else _theta_of_urdf(robot, found)
+    if found is not None and theta is not None:
+        if found.massless:
+            remarks.append(
+                f"masses moved by {_listed(robot.joints[k - 1].name for k in found.massless)}: not in the URDF"
+            )
         remarks.append("torques of rotor inertias, and of friction that the URDF does not give")
     return SafetyModel(collision, theta, "the masses of the URDF", tuple(remarks))
 
 
-def _theta_of_urdf(robot: RobotConfig, source: str | Path) -> Floats | None:
+def _theta_of_urdf(robot: RobotConfig, found: UrdfInertials) -> Floats | None:
     """Standard parameters (p,) of the masses and friction of a URDF; ``None`` if it has no masses."""
-    found = load_inertials(source)
-    if found is None or not any(value > 0.0 for name, value in found.standard.items() if name.startswith("m")):
+    if len(found.massless) == robot.n:
         return None
     values = found.standard | found.friction
     return np.array([values.get(name, 0.0) for name in arm_model(robot).names])
