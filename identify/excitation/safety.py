@@ -6,12 +6,12 @@ from pathlib import Path
 
 import numpy as np
 
-from armident.configs import RobotConfig
+from armident.configs import ConfigError, RobotConfig
 from armident.configs.loading import load_inertials, load_shapes
 from armident.configs.urdf_inertials import UrdfInertials
 from armident.identify.effects.terms import arm_model
 from armident.identify.excitation.collision import CollisionModel
-from armident.identify.excitation.design import PERIOD, Design
+from armident.identify.excitation.design import ASSUMED_NOISE, PERIOD, Design, excesses, predict_precision
 from armident.identify.excitation.link_geometry import capsules_of
 from armident.identify.excitation.previous_estimate import PreviousEstimate
 from armident.identify.robot.chain import Floats
@@ -140,6 +140,100 @@ def check_safety(robot: RobotConfig, design: Design, safety: SafetyModel) -> Saf
         left.append(f"obstacles: {NO_BOXES}")
     left.append("cables, and a tool that neither the URDF nor collision.capsules contains")
     return SafetyChecks(tuple(done), tuple(left))
+
+
+@dataclass(frozen=True, eq=False)
+class CheckedTrajectory:
+    """Result of ``armident trajectory``.
+
+    Parameters
+    ----------
+    robot
+        Configuration of the robot.
+    path
+        File of the trajectory; ``None``: it is not in a file.
+    design
+        Trajectory with its predicted precision.
+    std
+        Predicted standard deviations of the base parameters (b,), SI.
+    prior
+        Earlier estimate; ``None``: the standard deviations are those of an assumed noise.
+    safety
+        Masses and bodies.
+    checks
+        Properties that were checked, and those that were not.
+    excess
+        Limits that an existing trajectory exceeds.
+    """
+
+    robot: RobotConfig
+    path: Path | None
+    design: Design
+    std: Floats
+    prior: PreviousEstimate | None
+    safety: SafetyModel
+    checks: SafetyChecks
+    excess: tuple[str, ...]
+
+    def refuse_excess(self) -> None:
+        """Refuse a trajectory that exceeds limits of torque or distance.
+
+        Raises
+        ------
+        ConfigError
+            Names each excess and the next step.
+        """
+        if self.excess:
+            next_step = "Next: design another one with --out FILE, or correct limits.torque and collision of the robot"
+            raise ConfigError(f"{self.path}: needs {'; '.join(self.excess)}. {next_step}")
+
+
+def checked_trajectory(
+    robot: RobotConfig, design: Design, safety: SafetyModel, prior: PreviousEstimate | None, path: Path | None = None
+) -> CheckedTrajectory:
+    """Return a trajectory with all checks.
+
+    Parameters
+    ----------
+    robot
+        Configuration with the limits.
+    design
+        The trajectory.
+    safety
+        Masses and bodies by which it was designed or checked.
+    prior
+        Earlier estimate, if there is one.
+    path
+        File of the trajectory, if there is one.
+    """
+    std, checks = expected_std(robot, design, prior), check_safety(robot, design, safety)
+    return CheckedTrajectory(
+        robot, path, design, std, prior, safety, checks, tuple(excesses(robot, design, safety.collision))
+    )
+
+
+def expected_std(robot: RobotConfig, design: Design, prior: PreviousEstimate | None) -> Floats:
+    """Return the predicted standard deviations of the base parameters (b,), SI; of an assumed noise without estimate.
+
+    Parameters
+    ----------
+    robot
+        Configuration of the robot.
+    design
+        The trajectory.
+    prior
+        Earlier estimate, if there is one.
+    """
+    std = design.std
+    if prior is None or std is None:
+        std = predict_precision(arm_model(robot), design.trajectory, assumed_noise(robot)).std
+        assert std is not None
+    return std
+
+
+def assumed_noise(robot: RobotConfig) -> Floats:
+    """Return the torque noise (n,) that is assumed where none is known, N m or N."""
+    return ASSUMED_NOISE * np.array([joint.limits.torque for joint in robot.joints])
 
 
 def _listed(names: Iterable[str], most: int = 6) -> str:
