@@ -20,7 +20,7 @@ from armident.identify.print_table import print_table
 from armident.identify.setup.result import SetupCheck
 
 if TYPE_CHECKING:
-    from armident.identify.prediction import PredictionDocument
+    from armident.identify.model_documents import PredictionDocument
 
 SHOW_AFTER_S = 2.0
 """Duration after which progress is shown, s."""

@@ -640,10 +640,16 @@ def diagnosis_from_version_1(data: Mapping[str, Any]) -> dict[str, Any]:
     return {names.get(key, key): changes[key](value) if key in changes else value for key, value in data.items()}
 
 
-SCHEMA_FILES: dict[str, type[Document]] = {
-    "identification.schema.json": IdentificationDocument,
-    "diagnosis.schema.json": DiagnosisDocument,
-}
+def schema_files() -> dict[str, type[Document]]:
+    """Return the documents that have a JSON Schema in ``configs/json_schemas``, by the name of its file."""
+    from armident.identify.model_documents import ComparisonDocument, PredictionDocument
+
+    return {
+        "identification.schema.json": IdentificationDocument,
+        "diagnosis.schema.json": DiagnosisDocument,
+        "prediction.schema.json": PredictionDocument,
+        "comparison.schema.json": ComparisonDocument,
+    }
 
 
 def identification_document(
@@ -873,8 +879,10 @@ def _text(path: Path) -> str:
         return path.read_text(encoding="utf-8")
     except FileNotFoundError as error:
         raise ConfigError(f"{path}: no such file") from error
-    except (OSError, UnicodeDecodeError) as error:
-        raise DataError(f"{path}: cannot be read: {error}") from error
+    except UnicodeDecodeError as error:
+        raise DataError(f"{path}: not a JSON document") from error
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read: {error.strerror}") from error
 
 
 def write_atomically(path: Path, text: str) -> None:
@@ -909,7 +917,7 @@ def schema_text(kind: type[Document]) -> str:
 
 def main() -> None:
     """Write the schema files: ``python -m armident.identify.document``."""
-    for name, kind in SCHEMA_FILES.items():
+    for name, kind in schema_files().items():
         write_atomically(Path(configs.__file__).parent / "json_schemas" / name, schema_text(kind))
 
 

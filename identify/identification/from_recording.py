@@ -19,6 +19,8 @@ STILL_SHARE = 1e-3
 """Share of its position range below which a joint counts as not moving."""
 RATE_TOLERANCE = 0.01
 """Relative difference between the nominal rate and the receive times above which a note is added."""
+NO_REFERENCE = "no reference trajectory was recorded: identified without one"
+"""Note on a recording without demands."""
 EFFORTS: tuple[Literal["torque", "current", "voltage"], ...] = ("torque", "current", "voltage")
 
 Array = NDArray[np.float64]
@@ -71,7 +73,7 @@ def _converted(recording: Recording, robot: RobotConfig) -> tuple[list[Experimen
     tau = joint_torques(samples, robot)
     q_ref, has_ref = _reference(recording, robot)
     if q_ref is None:
-        notes.append("no reference trajectory was recorded: identified without one")
+        notes.append(NO_REFERENCE)
 
     experiments: list[Experiment] = []
     for first, last in recording.experiments():
