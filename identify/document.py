@@ -247,6 +247,11 @@ class IdentificationDocument(Document):
         Statistics of the residuals for later comparison; null in documents of former versions.
     configuration
         Robot configuration that the parameters belong to; null in documents of former versions.
+    held_out_error_pct
+        Torque error where each fifth of the recordings is predicted by least squares from the rest, percent; null where
+        the rest does not determine the parameters, and in documents of former versions.
+    held_out_error_pct_by_joint
+        The same of each joint, percent.
     """
 
     schema_: Literal["armident/identification/1"] = Field("armident/identification/1", alias="schema")
@@ -279,6 +284,8 @@ class IdentificationDocument(Document):
     criteria: dict[str, float] | None = None
     residual_statistics: list[ResidualStatistics] | None = None
     configuration: dict[str, Any] | None = None
+    held_out_error_pct: float | None = None
+    held_out_error_pct_by_joint: dict[str, float] | None = None
 
 
 class Alternative(Document):
@@ -694,6 +701,10 @@ def identification_document(
         relative_error_pct_by_joint=dict(
             zip(joints, (float(v) for v in result.relative_error_pct_by_joint), strict=True)
         ),
+        held_out_error_pct=None if result.held_out is None else result.held_out[0],
+        held_out_error_pct_by_joint=None
+        if result.held_out is None
+        else dict(zip(joints, (float(v) for v in result.held_out[1]), strict=True)),
         iterations=int(result.iterations),
         converged=bool(result.converged),
         stop_reason=result.stop_reason,
