@@ -4,6 +4,7 @@ from pathlib import Path
 
 from armident.configs import RobotConfig, Scenario, Trajectory, load_robot, load_scenario, load_trajectory
 from armident.daq.recording import Recording
+from armident.extras import named_extra
 
 
 def simulate_recording(
@@ -55,7 +56,8 @@ def simulate_recording(
     >>> recording.sample_rate_hz
     5000.0
     """
-    from armident.virtual_robot.offline import simulate_recording as simulate
+    with named_extra("armident.simulate_recording", __name__):
+        from armident.virtual_robot.offline import simulate_recording as simulate
 
     config = robot if isinstance(robot, RobotConfig) else load_robot(robot)
     reference = trajectory if isinstance(trajectory, Trajectory) else load_trajectory(trajectory)

@@ -58,10 +58,19 @@ def test_a_command_without_its_extra_names_the_installation(words: tuple[str, ..
     assert (done.returncode, done.stdout, done.stderr) == (2, "", line)
 
 
-def test_a_name_of_the_api_without_its_extra_names_the_installation(tmp_path: Path) -> None:
-    program = "import armident\ntry:\n    armident.compare\nexcept ImportError as error:\n    print(error)\n"
-    done = run_without({"scipy"}, program, tmp_path)
-    assert done.stdout == "armident.compare needs extra packages: pip install 'armident[identify]'\n"
+@pytest.mark.parametrize(
+    ("use", "extra"),
+    [
+        ("compare", "identify"),
+        ("identify('run.mcap')", "identify"),
+        ("simulate_recording('emps', 'emps_excitation')", "virtual"),
+    ],
+)
+def test_a_name_of_the_api_without_its_extra_names_the_installation(use: str, extra: str, tmp_path: Path) -> None:
+    program = f"import armident\ntry:\n    armident.{use}\nexcept ImportError as error:\n    print(error)\n"
+    done = run_without({"scipy", "numba", "pinocchio"}, program, tmp_path)
+    name = use.partition("(")[0]
+    assert done.stdout == f"armident.{name} needs extra packages: pip install 'armident[{extra}]'\n", done.stderr
 
 
 def test_a_missing_module_of_no_extra_is_not_taken_for_one() -> None:
