@@ -1,4 +1,4 @@
-"""The command ``armident doctor``: checks session and machine before a capture, and names the remedies."""
+"""The command ``armident doctor``: checks session and machine before a command, and names the remedies."""
 
 import json
 import os
@@ -18,10 +18,13 @@ from armident.configs import (
     ConfigError,
     RobotConfig,
     SessionConfig,
+    config_path,
     load_robot,
     load_session,
     load_trajectory,
 )
+from armident.configs.blanks import listed, needed, pattern
+from armident.configs.loading import is_session
 from armident.configs.schema.session import Bus
 from armident.daq.capture.clock import clock_state
 from armident.daq.capture.files import chunk_duration_ns
@@ -35,6 +38,8 @@ from armident.drivers.compiled import MODE, require_compiled
 from armident.drivers.vcan.interfaces import NETWORK, have_socketcan, is_up
 
 Verdict = Literal["ok", "warning", "failed"]
+Command = Literal["capture", "import", "identify", "trajectory", "robot"]
+"""Commands whose needs are checked."""
 
 _LEAST_HOURS = 24.0
 """Recording time for which the disk should have space, h."""
@@ -62,6 +67,39 @@ class Check:
     message: str
 
 
+def checks_for(config: str | Path, command: Command) -> list[Check]:
+    """Check everything that a command needs of a configuration.
+
+    Parameters
+    ----------
+    config
+        Robot or session configuration.
+    command
+        The command; for ``capture`` as `run_checks`, which needs a session.
+    """
+    if command == "capture":
+        return run_checks(config)
+    try:
+        path = config_path(config)
+        session = load_session(path, "") if is_session(path) else None
+        robot = load_robot(path if session is None else session.robot, "")
+    except ArmidentError as error:
+        return [Check("configuration", "failed", str(error))]
+    of_session = () if session is None else session.blanks
+    missing = (*needed(of_session, command), *robot.blanks_for(command))
+    checks = [Check("configuration", "ok", f"{config}: robot {robot.name}, {robot.n} joints")]
+    checks += [Check("blank", "failed", line) for line in listed(missing)]
+    if command == "trajectory" and not missing:
+        try:
+            robot.check_movable(str(path))
+        except ConfigError as error:
+            checks.append(Check("limits", "failed", str(error)))
+    later = [key for key in (*of_session, *robot.blanks) if key not in missing]
+    if later:
+        checks.append(Check("not needed yet", "ok", ", ".join(dict.fromkeys(map(pattern, later)))))
+    return checks
+
+
 def run_checks(config: str | Path) -> list[Check]:
     """Check everything that a capture of a session needs.
 
@@ -74,11 +112,14 @@ def run_checks(config: str | Path) -> list[Check]:
         Session configuration.
     """
     try:
-        session = load_session(config)
+        session = load_session(config, "")
+        robot = load_robot(session.robot, "")
+        blanks = (*needed(session.blanks, "capture"), *robot.blanks_for("capture"))
     except ArmidentError as error:
         return [Check("configuration", "failed", str(error)), _installation(), _clock()]
+    if blanks:
+        return [*(Check("blank", "failed", line) for line in listed(blanks)), _installation(), _clock()]
     try:
-        robot = load_robot(session.robot)
         captured_streams(session, robot)
         if session.setpoints is not None:
             trajectory = load_trajectory(session.setpoints.trajectory)
@@ -313,27 +354,30 @@ def _zenoh(session: SessionConfig) -> Check:
     return Check("zenoh", "ok", f"peers on loopback, port {port}")
 
 
-def doctor(config: str, as_json: bool) -> None:
+def doctor(config: str, as_json: bool, command: Command = "capture") -> None:
     """Run ``armident doctor``: print the checks.
 
     Parameters
     ----------
     config
-        Session configuration.
+        Session configuration; for other commands than ``capture`` also a robot configuration.
     as_json
         Print JSON.
+    command
+        Command in mind.
 
     Raises
     ------
     ConfigError
-        If a check failed: a capture would not run.
+        If a check failed: the command would not run.
     """
-    checks = run_checks(config)
+    checks = checks_for(config, command)
     if as_json:
         print(json.dumps([{"what": c.name, "verdict": c.verdict, "found": c.message} for c in checks]))
     else:
         for check in checks:
             print(f"{check.verdict:8} {check.name}: {check.message}")
-    failed = [check.name for check in checks if check.verdict == "failed"]
+    failed = dict.fromkeys(check.name for check in checks if check.verdict == "failed")
     if failed:
-        raise ConfigError(f"{config}: a capture would not run: {', '.join(failed)}")
+        what = "a capture" if command == "capture" else command
+        raise ConfigError(f"{config}: {what} would not run: {', '.join(failed)}")

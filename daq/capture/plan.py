@@ -112,8 +112,8 @@ def load_plan(
         loops of the bus are not compiled.
     """
     require_compiled()
-    session = load_session(config)
-    robot = load_robot(session.robot)
+    session = load_session(config, "capture")
+    robot = load_robot(session.robot, "capture")
     check_fits(session, str(config))
     if sniff_s is not None:
         if not listen_only:

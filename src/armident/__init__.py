@@ -32,6 +32,8 @@ if TYPE_CHECKING:
     from armident.identify.api import diagnose as diagnose
     from armident.identify.api import effects as effects
     from armident.identify.api import identify as identify
+    from armident.identify.api import predict as predict
+    from armident.identify.prediction import TorquePrediction as TorquePrediction
     from armident.identify.robot_model import RobotModel as RobotModel
     from armident.virtual_robot.api import simulate_recording as simulate_recording
 
@@ -41,8 +43,9 @@ _HOMES = {
     "armident.daq.recording": ("Recording", "read_recording"),
     "armident.identify.api": (
         "ChangeTest", "Design", "Diagnosis", "Effect", "Identification", "check", "compare", "design_trajectory",
-        "diagnose", "effects",
+        "diagnose", "effects", "predict",
     ),
+    "armident.identify.prediction": ("TorquePrediction",),
     "armident.identify.robot_model": ("RobotModel",),
     "armident.virtual_robot.api": ("simulate_recording",),
 }  # fmt: skip

@@ -83,7 +83,7 @@ def fleet_command(pattern: str, asked: ReidentifyOptions, *, as_json: bool) -> i
     paths = [Path(name).resolve() for name in sorted(glob.glob(pattern, recursive=True))]
     if not paths:
         raise ConfigError(f"--recordings {pattern}: no such file")
-    robot = None if asked.config is None else load_robot(asked.config)
+    robot = None if asked.config is None else load_robot(asked.config, "identify")
     known = None if asked.baseline is None else load_document(asked.baseline, IdentificationDocument)
     history = History(asked.store)
     rows: list[Row] = []
