@@ -40,6 +40,21 @@ def rotation(roll: float, pitch: float, yaw: float) -> Floats:
     return matrix
 
 
+def angles_of(matrix: Floats) -> tuple[float, float, float]:
+    """Roll, pitch and yaw (rad) of a rotation: the inverse of `rotation`, with yaw 0 where only their sum is known.
+
+    Parameters
+    ----------
+    matrix
+        Rotation matrix, shape (3, 3).
+    """
+    cos_pitch = math.hypot(matrix[0, 0], matrix[1, 0])
+    pitch = math.atan2(-matrix[2, 0], cos_pitch)
+    if cos_pitch < EXACT:
+        return math.atan2(-matrix[1, 2], matrix[1, 1]), pitch, 0.0
+    return math.atan2(matrix[2, 1], matrix[2, 2]), pitch, math.atan2(matrix[1, 0], matrix[0, 0])
+
+
 def _cos_sin(angle: float) -> tuple[float, float]:
     c, s = math.cos(angle), math.sin(angle)
     return (float(round(c)), float(round(s))) if min(abs(c), abs(s)) < 1e-15 else (c, s)

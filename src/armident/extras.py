@@ -5,7 +5,8 @@ from contextlib import contextmanager
 
 EXTRAS: dict[str, tuple[str, ...]] = {
     "identify": (
-        "clarabel", "coal", "filterpy", "jinja2", "markupsafe", "matplotlib", "numba", "scipy", "sqlalchemy", "threadpoolctl",
+        "clarabel", "coal", "filterpy", "jinja2", "markupsafe", "matplotlib", "numba", "scipy", "sqlalchemy",
+        "threadpoolctl",
     ),
     "virtual": ("clarabel", "numba", "pinocchio", "scipy"),
     "fleet": ("distributed",),

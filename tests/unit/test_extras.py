@@ -94,3 +94,19 @@ def test_a_capture_without_compiled_loops_is_refused(tmp_path: Path) -> None:
     checks = run_without({"numba"}, armident("doctor", "--config", "tx40_cell.yaml"), tmp_path)
     assert checks.returncode == 2
     assert "no compiled code for the bus" in " ".join(checks.stdout.split())
+
+
+def test_the_packages_of_a_capture_machine_import_no_module_of_an_extra(tmp_path: Path) -> None:
+    """Only the guard does: it checks every frame of a moving arm in loops that numba compiles."""
+    program = (
+        "import armident.configs, armident.daq, armident.drivers, importlib, pkgutil\n"
+        "for package in (armident.configs, armident.daq, armident.drivers):\n"
+        "    for found in pkgutil.walk_packages(package.__path__, package.__name__ + '.'):\n"
+        "        try:\n"
+        "            found.name.endswith('__main__') or importlib.import_module(found.name)\n"
+        "        except ImportError as error:\n"
+        "            print(found.name, error.name)\n"
+    )
+    done = run_without({module for modules in EXTRAS.values() for module in modules}, program, tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert all(line.startswith("armident.daq.guard.") for line in done.stdout.splitlines()), done.stdout
