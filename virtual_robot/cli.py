@@ -120,7 +120,8 @@ def demo(
     Example: armident demo --out demo
     """
     from armident.extras import require
-    from armident.virtual_robot.demo import demo as run_demo
 
     require("armident demo", "identify", "virtual")
+    from armident.virtual_robot.demo import demo as run_demo
+
     run_demo(out=out, keep_going=keep_going, quick=quick)
