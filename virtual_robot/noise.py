@@ -60,15 +60,19 @@ class Noise:
         Seed of the random numbers.
     level
         Factor on the amplitudes; 0: no noise.
+    size
+        Variances of the noise; ``None``: those of the TX40 or the EMPS.
     """
 
-    def __init__(self, robot: RobotConfig, period: float, seed: int, level: float = 1.0) -> None:
+    def __init__(
+        self, robot: RobotConfig, period: float, seed: int, level: float = 1.0, size: NoiseSize | None = None
+    ) -> None:
         n = robot.n
-        size = SIZES[robot.name]
+        size = SIZES[robot.name] if size is None else size
         total, low = np.array(size.sampled), np.array(size.decimated)
         white_low = DECIMATION_HZ * 2 * period
         slow_low = 2 / np.pi * np.arctan(DECIMATION_HZ / DISTURBANCE_HZ)
-        slow = (low - white_low * total) / (slow_low - white_low)
+        slow = np.clip((low - white_low * total) / (slow_low - white_low), 0.0, None)
         gain = np.array([joint.drive.gain for joint in robot.joints])
         motor = np.linalg.solve(robot.transmission_matrix.T**2, np.maximum(total - slow, 0.0))
         self._current = level * np.sqrt(np.maximum(motor, 0.0)) / np.abs(gain)

@@ -430,8 +430,8 @@ def run_worker(config: Path, *, once: bool, out: Path | None) -> int:
     ConfigError
         If the configuration is wrong.
     """
-    session = load_session(config)
-    robot = load_robot(session.robot)
+    session = load_session(config, "identify")
+    robot = load_robot(session.robot, "identify")
     stopped = threading.Event()
 
     def stop(_signal: int, _frame: FrameType | None) -> None:
