@@ -517,7 +517,7 @@ def diagnose(
         name = baseline if isinstance(baseline, str | Path) else "baseline"
         raise DataError(f"{name}: the baseline is of robot {numbers.robot!r}, the recording of {config.name!r}")
     training, notes = experiments_of(read, config, name_files=True)
-    held_out: list[Experiment] = []
+    held_out: Sequence[Experiment] = []
     if validate is not None:
         read = (*read, *_read(validate))
         held_out, more = experiments_of(read[-1:], config, name_files=True)

@@ -143,8 +143,8 @@ def _options(written: dict[str, Any]) -> Options:
 
 
 def _equations(
-    model: SavedModel, experiments: list[Experiment], options: Options
-) -> tuple[list[Derivatives], list[ExperimentEquations]]:
+    model: SavedModel, experiments: Sequence[Experiment], options: Options
+) -> tuple[Sequence[Derivatives], Sequence[ExperimentEquations]]:
     """Return the derivatives, and the equations after the filters of IDIM-LS as in an identification."""
     robot, arm = model.robot, model.arm
     dt, lengths = experiments[0].dt, [e.q.shape[0] for e in experiments]
