@@ -221,6 +221,30 @@ def test_drives_keep_time_with_any_sync_period(period_us: int, panda: RobotConfi
     assert period_us * 1e-6 / period == pytest.approx(round(period_us * 1e-6 / period))
 
 
+def test_the_reported_signal_moves_the_arm_from_the_reported_position_to_the_next() -> None:
+    """An axis without friction: second differences of the position are the signal over the mass."""
+    emps = load_robot("emps").model_copy(update={"name": "axis", "controller": None})
+    quiet = scenario("friction: {joint_1: {viscous: 0.0, coulomb: 0.0, offset: 0.0}}\n")
+    robot, parameters, _ = complete(emps)
+    arm = Arm(robot, [0.0], 1e-3, noise=0.0, scenario=quiet, parameters=parameters)
+    arm.enable(0, True)
+    arm.interpolation_time(0, 5e-3)
+    position, signal = [], []
+    for k in range(60):
+        position.append(float(arm.position[0]))
+        signal.append(float(arm.current[0]))
+        arm.set_targets(np.array([20_000 if k == 10 else 0], np.int32), np.array([k == 10]))
+        arm.advance()
+    drive = robot.joints[0].drive
+    force = np.array(signal) * drive.rated / 1000 * drive.gain
+    mass = parameters.standard["m1"] + parameters.standard["ia1"]
+    bends = np.diff(position, 2) / counts_per_si(robot)[0] / 1e-6 * mass
+    # Within a period the force changes: 8 % of the largest. Forces at the instants of SYNC are 48 % and 4 % off.
+    means = np.convolve(force, [0.5, 0.5])[1 : bends.size + 1]
+    np.testing.assert_allclose(means, bends, atol=0.15 * np.abs(bends).max())
+    assert abs(np.sum(force) - np.sum(bends)) < 0.01 * np.abs(force).sum()
+
+
 @pytest.mark.parametrize("name", ["panda", "kuka_lwr4", "tx40", "emps"])
 def test_the_motion_keeps_the_limits_and_uses_them(name: str) -> None:
     robot, _, _ = complete(load_robot(name))
@@ -246,6 +270,7 @@ def test_the_written_configuration_is_that_of_the_arm(tmp_path: Path) -> None:
     assert session.setpoints is not None
     load_trajectory(session.setpoints.trajectory).check(robot)
     text = (tmp_path / "twin" / "robot.yaml").read_text()
+    assert "# friction.sign_smoothing: turn 150, elbow 150, lift 5000, spin 150" in text
     assert "# limits.acceleration: turn 20, elbow 25, lift 4, spin 60" in text
     again = load_twin(tmp_path / "twin" / "cell.yaml")
     assert again.assumed == ()
