@@ -71,7 +71,7 @@ def read_inertials(file: Path, base: str | None = None, tip: str | None = None) 
     bodies = np.zeros((len(joints), 4, 4))
     impossible: list[str] = []
     held: list[str] = []
-    for link, owner, placement, held_joint in _carried(tree, first, names):
+    for link, owner, placement, held_joint in carried_links(tree, first, names):
         held += [] if held_joint is None else [held_joint]
         if owner < 0:
             continue
@@ -93,8 +93,18 @@ def read_inertials(file: Path, base: str | None = None, tip: str | None = None) 
     )
 
 
-def _carried(tree: UrdfTree, base: str, chain: list[str]) -> Iterator[tuple[str, int, Floats, str | None]]:
-    """Links below the base: name, index of the joint that moves it (-1: none), placement, joint that is held still."""
+def carried_links(tree: UrdfTree, base: str, chain: list[str]) -> Iterator[tuple[str, int, Floats, str | None]]:
+    """Links below the base: name, index of the joint that moves it (-1: none), placement, joint that is held still.
+
+    Parameters
+    ----------
+    tree
+        Links and joints of the URDF.
+    base
+        First link of the chain.
+    chain
+        Names of the moving joints of the chain in the URDF.
+    """
     todo: list[tuple[str, int, Floats]] = [(base, -1, np.eye(4))]
     while todo:
         link, owner, placement = todo.pop()

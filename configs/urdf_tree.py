@@ -4,6 +4,7 @@ import math
 import re
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from decimal import Decimal, InvalidOperation
 from itertools import pairwise
@@ -86,6 +87,98 @@ def read_chain(file: Path, base: str | None = None, tip: str | None = None) -> t
     return tuple(chain)
 
 
+def serial_tips(file: Path, base: str | None = None) -> dict[str, tuple[str, ...]]:
+    """Names of the moving joints to each link at which a serial chain can end: ends of branches, and their forks.
+
+    Parameters
+    ----------
+    file
+        Path of the URDF.
+    base
+        First link of the chains; ``None``: the root of the tree.
+
+    Raises
+    ------
+    ConfigError
+        If the file is not a URDF or not a tree. Chains that cannot be identified are left out.
+    """
+    tree = read_tree(file)
+    found: dict[str, tuple[str, ...]] = {}
+    base = tree.root() if base is None else tree.known(base, "urdf.base")
+    todo: list[str] = [base]
+    for link in todo:
+        ways = [element for element in tree.below.get(link, []) if tree.moves(element)]
+        todo += [end_link(element, "child") for element in ways]
+        if len(ways) != 1 and link != base:
+            with suppress(ConfigError):
+                found[link] = tuple(joint.name for joint in read_chain(file, base, link))
+    return found
+
+
+def moving_links(file: Path, base: str | None, tip: str) -> list[tuple[str, str]]:
+    """Links before and after each moving joint of a chain, base to tip.
+
+    Parameters
+    ----------
+    file
+        Path of the URDF.
+    base, tip
+        First and last link of the chain; ``base`` ``None``: the root of the tree.
+
+    Raises
+    ------
+    ConfigError
+        If the file is not a URDF, or the base does not move the tip.
+    """
+    tree = read_tree(file)
+    path = tree.path_to(tree.root() if base is None else base, tree.known(tip, "urdf.tip"))
+    return [
+        (end_link(element, "parent"), end_link(element, "child"))
+        for element in path
+        if tree.type_of(element) != "fixed"
+    ]
+
+
+def orientation(file: Path, link: str) -> Floats:
+    """Rotation of a link in the root of a URDF with all joints at zero, shape (3, 3).
+
+    Parameters
+    ----------
+    file
+        Path of the URDF.
+    link
+        Name of the link.
+
+    Raises
+    ------
+    ConfigError
+        If the file is not a URDF, or has no such link.
+    """
+    tree = read_tree(file)
+    turned = np.eye(3)
+    element = tree.above.get(tree.known(link, "urdf.base"))
+    while element is not None:
+        turned = tree.origin(element, element.find("origin"))[:3, :3] @ turned
+        element = tree.above.get(end_link(element, "parent"))
+    return turned
+
+
+def robot_name(file: Path) -> str:
+    """Name of the robot in a URDF, as it is written there; empty if it has none.
+
+    Parameters
+    ----------
+    file
+        Path of the URDF.
+
+    Raises
+    ------
+    ConfigError
+        If the file is not a URDF or not a tree.
+    """
+    return read_tree(file).name
+
+
 @dataclass(frozen=True)
 class UrdfTree:
     """Links and joints of a URDF.
@@ -104,6 +197,7 @@ class UrdfTree:
     links: Mapping[str, ET.Element]
     above: Mapping[str, ET.Element]
     below: Mapping[str, list[ET.Element]]
+    name: str = ""
 
     def known(self, link: str, key: str) -> str:
         """Return the name of a link that the file contains.
@@ -183,7 +277,7 @@ class UrdfTree:
         """Joints from base to the last that moves."""
         link = base
         while True:
-            ways = [element for element in self.below.get(link, []) if self._moves(element)]
+            ways = [element for element in self.below.get(link, []) if self.moves(element)]
             if not ways:
                 return
             self._refuse_branch(link, ways)
@@ -192,7 +286,7 @@ class UrdfTree:
 
     def _refuse_branch(self, link: str, joints: list[ET.Element]) -> None:
         """Refuse a second moving joint or subtree at a link; the first one given is the chain's."""
-        others = [element for element in joints[1:] if self._moves(element)]
+        others = [element for element in joints[1:] if self.moves(element)]
         if others:
             names = " and ".join(repr(element.get("name")) for element in [joints[0], *others])
             raise ConfigError(
@@ -200,10 +294,16 @@ class UrdfTree:
                 "(urdf.base and urdf.tip choose a part)"
             )
 
-    def _moves(self, element: ET.Element) -> bool:
-        """Return True if this joint or any joint after it moves."""
+    def moves(self, element: ET.Element) -> bool:
+        """Return True if this joint or any joint after it moves.
+
+        Parameters
+        ----------
+        element
+            Element of the joint.
+        """
         return self.type_of(element) != "fixed" or any(
-            self._moves(after) for after in self.below.get(end_link(element, "child"), [])
+            self.moves(after) for after in self.below.get(end_link(element, "child"), [])
         )
 
     def type_of(self, element: ET.Element) -> str:
@@ -386,7 +486,7 @@ def read_tree(file: Path) -> UrdfTree:
             )
         above[child] = element
         below.setdefault(end_link(element, "parent"), []).append(element)
-    tree = UrdfTree(file, links, above, below)
+    tree = UrdfTree(file, links, above, below, root.get("name", ""))
     reached = [tree.root()]
     for link in reached:
         reached += [end_link(element, "child") for element in below.get(link, [])]

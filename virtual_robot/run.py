@@ -83,8 +83,8 @@ def run_robot(
     """
     hidden = load_scenario(scenario) if scenario is not None else None
     if replay is not None:
-        session = load_session(config)
-        robot = load_robot(session.robot)
+        session = load_session(config, "robot")
+        robot = load_robot(session.robot, "robot")
         motion = _replay(session, robot, replay)
     else:
         twin = load_twin(config, choice)

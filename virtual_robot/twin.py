@@ -9,7 +9,7 @@ import numpy as np
 import yaml
 
 from armident.configs import ConfigError, RobotConfig, SessionConfig, Trajectory, config_path, load_robot, load_session
-from armident.configs.loading import load_inertials
+from armident.configs.loading import is_session, load_inertials
 from armident.configs.schema.session import Bus, MetricsOptions, ZenohOptions
 from armident.configs.yaml_loader import read_yaml
 from armident.virtual_robot.arm_parameters import ArmParameters, arm_parameters
@@ -112,12 +112,9 @@ def load_twin(config: Path, choice: ParameterChoice = STANDARD) -> Twin:
         If a file is wrong, or is not of this robot.
     """
     path = config_path(config)
-    if _is_robot(path):
-        robot, session = load_robot(path), None
-    else:
-        session = load_session(path)
-        path = session.robot
-        robot = load_robot(path)
+    session = load_session(path, "robot") if is_session(path) else None
+    path = path if session is None else session.robot
+    robot = load_robot(path, "robot")
     inertials = None if choice.draw_masses else load_inertials(path)
     robot, parameters, assumed = complete(robot, model=choice.model, inertials=inertials, seed=choice.seed)
     if session is None:
@@ -175,6 +172,7 @@ def on_virtual_bus(session: SessionConfig, channel: str, cell: str) -> SessionCo
     return session.model_copy(
         update={
             "cell": cell,
+            "blanks": (),
             "bus": Bus(channel=channel, fd=fd),
             "buses": (),
             "drives": tuple(drive.model_copy(update={"bus": None}) for drive in session.drives),
@@ -184,11 +182,6 @@ def on_virtual_bus(session: SessionConfig, channel: str, cell: str) -> SessionCo
             "metrics": MetricsOptions(),
         }
     )
-
-
-def _is_robot(path: Path) -> bool:
-    data = read_yaml(path.read_text(encoding="utf-8", errors="replace"), str(path))
-    return isinstance(data, dict) and str(data.get("schema")).startswith("armident/robot/")
 
 
 def complete(robot: RobotConfig, **choice: Any) -> tuple[RobotConfig, ArmParameters, tuple[str, ...]]:
@@ -209,6 +202,7 @@ def complete(robot: RobotConfig, **choice: Any) -> tuple[RobotConfig, ArmParamet
     robot, limits = with_limits(robot)
     parameters = arm_parameters(robot, **choice)
     robot, drives = _with_drives(robot, parameters)
+    robot = robot.model_copy(update={"blanks": ()})
     return robot, parameters, (*limits, *drives)
 
 

@@ -24,7 +24,6 @@ from mcap.records import Channel, Chunk, McapRecord, Message, Schema
 from mcap.stream_reader import breakup_chunk
 
 from armident.configs import ConfigError, DataError
-from armident.daq.interchange.sandbox import error_line
 from armident.daq.recording.mcap_records import MAGIC, RECORD_HEAD, records
 
 SUFFIXES = (".mcap", ".db3", ".mcap.zstd", ".db3.zstd")
@@ -142,7 +141,7 @@ class BagReader:
                     self._read[message.topic] += 1
                     yield message
             except OSError as error:
-                raise ConfigError(f"{file}: cannot be read: {error.strerror or error_line(error)}") from error
+                raise ConfigError(f"{file}: cannot be read: {error.strerror or 'damaged'}") from error
         self._expected |= _listed_counts(self._path)
         for topic, expected in sorted(self._expected.items()):
             read = self._read[topic]
@@ -191,9 +190,9 @@ class BagReader:
                 break
             try:
                 parts = _records(opcode, body)
-            except Exception as error:  # the readers of MCAP, zstd and lz4 raise various errors for damaged records
+            except Exception:  # the readers of MCAP, zstd and lz4 raise various errors for damaged records
                 kind = "chunk" if opcode == Opcode.CHUNK else "record"
-                self.losses.append(f"{where}the {kind} at byte {at} is damaged ({error_line(error)})")
+                self.losses.append(f"{where}the {kind} at byte {at} is damaged")
                 continue
             for part in parts:
                 if isinstance(part, Schema):
@@ -247,15 +246,15 @@ class BagReader:
                 for number, logged, data in database.execute(query, list(chosen)):
                     if isinstance(data, bytes) and isinstance(logged, int):
                         yield BagMessage(chosen[number], logged, _plain(data))
-        except _DAMAGED as error:
-            self.losses.append(f"{where}the database is damaged ({error_line(error)}): later messages are missing")
+        except _DAMAGED:
+            self.losses.append(f"{where}the database is damaged: later messages are missing")
 
     def _database_topics(self, database: sqlite3.Connection) -> dict[int, str]:
         """Return the topics of the type by their number in a SQLite file."""
         try:
             rows = database.execute("SELECT id, name, type, serialization_format FROM topics").fetchall()
         except _DAMAGED as error:
-            raise DataError(f"not a readable bag in SQLite: {error_line(error)}") from error
+            raise DataError("not a readable bag in SQLite: damaged, or without its table of topics") from error
         chosen: dict[int, str] = {}
         for number, topic, kind, encoding in rows:
             self.topics[str(topic)] = str(kind) + ("" if encoding == _CDR else f" in {encoding}")

@@ -13,6 +13,7 @@ from mcap_ros2.decoder import DecoderFactory
 from numpy.typing import NDArray
 
 from armident.configs import DataError
+from armident.daq.interchange.text_files import listed
 
 MESSAGE_TYPE = "sensor_msgs/msg/JointState"
 DEFINITION = """std_msgs/Header header
@@ -112,7 +113,7 @@ class TopicMessages:
                 self._refuse(f"has {len(values)} {what} of {len(names)} joints")
                 return
         if len(set(names)) < len(names):
-            self._refuse(f"has a joint twice: {', '.join(names)}")
+            self._refuse(f"has a joint twice: {listed(names)}")
             return
         if not (len(q) or len(tau)):
             self._refuse("has neither positions nor efforts")

@@ -6,9 +6,7 @@ from dataclasses import dataclass
 
 from armident.configs import DataError
 from armident.configs.schema.robot import Joint
-
-LISTED = 40
-"""Number of names in a message; further ones are counted."""
+from armident.daq.interchange.text_files import listed
 
 _WORD = re.compile(r"[^\W\d_]+|\d+")
 """A run of letters of any alphabet, or a run of digits."""
@@ -68,7 +66,7 @@ def match_joints(
     """
     twice = sorted({name for name in found if list(found).count(name) > 1})
     if twice:
-        raise DataError(f"joint name {', '.join(twice)} is there twice: {_listed(found)}")
+        raise DataError(f"joint name {', '.join(twice)} is there twice: {listed(found)}")
     if joints is not None:
         return _as_chosen(found, wanted, joints)
     if by_position:
@@ -83,12 +81,12 @@ def _as_chosen(found: Sequence[str], wanted: Sequence[Joint], joints: Sequence[s
     """Return the joints that the user has named."""
     if len(joints) != len(wanted) or len(set(joints)) != len(joints):
         raise DataError(
-            f"--joints: expected {len(wanted)} different names, one for each of {_listed(_names(wanted))}; "
-            f"found {_listed(joints)}"
+            f"--joints: expected {len(wanted)} different names, one for each of {listed(_names(wanted))}; "
+            f"found {listed(joints)}"
         )
     unknown = [name for name in joints if name not in found]
     if unknown:
-        raise DataError(f"--joints: no joint {', '.join(unknown)}; the file has {_listed(found) or 'no names'}")
+        raise DataError(f"--joints: no joint {', '.join(unknown)}; the file has {listed(found) or 'no names'}")
     return JointMatch(tuple(found.index(name) for name in joints), tuple(joints))
 
 
@@ -102,13 +100,13 @@ def _in_order(found: Sequence[str], wanted: Sequence[Joint]) -> JointMatch:
         return match
     if match is not None:
         raise DataError(
-            f"--by-position contradicts the names: the file has {_listed(found)}, the robot {_listed(_names(wanted))}; "
+            f"--by-position contradicts the names: the file has {listed(found)}, the robot {listed(_names(wanted))}; "
             "omit --by-position to match by name, or give the order with --joints"
         )
     if len(found) != len(wanted):
         raise DataError(
-            f"--by-position needs {len(wanted)} joints, the file has {len(found)}: {_listed(found)}; "
-            f"the robot has {_listed(_names(wanted))}; --joints NAME,... chooses"
+            f"--by-position needs {len(wanted)} joints, the file has {len(found)}: {listed(found)}; "
+            f"the robot has {listed(_names(wanted))}; --joints NAME,... chooses"
         )
     pairs = ", ".join(f"{name} as {joint.name}" for name, joint in zip(found, wanted, strict=True))
     return JointMatch(tuple(range(len(found))), tuple(found), (f"joints taken by position: {pairs}",))
@@ -223,11 +221,6 @@ def _refusal(found: Sequence[str], wanted: Sequence[Joint], reason: str) -> str:
     """Return a message with both lists of names and the options that decide."""
     position = ", or --by-position takes them in this order" if len(found) == len(wanted) else ""
     return (
-        f"{reason}; the file has {_listed(found) or 'no names'}; the robot has {_listed(_names(wanted))}; "
+        f"{reason}; the file has {listed(found) or 'no names'}; the robot has {listed(_names(wanted))}; "
         f"--joints NAME,... names those of the file in the robot's order{position}"
     )
-
-
-def _listed(names: Sequence[str]) -> str:
-    more = f" and {len(names) - LISTED} more" if len(names) > LISTED else ""
-    return ", ".join(names[:LISTED]) + more

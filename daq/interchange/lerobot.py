@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armident.configs import DataError
-from armident.daq.interchange.table_columns import listed
+from armident.daq.interchange.text_files import listed
 
 STATE, ACTION = "observation.state", "action"
 _EFFORTS = {
@@ -89,7 +89,7 @@ def lerobot_table(path: Path, arrays: Mapping[str, Any]) -> tuple[dict[str, NDAr
     if len({len(values) for values in table.values()}) > 1:
         raise DataError(f"{path}: its columns have unequal lengths")
     if "timestamp" in arrays:
-        table["t"] = _one_clock(np.asarray(arrays["timestamp"], np.float64).ravel(), arrays, notes)
+        table["t"] = _one_clock(_matrix(path, "timestamp", arrays["timestamp"]).ravel(), arrays, notes)
     return table, notes
 
 

@@ -11,6 +11,7 @@ from armident.daq.interchange.resample import onto_even_clock
 from armident.daq.interchange.sample_clock import sample_numbers
 from armident.daq.interchange.table_files import Source
 from armident.daq.interchange.table_rows import Rows
+from armident.daq.interchange.text_files import listed
 from armident.daq.interchange.time_stamps import EQUAL, clock_of, in_seconds, repeated_share
 from armident.daq.recording.model import Quantity
 
@@ -100,7 +101,7 @@ def sampled(
         if rate_hz is None:
             raise DataError(
                 f"no time column t; give the sampling rate with --rate, or the column with --map time=NAME; "
-                f"found {', '.join(source.table)}"
+                f"found {listed(list(source.table))}"
             )
         numbers = rows.row - rows.row[0]
         if repeated > _POLLED_SHARE:

@@ -82,7 +82,7 @@ def check_units(
             continue
         peaks = np.abs(joint).max(axis=0)
         for axis, peak, limit in zip(robot.joints, peaks, limits, strict=True):
-            if peak > factor * limit:
+            if not peak <= factor * limit:
                 raise DataError(
                     f"{path}: {name} of {axis.name} reaches {peak:.4g}, its limit is {limit:.4g}: expected {hint}"
                 )

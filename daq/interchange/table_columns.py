@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from armident.configs import DataError, RobotConfig
 from armident.daq.interchange.joint_names import match_joints
+from armident.daq.interchange.text_files import listed, shortened
 
 NAMES: Mapping[str, tuple[str, ...]] = {
     "time": ("t", "time", "times", "timestamp", "timestamps", "__time", "stamp", "elapsed"),
@@ -32,8 +33,6 @@ _DEMANDED = frozenset({"desired", "reference", "target", "setpoint", "command", 
 _WORD = re.compile(r"[^\W_]+")
 _UNIT = re.compile(r"^(.*?)\s*[\[(]([^\])]*)[\])]$")
 _TIME_UNIT = re.compile(r"^(.*?)_(s|sec|ms|us|ns)$", re.IGNORECASE)
-_LISTED = 40
-"""Number of column names in a message."""
 SCALES: Mapping[str, float] = {
     "deg": np.pi / 180, "degree": np.pi / 180, "degrees": np.pi / 180, "°": np.pi / 180,
     "mm": 1e-3, "ma": 1e-3, "mnm": 1e-3, "nmm": 1e-3, "mv": 1e-3,
@@ -60,18 +59,6 @@ class Columns:
     values: NDArray[np.float64]
     labels: tuple[str, ...]
     notes: tuple[str, ...] = ()
-
-
-def listed(names: Sequence[str]) -> str:
-    """Return names for a message.
-
-    Parameters
-    ----------
-    names
-        Any number of names; the first ones are listed.
-    """
-    more = f" and {len(names) - _LISTED} more" if len(names) > _LISTED else ""
-    return ", ".join(names[:_LISTED]) + more
 
 
 def without_units(table: Table, units: Sequence[str] = ()) -> tuple[dict[str, NDArray[np.float64]], str, list[str]]:
@@ -103,7 +90,7 @@ def without_units(table: Table, units: Sequence[str] = ()) -> tuple[dict[str, ND
             values = values * SCALES[unit.lower()]
             converted.append(f"{name} from {unit}")
         if bare in made:
-            raise DataError(f"two columns are named {bare}; found {listed(list(table))}")
+            raise DataError(f"two columns are named {shortened(bare)}; found {listed(list(table))}")
         made[bare] = values
     return made, time_unit, [f"converted to SI units: {listed(converted)}"] if converted else []
 

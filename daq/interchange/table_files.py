@@ -14,7 +14,8 @@ from armident.daq.interchange.csv_files import read_csv
 from armident.daq.interchange.lerobot import data_files, is_lerobot, lerobot_table
 from armident.daq.interchange.sandbox import read_in_subprocess
 from armident.daq.interchange.table_columns import without_units
-from armident.daq.interchange.text_files import printable
+from armident.daq.interchange.text_files import printable, shortened
+from armident.extras import install_line
 
 Table = dict[str, NDArray[np.float64]]
 _LATER_MAT = b"MATLAB 7.3"
@@ -144,7 +145,7 @@ def _csv(path: Path) -> Source:
     header = [printable(name) for name in table.header]
     twice = sorted({name for name in header if name and header.count(name) > 1})
     if twice:
-        raise DataError(f"{path}: several columns are named {twice[0]}")
+        raise DataError(f"{path}: several columns are named {shortened(twice[0])}")
     columns = {name: table.values[:, k] for k, name in enumerate(header) if name}
     units = [unit for name, unit in zip(header, table.units, strict=False) if name]
     return _converted(Source(path, columns, table.lines, notes=table.notes), units)
@@ -193,7 +194,7 @@ def _parquet(path: Path) -> dict[str, Any]:
         import pyarrow
         import pyarrow.parquet
     except ImportError as error:
-        raise ConfigError(f"{path}: Parquet needs the package pyarrow (pip install pyarrow)") from error
+        raise ConfigError(install_line(f"{path}: Parquet", ["parquet"])) from error
     try:
         table = pyarrow.parquet.read_table(path)  # type: ignore[no-untyped-call]
         return {name: table.column(name).to_numpy() for name in table.column_names}

@@ -8,8 +8,9 @@ from numpy.typing import NDArray
 
 from armident.configs import DataError, RobotConfig
 from armident.daq.interchange.si_checks import OMITTED
-from armident.daq.interchange.table_columns import Columns, find_columns, find_time, listed
+from armident.daq.interchange.table_columns import Columns, find_columns, find_time
 from armident.daq.interchange.table_files import Source
+from armident.daq.interchange.text_files import listed
 from armident.daq.recording.model import Quantity
 
 EFFORTS: tuple[Quantity, ...] = ("torque", "current", "voltage")

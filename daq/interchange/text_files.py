@@ -1,12 +1,17 @@
 """Text files of other tools: their encoding, and parts of them in messages."""
 
 import codecs
+from collections.abc import Sequence
 from pathlib import Path
+
+from armident.configs import ConfigError
 
 _HEAD = 65536
 """Bytes at the beginning of a file that decide its encoding."""
 _LONGEST = 60
 """Longest part of a file in a message, characters."""
+_LISTED = 40
+"""Number of names in a message; further ones are counted."""
 
 
 def encoding_of(path: Path) -> str:
@@ -41,8 +46,19 @@ def excerpt(text: str) -> str:
     text
         Any text.
     """
+    return f"'{shortened(text)}'"
+
+
+def shortened(text: str) -> str:
+    """Return a text in one line of limited length, for messages.
+
+    Parameters
+    ----------
+    text
+        Any text.
+    """
     shown = printable(text)
-    return f"'{shown[:_LONGEST]}...'" if len(shown) > _LONGEST else f"'{shown}'"
+    return shown if len(shown) <= _LONGEST else f"{shown[:_LONGEST]}..."
 
 
 def printable(text: str) -> str:
@@ -54,3 +70,37 @@ def printable(text: str) -> str:
         Any text.
     """
     return " ".join("".join(c if c.isprintable() else " " for c in text).split())
+
+
+def listed(names: Sequence[str]) -> str:
+    """Return names for a message.
+
+    Parameters
+    ----------
+    names
+        Any number of names; the first ones are listed.
+    """
+    more = f" and {len(names) - _LISTED} more" if len(names) > _LISTED else ""
+    return ", ".join(map(shortened, names[:_LISTED])) + more
+
+
+def pairs_of(option: str, text: str) -> dict[str, str]:
+    """Return the pairs of an option, ``QUANTITY=NAME,...``.
+
+    Parameters
+    ----------
+    option
+        Name of the option, for the message.
+    text
+        Its value.
+
+    Raises
+    ------
+    ConfigError
+        If a pair is incomplete.
+    """
+    pairs = [pair.partition("=") for pair in text.split(",") if pair]
+    for key, equals, value in pairs:
+        if not (key and equals and value):
+            raise ConfigError(f"{option}: expected QUANTITY=NAME,..., found {key + equals + value!r}")
+    return {key: value for key, _, value in pairs}

@@ -15,12 +15,12 @@ import time
 from pathlib import Path
 
 from tests.fuzz.harness import Finding, Target, attempt
-from tests.fuzz.targets import TARGETS
+from tests.fuzz.targets import IMPORTERS, TARGETS
 
-STUCK_S = 60.0
-"""A process that has not begun another input for so long is killed, s."""
-WARM_UP_S = 600.0
-"""What it has before the first input, while everything is compiled, s."""
+STUCK_S = 30.0
+"""A process that computes for so long without another input is killed, s of its processor time."""
+WAITING_S = 600.0
+"""So is one that waits for so long, s; a process of low priority may have to."""
 NOTE_S = 0.25
 FOUND = 3
 """What the process of the inputs returns where it found something."""
@@ -29,17 +29,20 @@ FOUND = 3
 def main() -> int:
     """Fuzz the targets named on the command line; 1 if something was found."""
     parser = argparse.ArgumentParser(prog="python -m tests.fuzz", description=__doc__)
-    parser.add_argument("--target", action="append", choices=[*TARGETS, "all"], help="default: all")
+    parser.add_argument("--target", action="append", choices=[*TARGETS, "all", "importers"])
     parser.add_argument("--seconds", type=float, default=60.0, help="for each target")
+    parser.add_argument("--minutes", type=float, help="for all targets together, in place of --seconds")
     parser.add_argument("--seed", type=int, default=int(time.time()))
     parser.add_argument("--child", help=argparse.SUPPRESS)
     arguments = parser.parse_args()
-    wanted = arguments.target or ["all"]
+    wanted = [*(arguments.target or ["all"])]
+    wanted += IMPORTERS if "importers" in wanted else ()
     targets = [t for t in TARGETS.values() if t.name in wanted or "all" in wanted]
     if arguments.child is not None:
         return _child(targets[0], arguments.seconds, arguments.seed, Path(arguments.child))
     print(f"seed {arguments.seed}")
-    found = sum(_supervise(target, arguments.seconds, arguments.seed) for target in targets)
+    seconds = arguments.seconds if arguments.minutes is None else 60.0 * arguments.minutes / len(targets)
+    found = sum(_supervise(target, seconds, arguments.seed) for target in targets)
     return int(found > 0)
 
 
@@ -81,13 +84,14 @@ def _supervise(target: Target, seconds: float, seed: int) -> int:
             command = [sys.executable, "-m", "tests.fuzz", "--target", target.name, "--seconds", str(left)]
             process = subprocess.Popen([*command, "--seed", str(seed), "--child", state.name])
             # By our own clock, not the file's: that one may be set meanwhile.
-            begun, last = os.stat(state.name).st_mtime_ns, (0, time.monotonic())
+            begun, last = os.stat(state.name).st_mtime_ns, (0, time.monotonic(), 0.0)
             while process.poll() is None:
                 time.sleep(NOTE_S)
                 touched = os.stat(state.name).st_mtime_ns
                 if touched not in (last[0], begun):
-                    last = touched, time.monotonic()
-                if time.monotonic() - last[1] > (STUCK_S if last[0] else WARM_UP_S):
+                    last = touched, time.monotonic(), _computed_s(process.pid)
+                waited, computed = time.monotonic() - last[1], _computed_s(process.pid) - last[2]
+                if waited > WAITING_S or (last[0] and computed > STUCK_S):
                     process.send_signal(signal.SIGKILL)
                     process.wait()
             if process.returncode in (0, FOUND):
@@ -100,6 +104,15 @@ def _supervise(target: Target, seconds: float, seed: int) -> int:
             print(f"FOUND {target.name}: the process ended with {process.returncode}\n  kept as {kept}", flush=True)
             found, seed = found + 1, seed + 1
     return found
+
+
+def _computed_s(process: int) -> float:
+    """Processor time of a process, s; that of its ended children is not in it."""
+    try:
+        values = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
+    except OSError:
+        return 0.0
+    return (int(values[11]) + int(values[12])) / os.sysconf("SC_CLK_TCK")
 
 
 if __name__ == "__main__":

@@ -2,9 +2,11 @@
 
 import hashlib
 import random
+import re
 import resource
 import signal
 import traceback
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -21,6 +23,10 @@ SLOW_S = 5.0
 """Longest time of the processor that an input may take, s."""
 MEMORY = 1_000_000_000
 """Most address space that an input may add, bytes."""
+FOREIGN_WORDS = re.compile(
+    r"Traceback|Error\b|Exception|object has no|codec can't|invalid literal|could not convert|NoneType"
+)
+"""Words of Python, which no message for the user has."""
 
 
 class TooSlowError(BaseException):
@@ -97,12 +103,16 @@ class Finding:
 def attempt(target: Target, data: bytes, folder: Path) -> bool | Finding:
     """Try one input: whether it was accepted, or what is wrong with how it was treated."""
     try:
-        with _limited():
+        with _limited(), warnings.catch_warnings():
+            # A warning of NumPy would be printed between the messages for the user.
+            warnings.simplefilter("error", RuntimeWarning)
             return target.check(data, folder)
     except (ConfigError, DataError) as error:
         text = str(error)
         if not text.strip() or "\n" in text or len(text) > 2000:
             return Finding(target.name, data, f"an error that is not one line: {text[:200]!r}", traceback.format_exc())
+        if FOREIGN_WORDS.search(text.replace(str(folder), "")):
+            return Finding(target.name, data, f"words of Python: {text[:200]!r}", traceback.format_exc())
         return False
     except TooSlowError:
         return Finding(target.name, data, f"slower than {SLOW_S:g} s", traceback.format_exc())

@@ -1,12 +1,18 @@
 """Ways to spoil an input: bytes of any kind, lines of text, the records of an MCAP file, trees of configuration."""
 
 import copy
+import io
 import json
 import random
 import re
+import sqlite3
 import struct
+import tempfile
+import zipfile
 import zlib
 from collections.abc import Callable, Sequence
+from contextlib import closing, suppress
+from pathlib import Path
 from typing import Any
 
 import yaml
@@ -29,6 +35,12 @@ WORDS = (
 VALUES: tuple[Any, ...] = (
     None, True, False, 0, -1, 1e308, float("nan"), float("inf"), "", "x", [], {}, [[]], {"a": 1}, "1",
 )  # fmt: skip
+_CELLS: tuple[Any, ...] = (
+    None, 0.0, -1.0, 1e308, float("nan"), float("inf"), -1e-320, 1e9, True, "x", b"x", [], [1.0], {"a": 1},
+)  # fmt: skip
+"""Values of cells of a table; those up to the eighth are numbers or none."""
+_BLF_CONTAINER = 32
+"""Size of the two heads of a container in a BLF log, bytes."""
 _NUMBER = re.compile(rb"-?\d+(?:\.\d+)?(?:e-?\d+)?")
 _TOKEN = re.compile(rb"[A-Za-z0-9_.+-]+")
 
@@ -147,6 +159,93 @@ def forge_block(rng: random.Random, seeds: Sequence[bytes]) -> bytes:
     return struct.pack("<4sHII", b"ARMB", VERSION, len(head), zlib.crc32(head + body)) + head + body
 
 
+def forge_zip(rng: random.Random, seeds: Sequence[bytes]) -> bytes:
+    """Spoils one file of a ZIP archive, such as NPZ, and makes its checksums right again."""
+    try:
+        with zipfile.ZipFile(io.BytesIO(rng.choice(seeds))) as archive:
+            files = {name: archive.read(name) for name in archive.namelist()}
+    except (zipfile.BadZipFile, zlib.error, ValueError, OSError):
+        return spoil_bytes(rng, seeds)
+    if not files:
+        return spoil_bytes(rng, seeds)
+    name = rng.choice(sorted(files))
+    files[name] = spoil_bytes(rng, [files[name], *files.values()])
+    made = io.BytesIO()
+    with zipfile.ZipFile(made, "w") as archive:
+        for name, content in files.items():
+            archive.writestr(name, content)
+    return made.getvalue()
+
+
+def forge_blf(rng: random.Random, seeds: Sequence[bytes]) -> bytes:
+    """Spoils what is inside the first container of a BLF log, and packs it again."""
+    data = rng.choice(seeds)
+    begin = data.find(b"LOBJ")
+    size = int.from_bytes(data[begin + 8 : begin + 12], "little")
+    if begin < 0 or size < _BLF_CONTAINER:
+        return spoil_bytes(rng, seeds)
+    try:
+        content = zlib.decompress(data[begin + _BLF_CONTAINER : begin + size])
+    except zlib.error:
+        return spoil_bytes(rng, seeds)
+    content = spoil_bytes(rng, [content])
+    packed = zlib.compress(content)
+    head = bytearray(data[begin : begin + _BLF_CONTAINER])
+    struct.pack_into("<L", head, 8, _BLF_CONTAINER + len(packed))
+    struct.pack_into("<L", head, 24, len(content))
+    return data[:begin] + bytes(head) + packed + bytes(size % 4) + data[begin + size + size % 4 :]
+
+
+def forge_database(rng: random.Random, seeds: Sequence[bytes]) -> bytes:
+    """Spoils values of rows in a SQLite database."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, "a.db3")
+        path.write_bytes(rng.choice(seeds))
+        with suppress(sqlite3.Error, OverflowError), closing(sqlite3.connect(path)) as database, database:
+            tables = [name for (name,) in database.execute("SELECT name FROM sqlite_master WHERE type = 'table'")]
+            for _ in range(rng.choice((1, 1, 2, 5))):
+                table = rng.choice(tables)
+                columns = [row[1] for row in database.execute(f"PRAGMA table_info({table})")]
+                column, rows = rng.choice(columns), database.execute(f"SELECT rowid FROM {table}").fetchall()
+                (row,) = rng.choice(rows)
+                (value,) = database.execute(f"SELECT {column} FROM {table} WHERE rowid = ?", (row,)).fetchone()
+                if isinstance(value, bytes) and rng.random() < 0.8:
+                    value = spoil_bytes(rng, [value])
+                else:
+                    value = rng.choice((None, -1, 0, 2**62, -(2**63), 1.5, "x", b"\xff", "cdr", value))
+                database.execute(f"UPDATE {table} SET {column} = ? WHERE rowid = ?", (value, row))
+        return path.read_bytes()
+
+
+def forge_parquet(rng: random.Random, seeds: Sequence[bytes]) -> bytes:
+    """Changes values, types and names of columns of a Parquet file."""
+    import pyarrow
+    import pyarrow.parquet
+
+    try:
+        table = pyarrow.parquet.read_table(io.BytesIO(rng.choice(seeds)))
+    except (pyarrow.ArrowException, OSError, ValueError):
+        return spoil_bytes(rng, seeds)
+    columns = {name: table.column(name).to_pylist() for name in table.column_names}
+    for _ in range(rng.choice((1, 1, 2, 4))):
+        name = rng.choice(sorted(columns))
+        match rng.randrange(6):
+            case 0 if len(columns) > 1:
+                del columns[name]
+            case 1:
+                columns[rng.choice((*WORDS, *columns))] = columns.pop(name)
+            case 2:
+                columns[name] = [rng.choice(_CELLS)] * len(columns[name])
+            case _:
+                _spoil_cell(rng, columns[name])
+    made = io.BytesIO()
+    try:
+        pyarrow.parquet.write_table(pyarrow.table(columns), made)  # type: ignore[no-untyped-call]
+    except (pyarrow.ArrowException, ValueError, OverflowError, TypeError):
+        return spoil_bytes(rng, seeds)
+    return made.getvalue()
+
+
 def either(*mutators: Mutator) -> Mutator:
     """One of several ways, by chance."""
     return lambda rng, seeds: rng.choice(mutators)(rng, seeds)
@@ -211,6 +310,21 @@ def _spoil_node(rng: random.Random, tree: Any) -> None:
             node.insert(key, copy.deepcopy(node[key]))
         case _:
             node[key] = rng.choice((*VALUES, *EDGES, rng.choice(WORDS)))
+
+
+def _spoil_cell(rng: random.Random, column: list[Any]) -> None:
+    """Change a value of a column, or one of the values that a cell is made of."""
+    if not column:
+        return
+    k = rng.randrange(len(column))
+    if isinstance(column[k], list) and column[k] and rng.random() < 0.8:
+        column[k] = [*column[k]]
+        if rng.random() < 0.3:
+            del column[k][rng.randrange(len(column[k]))]
+        else:
+            column[k][rng.randrange(len(column[k]))] = rng.choice(_CELLS[:8])
+    else:
+        column[k] = rng.choice(_CELLS[:8])
 
 
 def _exchanged(rng: random.Random, line: bytes, pattern: re.Pattern[bytes]) -> bytes:

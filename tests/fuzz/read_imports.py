@@ -1,10 +1,12 @@
 """Files of other tools: tables, and logs of a bus."""
 
+import hashlib
 import tempfile
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -13,11 +15,16 @@ from armident.daq.interchange.bus_log import recording_from_log
 from armident.daq.interchange.exporting import export_recording
 from armident.daq.interchange.importing import import_recording
 from armident.daq.recording import Recording, read_recording, write_recording
-from tests.fuzz.harness import MisreadError, Target
-from tests.fuzz.mutate import Mutator, either, spoil_bytes, spoil_text
+from tests.fuzz.harness import FOREIGN_WORDS, MisreadError, Target
+from tests.fuzz.mutate import Mutator, either, forge_blf, forge_parquet, forge_zip, spoil_bytes, spoil_text
 from tests.unit.daq.test_recording import make_recording
 
 ROWS = 60
+OPTIONS: tuple[dict[str, Any], ...] = (
+    {}, {}, {"rate_hz": 5000.0}, {"resample_hz": 5000.0}, {"rate_hz": 2500.0, "polled": True}, {"by_position": True},
+    {"motor_side": True, "time_unit": "ms"},
+)  # fmt: skip
+"""Options of imports; the content chooses one, so that a kept input is tried in the same way again."""
 
 
 @cache
@@ -53,14 +60,29 @@ def _exported(suffix: str) -> Callable[[], list[bytes]]:
     return seeds
 
 
-def _check_consistent(recording: Recording, folder: Path) -> None:
-    """What was imported can be written and read, and has one row of numbers for every sample."""
+def check_consistent(recording: Recording, folder: Path) -> None:
+    """Refuse a recording that cannot be written and read, or has not one row of numbers for every sample.
+
+    Parameters
+    ----------
+    recording
+        What was imported.
+    folder
+        Takes the file.
+
+    Raises
+    ------
+    MisreadError
+        If it is inconsistent.
+    """
     for stream in recording.streams.values():
         for name, values in stream.raw.items():
             if values.shape != (stream.sync.size, recording.robot.n):
                 raise MisreadError(f"{name} has shape {values.shape} for {stream.sync.size} samples")
             if not np.isfinite(values).all():
                 raise MisreadError(f"{name} is not finite")
+    if FOREIGN_WORDS.search(remarks := " ".join(recording.metadata.values())):
+        raise MisreadError(f"words of Python: {remarks[:200]}")
     if not 0.0 < recording.sample_rate_hz < np.inf:
         raise MisreadError(f"a rate of {recording.sample_rate_hz}")
     path = folder / "imported.mcap"
@@ -76,7 +98,8 @@ def _check_table(suffix: str) -> Callable[[bytes, Path], bool]:
     def check(data: bytes, folder: Path) -> bool:
         path = folder / f"x{suffix}"
         path.write_bytes(data)
-        _check_consistent(import_recording(path, robot), folder)
+        options = OPTIONS[hashlib.sha256(data).digest()[0] % len(OPTIONS)]
+        check_consistent(import_recording(path, robot, **options), folder)
         return True
 
     return check
@@ -92,7 +115,7 @@ def _check_log(suffix: str) -> Callable[[bytes, Path], bool]:
     def check(data: bytes, folder: Path) -> bool:
         path = folder / f"x{suffix}"
         path.write_bytes(data)
-        _check_consistent(recording_from_log(path, *_cell()), folder)
+        check_consistent(recording_from_log(path, *_cell()), folder)
         return True
 
     return check
@@ -108,12 +131,12 @@ def _log(suffix: str, mutate: Mutator) -> Target:
 
 TARGETS = (
     _table(".csv", either(spoil_text, spoil_bytes)),
-    _table(".npz", spoil_bytes),
+    _table(".npz", either(spoil_bytes, forge_zip, forge_zip)),
     _table(".mat", spoil_bytes),
-    _table(".parquet", spoil_bytes),
+    _table(".parquet", either(spoil_bytes, forge_parquet, forge_parquet)),
     _table(".mcap", spoil_bytes),
     _log(".log", either(spoil_text, spoil_bytes)),
     _log(".asc", either(spoil_text, spoil_bytes)),
-    _log(".blf", spoil_bytes),
+    _log(".blf", either(spoil_bytes, forge_blf, forge_blf)),
     _log(".trc", either(spoil_text, spoil_bytes)),
 )

@@ -1,6 +1,7 @@
 """Tables as tools write them: spellings of columns, damaged lines, and clocks."""
 
 import json
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -315,3 +316,34 @@ def test_joints_of_a_lerobot_data_set_are_found_by_name_and_its_effort_is_needed
         import_recording(data, TX40)
     lerobot(tmp_path / "c", None, "observation.current")
     assert "current" in import_recording(tmp_path / "c", TX40).samples.fields
+
+
+def test_times_of_a_lerobot_data_set_that_are_no_numbers_are_refused(tmp_path: Path) -> None:
+    import pyarrow
+    import pyarrow.parquet
+
+    data = lerobot(tmp_path, None)
+    table = pyarrow.parquet.read_table(data)  # type: ignore[no-untyped-call]
+    times = pyarrow.array([{"s": 1}] * len(table))
+    table = table.set_column(table.column_names.index("timestamp"), "timestamp", times)
+    pyarrow.parquet.write_table(table, data)  # type: ignore[no-untyped-call]
+    with pytest.raises(DataError, match="timestamp has rows of unequal lengths, or values that are no numbers"):
+        import_recording(data, TX40)
+
+
+def test_a_message_shortens_long_names_of_columns(tmp_path: Path) -> None:
+    path = tmp_path / "a.csv"
+    path.write_text(f"t,q1,{'9' * 5000}\n0,1,2\n1,2,3\n")
+    with pytest.raises(DataError, match=rf"found t, q1, {'9' * 60}\.\.\.") as refused:
+        import_recording(path, TX40)
+    assert len(str(refused.value)) < 1000
+
+
+def test_values_that_overflow_are_refused_without_warnings(tmp_path: Path) -> None:
+    values = motion(40)
+    values[7, 3] = 1e308
+    path = written(tmp_path / "a.csv", values)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        with pytest.raises(DataError, match=r"position of .* reaches"):
+            import_recording(path, TX40)

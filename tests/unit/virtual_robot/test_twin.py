@@ -278,6 +278,20 @@ def test_the_written_configuration_is_that_of_the_arm(tmp_path: Path) -> None:
     assert again.parameters.standard == pytest.approx(twin.parameters.standard)
 
 
+def test_blanks_are_assumed_and_said(tmp_path: Path) -> None:
+    config = write_scara(tmp_path)
+    config.write_text(
+        config.read_text() + "joints:\n- {name: lift, limits: {acceleration: FILL_IN}, "
+        "drive: {rated: FILL_IN, counts_per_unit: FILL_IN}}\n"
+    )
+    twin = load_twin(config)
+    text = "\n".join(twin.assumed)
+    for key in ("limits.acceleration", "drive.rated", "drive.counts_per_unit"):
+        assert next(line for line in twin.assumed if line.startswith(key)).count("lift ") == 1, text
+    assert twin.robot.joints[2].drive.rated == pytest.approx(0.25 * 150.0)
+    assert load_robot(load_session(write_twin(twin, tmp_path / "twin")).robot) == twin.robot
+
+
 def test_a_robot_file_is_enough_for_a_recording(tmp_path: Path) -> None:
     out, truth = tmp_path / "scara.mcap", tmp_path / "truth.json"
     record_robot(write_scara(tmp_path), out, truth=truth)
