@@ -20,7 +20,15 @@ from armident.virtual_robot.inertias import pseudo_inertia
 from armident.virtual_robot.plant import Plant
 from armident.virtual_robot.plausible_motion import plausible_trajectory
 from armident.virtual_robot.run import record_robot
-from armident.virtual_robot.twin import BUS_RANGE, ParameterChoice, complete, load_twin, write_twin
+from armident.virtual_robot.twin import (
+    BUS_RANGE,
+    ParameterChoice,
+    at_period,
+    complete,
+    load_twin,
+    on_virtual_bus,
+    write_twin,
+)
 from tests.fixtures.other_arms import write_scara
 
 
@@ -276,6 +284,27 @@ def test_the_written_configuration_is_that_of_the_arm(tmp_path: Path) -> None:
     assert again.assumed == ()
     assert again.trajectory is None
     assert again.parameters.standard == pytest.approx(twin.parameters.standard)
+
+
+def test_a_virtual_bus_has_all_drives_and_nothing_of_the_cell() -> None:
+    real = load_session("tx40_six_buses")
+    session = on_virtual_bus(real, "vcan7", "cell_test")
+    assert [bus.channel for bus in session.all_buses] == ["vcan7"]
+    assert session.all_buses[0].bitrate is None
+    assert len(session.drives_on(session.all_buses[0])) == 6
+    assert (session.cell, session.zenoh.config, session.zenoh.connect) == ("cell_test", None, ())
+    assert session.heartbeat_ms >= 1000
+    twins = tuple(drive.model_copy(update={"node_id": 1}) for drive in real.drives)
+    with pytest.raises(ConfigError, match="drives of several buses share node ids"):
+        on_virtual_bus(real.model_copy(update={"drives": twins}), "vcan7", "cell_test")
+
+
+def test_a_slower_cell_sends_everything_at_every_sync() -> None:
+    session = at_period(load_session("tx40_cell"), 2000)
+    assert session.sync_period == pytest.approx(2e-3)
+    assert {stream.every for stream in session.streams.values()} == {1}
+    assert session.setpoints is not None
+    assert session.setpoints.every == 1
 
 
 def test_blanks_are_assumed_and_said(tmp_path: Path) -> None:
