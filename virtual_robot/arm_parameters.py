@@ -84,7 +84,9 @@ def arm_parameters(
         bandwidth = tuple(servo.BANDWIDTH_HZ[j] for j in range(robot.n))
         source = f"parameters: those of the virtual {robot.name}"
         return ArmParameters(plant_parameters(robot), rest_posture(robot), SIZES[robot.name], bandwidth, (source,))
-    return _completed(robot, draw_bodies(robot, seed), (f"masses and inertias: drawn from seed {seed}",), seed)
+    reason = "" if inertials is None else ", the URDF has none"
+    source = f"masses and inertias: drawn from seed {seed}{reason}"
+    return _completed(robot, draw_bodies(robot, seed), (source,), seed)
 
 
 def _of_urdf(robot: RobotConfig, read: UrdfInertials, seed: int) -> tuple[dict[str, float], tuple[str, ...]]:

@@ -330,7 +330,21 @@ def write_twin(twin: Twin, folder: Path) -> Path:
     -------
     Path
         The session file.
+
+    Raises
+    ------
+    ConfigError
+        If the files cannot be written.
     """
+    try:
+        return _write_files(twin, folder)
+    except OSError as error:
+        raise ConfigError(
+            f"{folder}: the configuration cannot be written: {error.strerror or 'output error'}"
+        ) from error
+
+
+def _write_files(twin: Twin, folder: Path) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     robot, session = folder / "robot.yaml", twin.session.model_dump(mode="json", by_alias=True)
     head = ["For a virtual arm. Assumed, to be measured before a real arm is moved:", *twin.assumed]

@@ -9,7 +9,7 @@ import pytest
 
 import armident
 from armident.configs import ConfigError, RobotConfig, Scenario, load_robot, load_session, load_trajectory
-from armident.configs.loading import parse
+from armident.configs.loading import HERE, parse
 from armident.configs.units import counts_per_si
 from armident.daq.recording import read_recording
 from armident.virtual_robot import servo
@@ -17,6 +17,7 @@ from armident.virtual_robot.arm import Arm
 from armident.virtual_robot.arm_parameters import arm_parameters, with_scenario
 from armident.virtual_robot.drawn_parameters import TORQUE_SHARE, draw_bodies, torque_scale
 from armident.virtual_robot.inertias import pseudo_inertia
+from armident.virtual_robot.offline import effort_of, simulate_recording
 from armident.virtual_robot.plant import Plant
 from armident.virtual_robot.plausible_motion import plausible_trajectory
 from armident.virtual_robot.run import record_robot
@@ -299,6 +300,13 @@ def test_a_virtual_bus_has_all_drives_and_nothing_of_the_cell() -> None:
         on_virtual_bus(real.model_copy(update={"drives": twins}), "vcan7", "cell_test")
 
 
+def test_a_folder_that_cannot_be_written_is_named(tmp_path: Path) -> None:
+    twin = load_twin(write_scara(tmp_path))
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ConfigError, match=r"file/twin: the configuration cannot be written: Not a directory"):
+        write_twin(twin, tmp_path / "file" / "twin")
+
+
 def test_a_slower_cell_sends_everything_at_every_sync() -> None:
     session = at_period(load_session("tx40_cell"), 2000)
     assert session.sync_period == pytest.approx(2e-3)
@@ -330,6 +338,20 @@ def test_a_robot_file_is_enough_for_a_recording(tmp_path: Path) -> None:
     values = json.loads(truth.read_text())
     assert values["m3"] == pytest.approx(1.2)
     assert "zz1r" not in values, "groups of the TX40 are not those of this arm"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("path", sorted((HERE / "robots").glob("*.yaml")), ids=lambda path: path.stem)
+def test_every_shipped_robot_follows_a_motion_within_its_torque_limits(path: Path) -> None:
+    twin = load_twin(path)
+    robot, motion = twin.robot, plausible_trajectory(twin.robot)
+    recording = simulate_recording(robot, motion, 0, 0.0, period=twin.session.sync_period, parameters=twin.parameters)
+    inverse, stream = np.linalg.inv(robot.transmission_matrix).T, recording.streams["demand"]
+    error = (recording.samples.si("position")[stream.sync] - stream.si("demand")) @ inverse
+    assert np.abs(error).max() < 0.1
+    gain = np.array([joint.drive.gain for joint in robot.joints])
+    torque = recording.samples.si(effort_of(robot)) * gain @ robot.transmission_matrix
+    assert (np.abs(torque).max(axis=0) < [joint.limits.torque for joint in robot.joints]).all()
 
 
 def test_the_api_simulates_any_robot(panda: RobotConfig) -> None:
