@@ -250,11 +250,11 @@ def _with_drives(robot: RobotConfig, parameters: ArmParameters) -> tuple[RobotCo
         robot = robot.model_copy(update={"transmission": identity})
         remarks.append("transmission: the identity, counts and signals are those of the joints")
     if robot.friction.sign_smoothing is None:
-        smoothing = tuple(float(g) for g in robot.sign_smoothing)
+        smoothing = parameters.sign_smoothing or tuple(float(g) for g in robot.sign_smoothing)
         friction = robot.friction.model_copy(update={"sign_smoothing": smoothing})
         robot = robot.model_copy(update={"friction": friction})
-        for joint, g in zip(robot.joints, smoothing, strict=True):
-            assumed.setdefault("friction.sign_smoothing", []).append(f"{joint.name} {g:g}")
+        entries = [f"{joint.name} {g:g}" for joint, g in zip(robot.joints, smoothing, strict=True)]
+        assumed["friction.sign_smoothing"] = entries if parameters.sign_smoothing is None else []
     needed = needed_torque(robot, parameters.standard) if _lacks_torque(robot) else np.zeros(robot.n)
     ratio = np.abs(np.diag(robot.transmission_matrix))
     joints = []
@@ -293,7 +293,7 @@ def _three_digits(value: float) -> float:
 
 
 def _sentences(assumed: Mapping[str, Sequence[str]]) -> tuple[str, ...]:
-    return tuple(f"{key}: {', '.join(entries)}" for key, entries in assumed.items())
+    return tuple(f"{key}: {', '.join(entries)}" for key, entries in assumed.items() if entries)
 
 
 def _session_for(path: Path, robot: RobotConfig) -> SessionConfig:

@@ -125,9 +125,21 @@ def test_an_identification_gives_the_parameters(panda: RobotConfig, tmp_path: Pa
     assert parameters.sources == (f"parameters: the physically consistent ones of {file}",)
 
 
+def test_the_reversal_of_friction_is_that_of_the_identification(panda: RobotConfig, tmp_path: Path) -> None:
+    file = tmp_path / "identification.json"
+    smoothing = {joint.name: 100.0 + k for k, joint in enumerate(panda.joints)}
+    file.write_text(json.dumps(document(panda, sign_smoothing=smoothing)))
+    free = panda.model_copy(update={"friction": type(panda.friction)()})
+    robot, _, assumed = complete(free, model=file)
+    assert robot.friction.sign_smoothing == tuple(smoothing.values())
+    assert not any("sign_smoothing" in entry for entry in assumed)
+    assert complete(panda, model=file)[0].friction == panda.friction, "that of the configuration counts"
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
+        ({"sign_smoothing": {"joint_1": 5.0}}, "sign_smoothing: expected a number for each joint"),
         ({"robot": "tx40"}, "is of robot 'tx40', the configuration is of 'panda'"),
         ({"physical": None}, r"no physically consistent parameters; identify again: .* --physical"),
         ({"physical": {"parameters": []}}, "physical.parameters: no xx1; identify again with this configuration"),
