@@ -134,7 +134,7 @@ def geometry_from_urdf(given: UrdfGeometry, where: Path) -> dict[str, Any]:
     for name, joint, mdh in zip(names, joints, chain.parameters, strict=True):
         more = extra.get(name, JointGiven(name=name))
         limits = dict(joint.limits) | more.limits.model_dump(exclude_none=True)
-        settings = more.model_dump(include={"drive", "rotor_inertia"}, exclude_none=True)
+        settings = more.model_dump(include={"drive", "rotor_inertia"}, exclude_none=True, exclude_unset=True)
         settings |= {"source_name": joint.name} if joint.name != name else {}
         plain.append({"name": name, "type": MOVING[joint.type], "mdh": mdh.model_dump(), "limits": limits} | settings)
     gravity = chain.base[:3, :3].T @ np.array(given.gravity)
