@@ -64,15 +64,10 @@ class Noise:
 
     def __init__(self, robot: RobotConfig, period: float, seed: int, level: float = 1.0) -> None:
         n = robot.n
-        size = SIZES[robot.name]
-        total, low = np.array(size.sampled), np.array(size.decimated)
-        white_low = DECIMATION_HZ * 2 * period
-        slow_low = 2 / np.pi * np.arctan(DECIMATION_HZ / DISTURBANCE_HZ)
-        slow = (low - white_low * total) / (slow_low - white_low)
+        white, slow = amplitudes(robot, period)
         gain = np.array([joint.drive.gain for joint in robot.joints])
-        motor = np.linalg.solve(robot.transmission_matrix.T**2, np.maximum(total - slow, 0.0))
-        self._current = level * np.sqrt(np.maximum(motor, 0.0)) / np.abs(gain)
-        self._disturbance = level * np.sqrt(slow)
+        self._current = level * white / np.abs(gain)
+        self._disturbance = level * slow
         self._keep = float(np.exp(-2 * np.pi * DISTURBANCE_HZ * period))
         self._random = np.random.default_rng(seed)
         self._last = self._disturbance * self._random.standard_normal(n)
@@ -94,3 +89,29 @@ class Noise:
         self.disturbance[:], state = lfilter([1.0], [1.0, -self._keep], fresh, axis=0, zi=self._keep * self._last[None])
         self._last = state[0] / self._keep
         self._row = 0
+
+
+def amplitudes(robot: RobotConfig, period: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return standard deviations of both parts of the noise.
+
+    Parameters
+    ----------
+    robot
+        Robot with the name of a virtual arm, n joints.
+    period
+        Control period, s.
+
+    Returns
+    -------
+    white
+        White torque noise of the motors, motor side, (n,), N m or N.
+    slow
+        Disturbance torque of the joints, (n,), N m or N; its spectrum has the corner `DISTURBANCE_HZ`.
+    """
+    size = SIZES[robot.name]
+    total, low = np.array(size.sampled), np.array(size.decimated)
+    white_low = DECIMATION_HZ * 2 * period
+    slow_low = 2 / np.pi * np.arctan(DECIMATION_HZ / DISTURBANCE_HZ)
+    slow = (low - white_low * total) / (slow_low - white_low)
+    motor = np.linalg.solve(robot.transmission_matrix.T**2, np.maximum(total - slow, 0.0))
+    return np.sqrt(np.maximum(motor, 0.0)), np.sqrt(slow)

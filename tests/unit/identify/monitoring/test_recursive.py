@@ -23,8 +23,10 @@ from armident.identify.monitoring.recursive.noise import RunningNoise
 from armident.identify.monitoring.recursive.replay import RecordedBlock, blocks_of
 from armident.identify.monitoring.recursive.saved_state import state_of
 from armident.identify.monitoring.recursive.settings import RecursiveSettings
+from armident.virtual_robot.noise import amplitudes
 from tests.fixtures import arms
-from tests.statistics.recursive_life import healthy_life, seconds_to_alarm
+from tests.statistics.fresh_noise import FreshNoise, MotionRecorder, held
+from tests.statistics.recursive_life import healthy_life, play, seconds_to_alarm
 
 RATE = 1 / arms.FAST
 ROBOT = load_robot("tx40")
@@ -286,7 +288,7 @@ def test_ten_percent_more_friction_is_seen_within_a_minute(joint: str, motion: s
 
 @pytest.mark.slow
 def test_minutes_of_healthy_life_raise_no_alarm() -> None:
-    life = healthy_life(0.05, 4)
+    life = healthy_life(0.05, 4, simulated=True)
     assert life.alarms == []
     assert life.windows > 20
     assert life.largest_evidence < 0.5 * life.threshold
@@ -299,3 +301,24 @@ def test_hours_of_healthy_life_raise_no_alarm() -> None:
     life = healthy_life(float(os.environ.get("ARMIDENT_HEALTHY_HOURS", "50")), 5)
     assert life.alarms == []
     assert life.motion_h > 0.6 * life.hours
+
+
+@pytest.mark.slow
+def test_the_noise_of_a_simulation_can_be_exchanged_in_its_equations() -> None:
+    """What is left without its own noise is the error of the live filter, a small part of the variance."""
+    found, period = estimator(), arms.FAST
+    recorder = MotionRecorder(found, ROBOT, period)
+    recording = play("tx40_1", 7, {}, 1, period)
+    motion = [recorder.record(recording, 7) for _ in range(2)][1]
+    theta = found.reference.theta
+    residual = np.array([instant.y - instant.x @ theta for instant in motion.instants])
+    moves = np.array([instant.moving for instant in motion.instants]) >= RecursiveSettings().moving_share
+    drawn = FreshNoise(ROBOT, period, np.random.default_rng(1)).draw(40 * motion.samples)
+    fresh = recorder.filtered(held(drawn))
+    for j in range(ROBOT.n):
+        left = (residual - motion.own_noise)[moves[:, j], j]
+        assert np.var(left) < 0.1 * np.var(residual[moves[:, j], j])
+    # White noise up to half the sampling rate, and half of a disturbance with a corner of 20 Hz, behind 20 Hz.
+    white, slow = amplitudes(ROBOT, 2e-4)
+    expected = white**2 @ ROBOT.transmission_matrix**2 * (20.0 / (0.5 / period)) + 0.5 * slow**2
+    assert np.var(fresh, axis=0) == pytest.approx(expected, rel=0.1)
