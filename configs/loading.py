@@ -8,6 +8,7 @@ from typing import Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
+from armident.configs.blanks import check_filled, needed, without_marks
 from armident.configs.errors import ConfigError
 from armident.configs.schema.robot import RobotConfig
 from armident.configs.schema.scenario import Scenario
@@ -15,7 +16,9 @@ from armident.configs.schema.session import RENAMED, DriveNode, SessionConfig
 from armident.configs.schema.suite import SuiteConfig
 from armident.configs.schema.trajectory import Trajectory
 from armident.configs.suspected_units import suspected_units
-from armident.configs.urdf import UrdfGeometry, geometry_from_urdf
+from armident.configs.urdf import UrdfGeometry, geometry_from_urdf, urdf_file
+from armident.configs.urdf_inertials import UrdfInertials, read_inertials
+from armident.configs.urdf_shapes import UrdfShapes, read_shapes
 from armident.configs.yaml_loader import is_file, read_yaml
 
 HERE = Path(__file__).parent
@@ -74,7 +77,7 @@ def _shipped(path: Path) -> Path | None:
     return next((c for c in candidates if is_file(c)), None)
 
 
-def load_robot(name: str | Path) -> RobotConfig:
+def load_robot(name: str | Path, command: str | None = None) -> RobotConfig:
     """Load a robot configuration.
 
     If the file has a key ``urdf`` (see `armident.configs.urdf`), joints and geometry come from the URDF. In this case
@@ -84,24 +87,109 @@ def load_robot(name: str | Path) -> RobotConfig:
     ----------
     name
         A path, or the name of a shipped file (see `config_path`).
+    command
+        Command that uses the robot, such as ``identify``: keys that it does not need may be marked as blank
+        (`armident.configs.blanks`). ``None``: no key may.
 
     Raises
     ------
     ConfigError
-        If the file is missing or wrong; names file, key and expected value.
+        If the file is missing or wrong; names file, key and expected value. If values are missing, names all.
     """
     path = config_path(name)
-    data = _read_mapping(_read_text(path), str(path))
+    robot = _robot(path)
+    robot.check_filled(command, str(path))
+    return robot
+
+
+def is_session(path: Path) -> bool:
+    """Return True if a configuration file is that of a session by its schema.
+
+    Parameters
+    ----------
+    path
+        Path of the file.
+
+    Raises
+    ------
+    ConfigError
+        If the file cannot be read.
+    """
+    return str(_read_mapping(_read_text(path), str(path)).get("schema", "")).startswith("armident/session/")
+
+
+def _robot(path: Path) -> RobotConfig:
+    """Robot of a file, which may have blanks."""
+    data = _marked(path)
     file_keys = data.keys()
-    if "urdf" in data:
-        concerned = {key: data[key] for key in UrdfGeometry.model_fields if key in data}
-        geometry = geometry_from_urdf(_checked(concerned, UrdfGeometry, str(path)), path)
-        data = {key: value for key, value in data.items() if key not in concerned} | geometry
+    given = _urdf_geometry(data, path)
+    if given is not None:
+        geometry = geometry_from_urdf(given, path)
+        data = {key: value for key, value in data.items() if key not in UrdfGeometry.model_fields} | geometry
     robot = _checked(data, RobotConfig, str(path))
     suspected = suspected_units(robot, geometry="urdf" not in file_keys)
     if suspected:
         raise ConfigError(f"{path}: expected rad and m: {'; '.join(suspected[:3])}{_others(len(suspected) - 3)}")
     return robot
+
+
+def load_inertials(name: str | Path) -> UrdfInertials | None:
+    """Load the masses of a robot from the URDF of its configuration.
+
+    Parameters
+    ----------
+    name
+        A path, or the name of a shipped file (see `config_path`).
+
+    Returns
+    -------
+    UrdfInertials or None
+        ``None`` if the configuration names no URDF.
+
+    Raises
+    ------
+    ConfigError
+        If a file is missing or wrong; names file and element.
+    """
+    path = config_path(name)
+    given = _urdf_geometry(_marked(path), path)
+    return None if given is None else read_inertials(urdf_file(given, path), given.urdf.base, given.urdf.tip)
+
+
+def load_shapes(name: str | Path) -> UrdfShapes | None:
+    """Load the shapes of the links of a robot from the URDF of its configuration.
+
+    Parameters
+    ----------
+    name
+        A path, or the name of a shipped file (see `config_path`).
+
+    Returns
+    -------
+    UrdfShapes or None
+        ``None`` if the configuration names no URDF.
+
+    Raises
+    ------
+    ConfigError
+        If a file is missing or wrong; names file and element.
+    """
+    path = config_path(name)
+    given = _urdf_geometry(_marked(path), path)
+    return None if given is None else read_shapes(urdf_file(given, path), given.urdf.base, given.urdf.tip)
+
+
+def _urdf_geometry(data: dict[str, Any], path: Path) -> UrdfGeometry | None:
+    """Keys of a robot configuration that are combined with its URDF; ``None`` if it names none."""
+    if "urdf" not in data:
+        return None
+    return _checked({key: data[key] for key in UrdfGeometry.model_fields if key in data}, UrdfGeometry, str(path))
+
+
+def _marked(path: Path) -> dict[str, Any]:
+    """Content of a file without the blanks, which are listed as ``blanks``."""
+    data, blanks = without_marks(_read_mapping(_read_text(path), str(path)))
+    return {**data, "blanks": [*data.get("blanks", ()), *blanks]} if blanks else data
 
 
 def _others(count: int) -> str:
@@ -125,7 +213,7 @@ def load_trajectory(name: str | Path) -> Trajectory:
     return _load(config_path(name), Trajectory)
 
 
-def load_session(name: str | Path) -> SessionConfig:
+def load_session(name: str | Path, command: str | None = None) -> SessionConfig:
     """Load a session configuration and make its relative paths absolute.
 
     A relative path is searched beside the file first, then among the shipped files (see `config_path`).
@@ -134,14 +222,18 @@ def load_session(name: str | Path) -> SessionConfig:
     ----------
     name
         A path, or the name of a shipped file (see `config_path`).
+    command
+        Command that uses the session, such as ``capture``: keys that it does not need may be marked as blank
+        (`armident.configs.blanks`). ``None``: no key may.
 
     Raises
     ------
     ConfigError
-        If the file is missing or wrong; names file, key and expected value.
+        If the file is missing or wrong; names file, key and expected value. If values are missing in session or robot,
+        names all.
     """
     path = config_path(name)
-    data = _read_mapping(_read_text(path), str(path))
+    data = _marked(path)
     session = _checked(data, SessionConfig, str(path))
     for key in data.get("recording", {}):
         if key in RENAMED:
@@ -170,12 +262,18 @@ def load_session(name: str | Path) -> SessionConfig:
     if session.zenoh.config is not None:
         changes["zenoh"] = session.zenoh.model_copy(update={"config": resolved(session.zenoh.config, "zenoh.config")})
     session = session.model_copy(update=changes)
-    return session.model_copy(update={"drives": _with_known_joints(session, path)})
+    robot = _robot(session.robot)
+    check_filled(
+        f"{path} with {session.robot.name}",
+        (*needed(session.blanks, command), *robot.blanks_for(command)),
+        command,
+    )
+    return session.model_copy(update={"drives": _with_known_joints(session, robot, path)})
 
 
-def _with_known_joints(session: SessionConfig, path: Path) -> tuple[DriveNode, ...]:
+def _with_known_joints(session: SessionConfig, robot: RobotConfig, path: Path) -> tuple[DriveNode, ...]:
     """Drives with the names of their joints as the robot writes them; case does not count."""
-    joints = {j.name.lower(): j.name for j in load_robot(session.robot).joints}
+    joints = {j.name.lower(): j.name for j in robot.joints}
     for k, drive in enumerate(session.drives):
         if drive.joint.lower() not in joints:
             raise ConfigError(

@@ -1,7 +1,7 @@
 """Geometry of a robot from URDF: the chain from base to tip as modified Denavit-Hartenberg parameters.
 
-Only origins, axes, types and limits of the joints are read. Masses, meshes and transmissions are ignored, because the
-dynamics are identified.
+Only origins, axes, types and limits of the joints are read. Meshes and transmissions are ignored, and so are masses,
+because the dynamics are identified; `armident.configs.urdf_inertials` reads them for the virtual arm.
 """
 
 import re
@@ -10,13 +10,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import ConfigDict
+from scipy.spatial.transform import Rotation
 
 from armident.configs.errors import ConfigError
 from armident.configs.mdh import MdhChain, modified_dh
 from armident.configs.schema.base import FrozenModel
+from armident.configs.schema.collision import BASE, Box, Collision, LinkCapsule
 from armident.configs.schema.limits import Positive
 from armident.configs.schema.robot import Drive
+from armident.configs.urdf_origin import rotation
 from armident.configs.urdf_tree import MOVING, UrdfJoint, read_chain
 from armident.configs.yaml_loader import is_file
 
@@ -92,11 +96,14 @@ class UrdfGeometry(FrozenModel):
         Additions to its joints.
     gravity
         Acceleration of gravity in the frame of the base link, m/s^2.
+    collision
+        Bodies to keep apart; boxes in the frame of the base link, capsules in those of the URDF's links.
     """
 
     urdf: UrdfSource
     joints: tuple[JointGiven, ...] = ()
     gravity: tuple[float, float, float] = (0.0, 0.0, -9.81)
+    collision: Collision | None = None
 
 
 def geometry_from_urdf(given: UrdfGeometry, where: Path) -> dict[str, Any]:
@@ -112,16 +119,14 @@ def geometry_from_urdf(given: UrdfGeometry, where: Path) -> dict[str, Any]:
     Returns
     -------
     dict
-        Plain values: ``joints`` with ``mdh``, and ``gravity`` in frame 0 of the chain.
+        Plain values: ``joints`` with ``mdh``; ``gravity`` and the bodies of ``collision`` in frames of the chain.
 
     Raises
     ------
     ConfigError
         If the URDF is wrong or not a serial chain; names file and element.
     """
-    file = where.resolve().parent / given.urdf.file
-    if not is_file(file):
-        raise ConfigError(f"{where}: urdf.file: no such file {given.urdf.file} (looked for {file})")
+    file = urdf_file(given, where)
     joints = read_chain(file, given.urdf.base, given.urdf.tip)
     chain = mdh_of(joints, file)
     names = joint_names([joint.name for joint in joints], file)
@@ -134,7 +139,71 @@ def geometry_from_urdf(given: UrdfGeometry, where: Path) -> dict[str, Any]:
         settings |= {"source_name": joint.name} if joint.name != name else {}
         plain.append({"name": name, "type": MOVING[joint.type], "mdh": mdh.model_dump(), "limits": limits} | settings)
     gravity = chain.base[:3, :3].T @ np.array(given.gravity)
-    return {"joints": plain, "gravity": [float(g) for g in np.where(np.abs(gravity) < 1e-14, 0.0, gravity)]}
+    bodies = {}
+    if given.collision is not None:
+        frames = link_placements(joints, names, chain)
+        bodies["collision"] = _in_frames_of_the_chain(given.collision, frames, where).model_dump()
+    return {"joints": plain, "gravity": [float(g) for g in np.where(np.abs(gravity) < 1e-14, 0.0, gravity)]} | bodies
+
+
+def link_placements(joints: tuple[UrdfJoint, ...], names: list[str], chain: MdhChain) -> dict[str, NDArray[np.float64]]:
+    """Frames (4, 4) of the moved links of a URDF, and of its base link, in the frames of the chain, by link.
+
+    Parameters
+    ----------
+    joints, names
+        Moving joints, base to tip, and their names in the configuration.
+    chain
+        Their modified Denavit-Hartenberg parameters.
+    """
+    moved = zip(names, chain.frames, joints, strict=True)
+    base: dict[str, NDArray[np.float64]] = {BASE: np.asarray(np.linalg.inv(chain.base))}
+    return base | {name: np.asarray(np.linalg.solve(frame, joint.placement)) for name, frame, joint in moved}
+
+
+def _in_frames_of_the_chain(given: Collision, frames: dict[str, NDArray[np.float64]], where: Path) -> Collision:
+    """Bodies with boxes in frame 0 and capsules in frames j."""
+    boxes, capsules = [], []
+    for box in given.boxes:
+        turn = frames[BASE][:3, :3] @ rotation(*box.rpy)
+        rpy = Rotation.from_matrix(turn).as_euler("xyz")
+        boxes.append(Box(name=box.name, center=_point(frames[BASE], box.center), size=box.size, rpy=_triple(rpy)))
+    for capsule in given.capsules:
+        if capsule.link not in frames:
+            raise ConfigError(f"{where}: collision: no link {capsule.link!r}; links are {', '.join(frames)}")
+        start, end = (_point(frames[capsule.link], point) for point in (capsule.start, capsule.end))
+        capsules.append(LinkCapsule(link=capsule.link, start=start, end=end, radius=capsule.radius))
+    return given.model_copy(update={"boxes": tuple(boxes), "capsules": tuple(capsules)})
+
+
+def _point(frame: NDArray[np.float64], point: tuple[float, float, float]) -> tuple[float, float, float]:
+    return _triple(frame[:3, :3] @ point + frame[:3, 3])
+
+
+def _triple(values: NDArray[np.float64]) -> tuple[float, float, float]:
+    x, y, z = (float(v) for v in values)
+    return x, y, z
+
+
+def urdf_file(given: UrdfGeometry, where: Path) -> Path:
+    """Path of the URDF of a robot configuration.
+
+    Parameters
+    ----------
+    given
+        Keys of the configuration.
+    where
+        Path of the configuration.
+
+    Raises
+    ------
+    ConfigError
+        If there is no such file.
+    """
+    file = where.resolve().parent / given.urdf.file
+    if not is_file(file):
+        raise ConfigError(f"{where}: urdf.file: no such file {given.urdf.file} (looked for {file})")
+    return file
 
 
 def _additions(

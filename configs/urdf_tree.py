@@ -4,33 +4,29 @@ import math
 import re
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from decimal import Decimal, InvalidOperation
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from armident.configs.errors import ConfigError
 from armident.configs.suspected_units import FULL_TURN, LONGEST_LINK
+from armident.configs.urdf_file import expand, parse_urdf
 from armident.configs.urdf_origin import rotation, rotation_of_quaternion, rounded_angle
 
 MOVING = {"revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic"}
 """Joint type of the model by URDF joint type; a chain may have these and ``fixed``."""
-
-LONGEST = 500
-"""Maximum length of an attribute in characters; longer ones are refused."""
 
 LARGEST = 1e9
 """Largest magnitude of a coordinate in a URDF, SI units; larger ones are refused."""
 
 ENDLESS = (-math.inf, math.inf)
 """Position limits of a joint that has none."""
-
-XACRO = "xacro}"
-"""End of the namespace of xacro elements, such as ``{http://www.ros.org/wiki/xacro}macro``."""
 
 Floats = NDArray[np.float64]
 
@@ -79,12 +75,11 @@ def read_chain(file: Path, base: str | None = None, tip: str | None = None) -> t
         If the file is not a URDF or not a tree, if the chain branches, or if a joint is not of a serial chain.
         Names file and element.
     """
-    tree = _read_tree(file)
-    base = tree.root() if base is None else tree.known(base, "urdf.base")
-    path = tree.path_to(base, tree.known(tip, "urdf.tip")) if tip is not None else list(tree.only_way(base))
+    tree = read_tree(file)
+    base, path = tree.path(base, tip)
     placement, chain = np.eye(4), []
     for element in path:
-        placement = placement @ tree.origin(element)
+        placement = placement @ tree.origin(element, element.find("origin"))
         if tree.type_of(element) != "fixed":
             chain.append(tree.moving_joint(element, placement))
     if not chain:
@@ -92,14 +87,117 @@ def read_chain(file: Path, base: str | None = None, tip: str | None = None) -> t
     return tuple(chain)
 
 
+def serial_tips(file: Path, base: str | None = None) -> dict[str, tuple[str, ...]]:
+    """Names of the moving joints to each link at which a serial chain can end: ends of branches, and their forks.
+
+    Parameters
+    ----------
+    file
+        Path of the URDF.
+    base
+        First link of the chains; ``None``: the root of the tree.
+
+    Raises
+    ------
+    ConfigError
+        If the file is not a URDF or not a tree. Chains that cannot be identified are left out.
+    """
+    tree = read_tree(file)
+    found: dict[str, tuple[str, ...]] = {}
+    base = tree.root() if base is None else tree.known(base, "urdf.base")
+    todo: list[str] = [base]
+    for link in todo:
+        ways = [element for element in tree.below.get(link, []) if tree.moves(element)]
+        todo += [end_link(element, "child") for element in ways]
+        if len(ways) != 1 and link != base:
+            with suppress(ConfigError):
+                found[link] = tuple(joint.name for joint in read_chain(file, base, link))
+    return found
+
+
+def moving_links(file: Path, base: str | None, tip: str) -> list[tuple[str, str]]:
+    """Links before and after each moving joint of a chain, base to tip.
+
+    Parameters
+    ----------
+    file
+        Path of the URDF.
+    base, tip
+        First and last link of the chain; ``base`` ``None``: the root of the tree.
+
+    Raises
+    ------
+    ConfigError
+        If the file is not a URDF, or the base does not move the tip.
+    """
+    tree = read_tree(file)
+    path = tree.path_to(tree.root() if base is None else base, tree.known(tip, "urdf.tip"))
+    return [
+        (end_link(element, "parent"), end_link(element, "child"))
+        for element in path
+        if tree.type_of(element) != "fixed"
+    ]
+
+
+def orientation(file: Path, link: str) -> Floats:
+    """Rotation of a link in the root of a URDF with all joints at zero, shape (3, 3).
+
+    Parameters
+    ----------
+    file
+        Path of the URDF.
+    link
+        Name of the link.
+
+    Raises
+    ------
+    ConfigError
+        If the file is not a URDF, or has no such link.
+    """
+    tree = read_tree(file)
+    turned = np.eye(3)
+    element = tree.above.get(tree.known(link, "urdf.base"))
+    while element is not None:
+        turned = tree.origin(element)[:3, :3] @ turned
+        element = tree.above.get(end_link(element, "parent"))
+    return turned
+
+
+def robot_name(file: Path) -> str:
+    """Name of the robot in a URDF, as it is written there; empty if it has none.
+
+    Parameters
+    ----------
+    file
+        Path of the URDF.
+
+    Raises
+    ------
+    ConfigError
+        If the file is not a URDF or not a tree.
+    """
+    return read_tree(file).name
+
+
 @dataclass(frozen=True)
-class _Tree:
-    """Joint elements by child link (``above``) and by parent link (``below``)."""
+class UrdfTree:
+    """Links and joints of a URDF.
+
+    Parameters
+    ----------
+    file
+        Path of the URDF, for messages.
+    links
+        Link elements by name.
+    above, below
+        Joint elements by child link, and by parent link.
+    """
 
     file: Path
-    links: frozenset[str]
+    links: Mapping[str, ET.Element]
     above: Mapping[str, ET.Element]
     below: Mapping[str, list[ET.Element]]
+    name: str = ""
 
     def known(self, link: str, key: str) -> str:
         """Return the name of a link that the file contains.
@@ -122,11 +220,29 @@ class _Tree:
 
     def root(self) -> str:
         """Return the only link that no joint moves."""
-        roots = sorted(self.links - self.above.keys())
+        roots = sorted(self.links.keys() - self.above.keys())
         if len(roots) != 1:
             found = f"{len(roots)} ({', '.join(roots)})" if roots else "none: the joints form a loop"
             raise ConfigError(f"{self.file}: expected one link that no joint moves, found {found}")
         return roots[0]
+
+    def path(self, base: str | None, tip: str | None) -> tuple[str, list[ET.Element]]:
+        """First link of a chain, and all its joints, fixed ones included, from base to tip.
+
+        Parameters
+        ----------
+        base, tip
+            First and last link, as of `read_chain`.
+
+        Raises
+        ------
+        ConfigError
+            If there is no such link, or no chain between them.
+        """
+        base = self.root() if base is None else self.known(base, "urdf.base")
+        if tip is None:
+            return base, list(self.only_way(base))
+        return base, self.path_to(base, self.known(tip, "urdf.tip"))
 
     def path_to(self, base: str, tip: str) -> list[ET.Element]:
         """Joints from base to tip; branches that move are refused on the way.
@@ -148,11 +264,11 @@ class _Tree:
             if element is None:
                 raise ConfigError(f"{self.file}: link {tip!r} (urdf.tip) is not moved by link {base!r}")
             path.insert(0, element)
-            link = _end(element, "parent")
+            link = end_link(element, "parent")
         carried = False
         for element, following in pairwise(path):
             carried = carried or self.type_of(element) != "fixed"
-            link = _end(element, "child")
+            link = end_link(element, "child")
             if carried:
                 self._refuse_branch(link, [following, *(j for j in self.below[link] if j is not following)])
         return path
@@ -161,16 +277,16 @@ class _Tree:
         """Joints from base to the last that moves."""
         link = base
         while True:
-            ways = [element for element in self.below.get(link, []) if self._moves(element)]
+            ways = [element for element in self.below.get(link, []) if self.moves(element)]
             if not ways:
                 return
             self._refuse_branch(link, ways)
             yield ways[0]
-            link = _end(ways[0], "child")
+            link = end_link(ways[0], "child")
 
     def _refuse_branch(self, link: str, joints: list[ET.Element]) -> None:
         """Refuse a second moving joint or subtree at a link; the first one given is the chain's."""
-        others = [element for element in joints[1:] if self._moves(element)]
+        others = [element for element in joints[1:] if self.moves(element)]
         if others:
             names = " and ".join(repr(element.get("name")) for element in [joints[0], *others])
             raise ConfigError(
@@ -178,49 +294,68 @@ class _Tree:
                 "(urdf.base and urdf.tip choose a part)"
             )
 
-    def _moves(self, element: ET.Element) -> bool:
-        """Return True if this joint or any joint after it moves."""
+    def moves(self, element: ET.Element) -> bool:
+        """Return True if this joint or any joint after it moves.
+
+        Parameters
+        ----------
+        element
+            Element of the joint.
+        """
         return self.type_of(element) != "fixed" or any(
-            self._moves(after) for after in self.below.get(_end(element, "child"), [])
+            self.moves(after) for after in self.below.get(end_link(element, "child"), [])
         )
 
     def type_of(self, element: ET.Element) -> str:
-        """Return the URDF type of a joint."""
+        """Return the URDF type of a joint.
+
+        Parameters
+        ----------
+        element
+            Element of the joint.
+        """
         return element.get("type", "")
 
-    def origin(self, element: ET.Element) -> Floats:
-        """Placement of a joint in its parent link, homogeneous, shape (4, 4)."""
-        found = element.find("origin")
+    def origin(self, element: ET.Element, found: ET.Element | None) -> Floats:
+        """Placement of a joint in its parent link, or of an inertia in its link, homogeneous, shape (4, 4).
+
+        Parameters
+        ----------
+        element
+            Element of the joint or link, for messages.
+        found
+            Element ``origin``; ``None``: the origin of the parent.
+        """
         frame = np.eye(4)
         if found is not None:
             frame[:3, :3] = self._orientation(element, found)
-            frame[:3, 3] = [float(w) for w in self._words(element, found, "xyz")]
+            frame[:3, 3] = [float(w) for w in self.words(element, found, "xyz")]
             self._refuse_millimetres(element, frame[:3, 3])
         return frame
 
     def _orientation(self, element: ET.Element, origin: ET.Element) -> Floats:
         """Rotation of a joint's frame in its parent link, by ``rpy`` or (URDF 1.1) ``quat_xyzw``, shape (3, 3)."""
-        where = f"{self.file}: joint {element.get('name')!r}: origin"
+        where = f"{self.file}: {element.tag} {element.get('name')!r}: origin"
         for key in sorted(set(origin.keys()) - {"xyz", "rpy", "quat_xyzw"}):
             if re.search("quat|rpy|rot|euler", key, re.IGNORECASE):
                 raise ConfigError(f"{where}: unknown attribute {key:.40}; expected xyz, and rpy or quat_xyzw")
         if origin.get("quat_xyzw") is None:
-            angles = [rounded_angle(w) for w in self._words(element, origin, "rpy")]
+            angles = [rounded_angle(w) for w in self.words(element, origin, "rpy")]
             if max(abs(angle) for angle in angles) > FULL_TURN:
                 raise ConfigError(f"{where} rpy: {origin.get('rpy')!r:.80} looks like degrees; expected rad")
             return rotation(*angles)
         if origin.get("rpy") is not None:
             raise ConfigError(f"{where}: both rpy and quat_xyzw; expected one of them")
         try:
-            return rotation_of_quaternion([float(w) for w in self._words(element, origin, "quat_xyzw", count=4)])
+            return rotation_of_quaternion([float(w) for w in self.words(element, origin, "quat_xyzw", count=4)])
         except ValueError as error:
             raise ConfigError(f"{where} quat_xyzw: {error}") from error
 
     def _refuse_millimetres(self, element: ET.Element, xyz: Floats) -> None:
         """Refuse a distance between joints that no arm has; the frame of the first joint may be anywhere."""
         farthest = float(np.abs(xyz).max())
-        if farthest > LONGEST_LINK and _end(element, "parent") in self.above:
-            where = f"{self.file}: joint {element.get('name')!r}: origin xyz"
+        if farthest > LONGEST_LINK and end_link(element, "parent") in self.above:
+            where = f"{self.file}: {element.tag} {element.get('name')!r}: origin xyz"
             raise ConfigError(f"{where}: {farthest:g} looks like millimetres; expected m")
 
     def moving_joint(self, element: ET.Element, placement: Floats) -> UrdfJoint:
@@ -238,7 +373,7 @@ class _Tree:
         ConfigError
             If the joint is of another type, follows another joint, or has no usable axis.
         """
-        where = f"{self.file}: joint {element.get('name')!r}"
+        where = f"{self.file}: {element.tag} {element.get('name')!r}"
         kind = self.type_of(element)
         if kind not in MOVING:
             raise ConfigError(f"{where}: type {kind!r} cannot be identified; expected {', '.join(MOVING)} or fixed")
@@ -247,7 +382,7 @@ class _Tree:
         found = element.find("axis")
         axis = np.array([1.0, 0.0, 0.0])
         if found is not None:
-            axis = np.array([float(w) for w in self._words(element, found, "xyz", default=None)])
+            axis = np.array([float(w) for w in self.words(element, found, "xyz", default=None)])
         length = float(np.linalg.norm(axis))
         if not length > 0.0:
             raise ConfigError(f"{where}: axis: expected a direction, found 0 0 0")
@@ -279,67 +414,61 @@ class _Tree:
         except ValueError:
             value = math.nan
         if math.isnan(value):
-            self._words(element, found, key, count=1)
+            self.words(element, found, key, count=1)
         return value
 
-    def _words(
+    def words(
         self, element: ET.Element, child: ET.Element, key: str, *, count: int = 3, default: str | None = "0 0 0"
     ) -> list[str]:
-        """Finite numbers of an attribute, as written."""
+        """Finite numbers of an attribute, as written.
+
+        Parameters
+        ----------
+        element
+            Element of the joint or link, for messages.
+        child, key
+            Element below it, and the attribute.
+        count
+            Number of numbers.
+        default
+            Text if there is no such attribute; ``None``: it is required.
+
+        Raises
+        ------
+        ConfigError
+            If there are not that many finite numbers.
+        """
         text = child.get(key, default)
         words = (text or "").split()
         if len(words) != count or not all(_is_finite(word) for word in words):
             expected = "a number" if count == 1 else f"{count} numbers"
             hint = f"; {expand(self.file)}" if "$" in (text or "") else ""
-            where = f"{self.file}: joint {element.get('name')!r}: {child.tag} {key}"
+            where = f"{self.file}: {element.tag} {element.get('name')!r}: {child.tag} {key}"
             raise ConfigError(f"{where}: expected {expected}, found {text!r:.80}{hint}")
         return words
 
 
-def expand(file: Path) -> str:
-    """Text with the command that makes a URDF of a xacro file.
+def read_tree(file: Path) -> UrdfTree:
+    """Links and joints of a URDF file, checked to be a tree.
 
     Parameters
     ----------
     file
-        Path of the file.
+        Path of the URDF.
+
+    Raises
+    ------
+    ConfigError
+        If the file is not a URDF, or its joints are not those of a tree; names file and element.
     """
-    stem = file.name.split(".")[0]
-    return f"this is xacro, expand it first: xacro {file.name} > {stem}_expanded.urdf"
-
-
-def _parse(file: Path) -> ET.Element:
-    """Root element of a URDF file; xacro is refused by its name."""
-    try:
-        content = file.read_bytes()
-    except OSError as error:
-        raise ConfigError(f"{file}: cannot be read: {error.strerror or 'input error'}") from error
-    try:
-        root = ET.fromstring(content)
-    except ET.ParseError as error:
-        if b"xacro:" in content and "unbound prefix" in str(error):
-            raise ConfigError(f"{file}: {expand(file)}") from error
-        line, column = error.position
-        raise ConfigError(f"{file}: not valid XML: line {line}, column {column + 1}") from error
-    except (LookupError, ValueError) as error:
-        raise ConfigError(f"{file}: not valid XML: unknown encoding") from error
-    if any(XACRO in element.tag for element in root.iter()):
-        raise ConfigError(f"{file}: {expand(file)}")
-    return root
-
-
-def _read_tree(file: Path) -> _Tree:
-    root = _parse(file)
-    for element in root.iter():
-        for key, value in element.items():
-            if len(value) > LONGEST:
-                raise ConfigError(f"{file}: {element.tag:.40} {key:.40}: {len(value)} characters, expected {LONGEST}")
+    root = parse_urdf(file)
     if root.tag != "robot":
         raise ConfigError(f"{file}: expected a URDF with the root element robot, found {root.tag:.40}")
-    links = frozenset(str(link.get("name")) for link in root.findall("link"))
+    links = {str(link.get("name")): link for link in root.findall("link")}
     above: dict[str, ET.Element] = {}
     below: dict[str, list[ET.Element]] = {}
     names: set[str] = set()
+    ends: tuple[Literal["parent", "child"], ...] = ("parent", "child")
     for k, element in enumerate(root.findall("joint"), start=1):
         name = element.get("name")
         if not name:
@@ -347,22 +476,22 @@ def _read_tree(file: Path) -> _Tree:
         if name in names:
             raise ConfigError(f"{file}: joint {name!r}: there are two of this name")
         names.add(name)
-        for end in ("parent", "child"):
-            if _end(element, end) not in links:
-                raise ConfigError(f"{file}: joint {name!r}: {end}: no link {_end(element, end)!r}")
-        child = _end(element, "child")
+        for end in ends:
+            if end_link(element, end) not in links:
+                raise ConfigError(f"{file}: joint {name!r}: {end}: no link {end_link(element, end)!r}")
+        child = end_link(element, "child")
         if child in above:
             raise ConfigError(
                 f"{file}: link {child!r} is moved by two joints, {above[child].get('name')!r} and {name!r}"
             )
         above[child] = element
-        below.setdefault(_end(element, "parent"), []).append(element)
-    tree = _Tree(file, links, above, below)
+        below.setdefault(end_link(element, "parent"), []).append(element)
+    tree = UrdfTree(file, links, above, below, root.get("name", ""))
     reached = [tree.root()]
     for link in reached:
-        reached += [_end(element, "child") for element in below.get(link, [])]
+        reached += [end_link(element, "child") for element in below.get(link, [])]
     if len(reached) < len(links):
-        raise ConfigError(f"{file}: links {', '.join(sorted(links - set(reached)))} form a loop")
+        raise ConfigError(f"{file}: links {', '.join(sorted(links.keys() - set(reached)))} form a loop")
     return tree
 
 
@@ -373,7 +502,15 @@ def _is_finite(word: str) -> bool:
         return False
 
 
-def _end(element: ET.Element, end: str) -> str:
-    """Name of the ``parent`` or ``child`` link of a joint; empty if it has none."""
+def end_link(element: ET.Element, end: Literal["parent", "child"]) -> str:
+    """Name of the ``parent`` or ``child`` link of a joint; empty if it has none.
+
+    Parameters
+    ----------
+    element
+        Element of the joint.
+    end
+        The end.
+    """
     found = element.find(end)
     return "" if found is None else found.get("link", "")

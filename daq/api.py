@@ -23,6 +23,7 @@ def import_recording(
     topic: str | None = None,
     joints: Sequence[str] | None = None,
     by_position: bool = False,
+    units: Mapping[str, str] | None = None,
 ) -> Recording:
     """Read measured motion and effort from a file of another format; SI units.
 
@@ -56,6 +57,8 @@ def import_recording(
         Names in a bag of the robot's joints, in the robot's order; by default those of the robot.
     by_position
         True to take joints of other names in the order of the bag.
+    units
+        Units other than SI by quantity: ``position`` in ``deg``, ``mm`` or ``deg|mm``; ``torque`` in ``mnm``.
 
     Raises
     ------
@@ -71,7 +74,7 @@ def import_recording(
     """
     from armident.daq.interchange.importing import import_recording as read
 
-    config = robot if robot is None or isinstance(robot, RobotConfig) else load_robot(robot)
+    config = robot if robot is None or isinstance(robot, RobotConfig) else load_robot(robot, "import")
     second = None if effort is None else Path(effort)
     return read(
         Path(path),
@@ -86,6 +89,7 @@ def import_recording(
         topic=topic,
         joints=joints,
         by_position=by_position,
+        units=units,
     )
 
 

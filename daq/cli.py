@@ -87,10 +87,10 @@ def _add(app: typer.Typer, entry: importlib.metadata.EntryPoint) -> None:
         anything = {"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []}
         app.command(entry.name, help="(unavailable)", context_settings=anything)(unavailable)
     else:
-        app.command(entry.name)(_reported(function))
+        app.command(entry.name)(_reported(function, entry.name))
 
 
-def _reported(function: Callable[..., Any]) -> Callable[..., Any]:
+def _reported(function: Callable[..., Any], name: str) -> Callable[..., Any]:
     """Return a command whose log goes to stderr, and whose exceptions become one line on stderr and an exit code."""
 
     @functools.wraps(function)
@@ -105,13 +105,17 @@ def _reported(function: Callable[..., Any]) -> Callable[..., Any]:
         except KeyboardInterrupt:
             raise typer.Exit(INTERRUPTED) from None
         except Exception as error:
-            from armident.configs.errors import ArmidentError
+            from armident.configs.errors import ArmidentError, ConfigError
+            from armident.extras import install_line, needed_extra
 
             if interrupts:
                 # A compiler or a callback in C can turn the interrupt into another error.
                 raise typer.Exit(INTERRUPTED) from None
             if os.environ.get(DEBUG_VARIABLE):
                 traceback.print_exc()
+            if isinstance(error, ImportError) and (extra := needed_extra(error, function.__module__)) is not None:
+                print(f"armident: {install_line(f'armident {name}', [extra])}", file=sys.stderr)
+                raise typer.Exit(ConfigError.exit_code) from None
             if isinstance(error, ArmidentError):
                 print(f"armident: {_one_line(error)}", file=sys.stderr)
                 raise typer.Exit(error.exit_code) from None

@@ -2,7 +2,7 @@
 
 import logging
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -56,8 +56,8 @@ def command(
     known = next((each for each in COMMANDS if each == name), None)
     if known is None:
         raise ConfigError(f"no command {name!r}; choose from {', '.join(COMMANDS)}")
-    session = load_session(config)
-    send_command(session, load_robot(session.robot).name, Command(known, text))
+    session = load_session(config, name)
+    send_command(session, load_robot(session.robot, name).name, Command(known, text))
     print(f"{name}: accepted")
 
 
@@ -108,6 +108,9 @@ def import_(
     by_position: Annotated[
         bool, typer.Option("--by-position", help="Take joints of other names in the order of the file.")
     ] = False,
+    units: Annotated[
+        str, typer.Option("--units", help="Units other than SI: position=deg,torque=mnm,current=ma; mm, deg|mm, mv.")
+    ] = "",
 ) -> None:
     """Convert measurements of other tools to a recording.
 
@@ -124,35 +127,34 @@ def import_(
     Example: armident import DATA_EMPS.mat --config emps.yaml --out emps.mcap
     """
     from armident.configs import ConfigError, load_robot, load_session
+    from armident.configs.blanks import LOG
     from armident.daq.interchange.bus_log import SUFFIXES, recording_from_log
     from armident.daq.interchange.importing import import_recording
+    from armident.daq.interchange.text_files import pairs_of
     from armident.daq.recording import is_recording, write_recording
 
     own = is_recording(file)
     if config is None and not own:
         raise ConfigError(f"{file}: --config is missing, the robot configuration")
     if file.suffix.lower() in SUFFIXES:
-        others = (effort, motor_side, rate, names, polled, resample, time_unit, topic, joints, by_position)
+        others = (effort, motor_side, rate, names, polled, resample, time_unit, topic, joints, by_position, units)
         if any(others):
             raise ConfigError(f"{file}: a bus log takes no option but --config and --out")
-        session = load_session(str(config))
-        logged = recording_from_log(file, session, load_robot(session.robot))
+        session = load_session(str(config), LOG)
+        logged = recording_from_log(file, session, load_robot(session.robot, LOG))
         write_recording(logged, out)
         rows, gaps = logged.counters["samples.rows"], logged.counters["samples.in_gaps"]
         print(f"{out}: {rows} samples at {logged.sample_rate_hz:g} Hz, {gaps} in gaps, {_fields(logged)}")
         return
 
-    pairs = [pair.partition("=") for pair in names.split(",") if pair]
-    for key, equals, value in pairs:
-        if not (key and equals and value):
-            raise ConfigError(f"--map: expected QUANTITY=NAME,..., found {key + equals + value!r}")
     recording = import_recording(
         file,
-        None if config is None else load_robot(config),
+        None if config is None else load_robot(config, "import"),
         effort=effort,
         motor_side=motor_side,
         rate_hz=rate,
-        names={key: value for key, _, value in pairs},
+        names=pairs_of("--map", names),
+        units=pairs_of("--units", units),
         polled=polled,
         resample_hz=resample,
         time_unit=time_unit,
@@ -195,18 +197,56 @@ def export(
 
 
 def doctor(
-    config: Annotated[str, typer.Option("--config", help="Session configuration.")] = "tx40_cell.yaml",
+    config: Annotated[
+        str, typer.Option("--config", help="Session configuration; a robot configuration for other commands.")
+    ] = "tx40_cell.yaml",
     as_json: Annotated[bool, typer.Option("--json", help="Print the checks as JSON.")] = False,
+    command: Annotated[
+        Literal["capture", "import", "identify", "trajectory", "robot"],
+        typer.Option("--for", help="Command in mind: capture, import, identify, trajectory or robot."),
+    ] = "capture",
 ) -> None:
-    """Check session and machine before a capture: configuration, bus, clock, disk, Zenoh.
+    """Check what a command needs; before a capture: configuration, bus, clock, disk, Zenoh.
 
-    Nothing is sent to the bus. The exit code is 2 if a capture would not run, and 0 if there are only warnings.
+    For other commands, everything that is missing in the configuration is named with the way to find it. Nothing is
+    sent to the bus. The exit code is 2 if the command would not run, and 0 if there are only warnings.
 
     Example: armident doctor --config cell.yaml
+
+    Before an identification: armident doctor --for identify --config robot.yaml
     """
     from armident.daq.doctor import doctor as run
 
-    run(config, as_json)
+    run(config, as_json, command)
+
+
+def service(
+    action: Annotated[str, typer.Argument(help="install.")],
+    cell: Annotated[str, typer.Argument(help="Name of the cell, whose session is /etc/armident/CELL.yaml.")],
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Print what is to be done, and change nothing.")] = False,
+    root: Annotated[
+        Path, typer.Option("--root", help="Root folder of the system, for system images.", file_okay=False, exists=True)
+    ] = Path("/"),
+    executable: Annotated[
+        Path | None,
+        typer.Option(
+            "--executable", help="Path of armident in the units. [default: this one; in an image that in /opt/armident]"
+        ),
+    ] = None,
+) -> None:
+    """Install the services of a cell on a machine with systemd: user, folders, permissions and units.
+
+    What is there already is left alone; a second run does nothing. No service is enabled or started.
+
+    Example: armident service install line3 --dry-run
+    """
+    from armident.configs import ConfigError
+    from armident.daq.service import install
+
+    if action != "install":
+        raise ConfigError(f"no action {action!r}; expected: armident service install CELL")
+    for line in install(cell, root, executable, dry_run):
+        print(line)
 
 
 def recover(

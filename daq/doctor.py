@@ -1,4 +1,4 @@
-"""The command ``armident doctor``: checks session and machine before a capture, and names the remedies."""
+"""The command ``armident doctor``: checks session and machine before a command, and names the remedies."""
 
 import json
 import os
@@ -9,6 +9,7 @@ import subprocess
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
+from importlib.metadata import version
 from pathlib import Path
 from typing import Literal
 
@@ -17,10 +18,13 @@ from armident.configs import (
     ConfigError,
     RobotConfig,
     SessionConfig,
+    config_path,
     load_robot,
     load_session,
     load_trajectory,
 )
+from armident.configs.blanks import listed, needed, pattern
+from armident.configs.loading import is_session
 from armident.configs.schema.session import Bus
 from armident.daq.capture.clock import clock_state
 from armident.daq.capture.files import chunk_duration_ns
@@ -30,9 +34,12 @@ from armident.drivers.can.socketcan import RECEIVE_BUFFER, RawSocket
 from armident.drivers.can.timestamps import has_hardware_timestamps
 from armident.drivers.canopen.bus_load import check_fits
 from armident.drivers.canopen.eds import read_eds
+from armident.drivers.compiled import MODE, require_compiled
 from armident.drivers.vcan.interfaces import NETWORK, have_socketcan, is_up
 
 Verdict = Literal["ok", "warning", "failed"]
+Command = Literal["capture", "import", "identify", "trajectory", "robot"]
+"""Commands whose needs are checked."""
 
 _LEAST_HOURS = 24.0
 """Recording time for which the disk should have space, h."""
@@ -60,6 +67,39 @@ class Check:
     message: str
 
 
+def checks_for(config: str | Path, command: Command) -> list[Check]:
+    """Check everything that a command needs of a configuration.
+
+    Parameters
+    ----------
+    config
+        Robot or session configuration.
+    command
+        The command; for ``capture`` as `run_checks`, which needs a session.
+    """
+    if command == "capture":
+        return run_checks(config)
+    try:
+        path = config_path(config)
+        session = load_session(path, "") if is_session(path) else None
+        robot = load_robot(path if session is None else session.robot, "")
+    except ArmidentError as error:
+        return [Check("configuration", "failed", str(error))]
+    of_session = () if session is None else session.blanks
+    missing = (*needed(of_session, command), *robot.blanks_for(command))
+    checks = [Check("configuration", "ok", f"{config}: robot {robot.name}, {robot.n} joints")]
+    checks += [Check("blank", "failed", line) for line in listed(missing)]
+    if command == "trajectory" and not missing:
+        try:
+            robot.check_movable(str(path))
+        except ConfigError as error:
+            checks.append(Check("limits", "failed", str(error)))
+    later = [key for key in (*of_session, *robot.blanks) if key not in missing]
+    if later:
+        checks.append(Check("not needed yet", "ok", ", ".join(dict.fromkeys(map(pattern, later)))))
+    return checks
+
+
 def run_checks(config: str | Path) -> list[Check]:
     """Check everything that a capture of a session needs.
 
@@ -72,17 +112,20 @@ def run_checks(config: str | Path) -> list[Check]:
         Session configuration.
     """
     try:
-        session = load_session(config)
+        session = load_session(config, "")
+        robot = load_robot(session.robot, "")
+        blanks = (*needed(session.blanks, "capture"), *robot.blanks_for("capture"))
     except ArmidentError as error:
-        return [Check("configuration", "failed", str(error)), _clock()]
+        return [Check("configuration", "failed", str(error)), _installation(), _clock()]
+    if blanks:
+        return [*(Check("blank", "failed", line) for line in listed(blanks)), _installation(), _clock()]
     try:
-        robot = load_robot(session.robot)
         captured_streams(session, robot)
         if session.setpoints is not None:
             trajectory = load_trajectory(session.setpoints.trajectory)
             trajectory.check(robot, str(session.setpoints.trajectory))
     except ArmidentError as error:
-        return [Check("configuration", "failed", str(error)), *_data_sheets(session), _clock()]
+        return [Check("configuration", "failed", str(error)), *_data_sheets(session), _installation(), _clock()]
     checks = [Check("configuration", "ok", f"{config}: cell {session.cell}, robot {robot.name}")]
     foreign = session.sync.role == "consumer" and not session.sync.counter
     phase = unknown_phase(session) if foreign else None
@@ -91,7 +134,7 @@ def run_checks(config: str | Path) -> list[Check]:
     checks += [*_data_sheets(session), _bus_load(session, config)]
     for bus in session.all_buses:
         checks += _interface(bus)
-    checks.append(_clock())
+    checks += [_installation(), _clock()]
     checks += [*_disk(session, robot), _zenoh(session)]
     return checks
 
@@ -206,6 +249,15 @@ def _receive_buffer(bus: Bus) -> Check:
     )
 
 
+def _installation() -> Check:
+    """Check that the loops that handle every frame are compiled."""
+    try:
+        require_compiled()
+    except ConfigError as error:
+        return Check("installation", "failed", str(error))
+    return Check("installation", "ok", f"armident {version('armident')}, loops of the bus compiled {MODE}")
+
+
 def _clock() -> Check:
     """Check source and synchronisation of the system clock."""
     source = Path("/sys/devices/system/clocksource/clocksource0/current_clocksource")
@@ -302,27 +354,30 @@ def _zenoh(session: SessionConfig) -> Check:
     return Check("zenoh", "ok", f"peers on loopback, port {port}")
 
 
-def doctor(config: str, as_json: bool) -> None:
+def doctor(config: str, as_json: bool, command: Command = "capture") -> None:
     """Run ``armident doctor``: print the checks.
 
     Parameters
     ----------
     config
-        Session configuration.
+        Session configuration; for other commands than ``capture`` also a robot configuration.
     as_json
         Print JSON.
+    command
+        Command in mind.
 
     Raises
     ------
     ConfigError
-        If a check failed: a capture would not run.
+        If a check failed: the command would not run.
     """
-    checks = run_checks(config)
+    checks = checks_for(config, command)
     if as_json:
         print(json.dumps([{"what": c.name, "verdict": c.verdict, "found": c.message} for c in checks]))
     else:
         for check in checks:
             print(f"{check.verdict:8} {check.name}: {check.message}")
-    failed = [check.name for check in checks if check.verdict == "failed"]
+    failed = dict.fromkeys(check.name for check in checks if check.verdict == "failed")
     if failed:
-        raise ConfigError(f"{config}: a capture would not run: {', '.join(failed)}")
+        what = "a capture" if command == "capture" else command
+        raise ConfigError(f"{config}: {what} would not run: {', '.join(failed)}")

@@ -30,7 +30,7 @@ def bus_load(
     from armident.configs import ConfigError, load_session
     from armident.drivers.canopen.bus_load import bus_loads, check_fits
 
-    session = load_session(config)
+    session = load_session(config, "bus-load")
     if data_bitrate is not None and bitrate is None:
         raise ConfigError("--data-bitrate: needs --bitrate")
     if bitrate is not None:
@@ -47,7 +47,7 @@ def bus_load(
         virtual = bus.bitrate is None
         kind = "CAN FD" if bus.fd else "classic"
         table = Table(title=f"{bus.channel} ({kind}), SYNC every {session.sync.period_us} us")
-        table.add_column("message")
+        table.add_column("message", no_wrap=True)
         for heading in ("frames/s", "typical", "worst case"):
             table.add_column(heading, justify="right")
 

@@ -38,8 +38,10 @@ from armident.identify.identification.result import Identification as Estimation
 from armident.identify.identification.verdict import Reason
 from armident.identify.monitoring.change_test import ParameterChangeTest
 from armident.identify.monitoring.change_test import compare as test_parameter_change
+from armident.identify.prediction import TorquePrediction, predict_recording
 from armident.identify.regression.equations import MAX_AR_ORDER
 from armident.identify.report.files import robot_yaml
+from armident.identify.saved_model import load_model, model_of
 from armident.identify.setup.check import check_setup
 from armident.identify.setup.result import SetupCheck
 from armident.identify.signals.differentiate import NvrRule
@@ -48,6 +50,7 @@ from armident.identify.tables import EffectTable, ParameterTable, Table
 if TYPE_CHECKING:
     from armident.identify.diagnosis.diagnose import Diagnosis as DiagnosisResult
     from armident.identify.excitation.design import Design as DesignResult
+    from armident.identify.excitation.safety import SafetyChecks
 
 Array = NDArray[np.float64]
 Progress = Callable[[str, float], None]
@@ -178,6 +181,44 @@ class Identification(_Result):
         document = Path(folder) / "identification.json"
         write_atomically(document, to_json(self.document))
         return document, self.report(Path(folder) / "report.html")
+
+    def export(
+        self, path: str | Path, format: str, *, urdf: str | Path | None = None, nearest: bool = False
+    ) -> tuple[Path, ...]:
+        """Write the model for a simulator or a controller, with a page of what the format cannot hold.
+
+        Parameters
+        ----------
+        path
+            File, or folder in which the file is named after the robot.
+        format
+            ``urdf``, ``mjcf``, ``sdf``, ``pinocchio``, or another format that ``armident export-model --help`` lists.
+        urdf
+            URDF of the arm, whose link frames and names the file takes.
+        nearest
+            True to accept the nearest physical arm where the estimate differs significantly from every physical one.
+
+        Returns
+        -------
+        tuple of Path
+            Files written, the model first, the page of its limits last.
+
+        Raises
+        ------
+        ConfigError
+            If there is no such format, or the URDF is of another arm.
+        DataError
+            If the identification is unusable, or no physical arm has these parameters.
+        """
+        from armident.identify.model_export.exported_model import exported_model
+        from armident.identify.model_export.formats import export_model
+        from armident.identify.model_export.source_urdf import source_for
+
+        saved = model_of(self.document, Path("identification.json"), self.robot)
+        model = exported_model(saved, nearest=nearest)
+        if urdf is not None:
+            model = model.in_frames_of(source_for(self.robot, Path(urdf)))
+        return tuple(export_model(model, format, Path(path))[0])
 
     def _html(self) -> str:
         from armident.identify.report.identification import identification_report
@@ -578,6 +619,54 @@ def compare(
     return ChangeTest(test_parameter_change(_document(baseline), _document(now), false_alarm_rate))
 
 
+def predict(
+    recording: Recorded,
+    model: Identification | str | Path,
+    robot: Robot | None = None,
+    *,
+    progress: Progress | None = None,
+) -> TorquePrediction:
+    """Predict the torques of a recording with an identified model.
+
+    Parameters
+    ----------
+    recording
+        A recording, or the path of one; best one that the model was not identified from.
+    model
+        An identification, or the path of ``identification.json``, ``diagnosis.json``, or the folder of one.
+    robot
+        Configuration of the model, or the path or shipped name of one; by default that of the result.
+    progress
+        Called with the name of a stage and the share done, 0 to 1.
+
+    Returns
+    -------
+    TorquePrediction
+        Measured and predicted torques (M, n), N m or N, and the ``document`` with the errors.
+
+    Raises
+    ------
+    ConfigError
+        If a file does not exist.
+    DataError
+        If the model is unusable, or the recording is of another robot or too short.
+
+    Examples
+    --------
+    >>> import armident
+    >>> seen, unseen = (armident.simulate_recording("emps", name, seed=1) for name in ("emps_1", "emps_2"))
+    >>> armident.predict(unseen, armident.identify(seen, method="idim-ls")).document.held_out
+    True
+    """
+    (read,) = _read(recording)
+    config = None if robot is None else _robot(robot, ())
+    if isinstance(model, Identification):
+        loaded = model_of(model.document, Path("(in memory)"), config)
+    else:
+        loaded = load_model(Path(model), config, default=read.robot, progress=progress)
+    return predict_recording(read, loaded, progress)
+
+
 @dataclass(frozen=True, repr=False)
 class Design:
     """A reference trajectory and the precision to expect from a recording of it.
@@ -588,10 +677,13 @@ class Design:
         The robot it is for.
     result
         Trajectory, condition number, predicted standard deviations and torques.
+    checks
+        Properties that were checked, with the results (``checked``), and those that were not (``unchecked``).
     """
 
     robot: RobotConfig
     result: "DesignResult"
+    checks: "SafetyChecks"
 
     @property
     def trajectory(self) -> Trajectory:
@@ -648,6 +740,9 @@ def design_trajectory(
 ) -> Design:
     """Design an exciting trajectory within the limits of a robot (thesis section 2.3.5).
 
+    It keeps the bodies of ``collision`` in the configuration apart. Torques stay within their limits if ``known`` or
+    the URDF of the robot has masses.
+
     Parameters
     ----------
     robot
@@ -681,7 +776,9 @@ def design_trajectory(
     Raises
     ------
     ConfigError
-        If the robot cannot make a single move in that time, or an option is wrong.
+        If the robot cannot make a single move in that time, an option is wrong, or no trajectory keeps all limits.
+    DataError
+        If ``known`` is of another robot or model, or is not physical.
 
     Examples
     --------
@@ -692,24 +789,26 @@ def design_trajectory(
     """
     from armident.identify.excitation.design import design_trajectory as run
     from armident.identify.excitation.design import with_objective
-    from armident.identify.excitation.previous_estimate import previous_estimate
+    from armident.identify.excitation.previous_estimate import physical_estimate
+    from armident.identify.excitation.safety import check_safety, safety_model
 
     config = _robot(robot, ())
-    earlier = None if known is None else previous_estimate(_document(known), config, "known")
-    theta = None if earlier is None else earlier.theta
+    earlier = None if known is None else physical_estimate(_document(known), config, "known")
+    safety = safety_model(config, None if isinstance(robot, RobotConfig) else robot, earlier, "known")
     found = run(
         config,
         duration,
         seed,
         noise=None if earlier is None else earlier.noise,
         evaluations=evaluations,
-        theta=theta,
-        aim=with_objective(config, effect, joint, against, theta),
+        theta=safety.theta,
+        aim=with_objective(config, effect, joint, against, safety.theta),
         shape=shape,
         harmonics=harmonics,
+        collision=safety.collision,
         progress=None if progress is None else lambda share: progress("search", share),
     )
-    return Design(config, found)
+    return Design(config, found, check_safety(config, found, safety))
 
 
 def effects() -> EffectTable:
@@ -741,7 +840,7 @@ def _read(recordings: Recorded | Sequence[Recorded]) -> tuple[Recording, ...]:
 def _robot(robot: Robot | None, recordings: Sequence[Recording]) -> RobotConfig:
     if robot is None:
         return recordings[0].robot
-    return robot if isinstance(robot, RobotConfig) else load_robot(robot)
+    return robot if isinstance(robot, RobotConfig) else load_robot(robot, "identify")
 
 
 def _document(given: Identification | IdentificationDocument | str | Path) -> IdentificationDocument:

@@ -1,4 +1,4 @@
-"""Commands of this package: identify, check, diagnose, effects, history, trajectory, worker, reproduce, suite."""
+"""Commands of this package: identification, checks, diagnosis, use of models, history, trajectories, suite."""
 
 import os
 from pathlib import Path
@@ -151,6 +151,57 @@ def diagnose(
         raise typer.Exit(code)
 
 
+def predict(
+    recording: Annotated[Path, typer.Argument(help="Recording (.mcap), best one that the model has not seen.")],
+    model: Annotated[Path, typer.Option("--model", help="identification.json, diagnosis.json, or the folder of one.")],
+    config: Annotated[
+        Path | None, typer.Option("--config", help="Robot configuration. [default: that of the model]")
+    ] = None,
+    out: OutDirectory = None,
+    json: Json = False,
+) -> None:
+    """Predict the torques of a recording with an identified model, and report its error in total and by joint.
+
+    Says if the recording is held out, or one that the model was identified from. Writes prediction.json, torques.csv
+    and report.html. Exit code 4 if the model explains the torques no better than none.
+
+    Example: armident predict tuesday.mcap --model monday.identification
+    """
+    from armident.identify.commands import predict_command
+
+    code = predict_command(recording, model, config, out, as_json=json)
+    if code:
+        raise typer.Exit(code)
+
+
+def compare(
+    baseline: Annotated[Path, typer.Argument(help="The earlier identification.json, or its folder.")],
+    now: Annotated[Path, typer.Argument(help="The later identification.json, or its folder.")],
+    common: Annotated[
+        bool, typer.Option("--common", help="Compare the parameters that both have, if their models differ.")
+    ] = False,
+    false_alarms: Annotated[
+        float, typer.Option(min=1e-12, max=0.5, help="Probability of the verdict changed without a change.")
+    ] = 1e-4,
+    out: Annotated[
+        Path | None, typer.Option("--out", help="Folder for the results. [default: comparison, beside the later one]")
+    ] = None,
+    json: Json = False,
+) -> None:
+    """Compare two identified models of a robot joint by joint, with intervals, and test for a change.
+
+    Writes comparison.json and report.html with a plot. Exit code 4 if they differ significantly, 3 if they cannot be
+    compared.
+
+    Example: armident compare monday.identification tuesday.identification
+    """
+    from armident.identify.commands import compare_command
+
+    code = compare_command(baseline, now, out, false_alarms, common=common, as_json=json)
+    if code:
+        raise typer.Exit(code)
+
+
 def effects(
     name: Annotated[str | None, typer.Argument(help="One effect. [default: all]")] = None,
     json: Json = False,
@@ -205,7 +256,8 @@ def trajectory(
     known: Annotated[
         Path | None,
         typer.Option(
-            help="identification.json of the robot: keeps torques within limits, predicts standard deviations."
+            help="identification.json of the robot: keeps torques within limits, predicts standard deviations. "
+            "[default: masses of the URDF]"
         ),
     ] = None,
     evaluations: Annotated[int, typer.Option(min=1, help="Number of candidates to try.")] = 2000,
@@ -225,17 +277,21 @@ def trajectory(
         Path | None,
         typer.Option(help="Check and plot an existing trajectory instead, and predict its standard deviations."),
     ] = None,
+    report: Annotated[Path | None, typer.Option(help="Report (.html). [default: beside the trajectory]")] = None,
 ) -> None:
     """Design an exciting trajectory inside the limits of a robot, for the base parameters or for one effect.
 
-    Plots positions, velocities, accelerations and torques against their limits, and prints the predicted standard
-    deviation of every base parameter.
+    Keeps the bodies of collision in the robot configuration apart. Plots positions, velocities, accelerations and
+    torques against their limits, prints the predicted standard deviation of every base parameter, and lists what was
+    checked and what was not.
 
     Example: armident trajectory --config configs/tx40.yaml --out excitation.yaml --known identification.json
     """
+    from armident.identify.document import write_atomically
     from armident.identify.excitation.cli import TrajectoryOptions, trajectory_command
+    from armident.identify.report.trajectory import trajectory_report
 
-    trajectory_command(
+    found = trajectory_command(
         TrajectoryOptions(
             config=config,
             out=out,
@@ -252,6 +308,10 @@ def trajectory(
             look_at=look_at,
         )
     )
+    page = report or found.path.with_suffix(".html")
+    write_atomically(page, trajectory_report(found))
+    print(f"report: {page}")
+    found.refuse_excess()
 
 
 def reproduce(

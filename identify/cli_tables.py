@@ -4,6 +4,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numba.core import event
@@ -15,7 +16,11 @@ from rich.table import Table
 from armident.configs import RobotConfig
 from armident.identify.document import DiagnosisDocument, IdentificationDocument
 from armident.identify.effects.terms import arm_model
+from armident.identify.print_table import print_table
 from armident.identify.setup.result import SetupCheck
+
+if TYPE_CHECKING:
+    from armident.identify.prediction import PredictionDocument
 
 SHOW_AFTER_S = 2.0
 """Duration after which progress is shown, s."""
@@ -131,7 +136,7 @@ def design_table(robot: RobotConfig, theta: NDArray[np.float64] | None, std: NDA
     for name, value, deviation in () if theta is None else zip(names, theta, std, strict=True):
         relative = "" if value == 0 else f"{100 * deviation / abs(value):.1f}"
         table.add_row(name, f"{value:.4f}", f"{deviation:.4f}", relative)
-    Console().print(table)
+    print_table(table)
 
 
 def wanted_table(std: Mapping[str, float]) -> None:
@@ -141,7 +146,7 @@ def wanted_table(std: Mapping[str, float]) -> None:
     table.add_column("std", justify="right")
     for name, deviation in std.items():
         table.add_row(name, f"{deviation:.4g}" if np.isfinite(deviation) else "not visible")
-    Console().print(table)
+    print_table(table)
 
 
 COLOURS = {"trustworthy": "green", "doubtful": "yellow", "unusable": "red"}
@@ -178,7 +183,7 @@ def identification_table(document: IdentificationDocument) -> None:
         row = [p.name, f"{p.value:.4f}", f"{p.std:.4f}", relative, p.unit]
         table.add_row(*row, *([f"{beside[p.name].value:.4f}"] if beside else []))
     console = Console()
-    console.print(table)
+    print_table(table, console)
     essential = sum(p.essential for p in document.parameters)
     errors = ", ".join(f"{name} {value:.1f}" for name, value in document.relative_error_pct_by_joint.items())
     coloured = any(reason.kind in ("residual", "uncertainty") for reason in document.reasons)
@@ -204,7 +209,7 @@ def diagnosis_table(document: DiagnosisDocument) -> None:
     if document.findings:
         table = Table(title="findings", title_justify="left")
         for heading in ("joint", "effect", "parameters", "confidence", "held-out gap"):
-            table.add_column(heading, overflow="fold")
+            table.add_column(heading)
         for f in document.findings:
             std = f.evidence.get("std", {})
             values = ", ".join(
@@ -215,7 +220,7 @@ def diagnosis_table(document: DiagnosisDocument) -> None:
             if f.gap_without_derivative_noise is not None:
                 closed += f" ({f.gap_without_derivative_noise:.2f} % without derivative noise)"
             table.add_row(where, f.effect, values, f"{100 * f.confidence:.0f} %", closed)
-        console.print(table)
+        print_table(table, console)
         for f in document.findings:
             rivals = f.evidence.get("ambiguous_with", [])
             unsure = f"; ambiguous with {', '.join(rivals)}" if rivals else ""
@@ -236,6 +241,34 @@ def diagnosis_table(document: DiagnosisDocument) -> None:
     )
 
 
+def time_left(elapsed_s: float, share: float) -> str:
+    """Return the time left at a constant rate, in words.
+
+    Parameters
+    ----------
+    elapsed_s
+        Time since the beginning, s.
+    share
+        Share done, above 0 to 1.
+    """
+    seconds = round(elapsed_s * (1.0 - share) / share)
+    return f"{seconds} s" if seconds < 120 else f"{seconds // 60} min"
+
+
+def prediction_table(document: "PredictionDocument") -> None:
+    """Print the error of a model on a recording, in total and by joint."""
+    console = Console()
+    console.print(document.sentence, highlight=False, soft_wrap=True)
+    table = Table(title=f"{document.robot}: torque errors by joint", title_justify="left")
+    for heading in ("joint", "error %", "own data %", "error rms", "torque rms", "unit"):
+        table.add_column(heading, justify="left" if heading in ("joint", "unit") else "right", no_wrap=True)
+    for name, error in document.relative_error_pct_by_joint.items():
+        own = document.identification_error_pct_by_joint.get(name)
+        row = [name, f"{error:.2f}", "" if own is None else f"{own:.2f}"]
+        table.add_row(*row, f"{document.error_rms[name]:.4g}", f"{document.torque_rms[name]:.4g}", document.units[name])
+    print_table(table, console)
+
+
 def _plain_lines(what: str, begin: float) -> Report:
     """Print lines on stderr: one per stage, and one for every further fifth of the work."""
     last: tuple[str, int] | None = None
@@ -244,7 +277,8 @@ def _plain_lines(what: str, begin: float) -> Report:
         nonlocal last
         now = stage, int(5 * share)
         if now != last and time.monotonic() - begin > SHOW_AFTER_S:
-            print(f"{what}: {stage} ({100 * share:.0f} %)", file=sys.stderr, flush=True)
+            left = f", {time_left(time.monotonic() - begin, share)} left" if share > 0.0 else ""
+            print(f"{what}: {stage} ({100 * share:.0f} %{left})", file=sys.stderr, flush=True)
             last = now
 
     return show

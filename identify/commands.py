@@ -1,4 +1,4 @@
-"""Commands ``identify``, ``check`` and ``diagnose``: read, compute, write, print."""
+"""Commands ``identify``, ``check``, ``diagnose``, ``predict`` and ``compare``: read, compute, write, print."""
 
 import json
 import sys
@@ -8,14 +8,14 @@ from pathlib import Path
 from typing import Any
 
 from armident.configs import DataError
-from armident.identify.document import to_json
+from armident.identify.document import IdentificationDocument, load_document, to_json, write_atomically
 from armident.identify.identification.options import parse_decimation, parse_nvr
 
 UNUSABLE = DataError.exit_code
 """Exit code: the data cannot support the request as they are configured, and the result says why."""
 
 FOUND = 4
-"""Exit code: done, with findings or an unexplained residual."""
+"""Exit code: done, with findings, a change, or an unexplained residual."""
 
 
 def identify_command(
@@ -158,6 +158,104 @@ def diagnose_command(
         if document.model is not None:
             print(f"model:  {document.model}")
     return 0 if document.verdict == "no_gap" else FOUND
+
+
+def predict_command(path: Path, model: Path, config: Path | None, out: Path | None, *, as_json: bool) -> int:
+    """Carry out ``armident predict``.
+
+    Parameters
+    ----------
+    path
+        Recording.
+    model
+        Result with the identified parameters.
+    config
+        Robot configuration; ``None``: that of the model.
+    out
+        Folder of the results; ``None``: beside the recording.
+    as_json
+        Print the document on stdout instead of a table.
+
+    Returns
+    -------
+    int
+        Exit code: `FOUND` if the model explains the torques no better than none, otherwise 0.
+
+    Raises
+    ------
+    ConfigError, DataError
+        If a file is wrong, the model is unusable, or the recording cannot be used.
+    """
+    from armident.configs import load_robot
+    from armident.daq.recording import read_recording
+    from armident.identify.cli_tables import prediction_table, progress, warn
+    from armident.identify.prediction import predict_recording
+    from armident.identify.report.prediction import prediction_report
+    from armident.identify.saved_model import load_model
+
+    with progress(f"predict {path.name}") as report:
+        recording = read_recording(path)
+        robot = None if config is None else load_robot(config)
+        loaded = load_model(model, robot, default=recording.robot, progress=report)
+        found = predict_recording(recording, loaded, report)
+    document, folder = found.document, out or _beside(path, "prediction")
+    write_atomically(folder / "torques.csv", found.csv())
+    write_atomically(folder / "report.html", prediction_report(found, loaded.robot, loaded.document))
+    write_atomically(folder / "prediction.json", to_json(document))
+    if as_json:
+        sys.stdout.write(to_json(document))
+    else:
+        warn(document.warnings)
+        prediction_table(document)
+        print(f"result: {folder / 'prediction.json'}\ntorques: {folder / 'torques.csv'}")
+        print(f"report: {folder / 'report.html'}")
+    return FOUND if document.worthless else 0
+
+
+def compare_command(
+    baseline: Path, now: Path, out: Path | None, false_alarms: float, *, common: bool, as_json: bool
+) -> int:
+    """Carry out ``armident compare``.
+
+    Parameters
+    ----------
+    baseline, now
+        Two ``identification.json``, or their folders.
+    out
+        Folder of the results; ``None``: ``comparison`` beside the later one.
+    false_alarms
+        Probability of the verdict ``changed`` without a change.
+    common
+        Compare only the parameters that both have.
+    as_json
+        Print the document on stdout instead of a table.
+
+    Returns
+    -------
+    int
+        Exit code: `FOUND` if the parameters differ significantly, otherwise 0.
+
+    Raises
+    ------
+    ConfigError, DataError
+        If a file is wrong, or the two cannot be compared.
+    """
+    from armident.identify.cli_tables import warn
+    from armident.identify.monitoring.comparison import compare_models, comparison_report, comparison_table
+
+    files = [each / "identification.json" if each.is_dir() else each for each in (baseline, now)]
+    first, second = (load_document(file, IdentificationDocument) for file in files)
+    document = compare_models((first, files[0]), (second, files[1]), common=common, false_alarms=false_alarms)
+    folder = out or files[1].parent / "comparison"
+    write_atomically(folder / "report.html", comparison_report(document, second))
+    write_atomically(folder / "comparison.json", to_json(document))
+    if as_json:
+        sys.stdout.write(to_json(document))
+    else:
+        warn(document.warnings)
+        comparison_table(document)
+        print(f"result: {folder / 'comparison.json'}\nreport: {folder / 'report.html'}")
+    return FOUND if document.verdict == "changed" else 0
 
 
 def _beside(path: Path, suffix: str) -> Path:

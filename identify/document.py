@@ -18,6 +18,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from armident import configs
 from armident.configs import ConfigError, DataError, RobotConfig
+from armident.configs.schema.base import DescribedModel
 from armident.daq.recording import Recording
 
 if TYPE_CHECKING:
@@ -29,14 +30,26 @@ LIBRARIES = ("armident", "numpy", "scipy", "numba")
 T = TypeVar("T", bound=BaseModel)
 
 
-class Document(BaseModel):
+class Document(DescribedModel):
     """Part of a result document, without unknown keys and without NaN."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, populate_by_name=True)
 
 
 class RecordingReference(Document):
-    """Recording that was used; ``samples`` counts rows (one per SYNC)."""
+    """Recording that was used.
+
+    Parameters
+    ----------
+    path
+        File; null for a recording in memory.
+    sha256
+        Digest of the raw samples, hexadecimal.
+    sample_rate_hz
+        Sampling rate, Hz.
+    samples
+        Number of rows, one per SYNC.
+    """
 
     path: str | None
     sha256: str
@@ -45,9 +58,24 @@ class RecordingReference(Document):
 
 
 class Parameter(Document):
-    """One estimated parameter, SI; ``relative_std_pct`` is null where the value is zero.
+    """One estimated parameter, SI.
 
-    ``formula`` gives the standard parameters that a base parameter groups, for example ``my5 - mz6``.
+    Parameters
+    ----------
+    name
+        Name of the base parameter, for example ``zz1r``.
+    value
+        Estimate.
+    std
+        Standard deviation of the estimate.
+    relative_std_pct
+        Standard deviation in percent of the value; null where the value is zero.
+    unit
+        Unit of value and standard deviation.
+    essential
+        True for an essential parameter (thesis appendix B.2).
+    formula
+        Standard parameters that a base parameter groups, for example ``my5 - mz6``.
     """
 
     name: str
@@ -60,7 +88,17 @@ class Parameter(Document):
 
 
 class Whiteness(Document):
-    """Residual autocorrelation of a joint: fraction of the ``lags`` outside two standard deviations (white: 0.05)."""
+    """Residual autocorrelation of a joint.
+
+    Parameters
+    ----------
+    joint
+        Name of the joint.
+    lags
+        Number of lags that are tested.
+    fraction_outside_2sigma
+        Fraction of the lags outside two standard deviations; 0.05 for white residuals.
+    """
 
     joint: str
     lags: int
@@ -70,9 +108,24 @@ class Whiteness(Document):
 class ResidualStatistics(Document):
     """Statistics of the residuals of a joint, for the comparison with a later run of the same motion.
 
-    ``score`` and ``information`` belong to free functions of position (two thirds of them) and of velocity, estimated
-    beside all parameters; ``band_power`` is the mean square of the residuals between two ``band_edges_hz``, with its
-    degrees of freedom.
+    Parameters
+    ----------
+    joint
+        Name of the joint.
+    position_range
+        Lowest and highest position of the free functions, rad or m.
+    velocity_limit
+        Largest absolute velocity of the free functions, rad/s or m/s.
+    score
+        Score of the coefficients of free functions of position (two thirds of them) and of velocity.
+    information
+        Information matrix of these coefficients, estimated beside all parameters.
+    band_edges_hz
+        Edges of the frequency bands, Hz.
+    band_power
+        Mean square of the residuals between two edges, (N m)^2 or N^2.
+    band_degrees
+        Degrees of freedom of each band power.
     """
 
     joint: str
@@ -86,7 +139,21 @@ class ResidualStatistics(Document):
 
 
 class VerdictReason(Document):
-    """Defect of an identification: its level, the property judged, one sentence, and the next step."""
+    """Defect of an identification.
+
+    Parameters
+    ----------
+    level
+        Verdict that the defect causes.
+    kind
+        Property that is judged, for example ``convergence`` or ``negative_friction``.
+    joint
+        Joint with the defect; null if it belongs to the whole robot.
+    message
+        Defect in one sentence.
+    next_step
+        Remedy in one sentence.
+    """
 
     level: Literal["doubtful", "unusable"]
     kind: str
@@ -96,7 +163,17 @@ class VerdictReason(Document):
 
 
 class Comparison(Document):
-    """Estimate of a simpler method from the same data, for comparison."""
+    """Estimate of a simpler method from the same data, for comparison.
+
+    Parameters
+    ----------
+    method
+        Name of the method.
+    parameters
+        Its estimates.
+    relative_error_pct
+        Its relative torque error, percent.
+    """
 
     method: str
     parameters: list[Parameter]
@@ -106,17 +183,75 @@ class Comparison(Document):
 class IdentificationDocument(Document):
     """Content of ``identification.json``: estimated parameters, their covariance, the data, method and diagnostics.
 
-    ``verdict`` with its ``reasons`` states if the parameters can be used, by the limits in ``criteria``; it is null in
-    documents of former versions. ``torque_delay_samples`` has two numbers per joint: the number of samples by which the
-    torque leads the position, and its standard deviation. A drive that reports the torque that it holds until the next
-    sample has a lead of 0.5. ``sign_smoothing`` is ``g`` of each joint's ``sign(qd) -> (2/pi) atan(g qd)``, s/rad or
-    s/m. ``bias`` is the bias by derivatives, encoder noise and sampling that was subtracted from the parameters, null
-    where it is irrelevant. ``residual_statistics`` is null in documents of former versions.
+    Parameters
+    ----------
+    schema_
+        Name and version of the document.
+    verdict
+        Usability of the parameters by the limits in ``criteria``; null in documents of former versions.
+    reasons
+        Defects behind the verdict; empty for a trustworthy one.
+    robot
+        Name of the robot.
+    recording
+        Recording that was identified.
+    method
+        Estimator.
+    options
+        Options of the identification.
+    parameters
+        Estimated base parameters.
+    covariance
+        Covariance matrix of the parameters, in their order.
+    relative_error_pct
+        Norm of the torque error over the norm of the torque, percent.
+    relative_error_pct_by_joint
+        The same of each joint, percent.
+    iterations
+        Number of iterations.
+    converged
+        True if the iterations converged.
+    stop_reason
+        Reason for which the iterations ended.
+    whiteness
+        Residual autocorrelation of each joint.
+    noise_model
+        Noise model of the estimator: kind, and order and coefficients by joint.
+    controller
+        Controller of the simulated loop: source, gains and quality of its fit.
+    timing_s
+        Time of each step, s.
+    versions
+        Versions of Python and of the libraries.
+    warnings
+        Messages of conversion and estimation.
+    comparison
+        IDIM-LS estimate from the same data; null if the method is IDIM-LS.
+    diagnostics
+        Statistical tests of the estimate, with p-values.
+    physical
+        Nearest physically consistent parameters, where they were asked for.
+    torque_delay_samples
+        Number of samples by which the torque of each joint leads the position, and its standard
+        deviation. A drive that reports the torque that it holds until the next sample has a lead of 0.5.
+    further_recordings
+        Further recordings that were identified together with the first one.
+    bias
+        Bias by derivatives, encoder noise and sampling that was subtracted from each parameter; null where it is
+        irrelevant.
+    sign_smoothing
+        ``g`` of each joint's ``sign(qd) -> (2/pi) atan(g qd)``, s/rad or s/m.
+    criteria
+        Limits of the verdict.
+    residual_statistics
+        Statistics of the residuals for later comparison; null in documents of former versions.
+    configuration
+        Robot configuration that the parameters belong to; null in documents of former versions.
     """
 
     schema_: Literal["armident/identification/1"] = Field("armident/identification/1", alias="schema")
     verdict: Literal["trustworthy", "doubtful", "unusable"] | None = None
-    reasons: list[VerdictReason] = []
+    reasons: list[VerdictReason] = Field(default_factory=list)
     robot: str
     recording: RecordingReference
     method: str
@@ -143,10 +278,21 @@ class IdentificationDocument(Document):
     sign_smoothing: dict[str, float] | None = None
     criteria: dict[str, float] | None = None
     residual_statistics: list[ResidualStatistics] | None = None
+    configuration: dict[str, Any] | None = None
 
 
 class Alternative(Document):
-    """Another effect in place of a finding; ``score`` is its gain in log-likelihood (training and held-out data)."""
+    """Another effect in place of a finding.
+
+    Parameters
+    ----------
+    effect
+        Name of the effect.
+    joint
+        Name of its joint.
+    score
+        Its gain in log-likelihood, training and held-out data.
+    """
 
     effect: str
     joint: str
@@ -162,8 +308,31 @@ Verdict = Literal["no_gap", "explained", "partly_explained", "unexplained"]
 class Finding(Document):
     """One effect that the model lacks; gaps are relative torque errors in percent on held-out data.
 
-    ``law`` is the formula of the effect, empty for the first one of the catalogue, ``table`` for a free shape. The
-    effect ``unnamed`` is a regular torque without a known cause; its law is the variable that it depends on.
+    Parameters
+    ----------
+    effect
+        Name of the effect; ``unnamed``: a regular torque without a known cause.
+    law
+        Formula of the effect: empty for the first one of the catalogue, ``table`` for a free shape. For ``unnamed`` the
+        variable that the torque depends on.
+    joint
+        Joint at which it acts.
+    other
+        Second joint of an effect between two joints.
+    kind
+        ``structure``: the model lacks a term; ``numbers``: parameters differ from those of the baseline.
+    parameters
+        Estimated parameters, SI.
+    confidence
+        Probability that this effect is there, 0 to 1.
+    alternatives
+        Rivals of the finding, the best first.
+    gap_before
+        Torque error of the joint without the finding, percent.
+    gap_after
+        Torque error of the joint with it, percent.
+    evidence
+        Further figures: standard deviations, share of the error power, p-value of the confirmation.
     """
 
     effect: str
@@ -193,7 +362,19 @@ class Finding(Document):
 
 
 class Unexplained(Document):
-    """Part of a joint's residual that no effect of the catalogue explains, and the variable that it depends on."""
+    """Part of a joint's residual that no effect of the catalogue explains.
+
+    Parameters
+    ----------
+    joint
+        Name of the joint.
+    share_of_residual
+        Share of the power of the residual, 0 to 1.
+    varies_with
+        Variable that it depends on.
+    hint
+        Probable causes.
+    """
 
     joint: str
     share_of_residual: float
@@ -204,8 +385,16 @@ class Unexplained(Document):
 class Negligible(Document):
     """Effect that is significant and smaller than what counts as a cause; it is not in the model.
 
-    ``change_of_torque_pct`` is its torque in percent of that of the joint, ``share_of_residual`` the share of the power
-    of the joint's residual that it removes.
+    Parameters
+    ----------
+    effect
+        Name of the effect.
+    joint
+        Name of the joint.
+    change_of_torque_pct
+        Its torque in percent of that of the joint.
+    share_of_residual
+        Share of the power of the joint's residual that it removes, 0 to 1.
     """
 
     effect: str
@@ -215,7 +404,19 @@ class Negligible(Document):
 
 
 class NotVisible(Document):
-    """Effect that these recordings cannot show at a joint at any size; ``required_motion`` would show it."""
+    """Effect that these recordings cannot show at a joint at any size.
+
+    Parameters
+    ----------
+    effect
+        Name of the effect.
+    joint
+        Name of the joint.
+    reason
+        Reason for which it is invisible.
+    required_motion
+        Motion that would show it.
+    """
 
     effect: str
     joint: str
@@ -226,7 +427,18 @@ class NotVisible(Document):
 class DetectionLimit(Document):
     """Smallest size at which an effect at a joint would be detected with a probability of 0.9.
 
-    ``limits`` holds the size of each linear parameter with the others at zero, ``units`` their units.
+    Parameters
+    ----------
+    effect
+        Name of the effect.
+    joint
+        Name of the joint.
+    other
+        Second joint of an effect between two joints.
+    limits
+        Size of each linear parameter with the others at zero.
+    units
+        Unit of each.
     """
 
     effect: str
@@ -237,22 +449,48 @@ class DetectionLimit(Document):
 
 
 class Gap(Document):
-    """Relative torque error in percent, of all joints together and of each; ``rms`` is that of each in N m or N."""
+    """Relative torque error.
+
+    Parameters
+    ----------
+    all
+        Of all joints together, percent.
+    by_joint
+        Of each joint, percent.
+    rms
+        Root mean square of the torque error of each joint, N m or N.
+    """
 
     all: float
     by_joint: dict[str, float]
-    rms: dict[str, float] = {}
+    rms: dict[str, float] = Field(default_factory=dict)
 
 
 class BeforeAfter(Document):
-    """Gap of the model as configured, and of the model with the findings added."""
+    """Gap of two models.
+
+    Parameters
+    ----------
+    before
+        Gap of the model as configured.
+    after
+        Gap of the model with the findings added.
+    """
 
     before: Gap
     after: Gap
 
 
 class Gaps(Document):
-    """Gap on the training data and on the held-out data."""
+    """Gap on both parts of the data.
+
+    Parameters
+    ----------
+    train
+        Gap on the training data.
+    validation
+        Gap on the held-out data.
+    """
 
     train: BeforeAfter
     validation: BeforeAfter
@@ -261,11 +499,52 @@ class Gaps(Document):
 class DiagnosisDocument(Document):
     """``diagnosis.json``: effects that the model lacks, their share of the torque error, and the unexplained rest.
 
-    ``considered`` are effects that documents of former versions list beside the findings. ``negligible`` are effects
-    below the least change that counts (``--material``). ``sign_smoothing`` is ``g`` of each joint's
-    ``sign(qd) -> (2/pi) atan(g qd)``, s/rad or s/m; ``transitions`` are the velocities over which the dry friction of
-    a joint reverses, rad/s or m/s, where the data show them. ``criteria`` has all thresholds, and ``alpha`` the
-    division of the false-alarm rate among the tests.
+    Parameters
+    ----------
+    schema_
+        Name and version of the document.
+    robot
+        Name of the robot.
+    recordings
+        Recordings that were diagnosed.
+    verdict
+        Summary of findings and unexplained parts.
+    findings
+        Effects that the model lacks, those with a name first.
+    unexplained
+        Parts of the residual that depend on the motion and have no cause.
+    gap
+        Torque errors before and after the findings.
+    noise_floor
+        Torque error that noise alone causes.
+    recommended_experiment
+        Motion or recording that would decide between alternatives.
+    model
+        Robot configuration with the findings; null if there are none or it was not written.
+    timing_s
+        Time of each step, s.
+    versions
+        Versions of Python and of the libraries.
+    warnings
+        Messages of conversion and diagnosis.
+    not_visible
+        Effects that these recordings cannot show.
+    detection_limits
+        Sizes from which effects would be detected.
+    simulated
+        Errors of the simulated closed loop with both models, percent.
+    considered
+        Effects that documents of former versions list beside the findings.
+    negligible
+        Effects below the least change that counts (``--material``).
+    sign_smoothing
+        ``g`` of each joint's ``sign(qd) -> (2/pi) atan(g qd)``, s/rad or s/m.
+    transitions
+        Velocity over which the dry friction of a joint reverses, rad/s or m/s, where the data show it.
+    criteria
+        All thresholds.
+    alpha
+        Division of the false-alarm rate among the tests.
     """
 
     schema_: Literal["armident/diagnosis/2"] = Field("armident/diagnosis/2", alias="schema")
@@ -281,11 +560,11 @@ class DiagnosisDocument(Document):
     timing_s: dict[str, float]
     versions: dict[str, str]
     warnings: list[str]
-    not_visible: list[NotVisible] = []
-    detection_limits: list[DetectionLimit] = []
+    not_visible: list[NotVisible] = Field(default_factory=list)
+    detection_limits: list[DetectionLimit] = Field(default_factory=list)
     simulated: dict[str, dict[str, float]] | None = None
-    considered: list[Finding] = []
-    negligible: list[Negligible] = []
+    considered: list[Finding] = Field(default_factory=list)
+    negligible: list[Negligible] = Field(default_factory=list)
     sign_smoothing: dict[str, float] | None = None
     transitions: dict[str, float] | None = None
     criteria: dict[str, float] | None = None
@@ -372,7 +651,7 @@ def identification_document(
     recordings
         Recordings that they come from.
     robot
-        Configuration of the robot.
+        Configuration of the robot, which the document keeps.
     notes
         Messages of the conversion; they precede the estimator's warnings.
     """
@@ -432,6 +711,7 @@ def identification_document(
         sign_smoothing=dict(zip(joints, (float(g) for g in result.sign_smoothing), strict=True)),
         criteria=plain(result.criteria),
         residual_statistics=[ResidualStatistics(**plain(each)) for each in result.residual_statistics] or None,
+        configuration=robot.model_dump(mode="json", by_alias=True),
     )
 
 
@@ -550,13 +830,40 @@ def load_document(path: Path, kind: type[T]) -> T:
     DataError
         If the file cannot be read or is not such a document.
     """
+    return from_json(_text(path), kind, str(path))
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Return the JSON object of a file, for instance to find out the schema of a document.
+
+    Parameters
+    ----------
+    path
+        JSON file.
+
+    Raises
+    ------
+    ConfigError
+        If there is no such file.
+    DataError
+        If the file cannot be read or is no JSON object.
+    """
     try:
-        text = path.read_text(encoding="utf-8")
+        found = json.loads(_text(path))
+    except json.JSONDecodeError as error:
+        raise DataError(f"{path}: line {error.lineno}: not valid JSON: {error.msg}") from error
+    if not isinstance(found, dict):
+        raise DataError(f"{path}: expected a JSON object")
+    return found
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8")
     except FileNotFoundError as error:
         raise ConfigError(f"{path}: no such file") from error
     except (OSError, UnicodeDecodeError) as error:
         raise DataError(f"{path}: cannot be read: {error}") from error
-    return from_json(text, kind, str(path))
 
 
 def write_atomically(path: Path, text: str) -> None:

@@ -42,7 +42,7 @@ class RobotModel:
     """
 
     def __init__(self, robot: RobotConfig | str | Path) -> None:
-        self.robot = robot if isinstance(robot, RobotConfig) else load_robot(robot)
+        self.robot = robot if isinstance(robot, RobotConfig) else load_robot(robot, "identify")
         self._arm = arm_model(self.robot)
 
     @property

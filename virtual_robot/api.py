@@ -3,6 +3,7 @@
 from pathlib import Path
 
 from armident.configs import RobotConfig, Scenario, Trajectory, load_robot, load_scenario, load_trajectory
+from armident.configs.loading import load_inertials
 from armident.daq.recording import Recording
 
 
@@ -15,6 +16,8 @@ def simulate_recording(
     noise: float = 1.0,
     period: float | None = None,
     velocity_feedback: bool | None = None,
+    model: str | Path | None = None,
+    arm_seed: int = 0,
 ) -> Recording:
     """Simulate the recording that a capture of the virtual arm would make along a trajectory.
 
@@ -23,7 +26,8 @@ def simulate_recording(
     Parameters
     ----------
     robot
-        Configuration of a robot that has a virtual arm (TX40, EMPS), or the path or shipped name of one.
+        Configuration of a robot, or the path or shipped name of one. What it leaves open is assumed: the robot of the
+        recording is complete.
     trajectory
         Reference positions, or the path or shipped name of a trajectory file.
     scenario
@@ -37,6 +41,11 @@ def simulate_recording(
     velocity_feedback
         True if the velocity loop of the drives is fed with the velocity, False for the derivative of the position
         error; by default as the robot's configuration says.
+    model
+        ``identification.json`` with physically consistent parameters for the arm. By default masses are those of the
+        URDF that a robot's file names, else those shipped for the TX40 and the EMPS, else drawn.
+    arm_seed
+        Seed of masses and friction that are drawn.
 
     Returns
     -------
@@ -46,7 +55,7 @@ def simulate_recording(
     Raises
     ------
     ConfigError
-        If the trajectory leaves the limits of the robot, or the robot has no virtual arm.
+        If the trajectory leaves the limits of the robot, or ``model`` is of another robot.
 
     Examples
     --------
@@ -56,8 +65,14 @@ def simulate_recording(
     5000.0
     """
     from armident.virtual_robot.offline import simulate_recording as simulate
+    from armident.virtual_robot.twin import complete
 
-    config = robot if isinstance(robot, RobotConfig) else load_robot(robot)
+    config = robot if isinstance(robot, RobotConfig) else load_robot(robot, "robot")
+    inertials = None if isinstance(robot, RobotConfig) else load_inertials(robot)
+    document = None if model is None else Path(model)
+    config, parameters, _ = complete(config, model=document, inertials=inertials, seed=arm_seed)
     reference = trajectory if isinstance(trajectory, Trajectory) else load_trajectory(trajectory)
     hidden = scenario if isinstance(scenario, Scenario) or scenario is None else load_scenario(scenario)
-    return simulate(config, reference, seed, noise, hidden, period, velocity_feedback=velocity_feedback)
+    return simulate(
+        config, reference, seed, noise, hidden, period, velocity_feedback=velocity_feedback, parameters=parameters
+    )

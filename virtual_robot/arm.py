@@ -9,6 +9,7 @@ from armident.configs import ConfigError, RobotConfig
 from armident.configs.schema.scenario import Scenario
 from armident.configs.units import counts_per_si
 from armident.virtual_robot import servo
+from armident.virtual_robot.arm_parameters import ArmParameters, arm_parameters, with_scenario
 from armident.virtual_robot.effects import hidden_effects
 from armident.virtual_robot.effects.signals import Signals
 from armident.virtual_robot.noise import Noise
@@ -69,13 +70,15 @@ class Arm:
     q
         Initial posture, rad or m, shape (n,).
     sync_period
-        SYNC period, s, a multiple of the drives' control period; ``None``: one control period.
+        SYNC period, s; ``None``: one control period. That of the EMPS is a multiple of its control period.
     seed, noise
         Seed of the noise, and factor on its amplitude (see ``armident.virtual_robot.noise``).
     scenario
-        Hidden effects.
+        Hidden effects; controller, friction and noise.
     velocity_feedback
         Structure of the drives' velocity loop, see ``servo.design``.
+    parameters
+        Parameters of the arm; ``None``: `armident.virtual_robot.arm_parameters.arm_parameters` of the robot.
 
     Raises
     ------
@@ -92,17 +95,20 @@ class Arm:
         noise: float = 1.0,
         scenario: Scenario | None = None,
         velocity_feedback: bool | None = None,
+        parameters: ArmParameters | None = None,
     ) -> None:
-        n, period = robot.n, servo.control_period(robot)
+        n, period = robot.n, servo.control_period(robot, sync_period)
         sync_period = period if sync_period is None else sync_period
         self._periods = round(sync_period / period)
         if self._periods < 1 or abs(self._periods * period - sync_period) > 1e-9:
             raise ConfigError(
                 f"SYNC period {sync_period * 1e6:.0f} us: the virtual drives need a multiple of {period * 1e6:.0f} us"
             )
-        self.plant = Plant(robot, q, scenario)
+        parameters = arm_parameters(robot) if parameters is None else parameters
+        chosen = with_scenario(parameters, robot, scenario)
+        self.plant = Plant(robot, q, scenario, parameters)
         self._signals = Signals(hidden_effects(scenario, robot), robot, period)
-        self._noise = Noise(robot, period, seed, noise)
+        self._noise = Noise(robot, period, seed, noise, chosen.noise)
         self._ratio = robot.transmission_matrix
         drives = [joint.drive for joint in robot.joints]
         self._per_rad = counts_per_si(robot)
@@ -110,8 +116,8 @@ class Arm:
         self._limit = np.array([drive.saturation or np.inf for drive in drives])
         self._permille = np.array([1000.0 / drive.rated for drive in drives])
         # Drives are tuned for the arm without hidden effects.
-        known = self.plant if scenario is None else Plant(robot, q)
-        self._servo = servo.design(robot, known.mass_matrix(), velocity_feedback)
+        known = self.plant if scenario is None else Plant(robot, q, None, parameters)
+        self._servo = design_drives(robot, known.mass_matrix(), velocity_feedback, period, scenario, chosen)
         self._origin, self._target = np.zeros(n), np.zeros(n)
         self._age, self._steps = np.zeros(n, np.int64), np.ones(n, np.int64)
         self._held = np.ones(n, np.bool_)
@@ -194,3 +200,45 @@ class Arm:
             signals.rewired_torque(current, self.current)
             signals.rewired_position(position, self.position)
             signals.rewired_position(demand, self.demand)
+
+
+def design_drives(
+    robot: RobotConfig,
+    mass: NDArray[np.float64],
+    velocity_feedback: bool | None,
+    period: float,
+    scenario: Scenario | None,
+    parameters: ArmParameters,
+) -> servo.Servo:
+    """Design the drives of a virtual arm: gains of the scenario, else those of its configuration, else tuned gains.
+
+    Parameters
+    ----------
+    robot
+        The robot.
+    mass
+        Mass matrix of the healthy arm at power-on, joint side, rotors included, shape (n, n).
+    velocity_feedback
+        As for ``servo.design``.
+    period
+        Control period, s.
+    scenario
+        The scenario; ``None``: none.
+    parameters
+        Parameters of the arm in this scenario.
+
+    Raises
+    ------
+    ConfigError
+        If the gains are not those of n joints, or contradict ``velocity_feedback``.
+    """
+    given = None if scenario is None or scenario.controller is None else scenario.controller
+    known = None if given is None else given.gains
+    if known is not None and not len(known.kp) == len(known.kv) == robot.n:
+        raise ConfigError(f"scenario: controller.gains: expected {robot.n} numbers in kp and in kv")
+    if given is not None and known is None:
+        # A bandwidth is given: the known controller of the configuration does not count.
+        robot = robot.model_copy(update={"controller": None})
+    return servo.design(
+        robot, mass, velocity_feedback, period=period, bandwidth_hz=parameters.bandwidth_hz, known=known
+    )

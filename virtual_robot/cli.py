@@ -7,13 +7,30 @@ import typer
 
 
 def robot(
-    config: Annotated[Path, typer.Option(help="Session configuration.")] = Path("tx40_cell.yaml"),
+    config: Annotated[Path, typer.Option(help="Configuration of a session, or of a robot: any arm.")] = Path(
+        "tx40_cell.yaml"
+    ),
     scenario: Annotated[
-        Path | None, typer.Option(help="Scenario: effects hidden in the arm, oddities of its drives.")
+        Path | None,
+        typer.Option(help="Scenario: hidden effects, oddities of drives, controller, friction and noise."),
     ] = None,
     replay: Annotated[Path | None, typer.Option(help="Recording to replay in place of the plant.")] = None,
     seed: Annotated[int, typer.Option(help="Seed of the noise.")] = 0,
     noise: Annotated[float, typer.Option(min=0.0, help="Factor on the noise amplitude; 0: no noise.")] = 1.0,
+    model: Annotated[
+        Path | None,
+        typer.Option(help="Masses and friction from this identification.json, of armident identify --physical."),
+    ] = None,
+    arm_seed: Annotated[
+        int, typer.Option(min=0, help="Seed of masses, rotors and friction that are known from nowhere.")
+    ] = 0,
+    draw_masses: Annotated[
+        bool, typer.Option("--draw-masses", help="Draw the masses even if the URDF of the robot has some.")
+    ] = False,
+    write_config: Annotated[
+        Path | None,
+        typer.Option(help="Write robot, session and motion, with all that is assumed, to this folder for capture."),
+    ] = None,
     truth: Annotated[Path | None, typer.Option(help="Write the true parameters of the arm to this JSON file.")] = None,
     duration: Annotated[
         float | None, typer.Option(min=0.0, help="Duration, s. [default: until Ctrl-C]", show_default=False)
@@ -45,6 +62,8 @@ def robot(
 ) -> None:
     """Run a virtual robot arm on a bus: its CiA 402 drives with a simulated plant, or with a recording to replay.
 
+    Masses are those of --model, else of the robot's URDF, else stored for the TX40 and the EMPS, else drawn.
+
     Example: armident robot --config tx40_cell.yaml --scenario scenarios/tx40_worn_joint2.yaml
     """
     if list_effects:
@@ -60,13 +79,21 @@ def robot(
 
     from armident.configs import ConfigError
     from armident.virtual_robot.run import record_robot, run_robot
+    from armident.virtual_robot.twin import STANDARD, ParameterChoice
 
     if to_file is None and (trajectory is not None or encoder_counts is not None):
         raise ConfigError("--trajectory and --encoder-counts belong to --to-file")
+    if model is not None and draw_masses:
+        raise ConfigError("--model has masses, and --draw-masses draws them: give only one of them")
+    choice = ParameterChoice(model, arm_seed, draw_masses)
     if to_file is not None:
-        if replay is not None or duration is not None:
-            raise ConfigError("--to-file simulates one trajectory: --replay and --duration have no meaning with it")
-        record_robot(config, to_file, scenario, seed, noise, trajectory, encoder_counts, truth, velocity_feedback)
+        if replay is not None or duration is not None or write_config is not None:
+            raise ConfigError(
+                "--to-file simulates one trajectory: --replay, --duration and --write-config have no meaning with it"
+            )
+        record_robot(
+            config, to_file, scenario, seed, noise, trajectory, encoder_counts, truth, velocity_feedback, choice
+        )
         return
     if scenario is not None and replay is not None:
         raise ConfigError("--scenario hides effects in the plant, and --replay has no plant: give only one of them")
@@ -74,7 +101,9 @@ def robot(
         raise ConfigError("--velocity-feedback and --velocity-error choose drives, --replay has none")
     if truth is not None and replay is not None:
         raise ConfigError("--truth: a replayed recording does not know the parameters of its arm")
-    run_robot(config, scenario, replay, seed, noise, duration, truth, velocity_feedback)
+    if replay is not None and (choice != STANDARD or write_config is not None):
+        raise ConfigError("--model, --arm-seed, --draw-masses and --write-config are of a plant, --replay has none")
+    run_robot(config, scenario, replay, seed, noise, duration, truth, velocity_feedback, choice, write_config)
 
 
 def demo(
@@ -90,6 +119,8 @@ def demo(
 
     Example: armident demo --out demo
     """
+    from armident.extras import require
     from armident.virtual_robot.demo import demo as run_demo
 
+    require("armident demo", "identify", "virtual")
     run_demo(out=out, keep_going=keep_going, quick=quick)

@@ -22,6 +22,7 @@ import yaml
 from armident.configs import ArmidentError, ConfigError, SessionConfig, load_session
 from armident.drivers.vcan import ensure_vcan, have_socketcan, launcher_command, launcher_obstacle
 from armident.processes import CommandProcess, ProcessEnded, ProcessTimeout, start_command
+from armident.virtual_robot.twin import at_period
 
 CELL = "tx40_cell.yaml"
 SCENARIO = "scenarios/tx40_worn_joint2.yaml"
@@ -269,17 +270,7 @@ def _slower(session: SessionConfig) -> SessionConfig | None:
     """Session at the demo's lower rate, with set points on every SYNC; ``None`` if it is that slow already."""
     if session.sync.period_us >= SLOW_PERIOD_US:
         return None
-    return _at_period(session, SLOW_PERIOD_US)
-
-
-def _at_period(session: SessionConfig, period_us: int) -> SessionConfig:
-    return session.model_copy(
-        update={
-            "sync": session.sync.model_copy(update={"period_us": period_us}),
-            "streams": {name: s.model_copy(update={"every": 1}) for name, s in session.streams.items()},
-            "setpoints": session.setpoints and session.setpoints.model_copy(update={"every": 1}),
-        }
-    )
+    return at_period(session, SLOW_PERIOD_US)
 
 
 def _rate(session: SessionConfig) -> str:

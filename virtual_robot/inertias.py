@@ -203,29 +203,37 @@ def _stored(path: Path) -> dict[str, float]:
     return {k: float(v) for k, v in yaml.safe_load(path.read_text(encoding="utf-8"))["parameters"].items()}
 
 
-def plant_parameters(robot: RobotConfig) -> dict[str, float]:
-    """All standard parameters of the virtual arm of a robot, by name, SI.
+def has_stored_parameters(robot: RobotConfig) -> bool:
+    """Return True if the robot is the virtual TX40 or EMPS by name, joints and couplings.
 
     Parameters
     ----------
     robot
-        Robot with the name, joints and couplings of a virtual arm.
+        The robot.
+    """
+    path = HERE / f"{robot.name}_inertias.yaml"
+    expected = {f"{k}{j + 1}" for j in range(robot.n) for k in (*INERTIAL, "ia", "fv", "fc", "off")}
+    expected |= {f"{k}{c.name}" for c in robot.couplings for k in ("ia", "fv", "fc")}
+    return is_file(path) and expected == _stored(path).keys()
+
+
+def plant_parameters(robot: RobotConfig) -> dict[str, float]:
+    """All standard parameters of the virtual TX40 or EMPS, by name, SI.
+
+    Parameters
+    ----------
+    robot
+        Robot with stored parameters.
 
     Raises
     ------
     ConfigError
-        If there is no virtual arm of that name, or its joints or couplings differ.
+        If there are no stored parameters of that robot.
     """
-    path = HERE / f"{robot.name}_inertias.yaml"
-    if not is_file(path):
+    if not has_stored_parameters(robot):
         known = ", ".join(sorted(p.name.removesuffix("_inertias.yaml") for p in HERE.glob("*_inertias.yaml")))
-        raise ConfigError(f"robot {robot.name!r}: no virtual arm of that name (there is: {known})")
-    parameters = dict(_stored(path))
-    expected = {f"{k}{j + 1}" for j in range(robot.n) for k in (*INERTIAL, "ia", "fv", "fc", "off")}
-    expected |= {f"{k}{c.name}" for c in robot.couplings for k in ("ia", "fv", "fc")}
-    if odd := sorted(expected ^ set(parameters)):
-        raise ConfigError(f"robot {robot.name!r}: joints or couplings differ from the virtual arm's ({odd[0]})")
-    return parameters
+        raise ConfigError(f"robot {robot.name!r}: no stored parameters for these joints (there is: {known})")
+    return dict(_stored(HERE / f"{robot.name}_inertias.yaml"))
 
 
 def rest_posture(robot: RobotConfig) -> tuple[float, ...]:
@@ -234,9 +242,8 @@ def rest_posture(robot: RobotConfig) -> tuple[float, ...]:
     Parameters
     ----------
     robot
-        Robot of a virtual arm.
+        The TX40 or the EMPS.
     """
-    plant_parameters(robot)
     data = yaml.safe_load((HERE / f"{robot.name}_inertias.yaml").read_text(encoding="utf-8"))
     return tuple(float(x) for x in data["rest"])
 

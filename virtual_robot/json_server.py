@@ -23,7 +23,7 @@ from armident.configs import ArmidentError, RobotConfig, Trajectory, load_robot,
 from armident.configs.expression import evaluate
 from armident.configs.schema.scenario import HiddenEffect, Scenario
 from armident.daq.recording import write_recording
-from armident.virtual_robot.inertias import plant_parameters
+from armident.virtual_robot.arm_parameters import arm_parameters
 from armident.virtual_robot.offline import simulate_recording
 from armident.virtual_robot.plant import Plant
 
@@ -49,7 +49,7 @@ def joint_scale(robot: RobotConfig, joint: int, q: tuple[float, ...]) -> dict[st
         ``fv``, ``fc``: viscous and Coulomb friction; ``ia``: rotor inertia; ``inertia``: diagonal element of the mass
         matrix; ``speed``, ``torque``: limits; ``span``: width of the position range; ``ratio``: gear ratio.
     """
-    standard, limits = plant_parameters(robot), robot.joints[joint].limits
+    standard, limits = arm_parameters(robot).standard, robot.joints[joint].limits
     return {
         "fv": standard[f"fv{joint + 1}"],
         "fc": standard[f"fc{joint + 1}"],

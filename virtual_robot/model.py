@@ -48,7 +48,7 @@ def build_model(robot: RobotConfig, standard: Mapping[str, float]) -> Any:
 def _body(standard: Mapping[str, float], link: int) -> Any:
     xx, xy, xz, yy, yz, zz = (standard[f"{k}{link}"] for k in ("xx", "xy", "xz", "yy", "yz", "zz"))
     mass = standard[f"m{link}"]
-    com = np.array([standard[f"{k}{link}"] for k in ("mx", "my", "mz")]) / mass
+    com = np.array([standard[f"{k}{link}"] for k in ("mx", "my", "mz")]) / (mass or 1.0)
     about_origin = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
     shift = pin.skew(com)
     return pin.Inertia(mass, com, about_origin + mass * shift @ shift)

@@ -60,11 +60,15 @@ class Noise:
         Seed of the random numbers.
     level
         Factor on the amplitudes; 0: no noise.
+    size
+        Variances of the noise; ``None``: those of the TX40 or the EMPS.
     """
 
-    def __init__(self, robot: RobotConfig, period: float, seed: int, level: float = 1.0) -> None:
+    def __init__(
+        self, robot: RobotConfig, period: float, seed: int, level: float = 1.0, size: NoiseSize | None = None
+    ) -> None:
         n = robot.n
-        white, slow = amplitudes(robot, period)
+        white, slow = amplitudes(robot, period, size)
         gain = np.array([joint.drive.gain for joint in robot.joints])
         self._current = level * white / np.abs(gain)
         self._disturbance = level * slow
@@ -91,7 +95,9 @@ class Noise:
         self._row = 0
 
 
-def amplitudes(robot: RobotConfig, period: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def amplitudes(
+    robot: RobotConfig, period: float, size: NoiseSize | None = None
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return standard deviations of both parts of the noise.
 
     Parameters
@@ -100,6 +106,8 @@ def amplitudes(robot: RobotConfig, period: float) -> tuple[NDArray[np.float64], 
         Robot with the name of a virtual arm, n joints.
     period
         Control period, s.
+    size
+        Variances of the noise; ``None``: those of the TX40 or the EMPS.
 
     Returns
     -------
@@ -108,10 +116,10 @@ def amplitudes(robot: RobotConfig, period: float) -> tuple[NDArray[np.float64], 
     slow
         Disturbance torque of the joints, (n,), N m or N; its spectrum has the corner `DISTURBANCE_HZ`.
     """
-    size = SIZES[robot.name]
+    size = SIZES[robot.name] if size is None else size
     total, low = np.array(size.sampled), np.array(size.decimated)
     white_low = DECIMATION_HZ * 2 * period
     slow_low = 2 / np.pi * np.arctan(DECIMATION_HZ / DISTURBANCE_HZ)
-    slow = (low - white_low * total) / (slow_low - white_low)
+    slow = np.clip((low - white_low * total) / (slow_low - white_low), 0.0, None)
     motor = np.linalg.solve(robot.transmission_matrix.T**2, np.maximum(total - slow, 0.0))
     return np.sqrt(np.maximum(motor, 0.0)), np.sqrt(slow)

@@ -11,6 +11,7 @@ from armident.configs.units import counts_per_si
 from armident.daq.recording import Field, Mark, Recording, Stream
 from armident.virtual_robot import servo
 from armident.virtual_robot.arm import Arm
+from armident.virtual_robot.arm_parameters import ArmParameters
 
 Effort = Literal["current", "voltage", "torque"]
 
@@ -31,16 +32,17 @@ def simulate_recording(
     settle: float = 0.3,
     start_ns: int = 0,
     velocity_feedback: bool | None = None,
+    parameters: ArmParameters | None = None,
 ) -> Recording:
     """Simulate a recording of the virtual arm on a trajectory, as ``armident capture`` would write it.
 
     Parameters
     ----------
     robot
-        Robot with the name of a virtual arm (``tx40``, ``emps``).
+        Robot with everything that a drive needs (`armident.virtual_robot.twin.complete`).
     trajectory
         Reference trajectory, joint side; the arm is at its start when the recording begins.
-    seed, noise, scenario, velocity_feedback
+    seed, noise, scenario, velocity_feedback, parameters
         As for ``Arm``.
     period
         SYNC period, s; ``None``: the control period of the drives.
@@ -59,7 +61,7 @@ def simulate_recording(
     Raises
     ------
     ConfigError
-        If the trajectory exceeds the robot's limits, or there is no virtual arm of this name.
+        If the trajectory exceeds the robot's limits.
     """
     trajectory.check(robot)
     every, period = setpoint_every, servo.control_period(robot) if period is None else period
@@ -69,7 +71,7 @@ def simulate_recording(
     last = first + (len(rows) - 1) * every
     total = last + round(settle / period) + 1
 
-    arm = Arm(robot, trajectory.start, period, seed, noise, scenario, velocity_feedback)
+    arm = Arm(robot, trajectory.start, period, seed, noise, scenario, velocity_feedback, parameters)
     for joint in range(robot.n):
         arm.enable(joint, True)
         arm.interpolation_time(joint, period * every)

@@ -11,12 +11,12 @@ from numpy.typing import ArrayLike, NDArray
 from armident.configs import ConfigError, RobotConfig
 from armident.configs.schema.scenario import Scenario
 from armident.virtual_robot import dynamics
+from armident.virtual_robot.arm_parameters import ArmParameters, arm_parameters, with_scenario
 from armident.virtual_robot.effects import Hidden, hidden_effects
 from armident.virtual_robot.effects.bodies import add_rotors, base_vibrations, change_bodies, hinge_damping, rest_angles
 from armident.virtual_robot.effects.bristles import bristle_table, sliding_level
 from armident.virtual_robot.effects.forces import force_table
 from armident.virtual_robot.effects.gears import gear_rows, twist_under
-from armident.virtual_robot.inertias import plant_parameters
 from armident.virtual_robot.model import build_model
 
 pin: Any = pinocchio
@@ -26,6 +26,9 @@ BRAKE = 1e9
 
 FINE_STEP = 34e-6
 """Longest inner step (s) with elastic gears or bristles: a twentieth of the fastest contact's period."""
+
+POSTURES = 100
+"""Number of postures for the least inertia of a joint."""
 
 SETTLING = 20
 """Iterations for the static twist of gears under the weight of their links, which depends on the twist."""
@@ -45,7 +48,9 @@ class Plant:
     q
         Initial position, rad or m, shape (n,); the initial velocity is zero.
     scenario
-        Hidden effects.
+        Hidden effects, and friction in place of the arm's own.
+    parameters
+        Parameters of the arm; ``None``: `armident.virtual_robot.arm_parameters.arm_parameters` of the robot.
 
     Attributes
     ----------
@@ -57,8 +62,15 @@ class Plant:
         Deflection of the bristles, rad, shape (B,).
     """
 
-    def __init__(self, robot: RobotConfig, q: ArrayLike, scenario: Scenario | None = None) -> None:
-        standard = plant_parameters(robot)
+    def __init__(
+        self,
+        robot: RobotConfig,
+        q: ArrayLike,
+        scenario: Scenario | None = None,
+        parameters: ArmParameters | None = None,
+    ) -> None:
+        parameters = arm_parameters(robot) if parameters is None else parameters
+        standard = with_scenario(parameters, robot, scenario).standard
         hidden = hidden_effects(scenario, robot)
         n, start = robot.n, np.array(q, dtype=np.float64)
         self.model = build_model(robot, standard)
@@ -74,7 +86,8 @@ class Plant:
         add_rotors(rotor, hidden, links)
         table = force_table(hidden, robot, friction)
         bristles = bristle_table(hidden, robot, friction, np.diag(rotor) + np.diag(links))
-        gears, moved = gear_rows(hidden, robot, rotor, links)
+        least = self._least_inertia(robot, rotor) if any(h.target == "gear" for h in hidden) else np.zeros(n)
+        gears, moved = gear_rows(hidden, robot, rotor, links, least)
         _add_coupling_friction(hidden, friction, pairs)
         # A bristle replaces the joint's Coulomb friction.
         friction[bristles[:, 0].astype(np.int64), 1] = 0.0
@@ -110,6 +123,16 @@ class Plant:
         )  # fmt: skip
         self._rigid, self._fine = total == n, bool(gears.size or bristles.size)
         self._check(robot, hidden)
+
+    def _least_inertia(self, robot: RobotConfig, rotor: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Least inertia at each joint if all others are free, over random postures within the limits, shape (n,)."""
+        n, least = robot.n, np.full(robot.n, np.inf)
+        low, high = np.array([joint.limits.position for joint in robot.joints]).T
+        swing = np.zeros(self.model.nq - n)
+        for q in np.random.default_rng(0).uniform(low, high, (POSTURES, n)):
+            mass = _symmetric(pin.crba(self.model, self._data, np.concatenate([q, swing])))[:n, :n] + rotor
+            least = np.minimum(least, 1.0 / np.diag(np.linalg.inv(mass)))
+        return least
 
     def _settle(self, start: NDArray[np.float64], gears: NDArray[np.float64], soft: int) -> NDArray[np.float64]:
         """Twist the first ``soft`` gears under the weight of their links; return the nonlinear effects at rest."""

@@ -6,20 +6,31 @@ import math
 import signal
 from pathlib import Path
 from types import FrameType
+from typing import Any
 
 from numpy.typing import ArrayLike
 
-from armident.configs import ConfigError, RobotConfig, SessionConfig, load_robot, load_session, load_trajectory
+from armident.configs import (
+    ConfigError,
+    RobotConfig,
+    Scenario,
+    SessionConfig,
+    load_robot,
+    load_session,
+    load_trajectory,
+)
 from armident.configs.loading import load_scenario
 from armident.daq.recording import read_recording, write_recording
 from armident.virtual_robot import servo
-from armident.virtual_robot.arm import Arm, DriveBackend
-from armident.virtual_robot.inertias import base_parameters, plant_parameters, rest_posture
+from armident.virtual_robot.arm import Arm, DriveBackend, design_drives
+from armident.virtual_robot.arm_parameters import with_scenario
+from armident.virtual_robot.inertias import base_parameters, has_stored_parameters
 from armident.virtual_robot.oddities import drive_oddities
 from armident.virtual_robot.offline import simulate_recording, with_encoder_counts
 from armident.virtual_robot.plant import Plant
 from armident.virtual_robot.replay import Replay
 from armident.virtual_robot.server import Server
+from armident.virtual_robot.twin import STANDARD, ParameterChoice, Twin, load_twin, write_twin
 
 log = logging.getLogger(__name__)
 
@@ -33,13 +44,15 @@ def run_robot(
     duration: float | None = None,
     truth: Path | None = None,
     velocity_feedback: bool | None = None,
+    choice: ParameterChoice = STANDARD,
+    write_config: Path | None = None,
 ) -> None:
     """Serve the drives of a session until SIGINT or SIGTERM, or for a given time.
 
     Parameters
     ----------
     config
-        Session configuration.
+        Configuration of a session, or of a robot (`armident.virtual_robot.twin.load_twin`).
     scenario
         Scenario with hidden effects, and oddities of drives.
     replay
@@ -54,6 +67,10 @@ def run_robot(
         ``velocity_filter_hz`` if there is a filter, and ``velocity_feedback`` (0 or 1).
     velocity_feedback
         Structure of the drives' velocity loop, see ``servo.design``.
+    choice
+        Where the parameters of the arm come from.
+    write_config
+        Folder for the completed robot and session.
 
     Raises
     ------
@@ -64,17 +81,22 @@ def run_robot(
     BusDown
         If the bus goes down.
     """
-    session = load_session(config)
-    robot = load_robot(session.robot)
     hidden = load_scenario(scenario) if scenario is not None else None
-    oddities = drive_oddities(hidden, robot, str(scenario))
     if replay is not None:
+        session = load_session(config, "robot")
+        robot = load_robot(session.robot, "robot")
         motion = _replay(session, robot, replay)
     else:
-        motion = Arm(robot, rest_posture(robot), session.sync_period, seed, noise, hidden, velocity_feedback)
-        _warm_up(robot, session)
+        twin = load_twin(config, choice)
+        session, robot = twin.session, twin.robot
+        _describe(twin, config, write_config)
+        arguments = (seed, noise, hidden, velocity_feedback, twin.parameters)
+        motion = Arm(robot, twin.parameters.rest, session.sync_period, *arguments)
+        # Compile the loops before the first SYNC.
+        Arm(robot, twin.parameters.rest, session.sync_period, parameters=twin.parameters).advance()
         if truth is not None:
-            _write_truth(robot, rest_posture(robot), truth, velocity_feedback)
+            _write_truth(twin, twin.parameters.rest, truth, velocity_feedback, hidden)
+    oddities = drive_oddities(hidden, robot, str(scenario))
     stop = _Stop()
     with Server(session, robot, motion, oddities) as server:
         nodes = ", ".join(str(drive.node_id) for drive in server.drives)
@@ -95,16 +117,17 @@ def record_robot(
     encoder_counts: int | None = None,
     truth: Path | None = None,
     velocity_feedback: bool | None = None,
+    choice: ParameterChoice = STANDARD,
 ) -> None:
     """Write a simulated recording of one trajectory of the virtual arm, without a bus.
 
     Parameters
     ----------
     config
-        Session configuration: robot, SYNC period, set points.
+        Configuration of a session (robot, SYNC period, set points), or of a robot.
     out
         The recording to write.
-    scenario, seed, noise, truth, velocity_feedback
+    scenario, seed, noise, truth, velocity_feedback, choice
         As for ``run_robot``.
     trajectory
         Trajectory; ``None``: that of the session.
@@ -118,32 +141,57 @@ def record_robot(
     """
     if out.exists():
         raise ConfigError(f"{out}: the file exists already")
-    session = load_session(config)
-    robot = load_robot(session.robot)
-    setpoints = session.setpoints
-    if setpoints is None:
-        raise ConfigError(f"{config}: setpoints: --to-file needs them for the motion of the arm")
-    motion = load_trajectory(trajectory or setpoints.trajectory)
+    twin = load_twin(config, choice)
+    session, robot, setpoints = twin.session, twin.robot, twin.session.setpoints
+    _describe(twin, config, None)
+    if trajectory is not None or setpoints is not None:
+        motion = load_trajectory(trajectory or setpoints.trajectory)  # type: ignore[union-attr]
+    elif twin.trajectory is not None:
+        motion = twin.trajectory
+    else:
+        raise ConfigError(f"{config}: setpoints: --to-file needs a trajectory for the motion of the arm (--trajectory)")
     if encoder_counts is not None:
         robot = with_encoder_counts(robot, encoder_counts)
     hidden = None if scenario is None else load_scenario(scenario)
     if hidden is not None and hidden.drives:
         raise ConfigError(f"{scenario}: drives: --to-file has no bus, on which drives could be odd")
+    times: dict[str, Any] = {}
+    if setpoints is not None:
+        times = {"setpoint_every": setpoints.every, "settle": setpoints.settle_s}
     recording = simulate_recording(
-        robot, motion, seed, noise, hidden,
-        session.sync_period, setpoints.every, setpoints.settle_s, velocity_feedback=velocity_feedback,
+        robot, motion, seed, noise, hidden, session.sync_period,
+        velocity_feedback=velocity_feedback, parameters=twin.parameters, **times,
     )  # fmt: skip
     if truth is not None:
-        _write_truth(robot, motion.start, truth, velocity_feedback)
+        _write_truth(twin, motion.start, truth, velocity_feedback, hidden)
     write_recording(recording, out)
     log.info("%d samples of %s in %s", recording.samples.sync.size, robot.name, out)
 
 
-def _write_truth(robot: RobotConfig, q: ArrayLike, path: Path, velocity_feedback: bool | None) -> None:
+def _describe(twin: Twin, config: Path, write_config: Path | None) -> None:
+    """Log where the parameters come from and what was assumed, and write the completed configuration."""
+    for source in twin.parameters.sources:
+        log.info("%s", source)
+    for assumption in twin.assumed:
+        log.info("assumed: %s", assumption)
+    if write_config is not None:
+        log.info("armident capture --config %s records this arm", write_twin(twin, write_config))
+    elif twin.assumed:
+        log.info("%s leaves this open; armident capture needs it too: --write-config DIR writes files with it", config)
+
+
+def _write_truth(
+    twin: Twin, q: ArrayLike, path: Path, velocity_feedback: bool | None, scenario: Scenario | None
+) -> None:
     """Write the parameters of the plant, and of the drives tuned at posture ``q`` (n,)."""
-    parameters = plant_parameters(robot)
-    drives = servo.design(robot, Plant(robot, q).mass_matrix(), velocity_feedback)
-    values = parameters | base_parameters(parameters)
+    robot = twin.robot
+    chosen = with_scenario(twin.parameters, robot, scenario)
+    mass = Plant(robot, q, None, twin.parameters).mass_matrix()
+    period = servo.control_period(robot, twin.session.sync_period)
+    drives = design_drives(robot, mass, velocity_feedback, period, scenario, chosen)
+    values = dict(chosen.standard)
+    if robot.name == "tx40" and has_stored_parameters(robot):
+        values |= base_parameters(values)
     values["velocity_feedback"] = float(drives.velocity_feedback)
     values["velocity_samples"] = float(drives.velocity_samples)
     if math.isfinite(drives.filter_hz):
@@ -157,11 +205,6 @@ def _replay(session: SessionConfig, robot: RobotConfig, path: Path) -> DriveBack
     names = [joint.name for joint in robot.joints]
     joints = tuple(names.index(node.joint) for node in session.drives)
     return Replay(read_recording(path), robot, session.sync_period, joints)
-
-
-def _warm_up(robot: RobotConfig, session: SessionConfig) -> None:
-    """Compile the loops before the first SYNC."""
-    Arm(robot, rest_posture(robot), session.sync_period).advance()
 
 
 class _Stop:

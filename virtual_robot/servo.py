@@ -1,6 +1,7 @@
 """Servo drives: encoder, interpolated demand, cascade controller and current, by control period."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,6 +9,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from armident.configs import ConfigError, RobotConfig
+from armident.configs.schema.robot import Controller
 
 CONTROL_PERIOD = 200e-6
 """Control period of position, velocity and current command, s."""
@@ -130,44 +132,31 @@ def control(  # type: ignore[no-untyped-def]
             tau[i] += torque[i, j] * current[j]
 
 
-def control_period(robot: RobotConfig) -> float:
-    """Control period of the robot's drives, s.
+def control_period(robot: RobotConfig, sync_period: float | None = None) -> float:
+    """Control period of the robot's drives, s: at most ``CONTROL_PERIOD``, and a whole number of them in a SYNC period.
 
     Parameters
     ----------
     robot
-        The robot.
+        The robot; the EMPS has a period of its own.
+    sync_period
+        SYNC period, s; ``None``: any.
     """
-    return OTHER_PERIODS.get(robot.name, CONTROL_PERIOD)
+    if robot.name in OTHER_PERIODS or sync_period is None:
+        return OTHER_PERIODS.get(robot.name, CONTROL_PERIOD)
+    return sync_period / math.ceil(sync_period / CONTROL_PERIOD - 1e-6)
 
 
-def design(robot: RobotConfig, mass: NDArray[np.float64], velocity_feedback: bool | None = None) -> Servo:
-    """Design the drives of a virtual arm: the known controller of its configuration, else tuned gains.
-
-    Parameters
-    ----------
-    robot
-        Transmission, drive gains, and optionally a known controller, which has velocity feedback.
-    mass
-        Mass matrix at the posture for which the gains are tuned, joint side, rotors included, shape (n, n).
-    velocity_feedback
-        As for ``Servo``; ``None``: ``True`` with a known controller, else ``False``.
-
-    Raises
-    ------
-    ConfigError
-        If ``velocity_feedback`` is ``False`` with a known controller.
-    """
-    period, known = control_period(robot), robot.controller
-    if known is None:
-        return Servo(period, *gains(robot, mass), bool(velocity_feedback), 1, VELOCITY_FILTER_HZ)
-    if velocity_feedback is False:
-        raise ConfigError(f"robot {robot.name!r}: its controller (kp, kv) feeds back the velocity, and cannot without")
-    return Servo(period, np.array(known.kp), np.array(known.kv), True, known.velocity_samples, math.inf)
-
-
-def gains(robot: RobotConfig, mass: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Gains ``kp`` (1/s) and ``kv`` (A s/rad), motor side, for two equal poles at the bandwidths of ``BANDWIDTH_HZ``.
+def design(
+    robot: RobotConfig,
+    mass: NDArray[np.float64],
+    velocity_feedback: bool | None = None,
+    *,
+    period: float | None = None,
+    bandwidth_hz: Sequence[float] = BANDWIDTH_HZ,
+    known: Controller | None = None,
+) -> Servo:
+    """Design the drives of a virtual arm: a known controller, else tuned gains.
 
     Parameters
     ----------
@@ -175,6 +164,42 @@ def gains(robot: RobotConfig, mass: NDArray[np.float64]) -> tuple[NDArray[np.flo
         Transmission and drive gains.
     mass
         Mass matrix at the posture for which the gains are tuned, joint side, rotors included, shape (n, n).
+    velocity_feedback
+        As for ``Servo``; ``None``: ``True`` with a known controller, else ``False``.
+    period
+        Control period, s; ``None``: that of `control_period`.
+    bandwidth_hz
+        Bandwidths of the position loops for tuned gains, Hz; the last one counts for all further joints.
+    known
+        Known controller, which has velocity feedback; ``None``: that of the robot's configuration, if it has one.
+
+    Raises
+    ------
+    ConfigError
+        If ``velocity_feedback`` is ``False`` with a known controller.
+    """
+    period = control_period(robot) if period is None else period
+    known = robot.controller if known is None else known
+    if known is None:
+        return Servo(period, *gains(robot, mass, bandwidth_hz), bool(velocity_feedback), 1, VELOCITY_FILTER_HZ)
+    if velocity_feedback is False:
+        raise ConfigError(f"robot {robot.name!r}: its controller (kp, kv) feeds back the velocity, and cannot without")
+    return Servo(period, np.array(known.kp), np.array(known.kv), True, known.velocity_samples, math.inf)
+
+
+def gains(
+    robot: RobotConfig, mass: NDArray[np.float64], bandwidth_hz: Sequence[float] = BANDWIDTH_HZ
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Gains ``kp`` (1/s) and ``kv`` (A s/rad), motor side, for two equal poles at the given bandwidths.
+
+    Parameters
+    ----------
+    robot
+        Transmission and drive gains.
+    mass
+        Mass matrix at the posture for which the gains are tuned, joint side, rotors included, shape (n, n).
+    bandwidth_hz
+        Bandwidths of the position loops, Hz; the last one counts for all further joints.
 
     Returns
     -------
@@ -183,7 +208,7 @@ def gains(robot: RobotConfig, mass: NDArray[np.float64]) -> tuple[NDArray[np.flo
     """
     inverse = np.linalg.inv(robot.transmission_matrix)
     inertia = np.diag(inverse.T @ mass @ inverse)
-    bandwidth = np.array([BANDWIDTH_HZ[min(j, len(BANDWIDTH_HZ) - 1)] for j in range(robot.n)])
+    bandwidth = np.array([bandwidth_hz[min(j, len(bandwidth_hz) - 1)] for j in range(robot.n)])
     pole = 2 * np.pi * bandwidth / SHARE_OF_POLE
     drive_gain = np.array([joint.drive.gain for joint in robot.joints])
     return 0.5 * pole, 2.0 * pole * inertia / drive_gain

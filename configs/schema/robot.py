@@ -6,8 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
+from armident.configs.blanks import check_filled, needed
 from armident.configs.errors import ConfigError
-from armident.configs.schema.base import FrozenModel
+from armident.configs.schema.base import FrozenModel, WithBlanks
+from armident.configs.schema.collision import BASE, Collision
 from armident.configs.schema.limits import Limits, Positive, endless
 
 __all__ = [
@@ -220,7 +222,7 @@ class Preprocessing(FrozenModel):
     decimation_padlen: Annotated[int, Field(ge=0)] = 24
 
 
-class RobotConfig(FrozenModel):
+class RobotConfig(WithBlanks):
     """Serial robot arm; all values in SI units, joint side unless stated otherwise.
 
     Parameters
@@ -249,6 +251,10 @@ class RobotConfig(FrozenModel):
         Start values of the iterative methods, by parameter name, SI.
     preprocessing
         Filters of a published IDIM-LS fit, with a sharp ``sign(qd)``; ``None``: filters from the bandwidth.
+    collision
+        Bodies of the arm and of its cell, which designed trajectories keep apart.
+    blanks
+        Keys that the file marks as blank.
     """
 
     schema_: Literal["armident/robot/1"] = Field(alias="schema")
@@ -266,6 +272,7 @@ class RobotConfig(FrozenModel):
     preprocessing: Preprocessing | None = Field(
         None, description="filters of a published IDIM-LS fit, with a sharp sign(qd); None: from the bandwidth"
     )
+    collision: Collision | None = None
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
@@ -289,6 +296,9 @@ class RobotConfig(FrozenModel):
             for name in (effect.joint, effect.other):
                 if name is not None and name not in names:
                     raise ValueError(f"effects: no joint named {name!r}; joints are {', '.join(names)}")
+        for capsule in () if self.collision is None else self.collision.capsules:
+            if capsule.link not in (BASE, *names):
+                raise ValueError(f"collision: no link {capsule.link!r}; links are {', '.join((BASE, *names))}")
         threshold = self.friction.velocity_threshold
         if threshold is not None and len(threshold) != n:
             raise ValueError(f"friction.velocity_threshold: expected {n} numbers")
@@ -321,6 +331,34 @@ class RobotConfig(FrozenModel):
         if self.transmission is None:
             return np.eye(self.n)
         return np.array(self.transmission, dtype=np.float64)
+
+    def blanks_for(self, command: str | None) -> tuple[str, ...]:
+        """Blanks whose value a command needs.
+
+        Parameters
+        ----------
+        command
+            The command; ``None``: one that needs everything.
+        """
+        torques = all(joint.drive.signal == "torque" for joint in self.joints)
+        return needed(self.blanks, command, efforts_are_torques=torques)
+
+    def check_filled(self, command: str | None, where: str = "") -> None:
+        """Refuse a robot that lacks a value that a command needs.
+
+        Parameters
+        ----------
+        command
+            The command; ``None``: one that needs everything.
+        where
+            Name of the configuration in messages; empty: the robot's.
+
+        Raises
+        ------
+        ConfigError
+            If there are such blanks; lists all of them with the way to find their values.
+        """
+        check_filled(where or f"robot {self.name}", self.blanks_for(command), command)
 
     def check_movable(self, where: str = "") -> None:
         """Refuse to move an arm whose limits or transmission are not known.

@@ -5,7 +5,7 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, model_validator
 
-from armident.configs.schema.base import FrozenModel
+from armident.configs.schema.base import FrozenModel, WithBlanks
 from armident.configs.schema.robot import JointName, Name, Positive
 
 ObjectName = Literal["position", "velocity", "current", "torque", "demand", "status"]
@@ -289,7 +289,7 @@ class IdentificationOptions(FrozenModel):
     physical: bool = False
 
 
-class SessionConfig(FrozenModel):
+class SessionConfig(WithBlanks):
     """Session of one cell; relative paths are relative to the file that contains them.
 
     Parameters
@@ -320,6 +320,8 @@ class SessionConfig(FrozenModel):
         Reference trajectory that is played; ``None``: none.
     recording, zenoh, metrics, identification
         Options of recordings, Zenoh, Prometheus and the identification worker.
+    blanks
+        Keys that the file marks as blank.
     """
 
     schema_: Literal["armident/session/1"] = Field(alias="schema")

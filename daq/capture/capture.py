@@ -29,7 +29,6 @@ from armident.daq.capture.publisher import Publisher
 from armident.daq.capture.recorder import Outputs, Recorder
 from armident.daq.capture.reload import Change, Reloader
 from armident.daq.capture.sink import Sink
-from armident.daq.capture.systemd import Notifier
 from armident.daq.logs import log_to
 from armident.daq.recording import Mark, QueuedSeries
 from armident.daq.streaming import Keys
@@ -37,6 +36,7 @@ from armident.drivers.can.frames import FrameBus
 from armident.drivers.can.receiver import Receiver
 from armident.drivers.can.udp import UDP_WARNING, open_bus
 from armident.drivers.canopen.emcy_listener import EmcyListener
+from armident.systemd import Notifier
 
 __all__ = ["CapturePlan", "CaptureResult", "capture", "load_plan", "run_capture"]
 

@@ -20,7 +20,6 @@ from armident.daq.capture.publisher import Publisher
 from armident.daq.capture.remote_commands import Command
 from armident.daq.capture.setpoints import SetpointSchedule, StandstillDetector, plan_setpoints
 from armident.daq.capture.sink import Sink
-from armident.daq.capture.systemd import Notifier
 from armident.daq.matching.assembler import LATE_S, Assembler
 from armident.drivers.can.frames import BusDown
 from armident.drivers.can.receiver import Receiver
@@ -30,6 +29,7 @@ from armident.drivers.canopen.kernel_sync import KernelSync
 from armident.drivers.canopen.master import DriveEvent, DriveMaster
 from armident.drivers.canopen.sync_producer import SyncProducer
 from armident.drivers.canopen.temperature import TemperaturePoll
+from armident.systemd import Notifier
 
 HEALTH_S = 1.0
 """Interval of health reports, s."""

@@ -98,13 +98,13 @@ class Reloader:
         ConfigError
             If it cannot be read, or a key has changed that may not change during a capture.
         """
-        session = load_session(self._config)
+        session = load_session(self._config, "capture")
         fixed = [key for key in differences(self._session, session) if not key.startswith(CHANGEABLE)]
         if fixed:
             raise ConfigError(
                 f"{self._config}: {', '.join(fixed)}: cannot change during a capture; restart the capture"
             )
-        if load_robot(session.robot) != self._plan.robot:
+        if load_robot(session.robot, "capture") != self._plan.robot:
             raise ConfigError(f"{session.robot}: the robot cannot change during a capture; restart the capture")
         return session
 

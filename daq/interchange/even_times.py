@@ -5,7 +5,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline
 
 from armident.configs import DataError
 
@@ -74,6 +73,8 @@ def onto_even_times(times: Floats, raw: Mapping[str, Floats], rate_hz: float) ->
     DataError
         If there are too few rows, or too many holes.
     """
+    from scipy.interpolate import CubicSpline
+
     steps = np.diff(times)
     if steps.size + 1 < _FEWEST:
         raise DataError(f"only {steps.size + 1} rows: too few to resample")

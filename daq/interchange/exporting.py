@@ -11,6 +11,7 @@ from armident.configs import ConfigError, DataError
 from armident.daq.interchange.bus_log import SUFFIXES as LOG_SUFFIXES
 from armident.daq.interchange.bus_log import write_log
 from armident.daq.recording import Recording, Stream
+from armident.extras import install_line
 
 
 def columns(recording: Recording) -> dict[str, NDArray[np.float64]]:
@@ -121,7 +122,7 @@ def _write_parquet(_: Recording, table: dict[str, NDArray[np.float64]], path: Pa
         import pyarrow
         import pyarrow.parquet
     except ImportError as error:
-        raise ConfigError(f"{path}: Parquet needs the package pyarrow (pip install pyarrow)") from error
+        raise ConfigError(install_line(f"{path}: Parquet", ["parquet"])) from error
     pyarrow.parquet.write_table(pyarrow.table(table), path)  # type: ignore[no-untyped-call]
 
 

@@ -17,6 +17,7 @@ from armident.daq.interchange.rate_conversion import at_rate
 from armident.daq.interchange.sample_clock import gaps_and_counters
 from armident.daq.interchange.sampling import Sampled, sampled
 from armident.daq.interchange.si_checks import OMITTED, check_units, unit_of
+from armident.daq.interchange.stated_units import in_si
 from armident.daq.interchange.table_columns import NAMES
 from armident.daq.interchange.table_files import Source, read_pair, read_table
 from armident.daq.interchange.table_rows import Rows, complete_rows
@@ -45,6 +46,7 @@ def import_recording(
     topic: str | None = None,
     joints: Sequence[str] | None = None,
     by_position: bool = False,
+    units: Mapping[str, str] | None = None,
 ) -> Recording:
     """Return measured motion and effort as a recording, after checks of content, units and clock.
 
@@ -81,6 +83,8 @@ def import_recording(
         Names of the joints in the file, in the robot's order.
     by_position
         Take joints of other names in the order of the file.
+    units
+        Units of quantities that are not in SI units (`armident.daq.interchange.stated_units.CHOICES`).
 
     Raises
     ------
@@ -91,24 +95,16 @@ def import_recording(
         contradict the rate, values far outside the limits, or a demand that no joint followed.
     """
     if is_recording(path):
-        if effort is not None or motor_side or names or polled or time_unit or topic or joints or by_position:
+        if effort is not None or motor_side or names or polled or time_unit or topic or joints or by_position or units:
             raise ConfigError(f"{path}: a recording of armident takes no option but --rate, --config and --out")
         return _resampled(path, robot, rate_hz if rate_hz is not None else resample_hz)
     if robot is None:
         raise ConfigError(f"{path}: needs the configuration of the robot")
-    names = dict(names or {})
-    unknown = sorted(names.keys() - NAMES.keys())
-    if unknown:
-        raise ConfigError(f"--map: no quantity named {unknown[0]!r}; expected one of {', '.join(NAMES)}")
     _check_rates(rate_hz, polled, resample_hz)
-    if effort is None and is_bag(path) and not data_files(path):
-        source = _bag(path, robot, topic, joints, by_position)
-        rows = complete_rows(source, robot, names)
-    elif topic is not None:
-        raise ConfigError(f"{path}: --topic is an option of ROS 2 bags")
-    else:
-        source = read_pair(path, effort, robot) if effort is not None else read_table(path)
-        rows = complete_rows(source, robot, names, by_position=by_position, joints=joints)
+    source, rows = read_rows(
+        path, robot, effort=effort, names=names, topic=topic, joints=joints, by_position=by_position
+    )
+    rows = in_si(rows, robot, units or {})
     side: Side = "motor" if motor_side else "joint"
     fields: dict[str, Field] = {
         name: Field(
@@ -143,6 +139,43 @@ def import_recording(
     if resample_hz is None or abs(made.rate_hz / resample_hz - 1.0) < 1e-9:
         return recording
     return at_rate(recording, resample_hz)
+
+
+def read_rows(
+    path: Path,
+    robot: RobotConfig,
+    *,
+    effort: Path | None = None,
+    names: Mapping[str, str] | None = None,
+    topic: str | None = None,
+    joints: Sequence[str] | None = None,
+    by_position: bool = False,
+) -> tuple[Source, Rows]:
+    """Return a table, and its complete rows in the units of the file.
+
+    Parameters
+    ----------
+    path, robot, effort, names, topic, joints, by_position
+        As for `import_recording`.
+
+    Raises
+    ------
+    ConfigError
+        If a file or option is wrong.
+    DataError
+        If columns are missing, or too many rows are damaged.
+    """
+    chosen = dict(names or {})
+    unknown = sorted(chosen.keys() - NAMES.keys())
+    if unknown:
+        raise ConfigError(f"--map: no quantity named {unknown[0]!r}; expected one of {', '.join(NAMES)}")
+    if effort is None and is_bag(path) and not data_files(path):
+        source = _bag(path, robot, topic, joints, by_position)
+        return source, complete_rows(source, robot, chosen)
+    if topic is not None:
+        raise ConfigError(f"{path}: --topic is an option of ROS 2 bags")
+    source = read_pair(path, effort, robot) if effort is not None else read_table(path)
+    return source, complete_rows(source, robot, chosen, by_position=by_position, joints=joints)
 
 
 def _check_rates(rate_hz: float | None, polled: bool, resample_hz: float | None) -> None:

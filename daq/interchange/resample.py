@@ -10,8 +10,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline
-from scipy.ndimage import median_filter
 
 from armident.configs import DataError
 
@@ -69,6 +67,8 @@ def onto_even_clock(raw: Mapping[str, Floats]) -> EvenClockSamples:
     rows = np.concatenate(list(raw.values()), axis=1)
     changed = np.append(True, np.any(rows[1:] != rows[:-1], axis=1))
     index = np.flatnonzero(changed)
+    from scipy.interpolate import CubicSpline
+
     if index.size <= WINDOW:
         raise DataError(f"only {index.size} of {rows.shape[0]} rows differ from the row before: too few to resample")
     advances = _advances(raw["position"][index], np.diff(index))
@@ -87,6 +87,8 @@ def onto_even_clock(raw: Mapping[str, Floats]) -> EvenClockSamples:
 
 def _advances(q: Floats, rows: Ints) -> Ints:
     """Return the samples from each row (N, n) to the next, (N - 1,); during standstill, the number of ``rows`` read."""
+    from scipy.ndimage import median_filter
+
     steps = np.diff(q, axis=0)
     median_steps = median_filter(steps, size=(WINDOW, 1), mode="nearest")
     power = np.sum(median_steps**2, axis=1)

@@ -15,6 +15,7 @@ from armident.daq.interchange.lerobot import data_files, is_lerobot, lerobot_tab
 from armident.daq.interchange.sandbox import read_in_subprocess
 from armident.daq.interchange.table_columns import without_units
 from armident.daq.interchange.text_files import printable, shortened
+from armident.extras import install_line
 
 Table = dict[str, NDArray[np.float64]]
 _LATER_MAT = b"MATLAB 7.3"
@@ -193,7 +194,7 @@ def _parquet(path: Path) -> dict[str, Any]:
         import pyarrow
         import pyarrow.parquet
     except ImportError as error:
-        raise ConfigError(f"{path}: Parquet needs the package pyarrow (pip install pyarrow)") from error
+        raise ConfigError(install_line(f"{path}: Parquet", ["parquet"])) from error
     try:
         table = pyarrow.parquet.read_table(path)  # type: ignore[no-untyped-call]
         return {name: table.column(name).to_numpy() for name in table.column_names}

@@ -5,11 +5,11 @@ import socket
 from typing import Any
 
 import numpy as np
-from numba import carray, njit, types
 from numpy.typing import NDArray
 
 from armident.drivers.can.socketcan import Messages
 from armident.drivers.canopen.objects import COB_SYNC
+from armident.drivers.compiled import MODE, compiled
 
 MAX_LATE_PERIODS = 10
 """Delay, in periods, beyond which the time grid moves instead of being caught up with."""
@@ -38,12 +38,15 @@ _ABSOLUTE = 1
 _EINTR, _EAGAIN, _ENOBUFS = errno.EINTR, errno.EAGAIN, errno.ENOBUFS
 _DONTWAIT = int(socket.MSG_DONTWAIT)
 
-_clock_nanosleep: Any = types.ExternalFunction(
-    "clock_nanosleep", types.int32(types.int32, types.int32, types.intp, types.intp)
-)
-_clock_gettime: Any = types.ExternalFunction("clock_gettime", types.int32(types.int32, types.intp))
-_sendmmsg: Any = types.ExternalFunction("sendmmsg", types.int32(types.int32, types.intp, types.uint32, types.int32))
-_errno_location: Any = types.ExternalFunction("__errno_location", types.voidptr())
+if MODE == "by numba":
+    from numba import carray, types
+
+    _clock_nanosleep: Any = types.ExternalFunction(
+        "clock_nanosleep", types.int32(types.int32, types.int32, types.intp, types.intp)
+    )
+    _clock_gettime: Any = types.ExternalFunction("clock_gettime", types.int32(types.int32, types.intp))
+    _sendmmsg: Any = types.ExternalFunction("sendmmsg", types.int32(types.int32, types.intp, types.uint32, types.int32))
+    _errno_location: Any = types.ExternalFunction("__errno_location", types.voidptr())
 
 
 def is_knot(k: int, every: int) -> bool:
@@ -131,12 +134,12 @@ class Loop:
         body = messages.body.view(np.uint32)
         body[first[:-1], 0], body[place, 0] = COB_SYNC, cob_ids
         messages.body[first[:-1], 4], messages.body[place, 4] = (1 if self._fixed[2] else 0), 4
-        shared = messages.address, messages.body.view(np.int32), first.astype(np.int64), place
-        _run(*self._fixed, state, *self._shared, *shared, rows, every, self._spec)
+        body, first = messages.body.view(np.int32), first.astype(np.int64)
+        _run(*self._fixed, state, *self._shared, messages.address, body, first, place, rows, every, self._spec)
 
 
-@njit(nogil=True, cache=True)
-def monotonic_ns(spec):  # type: ignore[no-untyped-def]
+@compiled
+def monotonic_ns(spec: NDArray[np.int64]) -> int:
     """Read CLOCK_MONOTONIC, ns.
 
     Parameters
@@ -145,11 +148,11 @@ def monotonic_ns(spec):  # type: ignore[no-untyped-def]
         Memory of a ``struct timespec``, int64, shape (2,).
     """
     _clock_gettime(_MONOTONIC, spec.ctypes.data)
-    return spec[0] * 1_000_000_000 + spec[1]
+    return int(spec[0] * 1_000_000_000 + spec[1])
 
 
-@njit(nogil=True, cache=True)
-def utc_ns(spec):  # type: ignore[no-untyped-def]
+@compiled
+def utc_ns(spec: NDArray[np.int64]) -> int:
     """Read CLOCK_REALTIME, ns: the clock of the kernel's frame stamps.
 
     Parameters
@@ -158,11 +161,11 @@ def utc_ns(spec):  # type: ignore[no-untyped-def]
         Memory of a ``struct timespec``, int64, shape (2,).
     """
     _clock_gettime(_REALTIME, spec.ctypes.data)
-    return spec[0] * 1_000_000_000 + spec[1]
+    return int(spec[0] * 1_000_000_000 + spec[1])
 
 
-@njit(nogil=True, cache=True)
-def sleep_until(deadline, spec):  # type: ignore[no-untyped-def]
+@compiled
+def sleep_until(deadline: int, spec: NDArray[np.int64]) -> None:
     """Sleep until CLOCK_MONOTONIC reaches a deadline.
 
     Parameters
@@ -177,8 +180,8 @@ def sleep_until(deadline, spec):  # type: ignore[no-untyped-def]
         pass
 
 
-@njit(nogil=True, cache=True)
-def send_messages(descriptor, address, count, attempts, spec):  # type: ignore[no-untyped-def]
+@compiled
+def send_messages(descriptor: int, address: int, count: int, attempts: int, spec: NDArray[np.int64]) -> int:
     """Send messages by ``sendmmsg``; return 0, or errno if the kernel refuses them.
 
     Parameters
@@ -204,15 +207,16 @@ def send_messages(descriptor, address, count, attempts, spec):  # type: ignore[n
             continue
         code = carray(_errno_location(), 1, np.int32)[0]
         if code not in (_EAGAIN, _ENOBUFS, _EINTR):
-            return code
+            return int(code)
         sleep_until(monotonic_ns(spec) + _RETRY_NS, spec)
-    return code
+    return int(code)
 
 
-@njit(nogil=True, cache=True)
-def _run(  # type: ignore[no-untyped-def]
-    descriptors, period, counter, state, late, errors, unsent, times, address, body, first, place, rows, every, spec
-):
+@compiled
+def _run(
+    descriptors: Any, period: int, counter: int, state: Any, late: Any, errors: Any, unsent: Any, times: Any,
+    address: int, body: Any, first: Any, place: Any, rows: Any, every: int, spec: Any,
+) -> None:  # fmt: skip
     buses = descriptors.size
     if state[BASE_NS] == 0:
         state[BASE_NS] = monotonic_ns(spec) + period

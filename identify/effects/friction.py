@@ -409,7 +409,7 @@ class CouplingFriction(Effect):
 
     def columns(self, motion: Motion, place: Place, shapes: Mapping[str, float]) -> Array:
         """Return acceleration and velocity of the other joint, and the sign of the common velocity."""
-        columns = np.zeros((motion.samples, motion.n, 3))
+        columns = np.zeros((motion.samples, motion.n, 3), dtype=motion.q.dtype)
         for one, two in ((place.joint, place.second), (place.second, place.joint)):
             columns[:, one, 0] = motion.qdd[:, two]
             columns[:, one, 1] = motion.qd[:, two]

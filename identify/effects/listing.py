@@ -72,16 +72,16 @@ def effects_command(name: str | None, *, as_json: bool) -> None:
     if name is not None:
         _one(chosen[0])
         return
-    from rich.console import Console
     from rich.table import Table
+
+    from armident.identify.print_table import print_table
 
     table = Table(title="effects", title_justify="left")
     for heading in ("effect", "title", "parameters", "scope"):
-        table.add_column(heading, overflow="fold")
+        table.add_column(heading)
     for effect in chosen:
         table.add_row(effect.key, effect.title, ", ".join(_parameters(effect)), effect.scope)
-    console = Console()
-    console.print(table)
+    print_table(table)
     print("terms with a key of their own in the robot configuration:")
     for title, parameters, when in ALWAYS:
         print(f"  {title}: {parameters}; {when}")

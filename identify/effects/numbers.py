@@ -45,7 +45,8 @@ class ParameterChange(Effect):
     def columns(self, motion: Motion, place: Place, shapes: Mapping[str, float]) -> Array:
         """Return the columns of the rigid model's parameters."""
         regressor = motion.model.rigid_regressor(motion.q, motion.qd, motion.qdd, sharp_sign=motion.sharp)
-        columns: Array = regressor @ self.change(motion, place)
+        # The terms of the model, last among its base parameters, do not change.
+        columns: Array = regressor @ self.change(motion, place)[: regressor.shape[2]]
         return columns
 
     def may_be_added(self, motion: Motion, place: Place, present: Sequence[Shapes]) -> bool:

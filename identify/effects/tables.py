@@ -25,6 +25,9 @@ def hats(x: Array, knots: Sequence[float] | Array) -> Array:
         Increasing knots, (k,).
     """
     at = np.asarray(knots, dtype=np.float64)
+    if x.dtype == object:
+        # Symbols in place of numbers: a formula is derived, see `armident.identify.model_export.formulas`.
+        return np.array([symbol.hats(at) for symbol in x])
     left = np.clip(np.searchsorted(at, x, side="right") - 1, 0, at.size - 2)
     share = np.clip((x - at[left]) / (at[left + 1] - at[left]), 0.0, 1.0)
     out, rows = np.zeros((x.size, at.size)), np.arange(x.size)

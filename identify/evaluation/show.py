@@ -15,6 +15,7 @@ from armident.identify.evaluation.cases import Case
 from armident.identify.evaluation.store import CaseResult
 from armident.identify.evaluation.tables import AIM_COLUMNS, COLUMNS, HEALTHY_COLUMNS, OUTSIDE_COLUMNS, Tables
 from armident.identify.evaluation.workers import OnResult
+from armident.identify.print_table import print_table
 
 PLAIN_EVERY_S = 30.0
 """Time between two lines of progress if stderr is not a terminal, s."""
@@ -95,7 +96,7 @@ def show(result: Tables, run: int, total: int) -> None:
         ("targets", AIM_COLUMNS, result.aims),
     ):
         if rows:
-            console.print(_table(title, columns, rows))
+            print_table(_table(title, columns, rows), console)
     console.print(f"{run} of {total} cases have been run", highlight=False)
     if run < total:
         console.print("they are a sample of all kinds; the same command runs the others", highlight=False)

@@ -15,12 +15,15 @@ from armident.identify.excitation.design import (
     Design,
     Shape,
     design_trajectory,
+    excesses,
     predict_precision,
     with_objective,
 )
 from armident.identify.excitation.objective import EffectObjective
 from armident.identify.excitation.plot import check_name, draw
-from armident.identify.excitation.previous_estimate import PreviousEstimate, previous_estimate
+from armident.identify.excitation.previous_estimate import PreviousEstimate, physical_estimate
+from armident.identify.excitation.safety import SafetyChecks, SafetyModel, check_safety, safety_model
+from armident.identify.robot.chain import Floats
 
 SHAPES: tuple[Shape, ...] = ("moves", "fourier")
 """Values of ``--shape``."""
@@ -69,22 +72,73 @@ class TrajectoryOptions:
     look_at: Path | None = None
 
 
-def trajectory_command(options: TrajectoryOptions) -> None:
-    """Carry out ``armident trajectory``.
+@dataclass(frozen=True, eq=False)
+class CheckedTrajectory:
+    """Result of ``armident trajectory``.
+
+    Parameters
+    ----------
+    robot
+        Configuration of the robot.
+    path
+        File of the trajectory.
+    design
+        Trajectory with its predicted precision.
+    std
+        Predicted standard deviations of the base parameters (b,), SI.
+    prior
+        Earlier estimate; ``None``: the standard deviations are those of an assumed noise.
+    safety
+        Masses and bodies.
+    checks
+        Properties that were checked, and those that were not.
+    excess
+        Limits that an existing trajectory exceeds.
+    """
+
+    robot: RobotConfig
+    path: Path
+    design: Design
+    std: Floats
+    prior: PreviousEstimate | None
+    safety: SafetyModel
+    checks: SafetyChecks
+    excess: tuple[str, ...]
+
+    def refuse_excess(self) -> None:
+        """Refuse a trajectory that exceeds limits of torque or distance.
+
+        Raises
+        ------
+        ConfigError
+            Names each excess and the next step.
+        """
+        if self.excess:
+            next_step = "Next: design another one with --out FILE, or correct limits.torque and collision of the robot"
+            raise ConfigError(f"{self.path}: needs {'; '.join(self.excess)}. {next_step}")
+
+
+def trajectory_command(options: TrajectoryOptions) -> CheckedTrajectory:
+    """Carry out ``armident trajectory`` but for its report.
 
     Parameters
     ----------
     options
         As given by the user.
 
+    Returns
+    -------
+    CheckedTrajectory
+        A trajectory to check may exceed limits of torque, if masses are known, and of distance.
+
     Raises
     ------
     ConfigError
-        If an option is wrong, or a trajectory to check exceeds the limits (of torque, too, if parameters are known).
+        If an option is wrong, no trajectory keeps all limits, or a trajectory to check exceeds the limits of motion.
     DataError
-        If ``known`` is of another robot or model.
+        If ``known`` is of another robot or model, or is not physical.
     """
-    robot, out, look_at = load_robot(options.config), options.out, options.look_at
+    robot, out, look_at = load_robot(options.config, "trajectory"), options.out, options.look_at
     shape = _checked_shape(options)
     picture = options.picture
     if picture is None:
@@ -93,36 +147,54 @@ def trajectory_command(options: TrajectoryOptions) -> None:
     prior = None
     if options.known is not None:
         document = load_document(options.known, IdentificationDocument)
-        prior = previous_estimate(document, robot, str(options.known))
-    theta = None if prior is None else prior.theta
-    aim = with_objective(robot, options.wanted, options.joint, options.against, theta)
+        prior = physical_estimate(document, robot, str(options.known))
+    safety = safety_model(robot, options.config, prior, str(options.known))
+    aim = with_objective(robot, options.wanted, options.joint, options.against, safety.theta)
     if look_at is not None:
-        design = _looked_at(robot, look_at, prior, aim)
+        design = _looked_at(robot, look_at, prior, aim, safety)
     else:
-        with progress("trajectory") as report:
-            design = design_trajectory(
-                robot,
-                options.duration,
-                options.seed,
-                noise=None if prior is None else prior.noise,
-                evaluations=options.evaluations,
-                theta=theta,
-                aim=aim,
-                shape=shape,
-                harmonics=options.harmonics,
-                progress=lambda share: report("searching", share),
-            )
+        design = _designed(robot, options, shape, prior, aim, safety)
     if out is not None:
         content = design.trajectory.model_dump(mode="json", by_alias=True, exclude_defaults=True)
         write_atomically(out, yaml.safe_dump(content, sort_keys=False))
-    _print_precision(robot, design, prior)
-    name = str(out or look_at)
-    summary = f"{name}: {design.trajectory.duration:.2f} s, condition number {design.condition:.0f}"
+    std = _print_precision(robot, design, prior)
+    path = out or look_at or Path()
+    summary = f"{path}: {design.trajectory.duration:.2f} s, condition number {design.condition:.0f}"
     draw(robot, design, picture, f"{robot.name}, {summary}")
     print(summary)
     print(f"picture: {picture}")
-    if look_at is not None:
-        _refuse_torque(robot, design, name)
+    checks = check_safety(robot, design, safety)
+    for line in checks.checked:
+        print(f"checked: {line}")
+    for line in checks.unchecked:
+        print(f"not checked: {line}")
+    excess = tuple(excesses(robot, design, safety.collision))
+    return CheckedTrajectory(robot, path, design, std, prior, safety, checks, excess)
+
+
+def _designed(
+    robot: RobotConfig,
+    options: TrajectoryOptions,
+    shape: Shape,
+    prior: PreviousEstimate | None,
+    aim: EffectObjective | None,
+    safety: SafetyModel,
+) -> Design:
+    """Search a trajectory and show the progress."""
+    with progress("trajectory") as report:
+        return design_trajectory(
+            robot,
+            options.duration,
+            options.seed,
+            noise=None if prior is None else prior.noise,
+            evaluations=options.evaluations,
+            theta=safety.theta,
+            aim=aim,
+            shape=shape,
+            harmonics=options.harmonics,
+            collision=safety.collision,
+            progress=lambda share: report("searching", share),
+        )
 
 
 def _checked_shape(options: TrajectoryOptions) -> Shape:
@@ -137,16 +209,18 @@ def _checked_shape(options: TrajectoryOptions) -> Shape:
     return shape
 
 
-def _looked_at(robot: RobotConfig, path: Path, prior: PreviousEstimate | None, aim: EffectObjective | None) -> Design:
+def _looked_at(
+    robot: RobotConfig, path: Path, prior: PreviousEstimate | None, aim: EffectObjective | None, safety: SafetyModel
+) -> Design:
     trajectory = load_trajectory(path)
     trajectory.check(robot, str(path))
     noise = _assumed(robot) if prior is None else prior.noise
-    theta = None if prior is None else prior.theta
-    return predict_precision(arm_model(robot), trajectory, noise, theta=theta, aim=aim)
+    model, bodies = arm_model(robot), safety.collision
+    return predict_precision(model, trajectory, noise, theta=safety.theta, aim=aim, collision=bodies)
 
 
-def _print_precision(robot: RobotConfig, design: Design, prior: PreviousEstimate | None) -> None:
-    """Print the predicted standard deviations."""
+def _print_precision(robot: RobotConfig, design: Design, prior: PreviousEstimate | None) -> Floats:
+    """Print and return the predicted standard deviations (b,), SI."""
     std = design.std
     if prior is None or std is None:
         model = arm_model(robot)
@@ -158,18 +232,8 @@ def _print_precision(robot: RobotConfig, design: Design, prior: PreviousEstimate
         design_table(robot, prior.theta, std)
     if design.wanted is not None:
         wanted_table(design.wanted)
+    return std
 
 
-def _assumed(robot: RobotConfig) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+def _assumed(robot: RobotConfig) -> Floats:
     return ASSUMED_NOISE * np.array([joint.limits.torque for joint in robot.joints])
-
-
-def _refuse_torque(robot: RobotConfig, design: Design, name: str) -> None:
-    """Raise ConfigError where a trajectory needs more torque than allowed; the plot is written before."""
-    if design.torque is None:
-        return
-    for joint, peak in zip(robot.joints, np.abs(design.torque).max(axis=0), strict=True):
-        if peak > joint.limits.torque:
-            raise ConfigError(
-                f"{name}: {joint.name} needs a torque of {peak:.1f}, allowed is {joint.limits.torque:.1f}"
-            )

@@ -1,5 +1,7 @@
 """Optimal experiment design: exciting trajectories (thesis section 2.3.5).
 
+Candidates that exceed a torque limit or bring two bodies too close are ranked behind all others, by how far they do.
+
 A trajectory is a sequence of point-to-point moves within the limits, or a finite Fourier series per joint. A random
 search improves waypoints and paces, or coefficients. The criterion is D-optimality: the smallest geometric mean of the
 standard deviations of the base parameters, with the torque noise of each joint as weight. The condition number must be
@@ -20,13 +22,17 @@ from scipy.signal import butter, sosfiltfilt
 
 from armident.configs import ConfigError, RobotConfig, Trajectory
 from armident.identify.effects.terms import arm_model
+from armident.identify.excitation.collision import ClosestApproach, CollisionModel
 from armident.identify.excitation.fourier_series import FourierSearch
 from armident.identify.excitation.objective import EffectObjective, effect_objective
 from armident.identify.excitation.point_to_point import (
     CUTOFF,
     SEARCH_RATE,
+    WORST,
     PointToPointSearch,
+    Rank,
     equations_of,
+    predicted_torque,
     sample_trajectory,
     slow_share,
 )
@@ -63,6 +69,8 @@ class Design:
         Predicted torques (N, n) at `PERIOD`, N m or N; ``None`` if the parameters of the robot are unknown.
     wanted
         Predicted standard deviations of the linear parameters of the wanted effects; ``None`` as for ``std``.
+    closest
+        Smallest distance between bodies at `PERIOD`; ``None`` if there are none to compare.
     """
 
     trajectory: Trajectory
@@ -71,6 +79,7 @@ class Design:
     slow_share: Floats
     torque: Floats | None = None
     wanted: dict[str, float] | None = None
+    closest: ClosestApproach | None = None
 
 
 def design_trajectory(
@@ -85,6 +94,7 @@ def design_trajectory(
     aim: EffectObjective | None = None,
     shape: Shape = "moves",
     harmonics: int | None = None,
+    collision: CollisionModel | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> Design:
     """Design an exciting trajectory by random search.
@@ -110,6 +120,8 @@ def design_trajectory(
         Effects to make visible; those that depend on torques need ``theta``.
     shape, harmonics
         ``moves``: point-to-point with trapezoidal velocities; ``fourier``: series of that many harmonics.
+    collision
+        Bodies that the trajectory keeps apart by their clearance.
     progress
         Called with the share done, 0 to 1.
 
@@ -121,7 +133,8 @@ def design_trajectory(
     Raises
     ------
     ConfigError
-        If the robot cannot make a single move in that time, or an argument is wrong.
+        If the robot cannot make a single move in that time, an argument is wrong, or no candidate keeps the limits of
+        torque and the clearance.
     """
     robot.check_movable()
     model = arm_model(robot)
@@ -129,15 +142,55 @@ def design_trajectory(
     sigma = np.array([limit.torque for limit in limits]) if noise is None else np.asarray(noise, dtype=np.float64)
     if sigma.shape != (robot.n,) or not (sigma > 0.0).all():
         raise ConfigError(f"noise: expected {robot.n} positive numbers for {robot.name}")
-    search = PointToPointSearch(robot, model, duration, sigma, margin, theta, aim, np.random.default_rng(seed))
+    search = PointToPointSearch(
+        robot, model, duration, sigma, margin, theta, aim, np.random.default_rng(seed), collision
+    )
     if shape == "fourier":
-        trajectory = _search(FourierSearch(search, harmonics), evaluations, progress)
+        trajectory, rank = _search(FourierSearch(search, harmonics), evaluations, progress)
     elif harmonics is not None:
         raise ConfigError("harmonics: only for Fourier series; choose the shape fourier")
     else:
-        trajectory = _search(search, evaluations, progress)
+        trajectory, rank = _search(search, evaluations, progress)
     trajectory.check(robot, "designed trajectory")
-    return predict_precision(model, trajectory, sigma, known_noise=noise is not None, theta=theta, aim=aim)
+    found = predict_precision(
+        model, trajectory, sigma, known_noise=noise is not None, theta=theta, aim=aim, collision=collision
+    )
+    # The search samples torques more coarsely: those of a candidate that kept its share are compared with the limits.
+    excess = excesses(robot, found, collision, margin if rank.violation > 0.0 else 1.0)
+    if excess:
+        raise ConfigError(
+            f"no trajectory found that keeps all limits: the best of {evaluations + 1} candidates has "
+            f"{'; '.join(excess)}. "
+            "Next: more --evaluations, another --seed, a longer --duration, or narrower limits.position"
+        )
+    return found
+
+
+def excesses(robot: RobotConfig, design: Design, collision: CollisionModel | None, share: float = 1.0) -> list[str]:
+    """Return the violated limits of torque and distance of a trajectory, in words.
+
+    Parameters
+    ----------
+    robot
+        Configuration with the limits.
+    design
+        The trajectory.
+    collision
+        Bodies to keep apart.
+    share
+        Share of the torque limits that may be used.
+    """
+    found = []
+    if design.torque is not None:
+        for joint, peak in zip(robot.joints, np.abs(design.torque).max(axis=0), strict=True):
+            allowed = share * joint.limits.torque
+            if peak > allowed:
+                unit = "N m" if joint.type == "revolute" else "N"
+                found.append(f"a torque of {peak:.1f} {unit} at {joint.name} (allowed {allowed:.1f})")
+    if collision is not None and design.closest is not None and design.closest.distance < collision.clearance:
+        time = design.closest.sample * PERIOD
+        found.append(f"a distance of {design.closest} at {time:.2f} s (clearance {collision.clearance:g})")
+    return found
 
 
 class _Candidates(Protocol[C]):
@@ -147,24 +200,35 @@ class _Candidates(Protocol[C]):
 
     def neighbour(self, candidate: C) -> C: ...
 
-    def cost(self, candidate: C) -> float: ...
+    def rank(self, candidate: C, best: Rank) -> Rank:
+        """Return the rank of a candidate.
+
+        Parameters
+        ----------
+        candidate
+            The candidate.
+        best
+            Rank that it must beat.
+        """
 
     def trajectory(self, candidate: C) -> Trajectory: ...
 
 
-def _search(among: _Candidates[C], evaluations: int, progress: Callable[[float], None] | None) -> Trajectory:
-    """Return the best trajectory found."""
+def _search(
+    among: _Candidates[C], evaluations: int, progress: Callable[[float], None] | None
+) -> tuple[Trajectory, Rank]:
+    """Return the best trajectory found and its rank; one that violates a limit is repaired before it is improved."""
     best = among.random()
-    cost = among.cost(best)
+    rank = among.rank(best, WORST)
     for count in range(evaluations):
         # The first fifth explores, the rest improves the best candidate.
         candidate = among.random() if count < evaluations // 5 else among.neighbour(best)
-        candidate_cost = among.cost(candidate)
-        if candidate_cost < cost:
-            best, cost = candidate, candidate_cost
+        candidate_rank = among.rank(candidate, rank)
+        if candidate_rank < rank:
+            best, rank = candidate, candidate_rank
         if progress is not None and count % 50 == 0:
             progress(count / evaluations)
-    return among.trajectory(best)
+    return among.trajectory(best), rank
 
 
 def with_objective(
@@ -211,6 +275,7 @@ def predict_precision(
     known_noise: bool = True,
     theta: ArrayLike | None = None,
     aim: EffectObjective | None = None,
+    collision: CollisionModel | None = None,
 ) -> Design:
     """Predict condition number and standard deviations of an identification along a trajectory.
 
@@ -227,7 +292,7 @@ def predict_precision(
         2.3.2).
     known_noise
         False if ``noise`` is only a weight: there are no standard deviations then.
-    theta, aim
+    theta, aim, collision
         As in `design_trajectory`.
 
     Returns
@@ -237,7 +302,7 @@ def predict_precision(
     """
     period = PERIOD
     q, qd, qdd = sample_trajectory(trajectory, period)
-    torque = None if theta is None else model.inverse_dynamics(theta, q, qd, qdd)
+    torque = None if theta is None else predicted_torque(model, theta, q, qd, qdd, period)
     x = model.base_regressor(q, qd, qdd, dt=period)
     keep = max(1, round(0.5 / (cutoff_hz * period)))
     sections = butter(4, 2.0 * cutoff_hz * period, output="sos")
@@ -250,4 +315,6 @@ def predict_precision(
         decimation = design(period, cutoff_hz, keep)
         motion = (model if theta is None else model.anchored(theta)).motion(q, qd, qdd, period)
         wanted = aim.std(motion, *equations_of(model, motion, decimation, np.asarray(noise, dtype=np.float64)))
-    return Design(trajectory, float(singular[0] / singular[-1]), std, slow_share(model.robot, qd), torque, wanted)
+    closest = None if collision is None else collision.closest(q)
+    condition = float(singular[0] / singular[-1])
+    return Design(trajectory, condition, std, slow_share(model.robot, qd), torque, wanted, closest)

@@ -6,7 +6,7 @@ import numpy as np
 
 from armident.configs import Trajectory
 from armident.configs.schema.trajectory import Fourier
-from armident.identify.excitation.point_to_point import PointToPointSearch
+from armident.identify.excitation.point_to_point import PointToPointSearch, Rank
 from armident.identify.robot.chain import Floats
 
 HIGHEST_HZ = 1.6
@@ -111,6 +111,14 @@ class FourierSearch:
             fourier=Fourier(frequency=self.frequency, sine=sine, cosine=cosine),
         )
 
-    def cost(self, candidate: FourierSeries) -> float:
-        """Return the cost of a candidate, as in `PointToPointSearch`."""
-        return self._search.trajectory_cost(self.trajectory(candidate))
+    def rank(self, candidate: FourierSeries, best: Rank) -> Rank:
+        """Return the rank of a candidate, as in `PointToPointSearch`.
+
+        Parameters
+        ----------
+        candidate
+            The candidate.
+        best
+            Rank that it must beat.
+        """
+        return self._search.trajectory_rank(self.trajectory(candidate), best)

@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from armident.configs import ConfigError, RobotConfig
+from armident.configs import ConfigError, Joint, RobotConfig
 from armident.identify.excitation.design import PERIOD, Design
 from armident.identify.excitation.point_to_point import sample_trajectory
 
@@ -46,7 +46,7 @@ def draw(robot: RobotConfig, design: Design, path: Path, title: str) -> None:
     for j, joint in enumerate(robot.joints):
         turns = joint.type == "revolute"
         for k, (name, per, values) in enumerate(columns):
-            low, high = _limits(robot, j, name)
+            low, high = limits_of(joint, name)
             unit = ("N m" if turns else "N") if name == "torque" else f"{'rad' if turns else 'm'}{per}"
             axis = axes[j, k]
             margin = 0.12 * (high - low)
@@ -101,9 +101,17 @@ def check_name(path: Path) -> None:
         raise ConfigError(f"--picture {path}: expected a name that ends in {', '.join(SUFFIXES)}")
 
 
-def _limits(robot: RobotConfig, j: int, name: str) -> tuple[float, float]:
-    limits = robot.joints[j].limits
+def limits_of(joint: Joint, name: str) -> tuple[float, float]:
+    """Return the lower and upper limit of a quantity of a joint, rad or m, s, N m or N.
+
+    Parameters
+    ----------
+    joint
+        The joint.
+    name
+        ``position``, ``velocity``, ``acceleration`` or ``torque``.
+    """
     if name == "position":
-        return limits.position
-    most = {"velocity": limits.velocity, "acceleration": limits.acceleration, "torque": limits.torque}[name]
+        return joint.limits.position
+    most = float(getattr(joint.limits, name))
     return -most, most

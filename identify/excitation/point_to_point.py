@@ -1,12 +1,14 @@
 """Random search over point-to-point trajectories within the limits of a robot."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from armident.configs import RobotConfig, Trajectory
+from armident.configs import ConfigError, RobotConfig, Trajectory
 from armident.configs.schema.trajectory import RAMP_SHARE, Move
+from armident.identify.excitation.collision import CollisionModel
 from armident.identify.excitation.objective import EffectObjective, weighted_rows
 from armident.identify.robot.arm import ArmModel
 from armident.identify.robot.chain import Floats
@@ -56,6 +58,39 @@ STEPS, AIM_STEPS = (0.05, 0.2, 0.5), (0.01, 0.05, 0.2, 0.5)
 BASE_WEIGHT = 0.05
 """Weight of the precision of the base parameters in a design for an effect."""
 
+COLLISION_RATE = 1000.0
+"""Sampling rate of distances between bodies, Hz."""
+
+MOVE_SAMPLES = 100
+"""Samples of the way of one move at which its distances are computed."""
+
+TRIES = 30
+"""Number of waypoints to draw until the move to one of them touches nothing."""
+
+HOMES = 1000
+"""Number of random postures among which the start is sought where that at zero touches something."""
+
+MISS_UNIT = 0.01
+"""Distance (m) missing to the clearance that counts as much as a torque of twice the limit."""
+
+
+class Rank(NamedTuple):
+    """Rank of a candidate; the smaller one is better, and nothing is better than a violated limit.
+
+    Parameters
+    ----------
+    violation
+        Excess of torque over its limit, relative, plus missing distance in `MISS_UNIT`; 0 if all limits are kept.
+    cost
+        Mean log standard deviation with penalties.
+    """
+
+    violation: float
+    cost: float
+
+
+WORST = Rank(np.inf, np.inf)
+
 
 def slow_share(robot: RobotConfig, qd: Floats) -> Floats:
     """Return the share of slow samples of each joint, (n,).
@@ -101,6 +136,13 @@ class PointToPointSearch:
         Effects to make visible; ``None``: base parameters only.
     rng
         Source of random numbers.
+    collision
+        Bodies to keep apart, or ``None``.
+
+    Raises
+    ------
+    ConfigError
+        If no posture is free of collisions.
     """
 
     def __init__(
@@ -113,6 +155,7 @@ class PointToPointSearch:
         theta: ArrayLike | None,
         aim: EffectObjective | None,
         rng: np.random.Generator,
+        collision: CollisionModel | None = None,
     ) -> None:
         limits = [joint.limits for joint in robot.joints]
         bounds = np.array([limit.position for limit in limits])
@@ -121,7 +164,8 @@ class PointToPointSearch:
         self.velocity = margin * np.array([limit.velocity for limit in limits])
         self.acceleration = margin * np.array([limit.acceleration for limit in limits])
         self.torque = margin * np.array([limit.torque for limit in limits])
-        self.home = np.clip(0.0, self.low, self.high)
+        self.collision = collision
+        self.home = self._free_home(np.clip(0.0, self.low, self.high))
         self.model, self.duration, self.sigma, self.theta, self.rng = model, duration, sigma, theta, rng
         self.aim, self.anchored = aim, model if theta is None else model.anchored(theta)
         self.decimation = design(1.0 / (AIM_FACTOR * SEARCH_RATE), CUTOFF, AIM_FACTOR)
@@ -134,7 +178,7 @@ class PointToPointSearch:
         here, left = self.home, self.duration
         while True:
             way = self._far() if reach is None else reach
-            point = np.clip(here + self.rng.uniform(-way, way), self.low, self.high)
+            point = self._waypoint(here, way)
             pace = float(self._pace(1)[0])
             left -= pace * max(float(self._shortest((point - here)[None, :])[0]), SHORTEST_MOVE)
             if left < 0.0 and points:
@@ -144,6 +188,32 @@ class PointToPointSearch:
             here = point
         points[-1] = self.home
         return PointToPoint(np.array(points), np.array(paces))
+
+    def _waypoint(self, here: Floats, way: Floats) -> Floats:
+        """Return a random waypoint (n,), if possible one that a straight move in joint space reaches freely."""
+        for _ in range(TRIES):
+            point: Floats = np.clip(here + self.rng.uniform(-way, way), self.low, self.high)
+            if self.collision is None:
+                break
+            if self.collision.shortfall(np.linspace(here, point, MOVE_SAMPLES)) == 0.0:
+                break
+        return point
+
+    def _free_home(self, home: Floats) -> Floats:
+        """Return the free posture (n,) nearest to ``home`` of some random ones; it depends on no seed."""
+        collision = self.collision
+        if collision is None or collision.shortfall(home[None]) == 0.0:
+            return home
+        postures = np.random.default_rng(0).uniform(self.low, self.high, (HOMES, home.size))
+        far = np.linalg.norm((postures - home) / (self.high - self.low), axis=1)
+        for posture in postures[np.argsort(far)]:
+            if collision.shortfall(posture[None]) == 0.0:
+                return np.asarray(np.round(posture, 4))
+        closest = collision.closest(home[None])
+        raise ConfigError(
+            f"collision: none of {HOMES} postures keeps a clearance of {collision.clearance:g} m; at zero: {closest}. "
+            "Check collision.radius, capsules and boxes"
+        )
 
     def _far(self) -> Floats:
         """Return the reach (n,) of one move, drawn for each joint, so that single joints may move alone."""
@@ -174,26 +244,49 @@ class PointToPointSearch:
         )
         return Trajectory(schema="armident/trajectory/1", start=tuple(float(v) for v in self.home), moves=moves)
 
-    def cost(self, candidate: PointToPoint) -> float:
-        """Return the cost of a candidate: mean log standard deviation with penalties for conditioning and slowness.
+    def rank(self, candidate: PointToPoint, best: Rank) -> Rank:
+        """Return the rank of a candidate.
 
-        Infinite where a limit is exceeded.
+        Parameters
+        ----------
+        candidate
+            Candidate; one that exceeds a limit of velocity or acceleration is the worst.
+        best
+            Rank that it must beat: the distances of a candidate that does not are not computed.
         """
         durations = self._durations(candidate)
         lengths = np.diff(np.vstack([self.home, candidate.points]), axis=0)
         if (durations < np.maximum(self._shortest(lengths), SHORTEST_MOVE)).any():
-            return np.inf
-        return self.trajectory_cost(self.trajectory(candidate))
+            return WORST
+        return self.trajectory_rank(self.trajectory(candidate), best)
 
-    def trajectory_cost(self, trajectory: Trajectory) -> float:
-        """Return the cost of a trajectory within the motion limits; infinite where a torque limit is exceeded."""
+    def trajectory_rank(self, trajectory: Trajectory, best: Rank) -> Rank:
+        """Return the rank of a trajectory within the limits of motion.
+
+        Parameters
+        ----------
+        trajectory
+            The reference.
+        best
+            Rank that it must beat, as for `rank`.
+        """
         factor = 1 if self.aim is None else AIM_FACTOR
         period = 1.0 / (factor * SEARCH_RATE)
         q, qd, qdd = sample_trajectory(trajectory, period)
+        violation = 0.0
         if self.theta is not None:
-            torque = self.model.inverse_dynamics(self.theta, q, qd, qdd)
-            if (np.abs(torque) > self.torque).any():
-                return np.inf
+            torque = np.abs(predicted_torque(self.model, self.theta, q, qd, qdd, period))
+            violation = max(0.0, float((torque / self.torque).max()) - 1.0)
+        if violation > best.violation:
+            return Rank(violation, np.inf)
+        cost = self._cost(q, qd, qdd, period)
+        if self.collision is None or (violation, cost) >= best:
+            return Rank(violation, cost)
+        missing = self.collision.shortfall(trajectory.sample(1.0 / COLLISION_RATE))
+        return Rank(violation + missing / MISS_UNIT, cost)
+
+    def _cost(self, q: Floats, qd: Floats, qdd: Floats, period: float) -> float:
+        """Return the mean log standard deviation with penalties for conditioning and slowness; infinite if singular."""
         if self.aim is None:
             x = weighted_rows(self.model.base_regressor(q, qd, qdd, dt=period), self.sigma)
             return self._base_cost(x, qd, slow=True)
@@ -251,6 +344,26 @@ def equations_of(
     if model.terms:
         x = np.concatenate([x, decimation(model.term_regressor(motion))], axis=2)
     return weighted_rows(x, sigma), decimation, sigma
+
+
+def predicted_torque(model: ArmModel, theta: ArrayLike, q: Floats, qd: Floats, qdd: Floats, period: float) -> Floats:
+    """Return the joint torques along a motion with those of the model's terms, (N, n), N m or N.
+
+    Parameters
+    ----------
+    model
+        Model of the robot.
+    theta
+        Standard (p,) or base parameters (b,), SI.
+    q, qd, qdd
+        Positions, velocities and accelerations (N, n), rad or m, s.
+    period
+        Sampling period, s.
+    """
+    torque = model.inverse_dynamics(theta, q, qd, qdd)
+    if model.terms:
+        torque += model.term_torque(model.anchored(theta).motion(q, qd, qdd, period), np.asarray(theta)[-model.e :])
+    return torque
 
 
 def sample_trajectory(trajectory: Trajectory, period: float) -> tuple[Floats, Floats, Floats]:

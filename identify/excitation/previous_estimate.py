@@ -1,6 +1,6 @@
 """Parameters and noise of an earlier identification, for the design of the next experiment."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,7 +9,10 @@ from scipy import signal
 from armident.configs import DataError, RobotConfig
 from armident.identify.document import IdentificationDocument
 from armident.identify.effects.terms import arm_model
+from armident.identify.identification.criteria import IdentificationCriteria
 from armident.identify.identification.equations import LS_CUTOFF
+from armident.identify.identification.excitation_check import workspace_postures
+from armident.identify.identification.physics_check import impossible_values
 
 FREQUENCIES = 4096
 """Number of frequencies of a noise spectrum."""
@@ -65,6 +68,45 @@ def previous_estimate(document: IdentificationDocument, robot: RobotConfig, wher
     cutoff = min(LS_CUTOFF * robot.bandwidth_hz, rate / 2) if robot.bandwidth_hz is not None else rate / 2
     noise = [_deviation_below(cutoff, rate, joint["variance"], joint["coefficients"]) for joint in found["joints"]]
     return PreviousEstimate(np.array([values[name] for name in model.base.names]), np.array(noise))
+
+
+def physical_estimate(document: IdentificationDocument, robot: RobotConfig, where: str) -> PreviousEstimate:
+    """Return the estimate of `previous_estimate` with parameters that an arm can have: others predict wrong torques.
+
+    Where the document has the nearest physically consistent parameters, they are taken.
+
+    Parameters
+    ----------
+    document
+        The identification.
+    robot
+        Configuration of the robot.
+    where
+        Source of the document, for messages.
+
+    Raises
+    ------
+    DataError
+        As `previous_estimate`; or if the identification calls itself unusable, or friction, rotor inertias or mass
+        matrix are impossible by more than their uncertainty.
+    """
+    found = previous_estimate(document, robot, where)
+    without = "Next: identify the arm from a better recording, or design without --known"
+    if document.verdict == "unusable":
+        reason = next((r.message for r in document.reasons if r.level == "unusable"), "no reason given")
+        raise DataError(f"{where}: its verdict is unusable ({reason}). {without}")
+    model, names = arm_model(robot), [p.name for p in document.parameters]
+    if document.physical is not None:
+        consistent = {base["name"]: base["value"] for base in document.physical["base"]}
+        return replace(found, theta=np.array([consistent[name] for name in model.base.names]))
+    order = [names.index(name) for name in model.base.names]
+    covariance = np.asarray(document.covariance, dtype=np.float64)[np.ix_(order, order)]
+    postures = workspace_postures(robot, np.zeros((1, robot.n)))
+    faults = impossible_values(model, postures, found.theta, covariance, IdentificationCriteria())
+    if faults:
+        nearest = "take the nearest possible parameters (armident identify RECORDING --physical)"
+        raise DataError(f"{where}: no arm has these parameters: {'; '.join(faults)}. {without}, or {nearest}")
+    return found
 
 
 def _deviation_below(cutoff_hz: float, rate_hz: float, variance: float, coefficients: list[float]) -> float:

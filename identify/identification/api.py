@@ -78,8 +78,8 @@ def identify_recording(
             # Too short for the check: the identification itself decides if it is long enough for the parameters.
             notes = [*notes, f"the set-up was not checked: {error}"]
     result = identify_experiment(experiments, robot, options or Options(), progress, setup)
-    document = identification_document(result, recordings, robot, notes)
-    return IdentificationOutcome(recordings, with_numbers(robot, result.sign_smoothing), result, document)
+    used = with_numbers(robot, result.sign_smoothing)
+    return IdentificationOutcome(recordings, used, result, identification_document(result, recordings, used, notes))
 
 
 def experiments_of(

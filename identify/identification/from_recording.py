@@ -46,11 +46,14 @@ def experiments_from_recording(recording: Recording, robot: RobotConfig) -> tupl
 
     Raises
     ------
+    ConfigError
+        If the robot lacks a value that identification needs.
     DataError
         If the recording is of another robot, lacks a quantity or too many samples, contains NaN, or disagrees with
         its own counters; names the file, where there is one.
     """
     try:
+        robot.check_filled("identify")
         return _converted(recording, robot)
     except DataError as error:
         raise error if recording.path is None else DataError(f"{recording.path}: {error}") from error

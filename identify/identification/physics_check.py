@@ -57,10 +57,9 @@ def physics_reasons(
     """
     if not (np.isfinite(theta).all() and np.isfinite(covariance).all()):
         return []
-    faults = [
-        *_negative(model, theta, covariance, criteria),
-        *_indefinite(model, experiments, theta, covariance, criteria),
-    ]
+    seen = motion_postures(experiments)
+    postures = np.concatenate([seen, workspace_postures(model.robot, seen)])
+    faults = impossible_values(model, postures, theta, covariance, criteria)
     try:
         nearest = nearest_base(model, theta, covariance)
     except ArmidentError:
@@ -90,6 +89,27 @@ def physics_reasons(
     return [Reason("doubtful", message, USE_NEAREST, kind="physics")]
 
 
+def impossible_values(
+    model: ArmModel, q: Array, theta: Array, covariance: Array, criteria: IdentificationCriteria
+) -> list[str]:
+    """Return the values of an estimate that are significantly impossible, as parts of a sentence.
+
+    They are negative friction and rotor inertias, and a mass matrix that is not positive definite.
+
+    Parameters
+    ----------
+    model
+        The arm.
+    q
+        Postures (N, n) at which the mass matrix is computed, rad or m.
+    theta, covariance
+        Base estimate (b,) and its covariance (b, b), SI.
+    criteria
+        Limits.
+    """
+    return [*_negative(model, theta, covariance, criteria), *_indefinite(model, q, theta, covariance, criteria)]
+
+
 def _negative(model: ArmModel, theta: Array, covariance: Array, criteria: IdentificationCriteria) -> list[str]:
     """Friction and rotor inertias that are significantly negative, as one part of a sentence."""
     std, unit = np.sqrt(np.maximum(np.diag(covariance), 0.0)), units(model)
@@ -107,19 +127,13 @@ def _negative(model: ArmModel, theta: Array, covariance: Array, criteria: Identi
 
 
 def _indefinite(
-    model: ArmModel,
-    experiments: Sequence[Experiment],
-    theta: Array,
-    covariance: Array,
-    criteria: IdentificationCriteria,
+    model: ArmModel, q: Array, theta: Array, covariance: Array, criteria: IdentificationCriteria
 ) -> list[str]:
-    """Mass matrix that is significantly not positive definite, along the motion or in the workspace.
+    """Mass matrix that is significantly not positive definite at one of some postures.
 
     With the eigenvector v of the smallest eigenvalue, ``v' M v`` is linear in theta, so its standard deviation follows
     from the covariance.
     """
-    seen = motion_postures(experiments)
-    q = np.concatenate([seen, workspace_postures(model.robot, seen)])
     rigid = model.base.b - model.e
     arm, c, still = model.without_terms(), covariance[:rigid, :rigid], np.zeros_like(q)
     values, vectors = np.linalg.eigh(arm.mass_matrix(theta[:rigid], q))

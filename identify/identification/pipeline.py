@@ -124,7 +124,7 @@ def _identify(
     clock.enter("model", 0.0)
     moving = moving_joints(experiments, robot, criteria)
     require_motion(experiments, robot, moving)
-    experiments = _with_torque_shift(put_right(experiments, robot), robot, options, setup, notes)
+    experiments = shifted_experiments(put_right(experiments, robot), robot, options, setup, notes)
     bandwidth = (
         options.bandwidth_hz or robot.bandwidth_hz or motion_bandwidth([e.q for e in experiments], experiments[0].dt)
     )
@@ -133,7 +133,7 @@ def _identify(
     model = arm_model(robot)
 
     clock.enter("derivatives", 0.05)
-    signals = _derivatives(experiments, robot, options, bandwidth)
+    signals = smoothed_derivatives(experiments, robot, options, bandwidth)
 
     clock.enter("idim-ls", 0.2)
     if any(term.depends_on_torque for term in model.terms):
@@ -207,7 +207,7 @@ def _least_squares(
     factor = options.decimation if isinstance(options.decimation, int) else None
     plain = decimation(None if options.method in PREFILTERED else factor)
     published = model.robot.preprocessing
-    as_published = _as_published(model.robot, options)
+    as_published = has_published_filters(model.robot, options)
     if as_published and published is not None:
         blocks = published_equations(model, experiments, published)
     else:
@@ -222,17 +222,35 @@ def _least_squares(
     return LeastSquares(ls, blocks, plain, factor, as_published)
 
 
-def _as_published(robot: RobotConfig, options: Options) -> bool:
-    """Return True if IDIM-LS uses the filters of a published fit, which takes the torque as recorded."""
+def has_published_filters(robot: RobotConfig, options: Options) -> bool:
+    """Return True if IDIM-LS uses the filters of a published fit, which takes the torque as recorded.
+
+    Parameters
+    ----------
+    robot, options
+        Configuration, which may have such filters, and options of the identification.
+    """
     return options.derivatives is None and options.decimation is None and robot.preprocessing is not None
 
 
-def _with_torque_shift(
+def shifted_experiments(
     experiments: list[Experiment], robot: RobotConfig, options: Options, setup: SetupCheck | None, notes: Notes
 ) -> list[Experiment]:
-    """Experiments with the common shift of the torques that the check of the set-up found."""
+    """Return the experiments with the common shift of the torques that the check of the set-up found.
+
+    Parameters
+    ----------
+    experiments
+        Experiments of one robot.
+    robot, options
+        Its configuration, and options of the identification.
+    setup
+        Check of the set-up; ``None``: not made.
+    notes
+        Receives a remark on the shift.
+    """
     shift = None if setup is None else setup.torque_shift
-    if shift is None or not shift.applied or (options.method == "idim-ls" and _as_published(robot, options)):
+    if shift is None or not shift.applied or (options.method == "idim-ls" and has_published_filters(robot, options)):
         return experiments
     notes.warnings.append(shift.remark)
     return with_torque_shift(experiments, shift)
@@ -367,10 +385,20 @@ def _memory_of_noise(prepared: Prepared, theta: Array, reasons: list[Reason]) ->
     return found.factor
 
 
-def _derivatives(
+def smoothed_derivatives(
     experiments: Sequence[Experiment], robot: RobotConfig, options: Options, bandwidth: float
 ) -> list[Derivatives]:
-    """Smoothed positions and their derivatives (5.1)."""
+    """Smoothed positions of every experiment and their derivatives (5.1).
+
+    Parameters
+    ----------
+    experiments
+        Experiments of one robot.
+    robot, options
+        Its configuration, and options of the identification.
+    bandwidth
+        Closed-loop bandwidth, Hz.
+    """
     resolution = encoder_resolution(robot) if options.nvr == "tracking-error" else None
     return [
         replace(

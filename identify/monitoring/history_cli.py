@@ -145,8 +145,9 @@ def _entry(run: Run, drift: ParameterChangeTest | None) -> dict[str, object]:
 def _table(
     title: str, runs: Sequence[Run], drifts: Sequence[ParameterChangeTest | None], parameters: Sequence[str]
 ) -> None:
-    from rich.console import Console
     from rich.table import Table
+
+    from armident.identify.print_table import print_table
 
     table = Table(title=title)
     for heading in ("recorded (UTC)", "recording", "error", *parameters, "compared with the first"):
@@ -161,7 +162,7 @@ def _table(
             *(values[name] for name in parameters),
             drift.words if drift is not None else "baseline" if run is first else "inconclusive",
         )
-    Console().print(table)
+    print_table(table)
 
 
 def _plot(path: Path, title: str, runs: Sequence[Run], parameters: Sequence[str]) -> None:

@@ -6,7 +6,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Sequence
-from contextlib import suppress
+from contextlib import closing, suppress
 from pathlib import Path
 from types import FrameType
 from typing import TypeVar
@@ -27,6 +27,7 @@ from armident.identify.monitoring.recorded import (
 from armident.identify.monitoring.stream_buffer import LARGEST_BLOCK, LARGEST_EVENT, Assembly, StreamBuffer
 from armident.identify.monitoring.worker_link import LinkDown, WorkerLink
 from armident.identify.report.files import write_identification
+from armident.systemd import Notifier
 
 log = logging.getLogger(__name__)
 
@@ -38,6 +39,8 @@ RETRY_S, LONGEST_RETRY_S = 1.0, 30.0
 """First and longest wait before a write is tried again, s."""
 MOST_STREAMS = 8
 """Largest number of streams without a file that wait in memory."""
+LONGEST_STAGE_S = 1800.0
+"""Time after which an identification that reports no further stage counts as hung, s."""
 
 T = TypeVar("T")
 
@@ -60,6 +63,8 @@ class Worker:
         Configuration of its robot.
     out
         Folder of the results; each recording has a subfolder. The ledger is there.
+    progress
+        Called every second with the state, as long as the work advances; resets a watchdog.
 
     Raises
     ------
@@ -67,7 +72,9 @@ class Worker:
         If Zenoh's configuration is wrong.
     """
 
-    def __init__(self, session: SessionConfig, robot: RobotConfig, out: Path) -> None:
+    def __init__(
+        self, session: SessionConfig, robot: RobotConfig, out: Path, progress: Callable[[str], None] | None = None
+    ) -> None:
         self._robot, self._cell, self._out = robot, session.cell, out
         self._folders = (session.recording.directory, out)
         self._options = Options(**session.identification.model_dump())
@@ -80,6 +87,8 @@ class Worker:
         self._streams: dict[str, Recording] = {}
         self._last: bytes | None = None
         self._problem: str | None = None
+        self._progress = progress
+        self._state, self._advanced = "waiting", time.monotonic()
         self._wake, self._closing = threading.Event(), threading.Event()
         self._ledger: Ledger | None = None
         limits = LARGEST_EVENT, LARGEST_BLOCK
@@ -139,11 +148,18 @@ class Worker:
             except ArmidentError as error:
                 log.debug("lease not renewed: %s", error)
             self._link.check()
+            if self._progress is not None and time.monotonic() - self._advanced < LONGEST_STAGE_S:
+                self._progress(self._state)
+
+    def _advance(self, state: str) -> None:
+        """Note that the identifying thread has advanced; a thread that hangs does not, and the watchdog ends it."""
+        self._state, self._advanced = state, time.monotonic()
 
     def _identify_all(self) -> None:
         scanned = -SCAN_S
         while not self._closing.is_set():
             self._wake.clear()
+            self._advance(self._problem or "waiting")
             try:
                 ledger = self._opened()
                 with self._lock:
@@ -317,9 +333,11 @@ class Worker:
             return found[0], found[1].verdict or ""
         recording = Captured(entry.name, entry.paths).read() if entry.paths else self._streams[entry.sha256]
         source = "file" if entry.paths else "stream"
+        self._advance(f"identifying {entry.name}")
         print(f"worker: {recording.samples.sync.size} samples from the {source}, identifying", flush=True)
 
         def progress(stage: str, share: float) -> None:
+            self._advance(f"identifying {entry.name}: {stage}")
             self._link.status("identifying", capture=entry.name, stage=stage, share=share)
 
         outcome = identify_recording(recording, self._robot, self._options, progress)
@@ -375,6 +393,7 @@ class Worker:
                 log.warning("%s: %s; trying again", what, reason)
                 self._link.status("waiting", message=f"{what}: {reason}")
             said = reason
+            self._advance(f"waiting, {what}: {reason}")
             if self._closing.wait(wait):
                 raise _Closing
             wait = min(2 * wait, LONGEST_RETRY_S)
@@ -411,8 +430,8 @@ def run_worker(config: Path, *, once: bool, out: Path | None) -> int:
     ConfigError
         If the configuration is wrong.
     """
-    session = load_session(config)
-    robot = load_robot(session.robot)
+    session = load_session(config, "identify")
+    robot = load_robot(session.robot, "identify")
     stopped = threading.Event()
 
     def stop(_signal: int, _frame: FrameType | None) -> None:
@@ -420,10 +439,13 @@ def run_worker(config: Path, *, once: bool, out: Path | None) -> int:
 
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, stop)
-    with Worker(session, robot, out or session.recording.directory) as worker:
+    folder = out or session.recording.directory
+    with closing(Notifier()) as notifier, Worker(session, robot, folder, notifier.progress) as worker:
         print("worker: ready", flush=True)
+        notifier.ready(f"{session.cell}: waiting")
         while not stopped.is_set():
             code = worker.result(timeout=0.2)
             if once and code is not None:
                 return code
+        notifier.stopping()
     return 0

@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 from armident.identify.diagnosis.diagnose import Diagnosis
 from armident.identify.diagnosis.lack_of_fit import Dependence
 from armident.identify.document import DiagnosisDocument, Finding
-from armident.identify.report.glossary import diagnosis_entries
+from armident.identify.report.glossary import diagnosis_entries, meaning_of
+from armident.identify.report.identification import torque_plots
 from armident.identify.report.page import BAND, INK, MEASURED, MODEL, MUTED, RESIDUAL, figure, render
 
 Array = NDArray[np.float64]
@@ -20,6 +21,8 @@ VERDICTS = {
     "partly_explained": "The model lacks effects; the findings explain a part of the gap.",
     "unexplained": "The model lacks something that no effect of the catalogue explains.",
 }
+LEVELS = {"no_gap": "trustworthy", "explained": "doubtful", "partly_explained": "unusable", "unexplained": "unusable"}
+"""Colours of the verdicts, by the levels of an identification."""
 CERTAIN, LIKELY = 0.95, 0.6
 """Confidence from which a finding is called certain, and likely."""
 BINS, FILLED = 14, 5
@@ -44,9 +47,13 @@ def diagnosis_report(diagnosis: Diagnosis, document: DiagnosisDocument) -> str:
     hidden: dict[str, list[str]] = {}
     for i in document.not_visible:
         hidden.setdefault(f"{i.effect.replace('_', ' ')}: {i.reason}", []).append(i.joint)
+    units = [_unit(diagnosis, j) for j in range(len(joints))]
+    before = diagnosis.before if document.findings else None
     return render(
         "diagnosis.html",
         document=document,
+        level=LEVELS[document.verdict],
+        torques=torque_plots(diagnosis.t, diagnosis.measured, diagnosis.after, joints, units, before),
         detection_limits=_detection_limits(document),
         glossary=diagnosis_entries(document),
         verdict=VERDICTS[document.verdict],
@@ -118,10 +125,13 @@ def closed_share(finding: Finding, document: DiagnosisDocument) -> float | None:
     return float(np.clip((finding.gap_before**2 - after**2) / gap, 0.0, 1.0))
 
 
-def _rows(finding: Finding) -> list[tuple[str, float, float | None, str]]:
-    """Return the parameters with standard deviation and unit."""
+def _rows(finding: Finding) -> list[tuple[str, float, float | None, str, str]]:
+    """Return the parameters with standard deviation, unit and meaning."""
     std, units = finding.evidence.get("std", {}), finding.evidence.get("units", {})
-    return [(name, value, std.get(name), units.get(name, "")) for name, value in finding.parameters.items()]
+    return [
+        (name, value, std.get(name), units.get(name, ""), meaning_of(name, finding))
+        for name, value in finding.parameters.items()
+    ]
 
 
 def _gap_figure(document: DiagnosisDocument) -> str:

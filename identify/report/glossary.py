@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import get_args
 
-from armident.identify.document import DiagnosisDocument, IdentificationDocument, Verdict, write_atomically
+from armident.identify.document import DiagnosisDocument, Finding, IdentificationDocument, Verdict, write_atomically
 from armident.identify.effects.effect import Effect
 from armident.identify.effects.registry import catalogue
 from armident.identify.effects.tables import KNOTS
@@ -379,6 +379,52 @@ def base_entry(name: str) -> Entry | None:
     # A coupling may have any name: iam6, fvwrist.
     own = known.get(kind)
     return own or next((known[start] for start in ("ia", "fv", "fc") if name.startswith(start)), None)
+
+
+def in_words(name: str) -> str:
+    """Return the meaning of a base parameter in a few words, with its link, joint or coupling; empty if unknown.
+
+    Parameters
+    ----------
+    name
+        As in ``identification.json``.
+
+    Examples
+    --------
+    >>> in_words("my5r")
+    'first moment of mass of link 5 along y, grouped'
+    >>> in_words("fv3")
+    'viscous friction, joint 3'
+    """
+    entry, match = base_entry(name), _NAME.match(name)
+    if entry is None:
+        return ""
+    phrase = re.split("[:;,.]", entry.text)[0]
+    phrase = phrase.removesuffix(" of its frame")
+    phrase = phrase if phrase.startswith("Coulomb") else phrase[0].lower() + phrase[1:]
+    if match is None:
+        return phrase
+    if "the link" in phrase:
+        phrase = phrase.replace("the link", f"link {match[2]}", 1)
+    else:
+        phrase += f", coupling {match[2]}" if match[2].startswith("m") else f", joint {match[2]}"
+    return f"{phrase}, grouped" if match[3] else phrase
+
+
+def meaning_of(name: str, finding: Finding) -> str:
+    """Return the meaning of a parameter of a finding, as a sentence; empty if unknown.
+
+    Parameters
+    ----------
+    name
+        Parameter of the finding.
+    finding
+        A finding of a diagnosis.
+    """
+    effects = catalogue()
+    effect = effects.get(f"{finding.effect}/{finding.law}" if finding.law else finding.effect)
+    entries = [] if effect is None else [entry for entry in effect_entries(effect) if entry.name == name]
+    return entries[0].text if entries else in_words(name)
 
 
 def base_entries(names: Iterable[str]) -> list[Entry]:

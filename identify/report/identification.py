@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from markupsafe import Markup
 from numpy.typing import NDArray
 
 from armident.configs import RobotConfig
@@ -11,7 +12,8 @@ from armident.daq.recording import Recording
 from armident.identify.document import IdentificationDocument
 from armident.identify.identification.result import Identification
 from armident.identify.report.glossary import identification_entries
-from armident.identify.report.page import BAND, MEASURED, MODEL, MUTED, RESIDUAL, figure, render
+from armident.identify.report.page import BAND, CONFIGURED, INK, MEASURED, MODEL, MUTED, RESIDUAL, figure, render
+from armident.identify.report.plots import Plot, Series, plots_html
 
 Array = NDArray[np.float64]
 
@@ -45,7 +47,7 @@ def identification_report(
         recorded=[recorded(recording) for recording in recordings],
         essential=_rows(document),
         others=[p for p in document.parameters if not p.essential],
-        torques=torque_figure(result.t, result.tau_measured, result.tau_predicted, joints, _units(robot)),
+        torques=torque_plots(result.t, result.tau_measured, result.tau_predicted, joints, _units(robot)),
         autocorrelation=_autocorrelation_figure(result.residual_autocorrelation, result.autocorrelation_bound, joints),
         controller=_controller_figure(document.controller),
         beside={} if document.comparison is None else {p.name: p.value for p in document.comparison.parameters},
@@ -81,8 +83,10 @@ def recorded(recording: Recording) -> dict[str, Any]:
     }
 
 
-def torque_figure(t: Array, measured: Array, predicted: Array, joints: list[str], units: list[str]) -> str:
-    """Return a figure of measured and predicted torque and their difference, one plot per joint.
+def torque_plots(
+    t: Array, measured: Array, predicted: Array, joints: list[str], units: list[str], before: Array | None = None
+) -> Markup:
+    """Return plots of measured and predicted torque and their difference, one per joint, with common zoom.
 
     Parameters
     ----------
@@ -92,29 +96,34 @@ def torque_figure(t: Array, measured: Array, predicted: Array, joints: list[str]
         Torques (M, n), N m or N.
     joints, units
         Name and unit of each joint.
+    before
+        Torques (M, n) of another model for comparison, the one as configured.
     """
-    t = t - t[0]
     breaks = np.flatnonzero(np.diff(t) <= 0)
-    measured, predicted = measured.copy(), predicted.copy()
-    measured[breaks], predicted[breaks] = np.nan, np.nan
+    measured = measured.copy()
+    measured[breaks] = np.nan
     t = _continued(t)
-    columns = 2 if len(joints) > 1 else 1
-    rows = -(-len(joints) // columns)
-    with figure(rows, columns, 1.9) as (drawing, axes, picture):
-        for j, name in enumerate(joints):
-            axis = axes.flat[j]
-            axis.plot(t, measured[:, j], color=MEASURED, linewidth=2.2, label="measured")
-            axis.plot(t, predicted[:, j], color=MODEL, linewidth=0.9, label="model")
-            axis.plot(t, measured[:, j] - predicted[:, j], color=RESIDUAL, linewidth=0.7, label="difference")
-            axis.set_title(f"{name}  [{units[j]}]")
-            axis.margins(x=0.01)
-        for axis in axes[-1]:
-            axis.set_xlabel("s")
-        handles, labels = axes.flat[0].get_legend_handles_labels()
-        drawing.legend(handles, labels, frameon=False, ncols=3, loc="outside upper right", fontsize=8.5)
-        for axis in axes.flat[len(joints) :]:
-            axis.set_visible(False)
-    return picture[0]
+    plots = []
+    for j, (name, unit) in enumerate(zip(joints, units, strict=True)):
+        curves: tuple[Series, ...] = (
+            Series("measured", measured[:, j], MEASURED, 2.2),
+            Series("model", _broken(predicted[:, j], breaks), MODEL),
+            Series("difference", measured[:, j] - predicted[:, j], RESIDUAL, 1.0),
+        )
+        if before is not None:
+            curves += (
+                Series("model as configured", _broken(before[:, j], breaks), INK, 0.8),
+                Series("difference as configured", measured[:, j] - before[:, j], CONFIGURED, 0.8),
+            )
+        plots.append(Plot(name, unit, t, curves))
+    return plots_html(plots)
+
+
+def _broken(values: Array, breaks: NDArray[np.intp]) -> Array:
+    """Values (M,) with NaN where an experiment ends."""
+    values = values.copy()
+    values[breaks] = np.nan
+    return values
 
 
 def _autocorrelation_figure(values: Array, bounds: Array, joints: list[str]) -> str:
@@ -185,4 +194,5 @@ def _continued(t: Array) -> Array:
     """Return the times (M,) of consecutive experiments on one axis."""
     steps = np.diff(t, prepend=t[0])
     typical = float(np.median(steps[1:])) if t.size > 1 else 0.0
-    return np.cumsum(np.where(steps <= 0, typical, steps))
+    continued: Array = np.cumsum(np.where(steps <= 0, typical, steps))
+    return np.asarray(continued - continued[0])

@@ -12,6 +12,8 @@ import matplotlib
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 from markupsafe import Markup, escape
 
+from armident.identify.report.glossary import in_words
+
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
@@ -19,6 +21,7 @@ if TYPE_CHECKING:
 logging.getLogger("matplotlib.font_manager").setLevel(logging.ERROR)
 
 INK, MUTED, MEASURED, MODEL, RESIDUAL, BAND = "#1d2733", "#6b7785", "#b3bac4", "#c2410c", "#2f6f9f", "#dfe8f1"
+CONFIGURED = "#8fb4d1"
 STYLE: Any = {
     "font.family": "sans-serif",
     "font.size": 9,
@@ -45,6 +48,11 @@ _TEMPLATES = Environment(
     lstrip_blocks=True,
 )
 _TEMPLATES.filters["code"] = lambda text: Markup(re.sub("`([^`]+)`", r"<code>\1</code>", str(escape(text))))
+_TEMPLATES.filters["words"] = in_words
+_TEMPLATES.globals["plot_hint"] = Markup(
+    '<p class="hint">Drag over a plot to zoom all of them, double-click to see all again. '
+    "The line below a plot reads the values under the pointer; a click on a name hides its curve.</p>"
+)
 _TEMPLATES.filters["g"] = lambda value, digits=4: "" if value is None else f"{value:.{digits}g}"
 _TEMPLATES.filters["fixed"] = lambda value, digits=2: "" if value is None else f"{value:.{digits}f}"
 

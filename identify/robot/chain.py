@@ -183,3 +183,26 @@ def values_of(columns: Columns, theta: Floats, smoothing: Floats) -> Values:
         coupling=padded[columns.coupling],
         smoothing=smoothing,
     )
+
+
+def link_frames(chain: Chain, q: Floats) -> Floats:
+    """Frames of the links in frame 0, homogeneous, shape (N, n + 1, 4, 4); the first one is frame 0.
+
+    Parameters
+    ----------
+    chain
+        Geometry of the chain.
+    q
+        Postures (N, n), rad or m.
+    """
+    n, frames = chain.d.size, np.tile(np.eye(4), (q.shape[0], chain.d.size + 1, 1, 1))
+    for j in range(n):
+        theta = chain.theta[j] + (0.0 if chain.prismatic[j] else q[:, j])
+        r = chain.r[j] + (q[:, j] if chain.prismatic[j] else 0.0)
+        c, s, ca, sa = np.cos(theta), np.sin(theta), chain.cos_alpha[j], chain.sin_alpha[j]
+        step = frames[:, j + 1]
+        step[:, 0, 0], step[:, 0, 1], step[:, 0, 3] = c, -s, chain.d[j]
+        step[:, 1, 0], step[:, 1, 1], step[:, 1, 2], step[:, 1, 3] = ca * s, ca * c, -sa, -sa * r
+        step[:, 2, 0], step[:, 2, 1], step[:, 2, 2], step[:, 2, 3] = sa * s, sa * c, ca, ca * r
+        frames[:, j + 1] = frames[:, j] @ step
+    return frames

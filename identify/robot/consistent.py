@@ -130,7 +130,9 @@ class ConsistentParameters:
         }
 
 
-def nearest_consistent(model: ArmModel, theta_base: ArrayLike, covariance: ArrayLike) -> ConsistentParameters:
+def nearest_consistent(
+    model: ArmModel, theta_base: ArrayLike, covariance: ArrayLike, smallest_link: Floats | None = None
+) -> ConsistentParameters:
     """Find the physically consistent parameters nearest to a base estimate.
 
     Minimises ``(K theta - theta_base)' P^-1 (K theta - theta_base)`` over the standard parameters ``theta``. Their
@@ -149,6 +151,9 @@ def nearest_consistent(model: ArmModel, theta_base: ArrayLike, covariance: Array
         Estimate of the base parameters (b,), SI.
     covariance
         Covariance P of the estimate (b, b), positive definite.
+    smallest_link
+        Pseudo-inertia (4, 4) that every link contains, kg and kg m^2: the difference is positive semidefinite too, so
+        that no link is a point or a disc without thickness; ``None``: no such limit.
 
     Returns
     -------
@@ -173,7 +178,7 @@ def nearest_consistent(model: ArmModel, theta_base: ArrayLike, covariance: Array
     std = np.sqrt(np.diag(p))
     factor = std[:, None] * linalg.cholesky(p / np.outer(std, std), lower=True)
     whitened = linalg.solve_triangular(factor, theta, lower=True)
-    projection = _Projection(model, factor, max(float(np.sqrt(np.mean(whitened**2))), 1.0))
+    projection = _Projection(model, factor, max(float(np.sqrt(np.mean(whitened**2))), 1.0), smallest_link)
     standard, residual = projection.nearest(whitened)
     distance = float(np.linalg.norm(residual))
     degrees, p_value = 0.0, 1.0
@@ -183,7 +188,7 @@ def nearest_consistent(model: ArmModel, theta_base: ArrayLike, covariance: Array
         p_value = float(stats.chi2.sf(distance**2, degrees))
     else:
         standard = standard + np.linalg.pinv(model.base.regroup) @ (theta - model.base.regroup @ standard)
-    standard = _inside(model, standard)
+    standard = _inside(model, standard, smallest_link)
     base = model.base.regroup @ standard
     shifts = np.asarray((base - theta) / std)
     identifiable = identifiability(model)
@@ -317,9 +322,11 @@ class _Projection:
         Lower Cholesky factor L (b, b) of the covariance of the base estimate.
     scale
         Unit of the residual, standard deviations.
+    smallest_link
+        Pseudo-inertia (4, 4) that every link contains; ``None``: zero.
     """
 
-    def __init__(self, model: ArmModel, factor: Floats, scale: float) -> None:
+    def __init__(self, model: ArmModel, factor: Floats, scale: float, smallest_link: Floats | None = None) -> None:
         b, p = model.base.regroup.shape
         whitened = linalg.solve_triangular(factor, model.base.regroup, lower=True) / scale
         signed = non_negative(model)
@@ -342,6 +349,8 @@ class _Projection:
         rotors = model.columns.ia[model.columns.ia >= 0]
         self._weight[rotors] = 1 / length**2
         self._p, self._b, self._scale = p, b, scale
+        smallest = np.zeros(10) if smallest_link is None else _triangle(smallest_link, length)
+        self._limits = np.concatenate([np.zeros(b + signed.size), np.tile(-smallest, model.n)])
 
     def nearest(self, whitened: Floats, price: float = REGULARISATION) -> tuple[Floats, Floats]:
         """Solve the programme for one whitened base estimate.
@@ -358,7 +367,7 @@ class _Projection:
         theta, residual : ndarray
             Standard parameters (p,) of the nearest consistent arm, SI, and the whitened residual (b,).
         """
-        right = np.zeros(self._rows.shape[0])
+        right = self._limits.copy()
         right[: self._b] = whitened / self._scale
         x = _solve(self._quadratic, price * self._weight, self._rows, right, self._cones)
         return x[: self._p], self._scale * x[self._p :]
@@ -437,13 +446,14 @@ def _checked(model: ArmModel, theta_base: ArrayLike, covariance: ArrayLike) -> t
     return theta, p
 
 
-def _inside(model: ArmModel, theta: Floats) -> Floats:
+def _inside(model: ArmModel, theta: Floats, smallest_link: Floats | None = None) -> Floats:
     """Standard parameters (p,) moved into the cones: the solver may violate them by its tolerance."""
     inside = theta.copy()
     signed = non_negative(model)
     inside[signed] = np.maximum(inside[signed], 0.0)
     # Adding s to a pseudo-inertia adds s to its mass and second moments, and 2 s to the moments of inertia.
-    smallest = np.linalg.eigvalsh(pseudo_inertias(model, inside))[:, 0]
+    floor = np.zeros((4, 4)) if smallest_link is None else smallest_link
+    smallest = np.linalg.eigvalsh(pseudo_inertias(model, inside) - floor)[:, 0]
     missing = np.where(smallest < 0, -smallest * (1 + 1e-6) + 1e-16, 0.0)
     for kind, share in (("xx", 2.0), ("yy", 2.0), ("zz", 2.0), ("m", 1.0)):
         inside[model.columns.inertial[:, INERTIAL.index(kind)]] += share * missing
@@ -456,7 +466,6 @@ def _triangles(length: float) -> Floats:
     Lengths are in units of ``length`` (m). Triangles are stored column by column with off-diagonals times sqrt(2), an
     isometry, in the format of the solver.
     """
-    scale = np.array([1 / length, 1 / length, 1 / length, 1.0])
     out = np.empty((10, 10))
     for k, ten in enumerate(np.eye(10)):
         xx, xy, xz, yy, yz, zz, mx, my, mz, m = ten
@@ -465,9 +474,15 @@ def _triangles(length: float) -> Floats:
         matrix[:3, :3] = 0.5 * np.trace(inertia) * np.eye(3) - inertia
         matrix[:3, 3] = matrix[3, :3] = mx, my, mz
         matrix[3, 3] = m
-        matrix *= np.outer(scale, scale)
-        out[:, k] = [matrix[i, j] * (1.0 if i == j else np.sqrt(2.0)) for j in range(4) for i in range(j + 1)]
+        out[:, k] = _triangle(matrix, length)
     return out
+
+
+def _triangle(matrix: Floats, length: float) -> Floats:
+    """Upper triangle of a pseudo-inertia in the units and the order of `_triangles`, shape (10,)."""
+    scale = np.array([1 / length, 1 / length, 1 / length, 1.0])
+    scaled = matrix * np.outer(scale, scale)
+    return np.array([scaled[i, j] * (1.0 if i == j else np.sqrt(2.0)) for j in range(4) for i in range(j + 1)])
 
 
 def _length(model: ArmModel) -> float:

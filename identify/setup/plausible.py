@@ -37,9 +37,7 @@ def position_ratio(bench: Bench, h: Hypothesis) -> float:
     h
         Corrections.
     """
-    limits = np.array([max(abs(end) for end in joint.limits.position) for joint in bench.robot.joints])
-    peaks = np.abs(bench.recorded[0] @ h.position.T).max(axis=0)
-    return _mean(peaks / limits, limits, bench.moving)
+    return _mean(*_positions(bench, h), bench.moving)
 
 
 def velocity_ratio(bench: Bench, h: Hypothesis) -> float:
@@ -52,9 +50,7 @@ def velocity_ratio(bench: Bench, h: Hypothesis) -> float:
     h
         Corrections.
     """
-    limits = np.array([joint.limits.velocity for joint in bench.robot.joints])
-    peaks = np.abs(bench.recorded[1] @ h.position.T).max(axis=0)
-    return _mean(peaks / h.clock / limits, limits, bench.moving)
+    return _mean(*_velocities(bench, h), bench.moving)
 
 
 def torque_ratio(bench: Bench, h: Hypothesis) -> float:
@@ -67,9 +63,25 @@ def torque_ratio(bench: Bench, h: Hypothesis) -> float:
     h
         Corrections.
     """
+    return _mean(*_torques(bench, h), bench.moving)
+
+
+def _positions(bench: Bench, h: Hypothesis) -> tuple[Array, Array]:
+    """Largest position of each joint over its limit, and the limits."""
+    limits = np.array([max(abs(end) for end in joint.limits.position) for joint in bench.robot.joints])
+    return np.abs(bench.recorded[0] @ h.position.T).max(axis=0) / limits, limits
+
+
+def _velocities(bench: Bench, h: Hypothesis) -> tuple[Array, Array]:
+    """Largest velocity of each joint over its limit, and the limits."""
+    limits = np.array([joint.limits.velocity for joint in bench.robot.joints])
+    return np.abs(bench.recorded[1] @ h.position.T).max(axis=0) / h.clock / limits, limits
+
+
+def _torques(bench: Bench, h: Hypothesis) -> tuple[Array, Array]:
+    """Largest torque of each joint over its limit, and the limits."""
     limits = np.array([joint.limits.torque for joint in bench.robot.joints])
-    peaks = np.abs(bench.recorded[2] @ h.torque.T).max(axis=0)
-    return _mean(peaks / limits, limits, bench.moving)
+    return np.abs(bench.recorded[2] @ h.torque.T).max(axis=0) / limits, limits
 
 
 def plausible_factor(bench: Bench, h: Hypothesis) -> float:
@@ -103,6 +115,34 @@ def log_plausibility(bench: Bench, h: Hypothesis) -> float:
         + _beyond(torque_ratio(bench, h), *TORQUE)
         + _beyond(rate, RATE_LEAST_HZ, np.inf)
     )
+
+
+def worst_change(bench: Bench, old: Hypothesis, new: Hypothesis) -> float:
+    """Smallest change over the moving joints of the logarithm of the plausibility of each joint's own signals.
+
+    A wrong unit of one joint hardly changes the mean over all joints. A correction that makes the signals of the joint
+    itself implausible gives a negative number.
+
+    Parameters
+    ----------
+    bench
+        Signals.
+    old, new
+        Corrections before and after.
+    """
+
+    def each(h: Hypothesis) -> Array:
+        sums = np.zeros(bench.n)
+        for (ratios, limits), (least, most) in (
+            (_positions(bench, h), (0.0, POSITION_MOST)),
+            (_velocities(bench, h), VELOCITY),
+            (_torques(bench, h), TORQUE),
+        ):
+            usable = (limits < NO_LIMIT) & (ratios > 0)
+            sums += [_beyond(r, least, most) if u else 0.0 for r, u in zip(ratios, usable, strict=True)]
+        return sums[bench.moving]
+
+    return float((each(new) - each(old)).min(initial=0.0))
 
 
 def _mean(ratios: Array, limits: Array, moving: NDArray[np.bool_]) -> float:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from armident.identify.setup import assignment, gravity, moves, scales
 from armident.identify.setup.bench import Bench
 from armident.identify.setup.fit import Hypothesis, fit, fit_shares, held_out, joint_errors
-from armident.identify.setup.plausible import log_plausibility, plausible_factor
+from armident.identify.setup.plausible import log_plausibility, plausible_factor, worst_change
 from armident.identify.setup.prior import WIRING, cost, wiring_cost
 
 Array = NDArray[np.float64]
@@ -160,7 +160,7 @@ class Search:
             other = self._greedy(step)
             needed = 0.0 if best.families else LEAST_ODDS
             better = self._gain(best, other, self.bench.everywhere)[0] > needed
-            if better and self._together(first.h, other.h) >= LEAST_TOGETHER:
+            if better and self._material(first.h, other.h, LEAST_TOGETHER):
                 best = other
             clear = all(0.5 * RANKED_ROWS * (s.rank - step.rank) > LEAST_ODDS for s in starts[k + 1 : k + 2])
             if clear and self._understood(best.h):
@@ -212,9 +212,7 @@ class Search:
                 return None
             if drop >= CLEAR_TILT:
                 together = 1.0
-        material = drop >= least and self._together(step.h, best.h) >= together
-        # The reported errors are those without the free terms: they have to fall, too.
-        material = material and self._together(step.h, best.h, free=False) > 1.0
+        material = drop >= least and self._material(step.h, best.h, together)
         if gain < LEAST_ODDS or not (material or plausible >= LEAST_ODDS):
             return None
         others = [s for s in found if _differs(s.h, best.h)]
@@ -224,6 +222,16 @@ class Search:
         share = (1.0 + sum(equal.values())) / (1.0 + sum(odds.values()) + float(np.exp(-gain)))
         rivals = (*step.rivals, tuple(equal))
         return replace(best, rivals=rivals, probability=(*step.probability, share))
+
+    def _material(self, old: Hypothesis, new: Hypothesis, least: float) -> bool:
+        """True if a correction makes no joint implausible, and the structured residual shares fall by a factor.
+
+        They fall with the free terms and without them. Without them a wrong set-up leaves most: a correction that only
+        helps the free terms to explain an effect that the model lacks is no mistake of the set-up.
+        """
+        if worst_change(self.bench, old, new) < -LEAST_ODDS:
+            return False
+        return all(self._together(old, new, free=free) >= least for free in (True, False))
 
     def _together(self, old: Hypothesis, new: Hypothesis, *, free: bool = True) -> float:
         """Factor by which the structured residual shares of all moving joints together fall.

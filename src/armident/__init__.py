@@ -32,6 +32,8 @@ if TYPE_CHECKING:
     from armident.identify.api import diagnose as diagnose
     from armident.identify.api import effects as effects
     from armident.identify.api import identify as identify
+    from armident.identify.api import predict as predict
+    from armident.identify.prediction import TorquePrediction as TorquePrediction
     from armident.identify.robot_model import RobotModel as RobotModel
     from armident.virtual_robot.api import simulate_recording as simulate_recording
 
@@ -41,8 +43,9 @@ _HOMES = {
     "armident.daq.recording": ("Recording", "read_recording"),
     "armident.identify.api": (
         "ChangeTest", "Design", "Diagnosis", "Effect", "Identification", "check", "compare", "design_trajectory",
-        "diagnose", "effects",
+        "diagnose", "effects", "predict",
     ),
+    "armident.identify.prediction": ("TorquePrediction",),
     "armident.identify.robot_model": ("RobotModel",),
     "armident.virtual_robot.api": ("simulate_recording",),
 }  # fmt: skip
@@ -61,7 +64,15 @@ def __getattr__(name: str) -> Any:
         return importlib.import_module("armident.identify")
     if name not in _MODULES:
         raise AttributeError(f"module 'armident' has no attribute {name!r}")
-    value = getattr(importlib.import_module(_MODULES[name]), name)
+    try:
+        value = getattr(importlib.import_module(_MODULES[name]), name)
+    except ImportError as error:
+        from armident.extras import install_line, needed_extra
+
+        extra = needed_extra(error, _MODULES[name])
+        if extra is None:
+            raise
+        raise ImportError(install_line(f"armident.{name}", [extra]), name=error.name) from error
     globals()[name] = value
     return value
 

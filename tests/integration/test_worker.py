@@ -4,6 +4,7 @@ import json
 import os
 import queue
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -244,8 +245,21 @@ def test_sigterm_ends_a_waiting_worker_cleanly(tmp_path: Path) -> None:
         "--out",
         str(tmp_path),
     ]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None
-        assert process.stdout.readline().strip() == "worker: ready"
-        process.send_signal(signal.SIGTERM)
-        assert process.wait(30) == 0
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
+        manager.bind(str(tmp_path / "notify"))
+        manager.settimeout(30)
+        environment = os.environ | {"NOTIFY_SOCKET": str(tmp_path / "notify")}
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment)
+        try:
+            assert process.stdout is not None
+            assert process.stdout.readline().strip() == "worker: ready"
+            states = {manager.recv(200).decode().partition("STATUS=")[::2] for _ in range(3)}
+            assert {state for state, _ in states} == {"READY=1\n", "WATCHDOG=1\n"}
+            process.send_signal(signal.SIGTERM)
+            assert process.wait(30) == 0
+            while (last := manager.recv(200).decode()).startswith("WATCHDOG=1"):
+                pass
+            assert last == "STOPPING=1"
+        finally:
+            process.kill()
+            process.communicate()

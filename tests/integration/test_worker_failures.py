@@ -3,6 +3,7 @@
 import errno
 import json
 import os
+import threading
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -17,6 +18,7 @@ from armident.daq.recording import Recording, RecordingWriter, StreamLayout, rea
 from armident.daq.streaming import Keys, encode_block, encode_event, open_session
 from armident.daq.streaming.codec import end_content, start_content
 from armident.identify.document import IdentificationDocument, load_document
+from armident.identify.identification.api import identify_recording
 from armident.identify.monitoring import worker as module
 from armident.identify.monitoring.ledger import FILE, Ledger
 from armident.identify.monitoring.stream_buffer import LARGEST_BLOCK, MOST_CAPTURES, StreamBuffer
@@ -99,6 +101,35 @@ def test_a_full_disk_is_reported_and_the_result_written_when_there_is_space(
         assert worker.result(LONGEST_S) == 0
     assert caplog.text.count("result: No space left on device; trying again") == 1
     assert states(tmp_path) == {"emps-a": ("done", True)}
+
+
+def test_the_watchdog_is_fed_while_the_work_advances_and_not_while_it_hangs(
+    session: SessionConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hanging, released = threading.Event(), threading.Event()
+
+    def identified(*arguments: Any) -> Any:
+        hanging.set()
+        released.wait(LONGEST_S)
+        return identify_recording(*arguments)
+
+    monkeypatch.setattr(module, "identify_recording", identified)
+    monkeypatch.setattr(module, "LONGEST_STAGE_S", 3.0)
+    fed: list[str] = []
+    made = recorded(session, "a")
+    with Worker(session, made.robot, tmp_path, fed.append) as worker:
+        assert hanging.wait(LONGEST_S)
+        time.sleep(4.5)
+        before = len(fed)
+        assert fed[-1] == "identifying emps-a"
+        time.sleep(2.5)
+        assert len(fed) == before
+        released.set()
+        assert worker.result(LONGEST_S) == 0
+        until = time.monotonic() + 10.0
+        while fed[-1] != "waiting":
+            assert time.monotonic() < until
+            time.sleep(0.1)
 
 
 def test_the_file_counts_where_the_stream_differs(

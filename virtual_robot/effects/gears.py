@@ -15,7 +15,7 @@ COLUMNS = 6
 CONTACT_HZ = 100.0
 """Natural frequency of motor against link in contact, Hz, unless the scenario gives the stiffness."""
 MOTOR_SHARE = 0.3
-"""Motor's fraction of a joint's inertia if the robot has no separate rotor inertia."""
+"""Motor's fraction of the inertia that moves with a joint, if the robot has no separate rotor inertia."""
 ROUNDING = 0.004
 """Distance over which a contact closes on either side of its edge, relative to the gap."""
 
@@ -71,7 +71,11 @@ def twist_under(row: NDArray[np.float64], torque: float) -> float:
 
 
 def gear_rows(
-    hidden: Sequence[Hidden], robot: RobotConfig, rotor: NDArray[np.float64], mass: NDArray[np.float64]
+    hidden: Sequence[Hidden],
+    robot: RobotConfig,
+    rotor: NDArray[np.float64],
+    mass: NDArray[np.float64],
+    least: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Parameters of the elastic gears; the link of gear e has coordinate n + e.
 
@@ -85,6 +89,8 @@ def gear_rows(
         Rotor inertias, joint side, shape (n, n).
     mass
         Mass matrix of the links alone at the start, shape (n, n).
+    least
+        Least inertia at each joint if all others are free, over the postures, shape (n,).
 
     Returns
     -------
@@ -104,7 +110,7 @@ def gear_rows(
         entries = {h.effect: h for h in mine if h.joint == j}
         first = next(iter(entries.values()))
         own, total = float(rotor[j, j]), float(rotor[j, j] + mass[j, j])
-        motor = first.value_or("motor_inertia", own if own > 0.0 else MOTOR_SHARE * total)
+        motor = first.value_or("motor_inertia", own if own > 0.0 else MOTOR_SHARE * float(least[j]))
         if motor >= total:
             raise ConfigError(
                 f"{first.where}.parameters.motor_inertia: expected less than the {total:.4g} of "

@@ -150,11 +150,29 @@ def _bodies(rng: Generator, ranges: Ranges, n: int) -> tuple[Floats, Floats, Flo
     com, inertia = np.zeros((n, 3)), np.zeros((n, 3, 3))
     for j in range(n):
         size = rng.uniform(*ranges.length) * 0.85**j
-        com[j] = rng.normal(size=3) * size * np.array([0.4, 0.15, 0.3])
-        axes = np.linalg.qr(rng.normal(size=(3, 3)))[0]
-        second = mass[j] * axes @ np.diag((size * rng.uniform(0.08, 0.4, 3)) ** 2) @ axes.T
+        com[j], second = random_body(rng, size, mass[j])
         inertia[j] = np.trace(second) * np.eye(3) - second
     return mass, com, inertia
+
+
+def random_body(rng: Generator, size: float, mass: float) -> tuple[Floats, Floats]:
+    """Draw a body of positive second moments, so that it exists.
+
+    Parameters
+    ----------
+    rng
+        Source of random numbers.
+    size, mass
+        Length of the body, m, and its mass, kg.
+
+    Returns
+    -------
+    com, second
+        Centre of mass, m, shape (3,), and second moments about it, kg m^2, shape (3, 3).
+    """
+    com = rng.normal(size=3) * size * np.array([0.4, 0.15, 0.3])
+    axes = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    return com, mass * axes @ np.diag((size * rng.uniform(0.08, 0.4, 3)) ** 2) @ axes.T
 
 
 def _averages(

@@ -168,7 +168,7 @@ def watch_recordings(paths: Sequence[Path], config: Path | None, options: WatchO
     """
     reference = load_document(options.reference, IdentificationDocument)
     first = read_recording(paths[0])
-    robot = first.robot if config is None else load_robot(config)
+    robot = first.robot if config is None else load_robot(config, "identify")
     estimator = RecursiveEstimator(robot, reference, first.sample_rate_hz, with_reference=has_reference(first))
     _load_state(estimator, options.state)
     if not has_reference(first):
@@ -357,8 +357,8 @@ def watch_cell(config: Path | None, options: WatchOptions) -> int:
     """
     if config is None:
         raise ConfigError("give a RECORDING, or --config SESSION for the live stream of a cell")
-    session = load_session(config)
-    robot = load_robot(session.robot)
+    session = load_session(config, "identify")
+    robot = load_robot(session.robot, "identify")
     estimator = live_estimator(session, robot, load_document(options.reference, IdentificationDocument))
     _load_state(estimator, options.state)
     stopped = threading.Event()

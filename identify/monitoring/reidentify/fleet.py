@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from armident.configs import ArmidentError, ConfigError, DataError, RobotConfig, load_robot
 from armident.daq.recording import Recording, read_recording
+from armident.extras import install_line
 from armident.identify.document import IdentificationDocument, from_json, load_document, to_json
 from armident.identify.identification.api import identify_recording
 from armident.identify.identification.options import Options
@@ -82,7 +83,7 @@ def fleet_command(pattern: str, asked: ReidentifyOptions, *, as_json: bool) -> i
     paths = [Path(name).resolve() for name in sorted(glob.glob(pattern, recursive=True))]
     if not paths:
         raise ConfigError(f"--recordings {pattern}: no such file")
-    robot = None if asked.config is None else load_robot(asked.config)
+    robot = None if asked.config is None else load_robot(asked.config, "identify")
     known = None if asked.baseline is None else load_document(asked.baseline, IdentificationDocument)
     history = History(asked.store)
     rows: list[Row] = []
@@ -128,7 +129,7 @@ def cluster(scheduler: str | None, workers: int | None) -> "Iterator[Client]":
     try:
         from distributed import Client, LocalCluster
     except ImportError as error:
-        raise ConfigError("--recordings: Dask is not installed: pip install 'armident[fleet]'") from error
+        raise ConfigError(install_line("--recordings", ["fleet"])) from error
     # Failures of a recording are in its line, those of the cluster are raised.
     logging.getLogger("distributed").setLevel(logging.CRITICAL)
     if scheduler is None:

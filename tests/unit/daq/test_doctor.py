@@ -12,9 +12,9 @@ import yaml
 from typer.testing import CliRunner
 
 from armident.configs.loading import HERE
-from armident.daq.capture.systemd import Notifier
 from armident.daq.cli import application
 from armident.daq.doctor import Check, run_checks
+from armident.systemd import Notifier
 from tests.integration.test_capture_vcan import session_file
 
 SYSTEMD = HERE / "systemd"

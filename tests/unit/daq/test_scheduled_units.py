@@ -15,6 +15,7 @@ from armident.configs.loading import HERE
 from armident.daq.cli import application
 
 UNITS = sorted((HERE / "systemd").glob("*@.*"))
+SERVICES = [path for path in UNITS if path.suffix == ".service"]
 CRON = HERE / "cron" / "armident-reidentify.cron"
 
 
@@ -70,12 +71,59 @@ def test_systemd_takes_every_unit(path: Path, tmp_path: Path) -> None:
     assert complaints == []
 
 
-@pytest.mark.parametrize("path", [p for p in UNITS if p.suffix == ".service"], ids=lambda path: path.name)
+@pytest.mark.parametrize("path", SERVICES, ids=lambda path: path.name)
 def test_commands_of_units_exist(path: Path) -> None:
     found = commands(path)
     assert found
     for words in found:
         accepted(words)
+
+
+def values(path: Path, name: str) -> list[str]:
+    """Values of a key of ``[Service]`` that may repeat."""
+    return [value for key, value in Unit(path)["Service"].items() if key.partition("#")[0] == name]
+
+
+def gigabytes(size: str) -> float:
+    return float(size[:-1]) / {"G": 1.0, "M": 1024.0}[size[-1]]
+
+
+@pytest.mark.parametrize("path", SERVICES, ids=lambda path: path.name)
+def test_services_are_bounded_in_memory_system_calls_and_network(path: Path) -> None:
+    (most,) = values(path, "MemoryMax")
+    assert all(gigabytes(high) < gigabytes(most) for high in values(path, "MemoryHigh"))
+    assert values(path, "SystemCallFilter")[0].split()[0] == "@system-service"
+    assert values(path, "SystemCallErrorNumber") == ["EPERM"]
+    assert values(path, "IPAddressDeny") == ["any"]
+    assert values(path, "IPAddressAllow") == ["localhost"]
+
+
+@pytest.mark.parametrize("path", SERVICES, ids=lambda path: path.name)
+def test_who_has_a_watchdog_notifies_it(path: Path) -> None:
+    notifies = values(path, "Type") == ["notify"]
+    assert notifies == (path.name != "armident-reidentify@.service")
+    assert bool(values(path, "WatchdogSec")) == notifies
+    assert values(path, "NotifyAccess") == (["main"] if notifies else [])
+
+
+@pytest.mark.parametrize("name", ["capture", "reidentify"])
+def test_a_capture_may_read_the_state_of_the_clock_and_not_set_it(name: str) -> None:
+    """``ProtectClock=`` and ``@system-service`` alone forbid adjtimex(2), by which health reports the clock."""
+    path = HERE / "systemd" / f"armident-{name}@.service"
+    assert values(path, "ProtectClock") == []
+    assert values(path, "SystemCallFilter") == ["@system-service adjtimex clock_adjtime"]
+    assert "CAP_SYS_TIME" not in values(path, "CapabilityBoundingSet")[0]
+
+
+@pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="needs systemd-analyze")
+@pytest.mark.parametrize("path", SERVICES, ids=lambda path: path.name)
+def test_systemd_calls_the_exposure_of_a_service_low(path: Path, tmp_path: Path) -> None:
+    """At most 3.0 of 10 by ``systemd-analyze security``; a unit without sandbox has 9.6."""
+    unit = tmp_path / path.name.replace("@.", "@cell.")
+    unit.write_text(path.read_text(encoding="utf-8").replace("/opt/armident/bin/armident", "/bin/true"))
+    command = ["systemd-analyze", "security", "--offline=true", "--threshold=30", "--no-pager", str(unit)]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout.splitlines()[-1:] + done.stderr.splitlines()
 
 
 def test_the_timer_runs_its_service_weekly_and_catches_up_no_missed_run() -> None:

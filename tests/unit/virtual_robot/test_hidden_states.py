@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -11,7 +12,7 @@ from scipy.integrate import solve_ivp
 
 from armident.configs import ConfigError, RobotConfig
 from armident.configs.schema.scenario import HiddenEffect, Scenario
-from armident.virtual_robot.inertias import plant_parameters
+from armident.virtual_robot.arm_parameters import arm_parameters
 from armident.virtual_robot.plant import Plant
 
 PERIOD = 200e-6
@@ -232,11 +233,11 @@ def test_stribeck_and_presliding_of_one_joint_share_a_bristle(emps: RobotConfig)
     assert np.abs(moved - truth).max() < 2e-4 * np.ptp(truth)
 
 
-def test_a_bristle_needs_coulomb_friction_to_stand_for(emps: RobotConfig, monkeypatch: pytest.MonkeyPatch) -> None:
-    smooth = plant_parameters(emps) | {"fc1": 0.0}
-    monkeypatch.setattr("armident.virtual_robot.plant.plant_parameters", lambda robot: smooth)
+def test_a_bristle_needs_coulomb_friction_to_stand_for(emps: RobotConfig) -> None:
+    own = arm_parameters(emps)
+    smooth = replace(own, standard={**own.standard, "fc1": 0.0})
     with pytest.raises(ConfigError, match=r"effects\[0\]: joint_1 has no Coulomb friction"):
-        Plant(emps, [0.0], hide(entry("presliding_friction", deflection=1e-4)))
+        Plant(emps, [0.0], hide(entry("presliding_friction", deflection=1e-4)), smooth)
 
 
 def test_a_sloshing_payload_is_a_pendulum_on_a_cart(emps: RobotConfig) -> None:

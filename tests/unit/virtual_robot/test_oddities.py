@@ -155,7 +155,7 @@ def test_oddities_of_an_unknown_joint_are_refused(robot: RobotConfig) -> None:
 
 
 def test_an_empty_scenario_is_refused() -> None:
-    with pytest.raises(ValueError, match="expected at least one effect, or drives with oddities"):
+    with pytest.raises(ValueError, match="expected at least one of effects, drives"):
         Scenario(schema="armident/scenario/1")
 
 

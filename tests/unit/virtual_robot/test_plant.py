@@ -117,6 +117,6 @@ def test_friction_slows_by_the_coefficients_of_table_b4(tx40: RobotConfig) -> No
     assert wrist[5] == pytest.approx(0.65 * 2.0 + 0.30 + 0.61 * 1.0 + 1.90, rel=5e-3)
 
 
-def test_an_unknown_arm_is_refused_by_name() -> None:
+def test_stored_parameters_are_those_of_two_arms() -> None:
     with pytest.raises(ConfigError, match=r"'panda'.*emps, tx40"):
-        Plant(load_robot("panda.yaml"), np.zeros(7))
+        inertias.plant_parameters(load_robot("panda.yaml"))

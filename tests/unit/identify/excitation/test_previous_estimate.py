@@ -9,7 +9,7 @@ from scipy.signal import lfilter
 from armident.configs import DataError, load_robot, load_trajectory
 from armident.identify.cli import trajectory as trajectory_command
 from armident.identify.document import IdentificationDocument, to_json, write_atomically
-from armident.identify.excitation.previous_estimate import _deviation_below, previous_estimate
+from armident.identify.excitation.previous_estimate import _deviation_below, physical_estimate, previous_estimate
 from armident.identify.identification.equations import LS_CUTOFF
 from tests.fixtures.arms import identified
 
@@ -51,6 +51,33 @@ def test_another_robot_or_model_is_refused_by_name() -> None:
     positions = document().model_copy(update={"noise_model": document().noise_model | {"of": "joint position"}})
     with pytest.raises(DataError, match="noise_model: expected one model of joint torques for each of 6 joints"):
         previous_estimate(positions, load_robot("tx40"), "tx40.json")
+
+
+def changed(name: str, value: float) -> IdentificationDocument:
+    """The identification with another value of one parameter, and without a verdict, as of former versions."""
+    parameters = [p.model_copy(update={"value": value}) if p.name == name else p for p in document().parameters]
+    return document().model_copy(update={"parameters": parameters, "verdict": None, "reasons": []})
+
+
+def test_parameters_that_no_arm_has_are_refused_with_the_reason_and_the_next_step() -> None:
+    robot = load_robot("tx40")
+    assert physical_estimate(document(), robot, "tx40.json").theta.shape == (61,)
+    with pytest.raises(DataError, match=r"no arm has these parameters: negative fv2 = -5 .*Next: .*--physical"):
+        physical_estimate(changed("fv2", -5.0), robot, "tx40.json")
+    with pytest.raises(DataError, match=r"the mass matrix is not positive definite.*Next: "):
+        physical_estimate(changed("zz1r", -1.0), robot, "tx40.json")
+
+
+def test_the_nearest_physical_parameters_of_a_document_are_taken() -> None:
+    base = [{"name": p.name, "value": p.value, "shift_std": 0.0} for p in document().parameters]
+    odd = changed("fv2", -5.0).model_copy(update={"physical": {"base": base}})
+    assert physical_estimate(odd, load_robot("tx40"), "tx40.json").theta.min() > -5.0
+
+
+def test_an_unusable_identification_is_refused() -> None:
+    unusable = document().model_copy(update={"verdict": "unusable"})
+    with pytest.raises(DataError, match=r"its verdict is unusable .*Next: "):
+        physical_estimate(unusable, load_robot("tx40"), "tx40.json")
 
 
 def test_the_command_predicts_the_precision(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -8,6 +8,12 @@ import pytest
 
 from armident import configs
 from armident.configs import ConfigError, DataError
+from armident.configs.schema.base import DescribedModel, split_docstring
+from armident.configs.schema.robot import RobotConfig
+from armident.configs.schema.scenario import Scenario
+from armident.configs.schema.session import SessionConfig
+from armident.configs.schema.suite import SuiteConfig
+from armident.configs.schema.trajectory import Trajectory
 from armident.identify.document import (
     SCHEMA_FILES,
     BeforeAfter,
@@ -48,6 +54,38 @@ def diagnosis() -> DiagnosisDocument:
 def test_shipped_schema_is_the_one_of_the_code(name: str) -> None:
     text = (Path(configs.__file__).parent / "json_schemas" / name).read_text(encoding="utf-8")
     assert text == schema_text(SCHEMA_FILES[name]), "run: python -m armident.identify.document"
+
+
+@pytest.mark.parametrize(
+    "kind", [*SCHEMA_FILES.values(), RobotConfig, SessionConfig, Trajectory, Scenario, SuiteConfig]
+)
+def test_every_field_of_a_schema_is_described(kind: type[DescribedModel]) -> None:
+    schema = kind.model_json_schema(by_alias=True)
+    parts = {**schema.get("$defs", {}), kind.__name__: schema}
+    missing = [
+        f"{part}.{field}"
+        for part, definition in parts.items()
+        for field, entry in definition.get("properties", {}).items()
+        if not entry.get("description")
+    ]
+    assert not missing, "not in the Parameters section of the docstring"
+
+
+def test_names_that_share_a_description_each_have_it() -> None:
+    docstring = """Return a sum.
+
+    Parameters
+    ----------
+    a, b : float
+        Terms of
+        the sum.
+    c
+        Third term.
+    """
+    assert split_docstring(docstring) == (
+        "Return a sum.",
+        {"a": "Terms of the sum.", "b": "Terms of the sum.", "c": "Third term."},
+    )
 
 
 def test_a_document_survives_being_written_and_read(tmp_path: Path) -> None:

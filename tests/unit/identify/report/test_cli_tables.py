@@ -3,7 +3,7 @@
 import numba
 import pytest
 
-from armident.identify.cli_tables import progress
+from armident.identify.cli_tables import progress, time_left
 
 
 def test_the_compiler_message_appears_once(capsys: pytest.CaptureFixture[str]) -> None:
@@ -18,3 +18,18 @@ def test_the_compiler_message_appears_once(capsys: pytest.CaptureFixture[str]) -
     with progress("identify tx40.mcap"):
         assert one(1) == 2
     assert "compiling" not in capsys.readouterr().err
+
+
+def test_plain_progress_states_the_time_left(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("armident.identify.cli_tables.SHOW_AFTER_S", 0.0)
+    with progress("trajectory") as report:
+        report("searching", 0.0)
+        report("searching", 0.5)
+    assert capsys.readouterr().err.splitlines() == [
+        "trajectory: searching (0 %)",
+        "trajectory: searching (50 %, 0 s left)",
+    ]
+    assert time_left(30.0, 0.25) == "90 s"
+    assert time_left(600.0, 0.5) == "10 min"

@@ -1,5 +1,6 @@
 """Report of a diagnosis: one figure per finding, drawn from the curves of its numbers."""
 
+import json
 import re
 
 import numpy as np
@@ -76,3 +77,24 @@ def test_a_long_recording_is_drawn_where_the_finding_changes_most() -> None:
     assert stretch.start <= 3 * SHOWN + 10
     assert stretch.stop >= 3 * SHOWN + 50
     assert telling_stretch(added[:SHOWN]) == slice(0, SHOWN)
+
+
+@pytest.mark.slow
+def test_the_verdict_and_the_next_step_stand_before_the_findings(diagnosis: Diagnosis) -> None:
+    page = diagnosis_report(diagnosis, diagnosis.document)
+    card = page.index('<div class="verdict doubtful"><b>explained</b>')
+    assert card < page.index("<p>Next: identify with the findings") < page.index('class="finding"')
+    assert "Half the difference of the viscous friction" in page
+
+
+@pytest.mark.slow
+def test_held_out_torques_are_drawn_of_both_models(diagnosis: Diagnosis) -> None:
+    page = diagnosis_report(diagnosis, diagnosis.document)
+    found = re.search(r'<script type="application/json">(.*?)</script>', page)
+    assert found is not None
+    (plot,) = json.loads(found[1])
+    curves = {series["name"]: np.array(series["y"], dtype=np.float64) for series in plot["series"]}
+    np.testing.assert_allclose(
+        curves["difference as configured"], curves["measured"] - curves["model as configured"], atol=0.02
+    )
+    assert np.linalg.norm(curves["difference"]) < 0.1 * np.linalg.norm(curves["difference as configured"])

@@ -38,7 +38,9 @@ def test_every_essential_parameter_stands_in_the_report_with_its_value(
     essential = [p for p in outcome.document.parameters if p.essential]
     assert essential
     for p in essential:
-        assert re.search(rf"<td>{p.name}</td><td class=\"n\">{p.value:.4f}</td>", page), p.name
+        assert re.search(rf"<td>{p.name}</td><td class=\"words\">[^<]+</td><td class=\"n\">{p.value:.4f}</td>", page), (
+            p.name
+        )
 
 
 def test_warnings_reach_the_reader(outcome: IdentificationOutcome, page: str) -> None:

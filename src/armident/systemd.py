@@ -8,8 +8,8 @@ import time
 class Notifier:
     """Sends states to the service manager, if there is one (``$NOTIFY_SOCKET``).
 
-    `progress` resets the watchdog. The main loop calls it after it has read the buses; no timer does. So systemd
-    restarts a capture that hangs.
+    `progress` resets the watchdog. A service calls it when its work has advanced; no timer does. So systemd restarts
+    a service that hangs.
     """
 
     def __init__(self) -> None:
@@ -19,7 +19,7 @@ class Notifier:
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) if self._address else None
 
     def ready(self, status: str) -> None:
-        """Report that the capture records.
+        """Report that the service has started.
 
         Parameters
         ----------
@@ -37,7 +37,7 @@ class Notifier:
         self._send(f"RELOADING=1\nMONOTONIC_USEC={time.clock_gettime_ns(time.CLOCK_MONOTONIC) // 1000}")
 
     def stopping(self) -> None:
-        """Report that the capture finishes its file and ends."""
+        """Report that the service finishes its work and ends."""
         self._send("STOPPING=1")
 
     def close(self) -> None:
@@ -51,5 +51,5 @@ class Notifier:
             try:
                 self._socket.sendto(state.encode(), self._address)
             except OSError:
-                # The manager has ended or its buffer is full: the capture goes on without it.
+                # The manager has ended or its buffer is full: the service goes on without it.
                 return

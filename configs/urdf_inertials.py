@@ -1,0 +1,162 @@
+"""Masses and friction of a robot from URDF, as standard parameters in the frames of the identified model."""
+
+import xml.etree.ElementTree as ET
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armident.configs.errors import ConfigError
+from armident.configs.urdf import mdh_of
+from armident.configs.urdf_tree import UrdfTree, end_link, read_chain, read_tree
+
+INERTIAL = ("xx", "xy", "xz", "yy", "yz", "zz", "mx", "my", "mz", "m")
+"""Standard inertial parameters of a link: inertia about the origin of its frame, first moment, mass (thesis 2.1.2)."""
+
+ROUNDING = 0.01
+"""Share of a moment of inertia by which rounded numbers may break the triangle inequality: two written digits."""
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class UrdfInertials:
+    """Masses and friction of a chain of a URDF; SI, joint side.
+
+    Parameters
+    ----------
+    standard
+        Inertial parameters by name (``xx1`` to ``m6``) in the modified Denavit-Hartenberg frames of the chain.
+    friction
+        Viscous and Coulomb friction by name (``fv1``, ``fc1``), where the URDF gives a positive one.
+    massless
+        Numbers of the joints, from 1, that move no mass before the next joint.
+    impossible
+        Links whose moments of inertia no body has: one is larger than the sum of the others.
+    held
+        Moving joints after the tip, whose links count as a rigid load at position zero.
+    """
+
+    standard: dict[str, float]
+    friction: dict[str, float]
+    massless: tuple[int, ...]
+    impossible: tuple[str, ...]
+    held: tuple[str, ...]
+
+
+def read_inertials(file: Path, base: str | None = None, tip: str | None = None) -> UrdfInertials:
+    """Masses of the links between two links of a URDF, and the friction of its joints.
+
+    Links on fixed joints belong to the link that carries them, and everything after the tip to the last link.
+
+    Parameters
+    ----------
+    file
+        Path of the URDF.
+    base, tip
+        First and last link of the chain, as of `armident.configs.urdf_tree.read_chain`.
+
+    Raises
+    ------
+    ConfigError
+        If the file is wrong, or a mass or inertia is negative or not a number; names file and element.
+    """
+    joints = read_chain(file, base, tip)
+    frames = mdh_of(joints, file).frames
+    tree = read_tree(file)
+    first, path = tree.path(base, tip)
+    names = [joint.name for joint in joints]
+    bodies = np.zeros((len(joints), 4, 4))
+    impossible: list[str] = []
+    held: list[str] = []
+    for link, owner, placement, held_joint in carried_links(tree, first, names):
+        held += [] if held_joint is None else [held_joint]
+        if owner < 0:
+            continue
+        moments, possible = _moments(tree, tree.links[link])
+        impossible += [] if possible else [link]
+        frame = np.linalg.solve(frames[owner], placement)
+        bodies[owner] += frame @ moments @ frame.T
+    standard: dict[str, float] = {}
+    for k, body in enumerate(bodies, start=1):
+        inertia = np.trace(body[:3, :3]) * np.eye(3) - body[:3, :3]
+        values = (*inertia[np.triu_indices(3)], *body[:3, 3], body[3, 3])
+        standard |= {f"{name}{k}": float(value) for name, value in zip(INERTIAL, values, strict=True)}
+    return UrdfInertials(
+        standard=standard,
+        friction=_friction(tree, path, names),
+        massless=tuple(k for k, body in enumerate(bodies, start=1) if not body[3, 3] > 0.0),
+        impossible=tuple(impossible),
+        held=tuple(held),
+    )
+
+
+def carried_links(tree: UrdfTree, base: str, chain: list[str]) -> Iterator[tuple[str, int, Floats, str | None]]:
+    """Links below the base: name, index of the joint that moves it (-1: none), placement, joint that is held still.
+
+    Parameters
+    ----------
+    tree
+        Links and joints of the URDF.
+    base
+        First link of the chain.
+    chain
+        Names of the moving joints of the chain in the URDF.
+    """
+    todo: list[tuple[str, int, Floats]] = [(base, -1, np.eye(4))]
+    while todo:
+        link, owner, placement = todo.pop()
+        for element in tree.below.get(link, []):
+            name, moves = str(element.get("name")), tree.type_of(element) != "fixed"
+            if moves and name not in chain and owner < 0:
+                continue  # a branch at the base
+            here = chain.index(name) if name in chain else owner
+            child, frame = end_link(element, "child"), placement @ tree.origin(element, element.find("origin"))
+            yield child, here, frame, name if moves and name not in chain else None
+            todo.append((child, here, frame))
+
+
+def _moments(tree: UrdfTree, link: ET.Element) -> tuple[Floats, bool]:
+    """Pseudo-inertia of a link about its frame, shape (4, 4), and False if no body has such moments of inertia.
+
+    The pseudo-inertia holds the second moments, the first moment and the mass (Wensing, Kim and Slotine 2018).
+    """
+    inertial = link.find("inertial")
+    if inertial is None:
+        return np.zeros((4, 4)), True
+    where = f"{tree.file}: link {link.get('name')!r}: inertial"
+    mass = _number(tree, link, inertial.find("mass"), "value")
+    cells = inertial.find("inertia")
+    inertia = np.zeros((3, 3))
+    for i, j in zip(*np.triu_indices(3), strict=True):
+        inertia[i, j] = inertia[j, i] = _number(tree, link, cells, f"i{'xyz'[i]}{'xyz'[j]}")
+    smallest = float(np.linalg.eigvalsh(inertia)[0])
+    largest = float(np.abs(inertia).max())
+    if mass < 0.0 or smallest < -ROUNDING * largest:
+        raise ConfigError(f"{where}: mass and moments of inertia must not be negative; correct them in the URDF")
+    second = 0.5 * np.trace(inertia) * np.eye(3) - inertia
+    frame = tree.origin(link, inertial.find("origin"))
+    body = np.zeros((4, 4))
+    body[:3, :3], body[3, 3] = second, mass
+    return frame @ body @ frame.T, bool(np.linalg.eigvalsh(second)[0] >= -ROUNDING * largest)
+
+
+def _number(tree: UrdfTree, link: ET.Element, found: ET.Element | None, key: str) -> float:
+    return 0.0 if found is None else float(tree.words(link, found, key, count=1, default="0")[0])
+
+
+def _friction(tree: UrdfTree, path: list[ET.Element], chain: list[str]) -> dict[str, float]:
+    """Friction of the moving joints from ``dynamics``; zero and negative values are placeholders."""
+    out = {}
+    for element in path:
+        found = element.find("dynamics")
+        if found is None or element.get("name") not in chain:
+            continue
+        number = chain.index(str(element.get("name"))) + 1
+        for name, key in (("fv", "damping"), ("fc", "friction")):
+            value = float(tree.words(element, found, key, count=1, default="0")[0])
+            if value > 0.0:
+                out[f"{name}{number}"] = value
+    return out

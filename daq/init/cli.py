@@ -1,0 +1,135 @@
+"""Options of ``armident init``; the work is imported when the command runs."""
+
+import sys
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+
+def init(
+    urdf: Annotated[Path | None, typer.Argument(help="URDF of the arm.")] = None,
+    out: Annotated[Path, typer.Option("--out", help="Folder of robot.yaml and session.yaml.")] = Path(),
+    recording: Annotated[
+        Path | None, typer.Option("--recording", help="Recording of the arm: CSV, MAT, NPZ, Parquet, rosbag2, or MCAP.")
+    ] = None,
+    robot: Annotated[
+        str | None, typer.Option("--robot", help="Robot of the library instead of a URDF: ur5e, ...")
+    ] = None,
+    dh: Annotated[
+        Path | None, typer.Option("--dh", help="Table of Denavit-Hartenberg parameters instead: theta, d, a, alpha.")
+    ] = None,
+    convention: Annotated[
+        Literal["classical", "modified"] | None,
+        typer.Option("--convention", help="Of that table. [default: modified with a column r, else classical]"),
+    ] = None,
+    axes: Annotated[
+        int | None, typer.Option("--axes", help="Number of joints, if the geometry is not known yet.", min=1)
+    ] = None,
+    base: Annotated[str | None, typer.Option("--base", help="First link of the chain. [default: the root]")] = None,
+    tip: Annotated[str | None, typer.Option("--tip", help="Last link of the chain. [default: its end]")] = None,
+    name: Annotated[str | None, typer.Option("--name", help="Name of the robot. [default: that of the source]")] = None,
+    signal: Annotated[
+        Literal["torque", "current", "voltage"] | None,
+        typer.Option("--signal", help="Effort that the drives report. [default: that of the recording, or torque]"),
+    ] = None,
+    torque_sensors: Annotated[
+        bool, typer.Option("--torque-sensors", help="Efforts are measured behind the gears: a model without rotors.")
+    ] = False,
+    names: Annotated[
+        str, typer.Option("--map", help="Names in the recording: position=qm,torque=tau_J; demand=- omits it.")
+    ] = "",
+    joints: Annotated[
+        str, typer.Option("--joints", help="Joint names in the recording, in the robot's order: NAME,NAME,...")
+    ] = "",
+    by_position: Annotated[
+        bool, typer.Option("--by-position", help="Take joints of other names in the order of the recording.")
+    ] = False,
+    topic: Annotated[str | None, typer.Option("--topic", help="Topic of joint states in a bag.")] = None,
+    effort: Annotated[
+        Path | None, typer.Option("--effort", help="Second CSV file of the recording, one effort column per joint.")
+    ] = None,
+    motor_side: Annotated[bool, typer.Option("--motor-side", help="Recorded values are those of the motors.")] = False,
+    units: Annotated[
+        str, typer.Option("--units", help="Units of the recording: position=deg,torque=mnm. [default: by magnitude]")
+    ] = "",
+    time_unit: Annotated[
+        str | None, typer.Option("--time-unit", help="Unit of its times: s, ms, us, ns. [default: by magnitude]")
+    ] = None,
+    rate: Annotated[
+        float | None, typer.Option("--rate", help="Its sampling rate, Hz. [default: by its times]", min=0.001)
+    ] = None,
+    gravity: Annotated[
+        str, typer.Option("--gravity", help="Gravity in the frame of the base, X,Y,Z in m/s^2. [default: 0,0,-9.81]")
+    ] = "",
+    cell: Annotated[str | None, typer.Option("--cell", help="Name of the cell. [default: that of the robot]")] = None,
+    channel: Annotated[str | None, typer.Option("--channel", help="CAN interface of the drives, such as can0.")] = None,
+    bitrate: Annotated[
+        int | None, typer.Option("--bitrate", help="Bit rate of the bus, bit/s; 0 for a virtual bus.", min=0)
+    ] = None,
+    node_ids: Annotated[
+        str, typer.Option("--node-ids", help="CANopen nodes of the joints, base to tip: 1,2,3,...")
+    ] = "",
+    eds: Annotated[str | None, typer.Option("--eds", help="Electronic data sheet of the drives.")] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace files that exist.")] = False,
+) -> None:
+    """Write the configuration of an arm and of its cell, from what is known of it and a recording.
+
+    Sources of the geometry: a URDF, a robot of the library, a table of Denavit-Hartenberg parameters. Without any,
+    questions are asked on a terminal. What is not known yet is marked FILL_IN, with the way to find it. All blanks are
+    listed at the end; a command asks only for those that it needs.
+
+    Example: armident init arm.urdf --recording data.csv --out my_arm
+    """
+    from armident.configs import ConfigError
+    from armident.daq.init.command import InitOptions, run_init
+    from armident.daq.interchange.text_files import pairs_of
+
+    def numbers(option: str, text: str) -> list[float]:
+        try:
+            return [float(word) for word in text.split(",") if word.strip()]
+        except ValueError as error:
+            raise ConfigError(f"{option}: expected numbers, NUMBER,NUMBER,...; found {text!r}") from error
+
+    nodes = [int(number) for number in numbers("--node-ids", node_ids)]
+    down = numbers("--gravity", gravity)
+    if len(down) not in (0, 3):
+        raise ConfigError(f"--gravity: expected X,Y,Z, found {gravity!r}")
+    stated = {
+        "effort": effort,
+        "names": pairs_of("--map", names),
+        "joints": [word.strip() for word in joints.split(",") if word.strip()],
+        "by_position": by_position,
+        "topic": topic,
+        "motor_side": motor_side,
+        "units": pairs_of("--units", units),
+        "time_unit": time_unit,
+        "rate_hz": rate,
+    }
+    of_cell = {"cell": cell, "channel": channel, "bitrate": bitrate, "node_ids": nodes or None, "eds": eds}
+    options = InitOptions(
+        out=out,
+        urdf=urdf,
+        robot=robot,
+        dh=dh,
+        axes=axes,
+        convention=convention,
+        base=base,
+        tip=tip,
+        recording=recording,
+        stated=stated,
+        name=name,
+        signal=signal,
+        link_torques=torque_sensors,
+        gravity=(down[0], down[1], down[2]) if down else None,
+        cell={key: value for key, value in of_cell.items() if value is not None},
+        overwrite=overwrite,
+    )
+    if urdf is None and robot is None and dh is None and axes is None and sys.stdin.isatty():
+        from armident.daq.init.questionnaire import questionnaire
+
+        def ask(question: str, default: str) -> str:
+            return str(typer.prompt(question, default=default, show_default=bool(default)))
+
+        options = questionnaire(options, ask, print)
+    print(run_init(options))

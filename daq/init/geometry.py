@@ -1,0 +1,232 @@
+"""Geometry of an arm from a URDF or from the library of robots, as the beginning of a robot configuration."""
+
+import os.path
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from armident.configs import ArmidentError, ConfigError, RobotConfig, config_path, load_robot
+from armident.configs.blanks import MARK, without_marks
+from armident.configs.schema.robot import Mdh
+from armident.configs.urdf import UrdfGeometry, UrdfSource, geometry_from_urdf
+from armident.configs.urdf_tree import moving_links, orientation, robot_name, serial_tips
+from armident.configs.yaml_loader import is_file, read_yaml
+
+UPRIGHT = (0.0, 0.0, -9.81)
+"""Acceleration of gravity in the frame of an upright base, m/s^2."""
+
+
+URDF_SUFFIXES = (".urdf", ".xml", ".xacro")
+"""Suffixes of URDF files; a xacro file is refused with the command that expands it."""
+
+
+@dataclass(frozen=True)
+class Geometry:
+    """Geometry of an arm.
+
+    Parameters
+    ----------
+    source
+        Name of the source, for the user.
+    content
+        Keys of the robot configuration; ``joints`` has an entry for every joint, with its ``name``.
+    robot
+        The robot that these keys make.
+    notes
+        Sentences on what was assumed.
+    """
+
+    source: str
+    content: dict[str, Any]
+    robot: RobotConfig
+    notes: tuple[str, ...] = ()
+
+
+def from_library(name: str) -> Geometry:
+    """Geometry of a robot of the library, or of another configuration.
+
+    Parameters
+    ----------
+    name
+        Name of a robot in ``configs/robots``, or a path.
+
+    Raises
+    ------
+    ConfigError
+        If there is no such robot.
+    """
+    path = config_path(name, listed=("robots",))
+    robot = load_robot(path, "import")
+    content = read_yaml(path.read_text(encoding="utf-8"), str(path))
+    if "urdf" in content:
+        raise ConfigError(f"{path}: takes its geometry from a URDF; give that: armident init {content['urdf']['file']}")
+    return Geometry(path.name, content, robot)
+
+
+def from_urdf(
+    file: Path,
+    out: Path,
+    base: str | None = None,
+    tip: str | None = None,
+    fits: Callable[[RobotConfig], object] | None = None,
+) -> Geometry:
+    """Geometry of a URDF.
+
+    Parameters
+    ----------
+    file
+        The URDF.
+    out
+        Folder of the robot configuration, which refers to the URDF.
+    base, tip
+        First and last link of the chain. ``None``: the root; the end of the only chain, or of the one that ``fits``.
+    fits
+        Function that raises if a robot is not the recorded one; decides between several chains.
+
+    Raises
+    ------
+    ConfigError
+        If the URDF is wrong, or several chains remain; lists them.
+    """
+    if not is_file(file):
+        raise ConfigError(f"{file}: no such file")
+    if file.suffix.lower() not in URDF_SUFFIXES:
+        raise ConfigError(
+            f"{file}: expected a URDF ({', '.join(URDF_SUFFIXES)}); --recording gives a recording, --dh a table of "
+            "parameters, --robot a robot of the library"
+        )
+    if tip is not None:
+        return _of_chain(file, out, base, tip)
+    tips = serial_tips(file, base)
+    if not tips:
+        # The reader of the chain names the reason.
+        return _of_chain(file, out, base, None)
+    chains = [(base, one) for one in tips]
+    fitting = chains if fits is None else [chain for chain in chains if _is_fit(_of_chain(file, out, *chain), fits)]
+    if fits is not None and not fitting:
+        fitting = _longest_parts(file, out, base, list(tips), fits)
+    if len(fitting) == 1:
+        return _chosen(file, out, *fitting[0])
+    if len(chains) == 1:
+        return _chosen(file, out, *chains[0])
+    listed = "; ".join(f"--tip {one} ({', '.join(joints)})" for one, joints in tips.items())
+    why = "and the recording fits none of them" if not fitting else "of which one is identified"
+    raise ConfigError(f"{file}: has several chains, {why}: {listed}")
+
+
+def _chosen(file: Path, out: Path, base: str | None, tip: str) -> Geometry:
+    """Geometry of a chain; without its ends in the configuration where the file has no other chain."""
+    try:
+        whole = _of_chain(file, out, None, None)
+    except ConfigError:
+        whole = None
+    part = _of_chain(file, out, base, tip)
+    return whole if whole is not None and whole.content["joints"] == part.content["joints"] else part
+
+
+def _longest_parts(
+    file: Path, out: Path, base: str | None, tips: list[str], fits: Callable[[RobotConfig], object]
+) -> list[tuple[str | None, str]]:
+    """Ends of the longest parts of chains whose joints are the recorded ones; several if that does not decide."""
+    links = [moving_links(file, base, tip) for tip in tips]
+    for length in range(max(map(len, links)) - 1, 0, -1):
+        parts = {
+            (chain[first][0], chain[first + length - 1][1])
+            for chain in links
+            for first in range(len(chain) - length + 1)
+        }
+        found = sorted(part for part in parts if _is_fit(_of_chain(file, out, *part), fits))
+        if found:
+            return list(found)
+    return []
+
+
+def _is_fit(geometry: Geometry, fits: Callable[[RobotConfig], object]) -> bool:
+    try:
+        fits(geometry.robot)
+    except ArmidentError:
+        return False
+    return True
+
+
+def _of_chain(file: Path, out: Path, base: str | None, tip: str | None) -> Geometry:
+    part_file = file.resolve()
+    part = UrdfSource(file=str(part_file), base=base, tip=tip)
+    made = geometry_from_urdf(UrdfGeometry(urdf=part), out / "robot.yaml")
+    urdf = {"file": os.path.relpath(part.file, out.resolve()), **part.model_dump(exclude={"file"}, exclude_none=True)}
+    name = identifier(robot_name(file) or file.stem)
+    robot = RobotConfig.model_validate({"schema": "armident/robot/1", "name": name, **made})
+    content: dict[str, Any] = {
+        "schema": "armident/robot/1",
+        "name": name,
+        "urdf": urdf,
+        "joints": [{"name": joint.source_name or joint.name} for joint in robot.joints],
+    }
+    ends = " ".join(f"{word} link {link}" for word, link in (("from", base), ("up to", tip)) if link is not None)
+    if base is not None:
+        down = orientation(part_file, base).T @ UPRIGHT
+        content["gravity"] = [float(f"{g:.9g}") + 0.0 for g in np.where(np.abs(down) < 1e-9, 0.0, down)]
+    notes = [f"chain {ends}; what moves beyond it counts as its load"] if ends else []
+    if base is not None:
+        notes.append(f"gravity is that of an upright root of the URDF with the joints before link {base} at zero")
+    return Geometry(file.name, content, robot, tuple(notes))
+
+
+def of_rows(source: str, name: str, rows: list[tuple[str, str, Mdh]]) -> Geometry:
+    """Geometry of modified Denavit-Hartenberg rows.
+
+    Parameters
+    ----------
+    source
+        Name of the source, for the user.
+    name
+        Name of the robot.
+    rows
+        Name, type and parameters of each joint, base to tip.
+    """
+    content = {
+        "schema": "armident/robot/1",
+        "name": name,
+        "joints": [{"name": joint, "type": kind, "mdh": mdh.model_dump()} for joint, kind, mdh in rows],
+    }
+    return Geometry(source, content, RobotConfig.model_validate(content))
+
+
+def of_axes(count: int) -> Geometry:
+    """Geometry that is not known yet: joints with blank parameters.
+
+    Parameters
+    ----------
+    count
+        Number of joints.
+
+    Raises
+    ------
+    ConfigError
+        If there is none.
+    """
+    if count < 1:
+        raise ConfigError(f"--axes: expected the number of joints, found {count}")
+    content = {
+        "schema": "armident/robot/1",
+        "name": "arm",
+        "joints": [{"name": f"joint_{k}", "type": "revolute", "mdh": MARK} for k in range(1, count + 1)],
+    }
+    robot, blanks = without_marks(content)
+    return Geometry("a number of joints", content, RobotConfig.model_validate({**robot, "blanks": blanks}))
+
+
+def identifier(text: str) -> str:
+    """Name of a robot or cell: lower-case letters, digits and underscores, beginning with a letter.
+
+    Parameters
+    ----------
+    text
+        Any text.
+    """
+    plain = re.sub(r"[^a-z0-9]+", "_", text.lower()).strip("_")[:60]
+    return plain if plain and plain[0].isalpha() else f"arm_{plain}".rstrip("_")

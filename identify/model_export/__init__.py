@@ -1,0 +1,1 @@
+"""Export of an identified model to the formats of simulators and control software."""

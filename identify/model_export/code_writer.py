@@ -1,0 +1,196 @@
+"""Exported models as source code without dependencies: Python and C."""
+
+import json
+import keyword
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from textwrap import wrap
+from typing import Any
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+
+from armident.identify.document import versions, write_atomically
+from armident.identify.effects.link import GravityDirection
+from armident.identify.effects.numbers import ParameterChange
+from armident.identify.effects.registry import of_entry
+from armident.identify.model_export.exported_model import ExportedModel
+from armident.identify.model_export.formulas import FUNCTIONS, InstantModel, instant_model
+from armident.identify.model_export.sheet import PARTS, LimitationSheet, limitation_sheet
+
+EVERY_PART = (*PARTS, "couplings", "gravity")
+"""Parts of a model that code holds."""
+
+WIDTH = 100
+"""Width of a line of text in the head of a file."""
+
+_TEMPLATES = Environment(
+    loader=PackageLoader("armident.identify.model_export", "templates"),
+    undefined=StrictUndefined,
+    trim_blocks=True,
+    lstrip_blocks=True,
+    keep_trailing_newline=True,
+)
+_TEMPLATES.filters["number"] = lambda value: repr(float(value))
+_TEMPLATES.filters["quoted"] = lambda text: json.dumps(text, ensure_ascii=False)
+
+
+@dataclass(frozen=True)
+class Code:
+    """Content of the files of a model.
+
+    Parameters
+    ----------
+    name
+        Identifier of the robot.
+    content
+        Variables of the templates.
+    sheet
+        What the code does not hold.
+    """
+
+    name: str
+    content: Mapping[str, Any]
+    sheet: LimitationSheet
+
+    def render(self, template: str, **more: Any) -> str:
+        """Return the text of a file.
+
+        Parameters
+        ----------
+        template
+            Name in ``templates``.
+        **more
+            Further variables.
+        """
+        return _TEMPLATES.get_template(template).render(**self.content, **more)
+
+
+def write_python(model: ExportedModel, path: Path) -> tuple[list[Path], LimitationSheet]:
+    """Write a Python module that needs only ``math``; see `armident.identify.model_export.formats.Format.write`.
+
+    Parameters
+    ----------
+    model
+        The model.
+    path
+        File to write.
+    """
+    code = code_of(model, "python")
+    write_atomically(path, code.render("model.py.jinja"))
+    return [path], code.sheet
+
+
+def write_c(model: ExportedModel, path: Path) -> tuple[list[Path], LimitationSheet]:
+    """Write a C99 source file and its header, with inverse and forward dynamics.
+
+    Parameters
+    ----------
+    model
+        The model.
+    path
+        Source file to write; the header is beside it and has the name of the robot.
+    """
+    code = code_of(model, "c")
+    header = path.with_name(f"{code.name}.h")
+    write_atomically(header, code.render("model.h.jinja"))
+    write_atomically(path, code.render("model.c.jinja"))
+    return [path, header], code.sheet
+
+
+def code_of(model: ExportedModel, format_name: str) -> Code:
+    """Return names, tables and formulas of a model.
+
+    Parameters
+    ----------
+    model
+        The model.
+    format_name
+        Format for the sheet.
+    """
+    instant = instant_model(model.arm, model.theta)
+    values, chain = model.arm.values(instant.theta), model.arm.chain
+    friction = zip(values.ia, values.fv, values.fc, values.off, values.smoothing, strict=True)
+    couplings = [
+        (*joints, *three, values.smoothing[joints].min())
+        for joints, three in zip(values.coupling_joints, values.coupling, strict=True)
+    ]
+    frames = zip(chain.cos_alpha, chain.sin_alpha, chain.d, chain.theta, chain.r, chain.prismatic, strict=True)
+    effects = [
+        {"title": model.effects[number].title, "torques": list(torques.items())}
+        for number, torques in sorted(instant.torques.items())
+    ]
+    formulas = [text for torques in instant.torques.values() for text in torques.values()]
+    sheet = limitation_sheet(
+        model,
+        format_name,
+        EVERY_PART,
+        effects=[effect for number, effect in enumerate(model.effects) if number in instant.held],
+        remarks=_remarks(model, instant),
+    )
+    name = identifier(model.robot.name)
+    content = {
+        "head": {"title": f"Dynamics of the robot {model.robot.name}.", "lines": _head(model, sheet)},
+        "prefix": name,
+        "macro": name.upper(),
+        "n": model.arm.n,
+        "joints": [_joint(joint.name, joint.type) for joint in model.joints],
+        "gravity": instant.gravity.tolist(),
+        "frames": list(frames),
+        "links": values.inertial.tolist(),
+        "friction": list(friction),
+        "couplings": couplings,
+        "effects": effects,
+        "functions": sorted(
+            {"atan", "cos", "pi", "sin"} | {f for f in FUNCTIONS if any(f"{f}(" in t for t in formulas)}
+        ),
+        "uses_hat": any("hat(" in text for text in formulas),
+        "implicit": any(symbol in text for text in formulas for symbol in ("ddq[", "load[", "torque[")),
+    }
+    return Code(name, content, sheet)
+
+
+def identifier(name: str) -> str:
+    """Return a name as an identifier of Python and C.
+
+    Parameters
+    ----------
+    name
+        Name of a robot or joint.
+    """
+    found = re.sub(r"[^A-Za-z0-9_]", "_", name)
+    return f"_{found}" if not found or found[0].isdigit() or keyword.iskeyword(found) else found
+
+
+def _joint(name: str, kind: str) -> dict[str, str]:
+    prismatic = kind == "prismatic"
+    return {"name": name, "position": "m" if prismatic else "rad", "torque": "N" if prismatic else "N m"}
+
+
+def _head(model: ExportedModel, sheet: LimitationSheet) -> list[str]:
+    """Return the lines at the head of a file: source of the parameters, and what the file does not hold."""
+    document, recording = model.document, model.document.recording
+    recorded = f"{Path(recording.path or '(from the stream)').name}, SHA-256 {recording.sha256}"
+    lines = [
+        f"Written by armident {versions().get('armident', '')} from {model.source.name}.",
+        f"Parameters: method {document.method}, torque error {document.relative_error_pct:.2f} %, verdict "
+        f"{document.verdict or 'not judged'}, made physically consistent. Recording: {recorded}.",
+        *(f"Not in this file: {o.part}. {o.reason}".strip() for o in sheet.omitted),
+    ]
+    if sheet.undetermined:
+        lines.append(f"Not determined alone by the recordings: {', '.join(sheet.undetermined)}.")
+    # Names of files must end neither a comment of C nor a string of Python.
+    safe = [line.replace("*/", "* /").replace("\\", "/").replace('"', "'") for line in lines]
+    return [part for line in safe for part in wrap(line, WIDTH)]
+
+
+def _remarks(model: ExportedModel, instant: InstantModel) -> list[str]:
+    """Return a remark on effects that see other torques in the code than in the model."""
+    held = [of_entry(entry) for k, entry in enumerate(model.robot.effects) if k in instant.held]
+    changes = [effect.title for effect in held if isinstance(effect, ParameterChange | GravityDirection)]
+    dependent = [effect.title for effect in held if effect.depends_on_torque]
+    others = [title for title in dependent if [title] != changes]
+    if changes and others:
+        return [f"{', '.join(others)}: computed from torques that include {', '.join(changes)}, unlike in the model"]
+    return []

@@ -1,0 +1,161 @@
+"""Exported models as functional mock-up units: FMI 2.0 for Co-Simulation, torques in, motion out."""
+
+import platform
+import shutil
+import subprocess
+import tempfile
+import uuid
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+
+from armident.configs import ConfigError
+from armident.identify.model_export.code_writer import code_of
+from armident.identify.model_export.exported_model import ExportedModel
+from armident.identify.model_export.sheet import LimitationSheet
+
+TOLERANCE = 1e-8
+"""Relative and absolute tolerance of the integration, unless the experiment gives another one."""
+
+OPTIONS = ("-std=c99", "-O2", "-fPIC", "-shared")
+"""Options of the compiler."""
+
+MACHINE = ("Linux", "x86_64")
+"""System and machine for which FMI 2.0 has the folder ``linux64``."""
+
+EPOCH = (1980, 1, 1, 0, 0, 0)
+"""Time of the files inside, so that equal models give equal files."""
+
+
+@dataclass(frozen=True)
+class Variable:
+    """Variable of an FMU.
+
+    Parameters
+    ----------
+    name, causality, initial, unit, description
+        As in ``modelDescription.xml``; ``initial`` is empty where there is none.
+    start
+        Value at the start; ``None``: computed.
+    """
+
+    name: str
+    causality: str
+    initial: str
+    unit: str
+    description: str
+    start: float | None
+
+
+def write_fmu(model: ExportedModel, path: Path) -> tuple[list[Path], LimitationSheet]:
+    """Write an FMU for 64-bit Linux, compiled on this machine; its sources are inside.
+
+    Parameters
+    ----------
+    model
+        The model.
+    path
+        File to write.
+
+    Raises
+    ------
+    ConfigError
+        If there is no C compiler, or the machine is another one.
+    """
+    code, variables = code_of(model, "fmu"), variables_of(model)
+    source = code.render("model.c.jinja")
+    start = [variable.start or 0.0 for variable in variables[model.arm.n : 2 * model.arm.n]]
+    interface = {
+        "guid": f"{{{uuid.uuid5(uuid.NAMESPACE_URL, source)}}}",
+        "tolerance": TOLERANCE,
+        "start": start,
+        "variables": variables,
+        "outputs": [k for k, v in enumerate(variables, start=1) if v.causality == "output"],
+        "calculated": [k for k, v in enumerate(variables, start=1) if v.initial == "calculated"],
+    }
+    sources = {
+        f"{code.name}.c": source,
+        f"{code.name}.h": code.render("model.h.jinja"),
+        "fmu.c": code.render("fmu.c.jinja", **interface),
+    }
+    library = compiled(sources, code.name)
+    contents: dict[str, str | bytes] = {
+        "modelDescription.xml": code.render("modelDescription.xml.jinja", **interface),
+        f"binaries/linux64/{code.name}.so": library,
+        "documentation/limits.md": code.sheet.markdown(f"{model.robot.name} as FMU"),
+        **{f"sources/{name}": text for name, text in sources.items()},
+    }
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, content in contents.items():
+            archive.writestr(zipfile.ZipInfo(name, EPOCH), content, zipfile.ZIP_DEFLATED)
+    return [path], code.sheet
+
+
+def variables_of(model: ExportedModel) -> list[Variable]:
+    """Return the variables of an FMU: torques, positions, velocities and accelerations of the joints.
+
+    Parameters
+    ----------
+    model
+        The model. Joints start at zero, or in the middle of limits that exclude zero.
+    """
+    kinds = (
+        ("tau", "input", "", ("N.m", "N"), "torque or force of {}, held during a communication step"),
+        ("q", "output", "exact", ("rad", "m"), "position of {}"),
+        ("dq", "output", "exact", ("rad/s", "m/s"), "velocity of {}"),
+        ("ddq", "output", "calculated", ("rad/s2", "m/s2"), "acceleration of {}"),
+    )
+    found = []
+    for name, causality, initial, units, description in kinds:
+        for k, joint in enumerate(model.joints):
+            low, high = model.position_limits(k) or (0.0, 0.0)
+            start = 0.0 if name != "q" or low <= 0.0 <= high else (low + high) / 2
+            found.append(
+                Variable(
+                    f"{name}_{joint.name}",
+                    causality,
+                    initial,
+                    units[joint.type == "prismatic"],
+                    description.format(joint.name),
+                    None if initial == "calculated" else start,
+                )
+            )
+    return found
+
+
+def compiled(sources: dict[str, str], name: str) -> bytes:
+    """Compile C sources to a shared library with the compiler of this machine.
+
+    Parameters
+    ----------
+    sources
+        Texts by file name.
+    name
+        Name of the library.
+
+    Raises
+    ------
+    ConfigError
+        If there is no compiler, or the machine is not one of 64-bit Linux.
+    """
+    if (platform.system(), platform.machine()) != MACHINE:
+        raise ConfigError(f"--format fmu: needs {' '.join(MACHINE)}; on other machines use --format c")
+    compiler = shutil.which("gcc") or shutil.which("cc")
+    if compiler is None:
+        raise ConfigError("--format fmu: needs a C compiler: install gcc, or use --format c")
+    with tempfile.TemporaryDirectory() as folder:
+        for file, text in sources.items():
+            (Path(folder) / file).write_text(text, encoding="utf-8")
+        files = [file for file in sources if file.endswith(".c")]
+        library = Path(folder) / f"{name}.so"
+        done = subprocess.run(
+            [compiler, *OPTIONS, *files, "-o", library.name, "-lm"],
+            cwd=folder,
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        if done.returncode != 0:
+            first = next((line for line in done.stderr.splitlines() if "error" in line), "no message")
+            raise ConfigError(f"--format fmu: {compiler} fails: {first}; use --format c")
+        return library.read_bytes()

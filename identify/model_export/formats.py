@@ -1,0 +1,104 @@
+"""Formats of an exported model, and the export itself."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from armident.configs import ConfigError
+from armident.identify.document import write_atomically
+from armident.identify.model_export.code_writer import write_c, write_python
+from armident.identify.model_export.csv_writer import write_csv
+from armident.identify.model_export.exported_model import ExportedModel
+from armident.identify.model_export.fmu_writer import write_fmu
+from armident.identify.model_export.mjcf_writer import write_mjcf
+from armident.identify.model_export.pinocchio_writer import write_pinocchio
+from armident.identify.model_export.sdf_writer import write_sdf
+from armident.identify.model_export.sheet import LimitationSheet
+from armident.identify.model_export.urdf_writer import write_urdf
+
+
+@dataclass(frozen=True)
+class Format:
+    """A format of exported models.
+
+    Parameters
+    ----------
+    suffix
+        Suffix of its main file, with the dot.
+    title
+        Name in words.
+    write
+        Writes the model to the path of the main file; returns all files written, the main one first, and the sheet.
+    """
+
+    suffix: str
+    title: str
+    write: Callable[[ExportedModel, Path], tuple[list[Path], LimitationSheet]]
+
+
+FORMATS: dict[str, Format] = {
+    "urdf": Format(".urdf", "URDF", write_urdf),
+    "mjcf": Format(".xml", "MJCF (MuJoCo)", write_mjcf),
+    "sdf": Format(".sdf", "SDFormat (Gazebo, Drake)", write_sdf),
+    "python": Format(".py", "Python module", write_python),
+    "c": Format(".c", "C source", write_c),
+    "csv": Format(".csv", "table of parameters", write_csv),
+    "fmu": Format(".fmu", "FMU (FMI 2.0 for Co-Simulation)", write_fmu),
+    "pinocchio": Format(".pinocchio.xml", "Pinocchio model", write_pinocchio),
+}
+"""Formats by name."""
+
+
+def check_format(format_name: str) -> None:
+    """Refuse a format that does not exist.
+
+    Parameters
+    ----------
+    format_name
+        Name of the format.
+
+    Raises
+    ------
+    ConfigError
+        If there is no such format; names those that there are.
+    """
+    if format_name not in FORMATS:
+        raise ConfigError(f"--format: {format_name!r} is not one of {', '.join(FORMATS)}")
+
+
+def export_model(model: ExportedModel, format_name: str, out: Path) -> tuple[list[Path], LimitationSheet]:
+    """Write a model in a format, and the sheet of its limits beside it.
+
+    Parameters
+    ----------
+    model
+        The model.
+    format_name
+        Name in `FORMATS`.
+    out
+        Main file, or a folder in which it is named after the robot.
+
+    Returns
+    -------
+    files : list of Path
+        Files written: the main one first, the sheet last.
+    sheet : LimitationSheet
+        Parts that the format cannot hold, and parameters that were not determined.
+
+    Raises
+    ------
+    ConfigError
+        If there is no such format.
+    """
+    check_format(format_name)
+    chosen = FORMATS[format_name]
+    main = out / f"{model.robot.name}{chosen.suffix}" if out.is_dir() or not out.suffix else out
+    try:
+        main.parent.mkdir(parents=True, exist_ok=True)
+        files, sheet = chosen.write(model, main)
+        stem = main.name.removesuffix(chosen.suffix).removesuffix(main.suffix)
+        page = main.with_name(f"{stem}_{format_name}_limits.md")
+        write_atomically(page, sheet.markdown(f"{model.robot.name} as {chosen.title}"))
+    except OSError as error:
+        raise ConfigError(f"{main}: cannot be written: {error.strerror or 'output error'}") from error
+    return [*files, page], sheet

@@ -1,0 +1,324 @@
+"""Torques of effects as formulas of one instant, in the notation that Python and C share.
+
+The columns of an effect are evaluated with symbols in place of signals: elements of numpy's object arrays that record
+each operation. A formula is accepted if it has the values of the effect along a random motion. Effects with memory,
+such as backlash, have no such formula.
+"""
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numba.core.errors import NumbaError
+
+from armident.identify.effects.link import GravityDirection, across
+from armident.identify.effects.numbers import ParameterChange
+from armident.identify.effects.recorded import of_recording
+from armident.identify.effects.terms import Term, effect_terms
+from armident.identify.robot.arm import ArmModel
+from armident.identify.robot.chain import Floats
+from armident.identify.robot.motion import Motion
+
+SAMPLES = 24
+"""Instants of the random motion at which a formula is compared with its effect."""
+
+AGREEMENT = 1e-10
+"""Largest difference between formula and effect, relative to the largest torque of the effect: rounding."""
+
+
+class NotAFormula(Exception):
+    """The torque of an effect depends on more than the present instant."""
+
+
+@dataclass(frozen=True, eq=False)
+class Formula:
+    """Formula in the common notation of Python and C.
+
+    Parameters
+    ----------
+    text
+        The formula.
+    rank
+        Binding strength: 0 sum, 1 product, 2 atom.
+    """
+
+    text: str
+    rank: int = 2
+
+    __array_ufunc__ = None
+    """Numbers of numpy leave the operation to this class."""
+
+    def __add__(self, other: "Formula | float") -> "Formula":
+        """Return the sum; a zero is left out."""
+        return self if _is(other, 0.0) else Formula(f"{self.text} + {_of(other).inside(0)}", 0)
+
+    def __radd__(self, other: float) -> "Formula":
+        """Return the sum."""
+        return self if _is(other, 0.0) else Formula(f"{_of(other).text} + {self.inside(0)}", 0)
+
+    def __sub__(self, other: "Formula | float") -> "Formula":
+        """Return the difference."""
+        return self if _is(other, 0.0) else Formula(f"{self.text} - {_of(other).inside(1)}", 0)
+
+    def __rsub__(self, other: float) -> "Formula":
+        """Return the difference."""
+        return -self if _is(other, 0.0) else Formula(f"{_of(other).text} - {self.inside(1)}", 0)
+
+    def __mul__(self, other: "Formula | float") -> "Formula | float":
+        """Return the product; one and zero are simplified."""
+        if _is(other, 0.0):
+            return 0.0
+        return self if _is(other, 1.0) else Formula(f"{self.inside(1)} * {_of(other).inside(1)}", 1)
+
+    def __rmul__(self, other: float) -> "Formula | float":
+        """Return the product."""
+        if _is(other, 0.0):
+            return 0.0
+        return self if _is(other, 1.0) else Formula(f"{_of(other).inside(1)} * {self.inside(1)}", 1)
+
+    def __truediv__(self, other: "Formula | float") -> "Formula":
+        """Return the quotient."""
+        return self if _is(other, 1.0) else Formula(f"{self.inside(1)} / {_of(other).inside(2)}", 1)
+
+    def __pow__(self, power: float) -> "Formula":
+        """Return the power."""
+        return Formula(f"pow({self.text}, {_of(power).text})")
+
+    def __neg__(self) -> "Formula":
+        """Return the negative."""
+        return Formula(f"-{self.inside(2)}", 1)
+
+    def __abs__(self) -> "Formula":
+        """Return the magnitude."""
+        return self._call("fabs")
+
+    def inside(self, rank: int) -> str:
+        """Return the text, in brackets unless it binds at least as strongly as ``rank``."""
+        return self.text if self.rank >= rank else f"({self.text})"
+
+    def hats(self, knots: Floats) -> "list[Formula]":
+        """Return the piecewise linear functions at increasing knots, constant beyond the outermost.
+
+        ``hat(x, left, top, right)`` rises from zero at ``left`` to one at ``top``; it stays one on a side whose end is
+        ``top``.
+        """
+        ends = [knots[0], *knots, knots[-1]]
+        return [
+            Formula(f"hat({self.text}, {', '.join(_of(float(x)).text for x in ends[k : k + 3])})")
+            for k in range(knots.size)
+        ]
+
+    # Functions that numpy looks up as methods of the elements of an array of objects.
+    def sin(self) -> "Formula":
+        """Return the sine."""
+        return self._call("sin")
+
+    def cos(self) -> "Formula":
+        """Return the cosine."""
+        return self._call("cos")
+
+    def tanh(self) -> "Formula":
+        """Return the hyperbolic tangent."""
+        return self._call("tanh")
+
+    def arctan(self) -> "Formula":
+        """Return the arctangent."""
+        return self._call("atan")
+
+    def arcsinh(self) -> "Formula":
+        """Return the inverse hyperbolic sine."""
+        return self._call("asinh")
+
+    def exp(self) -> "Formula":
+        """Return the exponential."""
+        return self._call("exp")
+
+    def expm1(self) -> "Formula":
+        """Return the exponential less one."""
+        return self._call("expm1")
+
+    def log(self) -> "Formula":
+        """Return the natural logarithm."""
+        return self._call("log")
+
+    def sqrt(self) -> "Formula":
+        """Return the square root."""
+        return self._call("sqrt")
+
+    def _call(self, function: str) -> "Formula":
+        return Formula(f"{function}({self.text})")
+
+
+def _is(value: "Formula | float", number: float) -> bool:
+    return not isinstance(value, Formula) and float(value) == number
+
+
+def _of(value: "Formula | float") -> Formula:
+    """Return a number as a formula with all its digits; a negative one is in brackets."""
+    if isinstance(value, Formula):
+        return value
+    text = repr(float(value))
+    return Formula(text if value >= 0 else f"({text})")
+
+
+def hat(x: float, left: float, top: float, right: float) -> float:
+    """Return the function of `Formula.hats`, as the generated code has it.
+
+    Parameters
+    ----------
+    x
+        Variable.
+    left, top, right
+        Knots.
+    """
+    if x < top:
+        return 1.0 if left == top else max(0.0, (x - left) / (top - left))
+    return 1.0 if right == top else max(0.0, (right - x) / (right - top))
+
+
+FUNCTIONS: dict[str, Callable[..., float]] = {
+    **{name: getattr(math, name) for name in ("sin", "cos", "tanh", "atan", "asinh", "exp", "expm1", "log", "sqrt")},
+    "pow": math.pow,
+    "fabs": math.fabs,
+    "hat": hat,
+}
+"""Functions of formulas by name; all but ``hat`` are in Python's ``math`` and in C's ``math.h``."""
+
+
+class _Instant(Motion):
+    """Motion whose one sample consists of symbols."""
+
+    @cached_property
+    def torque(self) -> Any:
+        """Torques that the model predicts without effects."""
+        return _symbols("torque", self.n)
+
+    @cached_property
+    def transmitted(self) -> Any:
+        """Torques of the links."""
+        return _symbols("load", self.n)
+
+    @cached_property
+    def sign(self) -> Any:
+        """Smoothed signs of the velocities."""
+        return _symbols("sign", self.n)
+
+    def _unknown(self, *_: Any, **__: Any) -> Any:
+        raise NotAFormula
+
+    t = top_speed = span = whole_time = standard = links = property(_unknown)
+    rate = slopes = response = _unknown
+
+
+def _symbols(name: str, n: int) -> Any:
+    """Return one row of symbols ``name[j]``, (1, n)."""
+    return np.array([[Formula(f"{name}[{j}]") for j in range(n)]], dtype=object)
+
+
+@dataclass(frozen=True, eq=False)
+class InstantModel:
+    """The dynamics of one instant: parameters, gravity, and effects as formulas.
+
+    Parameters
+    ----------
+    theta
+        Standard parameters (p,), with those of effects that change them.
+    gravity
+        Gravity in the base frame, m/s^2, (3,).
+    torques
+        Formulas of the further torque by effect (its number in the configuration) and joint, N m or N. Symbols are
+        ``q``, ``dq``, ``ddq``; ``sign``, the smoothed sign of the velocity; ``load``, the torque of the links;
+        ``torque``, that of the links, rotors, couplings and friction.
+    held
+        Numbers of the effects of the configuration that the model contains.
+    """
+
+    theta: Floats
+    gravity: Floats
+    torques: dict[int, dict[int, str]]
+    held: frozenset[int]
+
+
+def instant_model(arm: ArmModel, theta: Floats) -> InstantModel:
+    """Return the dynamics of an arm at one instant, with those of its effects that have no memory.
+
+    Parameters
+    ----------
+    arm
+        Dynamic model with the effects as terms.
+    theta
+        Standard parameters (p,), those of the effects last, SI.
+    """
+    theta, gravity = theta.copy(), arm.chain.gravity.copy()
+    torques: dict[int, dict[int, str]] = {}
+    held: set[int] = set()
+    known = replace(arm, anchor=theta.copy())
+    first = len(arm.names) - arm.e
+    for number, term in _numbered_terms(arm):
+        values = theta[first : first + len(term.names)].copy()
+        first += len(term.names)
+        if isinstance(term.effect, ParameterChange):
+            names = term.effect.parameters(term.place, arm.n)
+            for k, value in zip(term.kept, values, strict=True):
+                theta[arm.names.index(names[k])] += value
+        elif isinstance(term.effect, GravityDirection):
+            size = float(np.linalg.norm(arm.chain.gravity))
+            gravity += size * (values @ across(arm.chain.gravity)[list(term.kept)]) if size else 0.0
+        else:
+            found = _formulas(known, term, values)
+            if found is None:
+                continue
+            torques[number] = found
+        held.add(number)
+    return InstantModel(theta, gravity, torques, frozenset(held))
+
+
+def _numbered_terms(arm: ArmModel) -> list[tuple[int, Term]]:
+    """Return the terms with the numbers of their entries in the configuration."""
+    numbers = [k for k, entry in enumerate(arm.robot.effects) if not of_recording(entry)]
+    return list(zip(numbers, effect_terms(arm), strict=True))
+
+
+def _formulas(arm: ArmModel, term: Term, values: Floats) -> dict[int, str] | None:
+    """Return the torque of a term by joint; ``None`` if it has no formula."""
+    q, dq, ddq = (_symbols(name, arm.n) for name in ("q", "dq", "ddq"))
+    motion = _Instant(arm, q, dq, ddq, dt=math.nan, theta=arm.anchor)
+    try:
+        with np.errstate(invalid="ignore"):
+            columns = term.effect.columns(motion, term.place, {**term.effect.defaults, **term.shapes})
+        row = columns[0][None, :] if columns.ndim == 2 else columns[0]
+        joints = [term.place.joint] if columns.ndim == 2 else range(arm.n)
+        found = {}
+        for j, of_joint in zip(joints, row, strict=True):
+            torque = sum(value * of_joint[k] for k, value in zip(term.kept, values, strict=True) if value != 0.0)
+            if not _is(torque, 0.0):
+                found[j] = _of(torque).text
+        right = _agrees(arm, term, values, found)
+    except (NotAFormula, NumbaError, TypeError, ValueError, AttributeError, IndexError, NameError):
+        # Effects of other packages may do anything with symbols; what is no formula is named as left out.
+        return None
+    return found if right else None
+
+
+def _agrees(arm: ArmModel, term: Term, values: Floats, formulas: Mapping[int, str]) -> bool:
+    """Return True if the formulas have the torques of the term along a random motion."""
+    rng = np.random.default_rng(0)
+    q, dq, ddq = (rng.uniform(-scale, scale, (SAMPLES, arm.n)) for scale in (2.0, 2.0, 8.0))
+    motion = arm.motion(q, dq, ddq, dt=1e-3)
+    expected = np.zeros((SAMPLES, arm.n))
+    term.add_torque(motion, values, expected)
+    signals = {"q": q, "dq": dq, "ddq": ddq, "sign": motion.sign}
+    if term.depends_on_torque:
+        signals |= {"torque": motion.torque, "load": motion.transmitted}
+    found = np.zeros((SAMPLES, arm.n))
+    for j, text in formulas.items():
+        code = compile(text, "formula", "eval")
+        for k in range(SAMPLES):
+            row = {name: values[k].tolist() for name, values in signals.items()}
+            # The text is made of numbers, symbols and names of `FUNCTIONS` by the class above.
+            found[k, j] = eval(code, {"__builtins__": {}, **FUNCTIONS}, row)
+    scale = max(float(np.abs(expected).max()), 1e-300)
+    return bool(np.abs(found - expected).max() <= AGREEMENT * scale)

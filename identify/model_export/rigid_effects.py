@@ -1,0 +1,74 @@
+"""Effects that are parameters of the arm in other words: rotor inertias, couplings, direction of gravity, springs."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from armident.identify.effects.link import across
+from armident.identify.model_export.exported_model import ExportedEffect, ExportedModel, JointCoupling
+
+SPRINGS = "springs"
+"""Part of a model that a linear spring is held as."""
+
+
+def with_rigid_effects(model: ExportedModel) -> tuple[ExportedModel, dict[int, str]]:
+    """Return the model with such effects added to its joints, couplings and gravity.
+
+    Parameters
+    ----------
+    model
+        The model.
+
+    Returns
+    -------
+    model : ExportedModel
+        The model with the sums; its effects are still listed.
+    parts : dict
+        Part of the model that holds an effect, by index of the effect: ``rotor inertia``, ``couplings``, ``gravity``
+        or `SPRINGS`. Springs are not added to anything: see `springs`.
+    """
+    parts = {k: part for k, effect in enumerate(model.effects) if (part := _part(model, effect)) is not None}
+    joints, couplings, gravity = list(model.joints), list(model.couplings), model.frames.gravity
+    for k, part in parts.items():
+        effect = model.effects[k]
+        value, j = effect.parameters, effect.joint
+        if part == "rotor inertia":
+            joints[j] = replace(joints[j], rotor_inertia=joints[j].rotor_inertia + value["iax"])
+        elif part == "couplings" and effect.other is not None:
+            name = f"{model.joints[j].name}_{model.joints[effect.other].name}"
+            three = (value.get(key, 0.0) for key in ("iac", "fvc", "fcc"))
+            couplings.append(JointCoupling(name, (j, effect.other), *three))
+        elif part == "gravity":
+            down = np.array(model.robot.gravity)
+            tilt = np.array([value.get("tilt_x", 0.0), value.get("tilt_y", 0.0)])
+            gravity = gravity + model.frames.frame_0 @ (np.linalg.norm(down) * tilt @ across(down))
+    frames = replace(model.frames, gravity=gravity)
+    return replace(model, joints=tuple(joints), couplings=tuple(couplings), frames=frames), parts
+
+
+def springs(model: ExportedModel) -> dict[int, float]:
+    """Return the stiffness of the linear spring at each joint that has one, N m/rad or N/m, by index of the joint.
+
+    Parameters
+    ----------
+    model
+        The model.
+    """
+    found: dict[int, float] = {}
+    for effect in model.effects:
+        if _part(model, effect) == SPRINGS:
+            found[effect.joint] = found.get(effect.joint, 0.0) + effect.parameters["ks"]
+    return found
+
+
+def _part(model: ExportedModel, effect: ExportedEffect) -> str | None:
+    """Part of the model that holds an effect; ``None`` if none does."""
+    if effect.of_recording:
+        return None
+    if effect.effect == "rotor_inertia":
+        # A motor that turns with two joints couples them.
+        alone = np.count_nonzero(model.robot.transmission_matrix[effect.joint]) == 1
+        return "rotor inertia" if alone else None
+    if effect.effect == "joint_spring":
+        return SPRINGS if not effect.law and effect.parameters.get("ks", 0.0) > 0.0 else None
+    return {"coupling_friction": "couplings", "gravity_direction": "gravity"}.get(effect.effect)

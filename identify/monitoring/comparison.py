@@ -1,0 +1,324 @@
+"""Comparison of two identifications, joint by joint: document, table and report of the change test."""
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from pydantic import Field
+
+from armident.configs import DataError
+from armident.identify.document import Document, IdentificationDocument, Parameter, RecordingReference
+from armident.identify.monitoring.change_test import FALSE_ALARMS, ParameterChangeTest, compare
+from armident.identify.print_table import print_table
+from armident.identify.report.glossary import identification_entries
+from armident.identify.report.page import BAND, MODEL, MUTED, RESIDUAL, figure, render
+
+LEVEL_95 = 1.959964
+"""Half width of a 95 % interval of a normal distribution, standard deviations."""
+
+SHOWN_PER_ROW = 18
+"""Most parameters in one row of the plot: their names stay readable."""
+
+
+class ComparedModel(Document):
+    """One of the two identifications."""
+
+    path: str
+    method: str
+    recording: RecordingReference
+    relative_error_pct: float
+
+
+class ComparedParameter(Document):
+    """One parameter in both identifications, SI.
+
+    ``std_of_difference`` is that of ``now - before``, ``p_value`` the probability of such a difference without a change
+    (Holm), ``joint`` the joint or coupling that it belongs to.
+    """
+
+    name: str
+    joint: str
+    unit: str
+    before: float
+    before_std: float
+    now: float
+    now_std: float
+    std_of_difference: float
+    p_value: float
+    changed: bool
+    essential: bool
+
+
+class ComparisonDocument(Document):
+    """Content of ``comparison.json``: the change test of two identifications of one robot.
+
+    ``left_out`` are parameters that only one of them has; they are not compared. ``changed_groups`` are friction or
+    masses of a joint that changed together, ``changed_residuals`` changes of structure, in words.
+    """
+
+    schema_: Literal["armident/comparison/1"] = Field("armident/comparison/1", alias="schema")
+    robot: str
+    verdict: Literal["changed", "unchanged"]
+    baseline: ComparedModel
+    now: ComparedModel
+    parameters: list[ComparedParameter]
+    changed_groups: list[str]
+    changed_residuals: list[str]
+    chi_square: float
+    degrees: int
+    p_value: float
+    false_alarm_rate: float
+    left_out: list[str]
+    warnings: list[str]
+
+    @property
+    def by_joint(self) -> dict[str, list[ComparedParameter]]:
+        """Parameters by joint or coupling, in the order of the document."""
+        found: dict[str, list[ComparedParameter]] = {}
+        for each in self.parameters:
+            found.setdefault(each.joint, []).append(each)
+        return found
+
+    @property
+    def sentence(self) -> str:
+        """Verdict in one sentence."""
+        test = f"chi-square {self.chi_square:.1f} of {self.degrees} degrees of freedom, p = {self.p_value:.2g}"
+        names = [each.name for each in self.parameters if each.changed]
+        parts = [*names, *self.changed_groups, *self.changed_residuals] or ["no single parameter significantly"]
+        if self.verdict == "changed":
+            return f"{self.robot} has changed: {', '.join(parts)} ({test})"
+        return f"{self.robot} has not changed significantly ({test})"
+
+
+def compare_models(
+    baseline: tuple[IdentificationDocument, Path],
+    now: tuple[IdentificationDocument, Path],
+    *,
+    common: bool = False,
+    false_alarms: float = FALSE_ALARMS,
+) -> ComparisonDocument:
+    """Test two identifications of a robot for a change.
+
+    Parameters
+    ----------
+    baseline, now
+        The identifications and their files.
+    common
+        Compare only the parameters that both have, instead of refusing different base parameters.
+    false_alarms
+        Probability of the verdict ``changed`` without a change.
+
+    Raises
+    ------
+    DataError
+        If they are of different robots or models, or cannot confirm or exclude a change.
+    """
+    (first, first_path), (second, second_path) = baseline, now
+    left_out = _different(first, second)
+    if left_out and first.robot == second.robot:
+        if not common:
+            raise DataError(
+                f"{first_path} and {second_path} have different base parameters ({', '.join(left_out[:5])}): identify "
+                "both with one configuration, or compare those that both have with --common"
+            )
+        first, second = _restricted(first, left_out), _restricted(second, left_out)
+    result = compare(first, second, false_alarms)
+    return _document(result, (first, first_path), (second, second_path), left_out)
+
+
+def _different(first: IdentificationDocument, second: IdentificationDocument) -> list[str]:
+    """Return the names of the parameters that are not the same combination of standard parameters in both."""
+    one, other = ({p.name: p.formula or p.name for p in document.parameters} for document in (first, second))
+    return sorted(name for name in one.keys() | other.keys() if one.get(name) != other.get(name))
+
+
+def _restricted(document: IdentificationDocument, without: Sequence[str]) -> IdentificationDocument:
+    """Return the identification without some parameters, and without residuals: those depend on all of them."""
+    kept = [k for k, p in enumerate(document.parameters) if p.name not in without]
+    if not kept:
+        raise DataError(f"{document.robot}: the two identifications have no parameter in common")
+    covariance = np.array(document.covariance)[np.ix_(kept, kept)].tolist()
+    parameters = [document.parameters[k] for k in kept]
+    return document.model_copy(update={"parameters": parameters, "covariance": covariance, "residual_statistics": None})
+
+
+def _document(
+    result: ParameterChangeTest,
+    baseline: tuple[IdentificationDocument, Path],
+    now: tuple[IdentificationDocument, Path],
+    left_out: list[str],
+) -> ComparisonDocument:
+    old = {p.name: p for p in baseline[0].parameters}
+    places = joints, couplings = _places(now[0])
+    parameters = [
+        _compared(p, old[p.name], joint_of(p.name, *places), float(std), float(p_value), p.name in result.changed)
+        for p, std, p_value in zip(result.parameters, result.std, result.p_values, strict=True)
+    ]
+    order = {name: k for k, name in enumerate([*joints, *couplings])}
+    parameters.sort(key=lambda each: order.get(each.joint, len(order)))
+    return ComparisonDocument(
+        robot=now[0].robot,
+        verdict="changed" if result.drifted else "unchanged",
+        baseline=_model(*baseline),
+        now=_model(*now),
+        parameters=parameters,
+        changed_groups=[f"{g.kind} {joint_of(g.members[0], *places)}" for g in result.changed_groups],
+        changed_residuals=[each.words for each in result.changed_residuals],
+        chi_square=result.chi_square,
+        degrees=result.degrees,
+        p_value=result.p_joint,
+        false_alarm_rate=result.false_alarms,
+        left_out=left_out,
+        warnings=_warnings(result, baseline[0], now[0], left_out),
+    )
+
+
+def _warnings(
+    result: ParameterChangeTest, baseline: IdentificationDocument, now: IdentificationDocument, left_out: Sequence[str]
+) -> list[str]:
+    lines = []
+    if left_out:
+        lines.append(f"compared on {len(result.parameters)} parameters that both have, without {', '.join(left_out)}")
+    if baseline.recording.sha256 == now.recording.sha256:
+        lines.append(
+            "both were identified from the same recording: their errors are not independent, as the test needs"
+        )
+    if result.residuals.reason and not left_out:
+        lines.append(result.residuals.reason)
+    doubtful = [name for name, each in (("baseline", baseline), ("now", now)) if each.verdict == "doubtful"]
+    if doubtful:
+        lines.append(f"the verdict of {' and of '.join(doubtful)} is doubtful: standard deviations may be too small")
+    return lines
+
+
+def _model(document: IdentificationDocument, path: Path) -> ComparedModel:
+    return ComparedModel(
+        path=str(path),
+        method=document.method,
+        recording=document.recording,
+        relative_error_pct=document.relative_error_pct,
+    )
+
+
+def _compared(
+    now: Parameter, before: Parameter, joint: str, std: float, p_value: float, changed: bool
+) -> ComparedParameter:
+    return ComparedParameter(
+        name=now.name,
+        joint=joint,
+        unit=now.unit,
+        before=before.value,
+        before_std=before.std,
+        now=now.value,
+        now_std=now.std,
+        std_of_difference=std,
+        p_value=p_value,
+        changed=changed,
+        essential=now.essential or before.essential,
+    )
+
+
+def joint_of(parameter: str, joints: Sequence[str], couplings: Sequence[str] = ()) -> str:
+    """Return the joint or coupling of a parameter by the end of its name; the name itself if that is neither.
+
+    Parameters
+    ----------
+    parameter
+        Name of a base parameter or of a parameter of an effect, for example ``zz1r``, ``iam6`` or ``fva2_2``.
+    joints, couplings
+        Names of the joints in order, and of the couplings.
+    """
+    name = re.sub(r"_\d+$", "", parameter)
+    for coupling in couplings:
+        if re.fullmatch(rf"(ia|fv|fc){re.escape(coupling)}r?", name):
+            return coupling
+    match = re.fullmatch(r".*?(\d+)r?", name)
+    number = 0 if match is None else int(match[1])
+    return joints[number - 1] if 1 <= number <= len(joints) else name
+
+
+def _places(document: IdentificationDocument) -> tuple[list[str], list[str]]:
+    """Return the names of the joints and of the couplings."""
+    configuration = document.configuration or {}
+    return list(document.relative_error_pct_by_joint), [each["name"] for each in configuration.get("couplings", [])]
+
+
+def comparison_report(document: ComparisonDocument, glossary_of: IdentificationDocument) -> str:
+    """Return the HTML page of a comparison, complete in one file.
+
+    Parameters
+    ----------
+    document
+        The comparison.
+    glossary_of
+        The later identification, whose parameters the glossary explains.
+    """
+    return render(
+        "comparison.html",
+        document=document,
+        picture=_picture(document),
+        level=LEVEL_95,
+        glossary=identification_entries(glossary_of),
+    )
+
+
+def comparison_table(document: ComparisonDocument) -> None:
+    """Print the verdict of a comparison, and the essential and the changed parameters with 95 % intervals by joint."""
+    from rich.console import Console
+    from rich.table import Table
+
+    console = Console()
+    colour = "red" if document.verdict == "changed" else "green"
+    console.print(f"verdict: {document.verdict}", style=f"bold {colour}", highlight=False)
+    console.print(f"{document.sentence}.", highlight=False, soft_wrap=True, markup=False)
+    table = Table(title=f"{document.robot}: parameters with 95 % intervals", title_justify="left")
+    for heading in ("joint", "parameter", "before", "now", "difference", "p", "unit", ""):
+        left = heading in ("joint", "parameter", "unit", "")
+        table.add_column(heading, justify="left" if left else "right", no_wrap=True)
+    hidden = 0
+    for joint, parameters in document.by_joint.items():
+        shown = [p for p in parameters if p.essential or p.changed]
+        hidden += len(parameters) - len(shown)
+        for k, p in enumerate(shown):
+            values = (
+                f"{value:.4g} ± {LEVEL_95 * std:.2g}"
+                for value, std in (
+                    (p.before, p.before_std),
+                    (p.now, p.now_std),
+                    (p.now - p.before, p.std_of_difference),
+                )
+            )
+            mark = "changed" if p.changed else ""
+            table.add_row(joint if k == 0 else "", p.name, *values, f"{p.p_value:.2g}", p.unit, mark)
+    print_table(table, console)
+    if hidden:
+        print(f"{hidden} parameters that are not essential and have not changed are in the report")
+
+
+def _picture(document: ComparisonDocument) -> str:
+    """Draw both values of every parameter with 95 % intervals, in standard deviations of their difference."""
+    rows = [
+        (joint, parameters[k : k + SHOWN_PER_ROW])
+        for joint, parameters in document.by_joint.items()
+        for k in range(0, len(parameters), SHOWN_PER_ROW)
+    ]
+    with figure(len(rows), 1, 1.7) as (_, axes, picture):
+        for axis, (joint, parameters) in zip(axes[:, 0], rows, strict=True):
+            x = np.arange(len(parameters))
+            scale = np.array([p.std_of_difference for p in parameters])
+            shift = np.array([p.now - p.before for p in parameters]) / scale
+            before, now = (
+                np.array([getattr(p, f"{end}_std") for p in parameters]) / scale for end in ("before", "now")
+            )
+            colours = [MODEL if p.changed else RESIDUAL for p in parameters]
+            axis.axhspan(-LEVEL_95, LEVEL_95, color=BAND)
+            axis.errorbar(x - 0.12, 0 * x, LEVEL_95 * before, fmt="o", color=MUTED, markersize=3, capsize=2)
+            axis.vlines(x + 0.12, shift - LEVEL_95 * now, shift + LEVEL_95 * now, color=colours, linewidth=1.4)
+            axis.scatter(x + 0.12, shift, color=colours, s=12, zorder=3)
+            axis.set_xticks(x, [p.name for p in parameters], rotation=45, ha="right", fontsize=7.5)
+            axis.set_xlim(-0.7, max(len(parameters), 6) - 0.3)
+            axis.set_title(joint)
+            axis.set_ylabel("std")
+    return picture[0]

@@ -1,0 +1,256 @@
+"""Prediction of the torques of a recording by an identified model, and its error."""
+
+import csv
+import io
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+from threadpoolctl import threadpool_limits
+
+from armident.configs import DataError
+from armident.daq.recording import Recording
+from armident.identify.document import Document, RecordingReference, reference, versions
+from armident.identify.effects.recorded import put_right
+from armident.identify.experiment import Experiment
+from armident.identify.identification.api import experiments_of
+from armident.identify.identification.equations import equations, least_rows, published_equations
+from armident.identify.identification.judgement import Notes
+from armident.identify.identification.options import Options
+from armident.identify.identification.pipeline import (
+    has_published_filters,
+    shifted_experiments,
+    smoothed_derivatives,
+)
+from armident.identify.identification.residual_statistics import SPEED_QUANTILE
+from armident.identify.identification.result import WORTHLESS_PCT, relative_errors
+from armident.identify.identification.solvers import decimation_of
+from armident.identify.regression.equations import ExperimentEquations
+from armident.identify.saved_model import SavedModel
+from armident.identify.setup.check import check_setup
+from armident.identify.setup.result import SetupCheck
+from armident.identify.signals.bandwidth import motion_bandwidth
+from armident.identify.signals.differentiate import Derivatives
+
+Array = NDArray[np.float64]
+
+BEYOND = 0.1
+"""Share of the identified range by which a motion may leave it without a warning (as for equal motions)."""
+
+
+class PredictionDocument(Document):
+    """Content of ``prediction.json``: error of an identified model on a recording.
+
+    ``held_out`` is false if the model was identified from this recording. ``relative_error_pct`` is
+    ``||y - X theta|| / ||y||`` on torques low-passed at twice the closed-loop bandwidth; ``identification_error_pct``
+    is that of the model on its own data. ``error_rms`` and ``torque_rms`` are in the ``units`` of each joint.
+    """
+
+    schema_: Literal["armident/prediction/1"] = Field("armident/prediction/1", alias="schema")
+    robot: str
+    model: str
+    method: str
+    recording: RecordingReference
+    held_out: bool
+    relative_error_pct: float
+    relative_error_pct_by_joint: dict[str, float]
+    identification_error_pct: float
+    identification_error_pct_by_joint: dict[str, float]
+    error_rms: dict[str, float]
+    torque_rms: dict[str, float]
+    units: dict[str, str]
+    samples: int
+    rate_hz: float
+    warnings: list[str]
+    versions: dict[str, str]
+
+    @property
+    def worthless(self) -> bool:
+        """True if the model explains the torques no better than none."""
+        return not self.relative_error_pct < WORTHLESS_PCT
+
+    @property
+    def sentence(self) -> str:
+        """Result in words: the data it holds for, and the error in total."""
+        data = "held-out data: the model was not identified from this recording"
+        if not self.held_out:
+            data = "not held out: the model was identified from this recording, so the error is too favourable"
+        worse = ". The model explains these torques no better than none" if self.worthless else ""
+        own = f"on its own data {self.identification_error_pct:.2f} %"
+        return f"Torque error {self.relative_error_pct:.2f} % ({data}); {own}{worse}."
+
+
+@dataclass(frozen=True, eq=False)
+class TorquePrediction:
+    """Torques that a model predicts along a recording, beside those measured.
+
+    Parameters
+    ----------
+    document
+        Errors in total and per joint.
+    t
+        Decimated instants (M,), s; a step back begins another experiment.
+    measured, predicted
+        Torques (M, n), N m or N, with the same filter.
+    std
+        Standard deviations of the predicted torques due to those of the parameters, (M, n), N m or N.
+    """
+
+    document: PredictionDocument
+    t: Array
+    measured: Array
+    predicted: Array
+    std: Array
+
+    def csv(self) -> str:
+        """Return the torques as CSV: ``t``, and for each joint ``measured``, ``predicted`` and ``std``."""
+        joints = self.document.units
+        heads = [f"{name}_{what}" for name in joints for what in ("measured", "predicted", "std")]
+        values = np.stack([self.measured, self.predicted, self.std], axis=2).reshape(self.t.size, -1)
+        stream = io.StringIO()
+        writer = csv.writer(stream, lineterminator="\n")
+        writer.writerow(["t", *heads])
+        writer.writerows([[f"{v:.9g}" for v in row] for row in np.column_stack([self.t, values])])
+        return stream.getvalue()
+
+
+def predict_recording(
+    recording: Recording, model: SavedModel, progress: Callable[[str, float], None] | None = None
+) -> TorquePrediction:
+    """Predict the torques of a recording, filtered as in the identification of the model.
+
+    Positions are differentiated, and torques aligned, by the steps of `armident.identify`, so that the recording of the
+    identification has the error that its document states.
+
+    Parameters
+    ----------
+    recording
+        The recording, of the same robot.
+    model
+        The model.
+    progress
+        Called with the name of a stage and the share done, 0 to 1.
+
+    Raises
+    ------
+    DataError
+        If the recording is of another robot, or too short.
+    """
+    show = progress or (lambda stage, share: None)
+    robot, notes = model.robot, Notes()
+    show("set-up", 0.0)
+    experiments, remarks = experiments_of([recording], robot, name_files=False)
+    setup = _setup(experiments, model, notes)
+    options = _options(model.document.options)
+    experiments = shifted_experiments(put_right(experiments, robot), robot, options, setup, notes)
+    show("torques", 0.5)
+    with threadpool_limits(1):  # type: ignore[no-untyped-call]
+        signals, blocks = _equations(model, experiments, options)
+    if not any(block.t.size for block in blocks):
+        raise DataError(f"{recording.path}: too short to predict: the filters leave no sample. Next: record longer")
+    document = _document(recording, model, blocks, [*remarks, *_beyond(signals, model), *notes.warnings])
+    show("done", 1.0)
+    theta, covariance = model.theta, model.covariance
+    variance = [np.einsum("kjb,bc,kjc->kj", block.x, covariance, block.x, optimize=True) for block in blocks]
+    return TorquePrediction(
+        document,
+        np.concatenate([block.t for block in blocks]),
+        np.concatenate([block.y for block in blocks]),
+        np.concatenate([block.x @ theta for block in blocks]),
+        np.sqrt(np.maximum(np.concatenate(variance), 0.0)),
+    )
+
+
+def _setup(experiments: Sequence[Experiment], model: SavedModel, notes: Notes) -> SetupCheck | None:
+    """Check the set-up of the recording; decisive findings become warnings."""
+    try:
+        found = check_setup(experiments, model.robot)
+    except DataError as error:
+        notes.warnings.append(f"the set-up was not checked: {error}")
+        return None
+    notes.warnings += [f"{each.message}; correct it by: {each.remedy}" for each in found.findings if each.decisive]
+    return found
+
+
+def _options(written: dict[str, Any]) -> Options:
+    """Return the options of the identification that still exist."""
+    known = {field.name for field in fields(Options)}
+    return Options(**{name: value for name, value in written.items() if name in known})
+
+
+def _equations(
+    model: SavedModel, experiments: list[Experiment], options: Options
+) -> tuple[list[Derivatives], list[ExperimentEquations]]:
+    """Return the derivatives, and the equations after the filters of IDIM-LS as in an identification."""
+    robot, arm = model.robot, model.arm
+    dt, lengths = experiments[0].dt, [e.q.shape[0] for e in experiments]
+    bandwidth = options.bandwidth_hz or robot.bandwidth_hz or motion_bandwidth([e.q for e in experiments], dt)
+    signals = smoothed_derivatives(experiments, robot, options, bandwidth)
+    if has_published_filters(robot, options) and robot.preprocessing is not None:
+        return signals, published_equations(arm, experiments, robot.preprocessing)
+    decimation = decimation_of("idim-ls", dt, bandwidth, None, samples=lengths, rows=least_rows(arm))
+    return signals, equations(arm, experiments, signals, decimation)
+
+
+def _document(
+    recording: Recording, model: SavedModel, blocks: Sequence[ExperimentEquations], warnings: Sequence[str]
+) -> PredictionDocument:
+    names = [joint.name for joint in model.robot.joints]
+    overall, by_joint = relative_errors(blocks, model.theta)
+    torque = np.concatenate([np.where(block.keep, block.y, 0.0) for block in blocks])
+    kept = np.maximum(np.concatenate([block.keep for block in blocks]).sum(axis=0), 1)
+    torque_rms = np.sqrt(np.sum(torque**2, axis=0) / kept)
+
+    def named(values: Array) -> dict[str, float]:
+        return {name: float(value) for name, value in zip(names, values, strict=True)}
+
+    used = reference(recording)
+    return PredictionDocument(
+        robot=model.robot.name,
+        model=str(model.path),
+        method=model.document.method,
+        recording=used,
+        held_out=used.sha256 not in model.recording_hashes,
+        relative_error_pct=overall,
+        relative_error_pct_by_joint=named(by_joint),
+        identification_error_pct=model.document.relative_error_pct,
+        identification_error_pct_by_joint=model.document.relative_error_pct_by_joint,
+        error_rms=named(torque_rms * by_joint / 100),
+        torque_rms=named(torque_rms),
+        units={joint.name: "N m" if joint.type == "revolute" else "N" for joint in model.robot.joints},
+        samples=sum(block.t.size for block in blocks),
+        rate_hz=_rate(blocks),
+        warnings=list(dict.fromkeys(warnings)),
+        versions=versions(),
+    )
+
+
+def _rate(blocks: Sequence[ExperimentEquations]) -> float:
+    t = max((block.t for block in blocks), key=len)
+    return float(1.0 / (t[1] - t[0])) if t.size > 1 else 0.0
+
+
+def _beyond(signals: Sequence[Derivatives], model: SavedModel) -> list[str]:
+    """Return a warning for every joint that leaves the range over which the model was identified."""
+    found = []
+    q = np.concatenate([s.q for s in signals])
+    speed = np.quantile(np.abs(np.concatenate([s.qd for s in signals])), SPEED_QUANTILE, axis=0)
+    names = [joint.name for joint in model.robot.joints]
+    for each in model.document.residual_statistics or []:
+        k = names.index(each.joint)
+        unit = "rad" if model.robot.joints[k].type == "revolute" else "m"
+        (low, high), (least, most) = each.position_range, (float(q[:, k].min()), float(q[:, k].max()))
+        if least < low - BEYOND * (high - low) or most > high + BEYOND * (high - low):
+            found.append(
+                f"{each.joint} moves over [{least:.3g}, {most:.3g}] {unit}; the model was identified over "
+                f"[{low:.3g}, {high:.3g}] {unit}"
+            )
+        if speed[k] > (1 + BEYOND) * each.velocity_limit:
+            found.append(
+                f"{each.joint} moves at {speed[k]:.3g} {unit}/s; the model was identified up to "
+                f"{each.velocity_limit:.3g} {unit}/s"
+            )
+    return found

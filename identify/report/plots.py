@@ -1,0 +1,120 @@
+"""Interactive line plots of the reports: data for ``templates/plots.js``, which every page contains."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from markupsafe import Markup
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+MOST_POINTS = 4000
+"""Largest number of points of a plot: two for every pixel of a wide screen."""
+
+DIGITS = 5
+"""Significant digits of values in a page."""
+
+
+@dataclass(frozen=True, eq=False)
+class Series:
+    """Curve of a plot.
+
+    Parameters
+    ----------
+    name
+        Name in words.
+    y
+        Values (M,); NaN breaks the curve.
+    colour, width
+        CSS colour, and width of the line, pixels.
+    """
+
+    name: str
+    y: Array
+    colour: str
+    width: float = 1.2
+
+
+@dataclass(frozen=True, eq=False)
+class Plot:
+    """Curves over a common axis.
+
+    Parameters
+    ----------
+    title, unit
+        Title, and unit of the values.
+    x
+        Ascending values (M,) of the axis.
+    series
+        The curves.
+    limits
+        Horizontal lines: name and value.
+    x_unit
+        Unit of the axis.
+    """
+
+    title: str
+    unit: str
+    x: Array
+    series: tuple[Series, ...]
+    limits: tuple[tuple[str, float], ...] = ()
+    x_unit: str = "s"
+
+
+def plots_html(plots: Sequence[Plot]) -> Markup:
+    """Return a group of plots that share zoom and pointer, as HTML.
+
+    Parameters
+    ----------
+    plots
+        Plots over axes of one unit.
+    """
+    content = json.dumps([_data(plot) for plot in plots], separators=(",", ":"), allow_nan=False)
+    safe = content.replace("<", "\\u003c")
+    return Markup(f'<div class="plots"><script type="application/json">{safe}</script></div>')
+
+
+def kept_points(curves: Sequence[Array], most: int = MOST_POINTS) -> NDArray[np.intp]:
+    """Return the indices of the points to draw: of every stretch the extremes of each curve, and all breaks.
+
+    Parameters
+    ----------
+    curves
+        Values (M,) of each curve; NaN is a break.
+    most
+        Largest number of points without breaks.
+    """
+    size = curves[0].size
+    if size <= most:
+        return np.arange(size)
+    stretches = max(1, most // (2 * len(curves)) - 1)
+    edges = np.linspace(0, size, stretches + 1).astype(int)
+    kept = {0, size - 1}
+    for curve in curves:
+        kept.update(int(k) for k in np.flatnonzero(np.isnan(curve)))
+        high, low = (np.where(np.isnan(curve), end, curve) for end in (-np.inf, np.inf))
+        for first, last in pairwise(edges):
+            kept.update((first + int(np.argmax(high[first:last])), first + int(np.argmin(low[first:last]))))
+    return np.array(sorted(kept))
+
+
+def _data(plot: Plot) -> dict[str, object]:
+    kept = kept_points([series.y for series in plot.series])
+    return {
+        "title": plot.title,
+        "unit": plot.unit,
+        "x_unit": plot.x_unit,
+        "x": [round(float(value), 6) for value in plot.x[kept]],
+        "series": [
+            {"name": s.name, "colour": s.colour, "width": s.width, "y": [_number(v) for v in s.y[kept]]}
+            for s in plot.series
+        ],
+        "limits": [{"name": name, "y": _number(value)} for name, value in plot.limits if np.isfinite(value)],
+    }
+
+
+def _number(value: float) -> float | None:
+    return float(f"{value:.{DIGITS}g}") if np.isfinite(value) else None

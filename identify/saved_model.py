@@ -1,0 +1,209 @@
+"""Identified models read back from result documents: configuration, parameters and their covariance."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import ValidationError
+
+from armident.configs import ConfigError, DataError, RobotConfig, load_robot
+from armident.daq.recording import read_recording
+from armident.identify.document import DiagnosisDocument, IdentificationDocument, load_document, read_json
+from armident.identify.effects.terms import arm_model
+from armident.identify.identification.api import identify_recording
+from armident.identify.identification.options import Options
+from armident.identify.identification.sign_smoothing import with_numbers
+from armident.identify.robot.arm import ArmModel
+
+Array = NDArray[np.float64]
+
+REFIT: Options = Options(method="idim-iv")
+"""Estimation of a diagnosed model: unbiased in closed loop (thesis section 2.3.3), and needs no noise model."""
+
+
+@dataclass(frozen=True, eq=False)
+class SavedModel:
+    """A robot configuration with identified parameters.
+
+    Parameters
+    ----------
+    robot
+        Configuration that the parameters belong to, with its effects and with numbers for the smoothing of the sign.
+    document
+        The identification.
+    path
+        File that it was read from.
+    """
+
+    robot: RobotConfig
+    document: IdentificationDocument
+    path: Path
+
+    @property
+    def arm(self) -> ArmModel:
+        """The arm; terms that depend on torques predict them with the parameters of this model."""
+        return arm_model(self.robot).anchored(self.theta)
+
+    @property
+    def theta(self) -> Array:
+        """Base parameters (b,), SI."""
+        return np.array([p.value for p in self.document.parameters])
+
+    @property
+    def covariance(self) -> Array:
+        """Covariance of the base parameters, (b, b)."""
+        return np.array(self.document.covariance, dtype=np.float64)
+
+    @property
+    def recording_hashes(self) -> tuple[str, ...]:
+        """SHA-256 of the recordings that the model was identified from."""
+        further = self.document.further_recordings or []
+        return tuple(each.sha256 for each in (self.document.recording, *further))
+
+
+def load_model(
+    path: Path,
+    robot: RobotConfig | None = None,
+    *,
+    default: RobotConfig | None = None,
+    progress: Callable[[str, float], None] | None = None,
+) -> SavedModel:
+    """Read an identified model from a result.
+
+    The structure that a diagnosis found is identified by IDIM-IV from the recordings of the diagnosis.
+
+    Parameters
+    ----------
+    path
+        ``identification.json``, ``diagnosis.json``, or the folder of one of them.
+    robot
+        Configuration to use; ``None``: that of the document.
+    default
+        Configuration to use if the document, written by a former version, has none.
+    progress
+        Called with the name of a stage and the share done, 0 to 1.
+
+    Raises
+    ------
+    ConfigError
+        If there is no such file, or no configuration for it.
+    DataError
+        If the file is no result, is judged unusable, or belongs to another configuration.
+    """
+    path = _file(path)
+    if str(read_json(path).get("schema", "")).startswith("armident/diagnosis/"):
+        return _diagnosed(path, robot, progress)
+    return model_of(load_document(path, IdentificationDocument), path, robot, default=default)
+
+
+def model_of(
+    document: IdentificationDocument,
+    path: Path,
+    robot: RobotConfig | None = None,
+    *,
+    default: RobotConfig | None = None,
+) -> SavedModel:
+    """Return the model of an identification.
+
+    Parameters
+    ----------
+    document
+        The identification.
+    path
+        Its file, for messages.
+    robot, default
+        As for `load_model`.
+
+    Raises
+    ------
+    ConfigError
+        If there is no configuration.
+    DataError
+        If the document is judged unusable, or belongs to another configuration.
+    """
+    if document.verdict == "unusable":
+        reason = document.reasons[0]
+        raise DataError(f"{path}: the model is unusable: {reason.message}. Next: {reason.next_step}")
+    config = robot or configuration_of(document, path) or default
+    if config is None:
+        raise ConfigError(f"{path}: written by a former version, without the robot: add --config ROBOT")
+    if config.name != document.robot:
+        raise DataError(f"{path}: the model is of robot {document.robot!r}, the configuration of {config.name!r}")
+    names = arm_model(config).base.names
+    if names != tuple(p.name for p in document.parameters):
+        odd = sorted(set(names) ^ {p.name for p in document.parameters}) or ["the same names in another order"]
+        raise DataError(
+            f"{path}: other base parameters than those of the configuration ({', '.join(odd[:5])}): "
+            "add --config with the configuration that was identified"
+        )
+    smoothing = document.sign_smoothing
+    if smoothing is not None:
+        if set(smoothing) != {joint.name for joint in config.joints}:
+            raise DataError(f"{path}: its joints are {', '.join(smoothing)}, other names than in the configuration")
+        config = with_numbers(config, [smoothing[joint.name] for joint in config.joints])
+    return SavedModel(config, document, path)
+
+
+def _file(path: Path) -> Path:
+    """Return the result file of a path that may be its folder."""
+    if path.suffix in (".yaml", ".yml"):
+        raise ConfigError(
+            f"{path}: a configuration has no identified parameters: run `armident identify RECORDING --config {path}` "
+            "and give its identification.json"
+        )
+    if not path.is_dir():
+        return path
+    for name in ("identification.json", "diagnosis.json"):
+        if (path / name).is_file():
+            return path / name
+    raise ConfigError(f"{path}: the folder has neither identification.json nor diagnosis.json")
+
+
+def configuration_of(document: IdentificationDocument, path: Path) -> RobotConfig | None:
+    """Return the robot configuration that an identification keeps; ``None`` in documents of former versions.
+
+    Parameters
+    ----------
+    document
+        The identification.
+    path
+        Its file, for messages.
+
+    Raises
+    ------
+    DataError
+        If it is no robot configuration.
+    """
+    if document.configuration is None:
+        return None
+    try:
+        return RobotConfig.model_validate(document.configuration)
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = ".".join(str(part) for part in first["loc"])
+        raise DataError(f"{path}: configuration.{key}: {first['msg']}") from error
+
+
+def _diagnosed(path: Path, robot: RobotConfig | None, progress: Callable[[str, float], None] | None) -> SavedModel:
+    """Identify the structure that a diagnosis found from the recordings that it names."""
+    document = load_document(path, DiagnosisDocument)
+    recordings = []
+    for each in document.recordings:
+        file = None if each.path is None else Path(each.path)
+        if file is None or not file.is_file():
+            raise DataError(
+                f"{path}: its recording {each.path or '(from the stream)'} is not here: run `armident identify` on it "
+                f"with --config {document.model or 'ROBOT'}, and give that identification.json"
+            )
+        recording = read_recording(file)
+        if recording.sha256 != each.sha256:
+            raise DataError(f"{path}: its recording {file} has changed since the diagnosis")
+        recordings.append(recording)
+    if not recordings:
+        raise DataError(f"{path}: the diagnosis names no recording")
+    if robot is None and document.model is not None:
+        robot = load_robot(document.model)
+    outcome = identify_recording(recordings, robot or recordings[0].robot, REFIT, progress)
+    return model_of(outcome.document, path)

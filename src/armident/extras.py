@@ -1,0 +1,68 @@
+"""Optional parts of the distribution, and the command that installs one that is missing."""
+
+from collections.abc import Iterable
+
+from armident.configs.errors import ConfigError
+
+EXTRAS: dict[str, tuple[str, ...]] = {
+    "identify": (
+        "clarabel", "filterpy", "jinja2", "markupsafe", "matplotlib", "numba", "scipy", "sqlalchemy", "threadpoolctl",
+    ),
+    "virtual": ("clarabel", "numba", "pinocchio", "scipy"),
+    "fleet": ("distributed",),
+    "parquet": ("pyarrow",),
+    "postgresql": ("psycopg",),
+}  # fmt: skip
+"""Modules that each extra brings; the base has none of them."""
+
+
+def needed_extra(error: ImportError, package: str = "") -> str | None:
+    """Return the extra that brings the module which an import did not find, ``None`` if none does.
+
+    Parameters
+    ----------
+    error
+        The error of the import.
+    package
+        Package that imports; ``virtual_robot`` needs extra ``virtual``.
+    """
+    module = (error.name or "").partition(".")[0]
+    found = [extra for extra, modules in EXTRAS.items() if module in modules]
+    if "virtual" in found and "virtual_robot" in package:
+        return "virtual"
+    return found[0] if found else None
+
+
+def install_line(what: str, extras: Iterable[str]) -> str:
+    """Return the line that names the missing extras and the command that installs them.
+
+    Parameters
+    ----------
+    what
+        What needs them, for example a command.
+    extras
+        Names of extras.
+    """
+    return f"{what} needs extra packages: pip install 'armident[{','.join(extras)}]'"
+
+
+def require(what: str, *extras: str) -> None:
+    """Check that the modules of extras can be found, without importing them.
+
+    Parameters
+    ----------
+    what
+        What needs them, for example a command.
+    extras
+        Names of extras.
+
+    Raises
+    ------
+    ConfigError
+        If modules are missing; names the command that installs all the extras that lack one.
+    """
+    from importlib.util import find_spec
+
+    missing = [extra for extra in extras if any(find_spec(module) is None for module in EXTRAS[extra])]
+    if missing:
+        raise ConfigError(install_line(what, missing))

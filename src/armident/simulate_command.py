@@ -1,0 +1,84 @@
+"""Command ``armident simulate``: the closed loop along a trajectory, of the virtual arm or of an identified model."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def simulate(
+    trajectory: Annotated[Path, typer.Option("--trajectory", help="Trajectory file: the reference positions.")],
+    out: Annotated[Path, typer.Option("--out", help="File to write: .mcap (recording) or .npz (arrays).")],
+    config: Annotated[
+        Path | None, typer.Option("--config", help="Robot configuration. [default: that of --model]")
+    ] = None,
+    model: Annotated[
+        Path | None, typer.Option("--model", help="Result whose identified dynamics move, in place of the virtual arm.")
+    ] = None,
+    scenario: Annotated[
+        Path | None, typer.Option("--scenario", help="Scenario: effects hidden in the virtual arm.")
+    ] = None,
+    seed: Annotated[
+        int | None, typer.Option("--seed", help="Seed of the noise of the virtual arm. [default: 0]")
+    ] = None,
+    noise: Annotated[
+        float | None, typer.Option("--noise", min=0.0, help="Factor on the noise of the virtual arm. [default: 1]")
+    ] = None,
+    rate: Annotated[
+        float | None,
+        typer.Option(
+            "--rate", min=1.0, help="Samples per second. [default: those of the drives, or of the model's recording]"
+        ),
+    ] = None,
+) -> None:
+    """Simulate the closed loop along a trajectory, and write a recording or arrays.
+
+    Without --model, the virtual arm moves: its physics are those of Pinocchio, with drives, noise and hidden effects.
+    With --model, the identified model moves: the equations of the identification, its effects included, without noise.
+
+    Arrays are in SI units at the joints: t, q1.., tau1.., qr1.. (reference).
+
+    Example: armident simulate --config tx40.yaml --trajectory tx40_1.yaml --out run.mcap
+
+    Example: armident simulate --model monday.identification --trajectory tx40_1.yaml --out run.npz
+    """
+    from armident.configs import ConfigError, load_robot, load_trajectory
+    from armident.configs.loading import load_scenario
+    from armident.daq.interchange.exporting import export_recording
+    from armident.daq.recording import write_recording
+
+    if out.suffix.lower() not in (".mcap", ".npz"):
+        raise ConfigError(f"--out {out}: expected a name that ends in .mcap or .npz")
+    if out.exists():
+        raise ConfigError(f"--out {out}: the file exists already")
+    robot, reference = None if config is None else load_robot(config), load_trajectory(trajectory)
+    if model is not None:
+        from armident.identify.saved_model import load_model
+        from armident.identify.simulated_recording import simulate_model
+
+        if scenario is not None or seed is not None or noise is not None:
+            raise ConfigError(
+                "--scenario, --seed and --noise belong to the virtual arm: they have no meaning with --model"
+            )
+        recording = simulate_model(load_model(model, robot), reference, rate)
+    else:
+        from armident.virtual_robot.api import simulate_recording
+
+        if robot is None:
+            raise ConfigError("--config: give the robot whose virtual arm moves, or --model")
+        hidden = None if scenario is None else load_scenario(scenario)
+        if hidden is not None and hidden.drives:
+            raise ConfigError(f"{scenario}: drives: a simulation has no bus, on which drives could be odd")
+        recording = simulate_recording(
+            robot,
+            reference,
+            scenario=hidden,
+            seed=seed or 0,
+            noise=1.0 if noise is None else noise,
+            period=None if rate is None else 1.0 / rate,
+        )
+    if out.suffix.lower() == ".mcap":
+        write_recording(recording, out)
+    else:
+        export_recording(recording, out)
+    print(out)

@@ -1,0 +1,104 @@
+"""Measures what an installation brings: packages and megabytes of each set of extras, in clean environments.
+
+``python -m tests.tools.installed_size`` builds a wheel of the checkout and installs it by pip, so it needs network.
+``--demo`` also runs the demo from the wheel with all extras, in a folder of its own.
+"""
+
+import argparse
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+EXTRAS = ("", "identify", "identify,virtual", "all")
+OF_THE_ENVIRONMENT = ("pip", "setuptools", "pkg_resources", "_distutils_hack", "distutils-precedence")
+"""First words of what a new environment holds before anything is installed."""
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Print a line per set of extras."""
+    parser = argparse.ArgumentParser(prog="python -m tests.tools.installed_size", description=__doc__)
+    parser.add_argument("--extras", nargs="*", default=list(EXTRAS), help="Sets of extras, each with commas.")
+    parser.add_argument("--python", default=sys.executable, help="Python of the environments.")
+    parser.add_argument("--wheel", type=Path, help="A wheel instead of one of the checkout.")
+    parser.add_argument("--demo", action="store_true", help="Run the demo from the wheel, too.")
+    options = parser.parse_args(arguments)
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        wheel = options.wheel or build(options.python, folder / "wheel")
+        for number, extras in enumerate(options.extras):
+            packages = install(options.python, folder / str(number), f"{wheel}[{extras}]" if extras else str(wheel))
+            print(f"armident[{extras}]: {size(packages)}", flush=True)
+        if options.demo:
+            install(options.python, folder / "demo", f"{wheel}[identify,virtual]")
+            run(str(folder / "demo/bin/armident"), "demo", "--out", str(folder / "out"), cwd=folder)
+
+
+def build(python: str, folder: Path) -> Path:
+    """Return a wheel of the checkout.
+
+    Parameters
+    ----------
+    python
+        Python for which it is built.
+    folder
+        Folder of the wheel.
+    """
+    run(python, "-m", "pip", "wheel", "-q", "--no-deps", "-w", str(folder), str(REPOSITORY), cwd=REPOSITORY)
+    (wheel,) = folder.glob("*.whl")
+    return wheel
+
+
+def install(python: str, folder: Path, requirement: str) -> Path:
+    """Install a wheel into a new environment and return its site-packages.
+
+    Parameters
+    ----------
+    python
+        Python of the environment.
+    folder
+        Folder of the environment.
+    requirement
+        The wheel, with extras in brackets.
+    """
+    run(python, "-m", "venv", str(folder), cwd=folder.parent)
+    run(str(folder / "bin/python"), "-m", "pip", "install", "-q", requirement, cwd=folder)
+    (packages,) = (folder / "lib").glob("python3*/site-packages")
+    return packages
+
+
+def size(packages: Path) -> str:
+    """Return number and size of the packages, without what every environment holds.
+
+    Parameters
+    ----------
+    packages
+        The folder site-packages.
+    """
+    present = (file for file in packages.rglob("*") if file.is_file() and not file.is_symlink())
+    files = [file for file in present if not file.relative_to(packages).parts[0].startswith(OF_THE_ENVIRONMENT)]
+    bytecode = sum(file.stat().st_size for file in files if file.suffix == ".pyc")
+    total = sum(file.stat().st_size for file in files)
+    count = sum(not path.name.startswith(OF_THE_ENVIRONMENT) for path in packages.glob("*.dist-info"))
+    return f"{count} packages, {(total - bytecode) / 1e6:.0f} MB, and {bytecode / 1e6:.0f} MB of bytecode"
+
+
+def run(*command: str, cwd: Path) -> None:
+    """Run a command outside the checkout's import path.
+
+    Parameters
+    ----------
+    command
+        The command.
+    cwd
+        Its working directory.
+    """
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    subprocess.run(command, cwd=cwd, env=environment | {"PIP_DISABLE_PIP_VERSION_CHECK": "1"}, check=True)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,183 @@
+"""``armident service install``: user, folders, permissions and units of a cell in a system image."""
+
+import os
+import stat
+import sys
+from collections.abc import Iterator
+from configparser import ConfigParser
+from pathlib import Path
+
+import pytest
+
+from armident.configs import ArmidentError, ConfigError
+from armident.configs.loading import HERE
+from armident.daq import service
+from armident.daq.service import ACCOUNT, HEADER, STATE, UNITS, System, install, steps
+
+needs_root = pytest.mark.skipif(os.geteuid() != 0, reason="owners of files are set by root only")
+
+
+@pytest.fixture
+def image(tmp_path: Path) -> Path:
+    """Root folder of a system without the account."""
+    (tmp_path / "etc").mkdir()
+    for name in ("passwd", "group", "shadow", "gshadow"):
+        (tmp_path / "etc" / name).touch()
+    (tmp_path / "etc" / "passwd").write_text("root:x:0:0:root:/root:/bin/bash\n")
+    (tmp_path / "etc" / "group").write_text("root:x:0:\n")
+    return tmp_path
+
+
+def contents(root: Path) -> Iterator[tuple[str, int, int, int, int]]:
+    for path in sorted(root.rglob("*")):
+        found = path.lstat()
+        yield str(path), found.st_mode, found.st_uid, found.st_gid, found.st_mtime_ns
+
+
+def test_a_dry_run_prints_every_part_and_changes_nothing(image: Path) -> None:
+    before = list(contents(image))
+    lines = install("line3", image, dry_run=True)
+    assert list(contents(image)) == before
+    parts = [line for line in lines if line.startswith("to do: ")]
+    units = {file.name for file in (HERE / "systemd").iterdir()}
+    assert units <= {line.rpartition("/")[2] for line in parts if "unit" in line}
+    for part in ("group armident", "user armident", "/etc/armident ", "/var/lib/armident/line3 "):
+        assert any(part in line for line in parts), part
+
+
+@needs_root
+def test_a_second_run_finds_nothing_to_do(image: Path) -> None:
+    install("line3", image)
+    before = list(contents(image))
+    assert install("line3", image)[0] == "nothing to do: the service of cell line3 is installed"
+    assert list(contents(image)) == before
+
+
+@needs_root
+def test_the_recordings_belong_to_the_user_of_the_units_and_the_settings_to_root(image: Path) -> None:
+    install("line3", image)
+    system = System(image, Path("/opt/armident/bin/armident"))
+    user, group = system.user_id(), system.group_id()
+    assert user is not None
+    assert group is not None
+    assert f"{ACCOUNT}:x:{user}:{group}::/var/lib/armident:/usr/sbin/nologin" in (image / "etc/passwd").read_text()
+    owners = {"var/lib/armident/line3": (user, group), "var/lib/armident": (0, 0), "etc/armident": (0, group)}
+    for folder, owner in owners.items():
+        found = (image / folder).stat()
+        assert (found.st_uid, found.st_gid) == owner, folder
+    assert not stat.S_IMODE((image / "etc/armident").stat().st_mode) & stat.S_IRWXO
+
+
+@needs_root
+def test_permissions_that_were_changed_are_mended_and_nothing_else_is_touched(image: Path) -> None:
+    install("line3", image)
+    session = image / "etc/armident/line3.yaml"
+    session.write_text("schema: armident/session/1\n")
+    session.chmod(0o600)
+    (image / STATE / "line3").chmod(0o700)
+    lines = install("line3", image)
+    assert [line.split(" (")[0] for line in lines if line.startswith("done")] == [
+        "done: folder /var/lib/armident/line3",
+        "done: /etc/armident/line3.yaml",
+    ]
+    assert session.read_text() == "schema: armident/session/1\n"
+    assert stat.S_IMODE(session.stat().st_mode) == 0o640
+
+
+@needs_root
+def test_a_second_cell_adds_its_folder_only(image: Path) -> None:
+    install("line3", image)
+    lines = install("line4", image)
+    assert [line for line in lines if line.startswith("done")] == [
+        "done: folder /var/lib/armident/line4 (armident:armident, 0755)"
+    ]
+
+
+@needs_root
+def test_units_start_the_installed_command(image: Path) -> None:
+    install("line3", image, executable=Path("/srv/robots/bin/armident"))
+    for file in (image / UNITS).iterdir():
+        text = file.read_text()
+        assert text.startswith(HEADER)
+        assert "/opt/armident/bin" not in text
+        shipped = (HERE / "systemd" / file.name).read_text()
+        assert text.count("/srv/robots/bin/armident") == shipped.count("/opt/armident/bin/armident")
+        assert stat.S_IMODE(file.stat().st_mode) == 0o644
+
+
+@needs_root
+def test_an_older_unit_of_ours_is_replaced_and_a_copy_of_the_shipped_one_too(image: Path) -> None:
+    (image / UNITS).mkdir(parents=True)
+    capture, worker = (image / UNITS / f"armident-{name}@.service" for name in ("capture", "worker"))
+    capture.write_text(f"{HEADER}[Service]\nExecStart=/old/armident capture\n")
+    worker.write_text((HERE / "systemd" / worker.name).read_text())
+    install("line3", image)
+    assert "/old/armident" not in capture.read_text()
+    assert worker.read_text().startswith(HEADER)
+
+
+def test_a_unit_of_other_origin_is_refused(image: Path) -> None:
+    unit = image / UNITS / "armident-worker@.service"
+    unit.parent.mkdir(parents=True)
+    unit.write_text("[Service]\nExecStart=/usr/local/bin/ours\n")
+    with pytest.raises(ConfigError, match="was not written by this command"):
+        install("line3", image)
+    assert unit.read_text() == "[Service]\nExecStart=/usr/local/bin/ours\n"
+    assert not (image / STATE).exists()
+
+
+@pytest.mark.parametrize("cell", ["", ".", "..", "a/b", "a b", "-x", "line@3", "x" * 65, "größe", "a\n"])
+def test_a_name_that_is_no_instance_of_a_unit_is_refused(cell: str, image: Path) -> None:
+    with pytest.raises(ConfigError, match="as the name of a cell"):
+        install(cell, image)
+
+
+def test_a_folder_that_is_no_system_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="not the root of a Linux system"):
+        install("line3", tmp_path)
+
+
+def test_without_the_rights_of_root_the_command_with_sudo_is_named(
+    image: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(os, "geteuid", lambda: 1000)
+    with pytest.raises(ConfigError, match="sudo /opt/armident/bin/armident service install line3"):
+        install("line3", image)
+
+
+@pytest.mark.parametrize("folder", ["/root/venv", "/home/alice/venv", "/tmp/venv"])
+def test_a_command_that_the_units_would_not_see_is_refused(folder: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "executable", f"{folder}/bin/python")
+    monkeypatch.setattr(Path, "is_file", lambda self: True)
+    with pytest.raises(ConfigError, match="python3 -m venv /opt/armident"):
+        service.installed_executable()
+
+
+def test_the_units_agree_with_the_account_and_the_folders(image: Path) -> None:
+    for file in sorted((HERE / "systemd").glob("*.service")):
+        unit = ConfigParser(strict=False, interpolation=None)
+        unit.read_string(file.read_text())
+        keys = unit["Service"]
+        assert (keys["User"], keys["Group"]) == (ACCOUNT, ACCOUNT)
+        assert keys["StateDirectory"] == "armident/%i"
+        assert keys["CacheDirectory"] == "armident"
+        assert keys.get("StateDirectoryMode", "0755") == "0755"
+    names = [step.name for step in steps(System(image, Path("/x")), "%i")]
+    assert any("/var/lib/armident/%i (armident:armident, 0755)" in name for name in names)
+    assert any("/var/cache/armident (armident:armident, 0755)" in name for name in names)
+
+
+def test_a_command_of_the_system_that_fails_is_one_line(image: Path) -> None:
+    with pytest.raises(ArmidentError, match=r"groupadd.*no-such-option") as caught:
+        System(image, Path("/x")).run("groupadd", "--no-such-option")
+    assert "\n" not in str(caught.value)
+
+
+def test_a_reader_without_rights_is_sent_to_sudo(image: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def closed(self: Path) -> bool:
+        raise PermissionError(13, "Permission denied", str(self))
+
+    session = Path.is_file
+    monkeypatch.setattr(Path, "is_file", lambda self: closed(self) if self.suffix == ".yaml" else session(self))
+    with pytest.raises(ConfigError, match=r"line3\.yaml: only root may read it: sudo"):
+        install("line3", image, dry_run=True)

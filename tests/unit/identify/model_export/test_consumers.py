@@ -1,0 +1,177 @@
+"""Exported models in the programs that read them: their inverse dynamics are those of our model."""
+
+import xml.etree.ElementTree as ET
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from numpy.typing import NDArray
+
+from armident.configs import load_robot
+from armident.identify.effects.terms import arm_model
+from armident.identify.model_export.exported_model import ExportedModel
+from armident.identify.model_export.formats import export_model
+from armident.identify.model_export.source_urdf import source_for, source_of
+from tests.model_exports import (
+    Motion,
+    exported,
+    mujoco_torque,
+    random_motion,
+    random_theta,
+    relative_error,
+    rigid_torque,
+)
+from tests.urdf_chains import configuration, random_urdf
+
+Floats = NDArray[np.float64]
+
+TOLERANCE = 1e-9
+"""Largest difference of inverse dynamics, relative to the torque: rounding, not modelling."""
+
+TILTED = (1.5, -3.0, -9.0)
+"""Gravity of an arm on a tilted base, m/s^2."""
+
+ARMS = ("tx40", "panda", "emps", "urdf", "urdf_right_angles")
+
+
+@pytest.fixture(params=ARMS)
+def model(request: pytest.FixtureRequest, tmp_path: Path) -> ExportedModel:
+    """An arm with random parameters on a tilted base; two come from a URDF, with a prismatic joint and skew axes."""
+    if not request.param.startswith("urdf"):
+        robot = load_robot(request.param).model_copy(update={"gravity": TILTED})
+        return exported(robot, random_theta(arm_model(robot), 5))
+    urdf = tmp_path / "arm.urdf"
+    urdf.write_text(random_urdf(np.random.default_rng(11), 5, right_angles=request.param != "urdf"))
+    config = tmp_path / "arm.yaml"
+    config.write_text(configuration(urdf, 5, np.array(TILTED)))
+    robot = load_robot(config)
+    assert {joint.type for joint in robot.joints} == {"revolute", "prismatic"}
+    source = source_of(config)
+    assert source is not None
+    return exported(robot, random_theta(arm_model(robot), 5)).in_frames_of(source)
+
+
+@pytest.fixture
+def motion(model: ExportedModel) -> Motion:
+    return random_motion(model.robot, np.random.default_rng(7))
+
+
+@pytest.mark.parametrize("right_angles", [True, False])
+@pytest.mark.parametrize("seed", range(8))
+def test_a_urdf_with_another_base_takes_the_inertias_of_an_arm_without_urdf(
+    seed: int, right_angles: bool, tmp_path: Path
+) -> None:
+    rng, urdf, config = np.random.default_rng(seed), tmp_path / "arm.urdf", tmp_path / "arm.yaml"
+    text = random_urdf(rng, 4, right_angles)
+    urdf.write_text(text)
+    config.write_text(configuration(urdf, 4, np.array(TILTED)))
+    robot = load_robot(config)
+    on_table = '<link name="table"/><joint name="bolts" type="fixed"><parent link="table"/><child link="base"/>'
+    urdf.write_text(text.replace("</robot>", f'{on_table}<origin xyz="0.3 -0.2 0.7" rpy="0.4 -1 2"/></joint></robot>'))
+    model = exported(robot, random_theta(arm_model(robot), seed)).in_frames_of(source_for(robot, urdf))
+    assert model.frames.base == "table"
+    arm = pin.buildModelFromUrdf(str(written(model, "urdf", tmp_path)))
+    arm.gravity.linear = model.frames.gravity
+    motion = random_motion(robot, rng)
+    assert relative_error(pinocchio_torque(arm, motion), rigid_torque(model, motion)) < TOLERANCE
+
+
+def written(model: ExportedModel, format_name: str, folder: Path) -> Path:
+    """The main file of an export."""
+    files, _ = export_model(model, format_name, folder / "out")
+    return files[0]
+
+
+def pinocchio_torque(arm: Any, motion: Motion) -> Floats:
+    """Inverse dynamics (N, n) by Pinocchio; endless joints have a cosine and a sine as position."""
+    data, rows = arm.createData(), []
+    for q, qd, qdd in zip(*motion, strict=True):
+        rows.append(pin.rnea(arm, data, pin.integrate(arm, pin.neutral(arm), q), qd, qdd))
+    return np.array(rows)
+
+
+def test_pinocchio_computes_our_torques_from_the_urdf(model: ExportedModel, motion: Motion, tmp_path: Path) -> None:
+    arm = pin.buildModelFromUrdf(str(written(model, "urdf", tmp_path)))
+    arm.gravity.linear = model.frames.gravity
+    assert list(arm.names)[1:] == list(model.frames.joints)
+    assert relative_error(pinocchio_torque(arm, motion), rigid_torque(model, motion)) < TOLERANCE
+
+
+def test_pinocchio_computes_our_torques_from_its_archive(model: ExportedModel, motion: Motion, tmp_path: Path) -> None:
+    arm = pin.Model()
+    arm.loadFromXML(str(written(model, "pinocchio", tmp_path)), "model")
+    assert all(arm.existFrame(link) for link in model.frames.links)
+    rotors = [name for name in model.arm.names if name.startswith("ia") and name[2:].isdigit()]
+    assert relative_error(pinocchio_torque(arm, motion), rigid_torque(model, motion, *rotors)) < TOLERANCE
+    assert arm.damping == pytest.approx([joint.viscous for joint in model.joints])
+    assert arm.friction == pytest.approx([joint.coulomb for joint in model.joints])
+    assert arm.rotorInertia * arm.rotorGearRatio**2 == pytest.approx([joint.rotor_inertia for joint in model.joints])
+
+
+def test_mujoco_computes_our_torques_with_rotors_viscous_friction_and_couplings(
+    model: ExportedModel, motion: Motion, tmp_path: Path
+) -> None:
+    found = mujoco_torque(written(model, "mjcf", tmp_path), motion)
+    assert relative_error(found, rigid_torque(model, motion, "ia", "fv")) < TOLERANCE
+
+
+def test_mujoco_computes_our_torques_from_the_urdf(model: ExportedModel, motion: Motion, tmp_path: Path) -> None:
+    found = mujoco_torque(written(model, "urdf", tmp_path), motion, model.frames.gravity)
+    viscous = [name for name in model.arm.names if name.startswith("fv") and name[2:].isdigit()]
+    assert relative_error(found, rigid_torque(model, motion, *viscous)) < TOLERANCE
+
+
+def test_the_numbers_of_the_sdf_give_our_torques(model: ExportedModel, motion: Motion, tmp_path: Path) -> None:
+    arm = arm_of_sdf(ET.parse(written(model, "sdf", tmp_path)).getroot())
+    arm.gravity.linear = model.frames.gravity
+    assert relative_error(pinocchio_torque(arm, motion), rigid_torque(model, motion)) < TOLERANCE
+    assert arm.damping == pytest.approx([joint.viscous for joint in model.joints])
+    assert arm.friction == pytest.approx([joint.coulomb for joint in model.joints])
+
+
+def arm_of_sdf(root: ET.Element) -> Any:
+    """A Pinocchio model of the tags of an SDF file, which this Pinocchio cannot read itself."""
+    arm, numbers = pin.Model(), {"base_link": 0}
+    model = root.find("model")
+    assert model is not None
+    links = {link.get("name"): link for link in model.findall("link")}
+
+    def values(element: ET.Element, path: str) -> Floats:
+        return np.array([float(word) for word in element.findtext(path, "").split()])
+
+    def pose(element: ET.Element) -> Any:
+        six = values(element, "pose")
+        return pin.SE3(pin.rpy.rpyToMatrix(six[3:]), six[:3])
+
+    for joint in model.findall("joint"):
+        parent, child = joint.findtext("parent", ""), joint.findtext("child", "")
+        if joint.get("type") == "fixed":
+            numbers[child] = 0
+            continue
+        link = links[child]
+        element = link.find("pose")
+        assert element is not None
+        assert element.get("relative_to") == parent
+        kinds = {"revolute": pin.JointModelRevoluteUnaligned, "prismatic": pin.JointModelPrismaticUnaligned}
+        kind = kinds["prismatic" if joint.get("type") == "prismatic" else "revolute"]
+        number = arm.addJoint(numbers[parent], kind(values(joint, "axis/xyz")), pose(link), joint.get("name"))
+        six = [values(link, f"inertial/inertia/i{cell}")[0] for cell in ("xx", "xy", "xz", "yy", "yz", "zz")]
+        inertia = np.array([[six[0], six[1], six[2]], [six[1], six[3], six[4]], [six[2], six[4], six[5]]])
+        inertial = link.find("inertial")
+        assert inertial is not None
+        body = pin.Inertia(values(inertial, "mass")[0], pose(inertial).translation, inertia)
+        arm.appendBodyToJoint(number, body, pin.SE3.Identity())
+        numbers[child] = number
+        arm.damping[number - 1] = values(joint, "axis/dynamics/damping")[0]
+        arm.friction[number - 1] = values(joint, "axis/dynamics/friction")[0]
+    return arm
+
+
+def test_gravity_of_the_file_points_as_in_the_model(model: ExportedModel, tmp_path: Path) -> None:
+    root = ET.parse(written(model, "mjcf", tmp_path)).getroot()
+    option = root.find("option")
+    assert option is not None
+    gravity = np.array([float(word) for word in option.get("gravity", "").split()])
+    assert gravity == pytest.approx(np.array(TILTED))

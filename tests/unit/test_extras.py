@@ -1,0 +1,87 @@
+"""Extras: a missing one is one line with the command that installs it."""
+
+import importlib.metadata
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from armident.configs import ConfigError
+from armident.extras import EXTRAS, needed_extra, require
+
+DISTRIBUTIONS = {"pinocchio": "pin", "markupsafe": "jinja2"}
+"""Distributions whose name is another than that of the module."""
+
+
+def run_without(hidden: set[str], program: str, cwd: Path) -> "subprocess.CompletedProcess[str]":
+    hide = f"import sys\nsys.modules.update(dict.fromkeys({sorted(hidden)!r}))\n"
+    command = [sys.executable, "-c", hide + program]
+    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=120, check=False)
+
+
+def armident(*words: str) -> str:
+    return f"from armident.daq.cli import main\nmain({list(words)!r})\n"
+
+
+def test_the_table_lists_modules_of_the_distributions_of_each_extra() -> None:
+    required = importlib.metadata.requires("armident") or []
+    of_extra: dict[str, set[str]] = {extra: set() for extra in EXTRAS}
+    base = set()
+    for line in required:
+        name = line.replace("[", " ").replace(">", " ").replace("<", " ").replace(";", " ").split()[0]
+        extra = line.partition('extra == "')[2].rstrip('"')
+        if extra in of_extra:
+            of_extra[extra].add(name)
+        elif not extra:
+            base.add(name)
+    for extra, modules in EXTRAS.items():
+        assert {DISTRIBUTIONS.get(module, module) for module in modules} == of_extra[extra], extra
+        assert not of_extra[extra] & base
+
+
+@pytest.mark.parametrize(
+    ("words", "extra"),
+    [
+        (("identify", "run.mcap"), "identify"),
+        (("check", "run.mcap"), "identify"),
+        (("history",), "identify"),
+        (("robot", "--to-file", "run.mcap"), "virtual"),
+        (("demo",), "identify,virtual"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else value[0],
+)
+def test_a_command_without_its_extra_names_the_installation(words: tuple[str, ...], extra: str, tmp_path: Path) -> None:
+    hidden = {module for modules in EXTRAS.values() for module in modules}
+    done = run_without(hidden, armident(*words), tmp_path)
+    line = f"armident: armident {words[0]} needs extra packages: pip install 'armident[{extra}]'\n"
+    assert (done.returncode, done.stdout, done.stderr) == (2, "", line)
+
+
+def test_a_name_of_the_api_without_its_extra_names_the_installation(tmp_path: Path) -> None:
+    program = "import armident\ntry:\n    armident.compare\nexcept ImportError as error:\n    print(error)\n"
+    done = run_without({"scipy"}, program, tmp_path)
+    assert done.stdout == "armident.compare needs extra packages: pip install 'armident[identify]'\n"
+
+
+def test_a_missing_module_of_no_extra_is_not_taken_for_one() -> None:
+    assert needed_extra(ImportError("no name")) is None
+    assert needed_extra(ModuleNotFoundError("x", name="somebodys_plugin")) is None
+    assert needed_extra(ModuleNotFoundError("x", name="scipy.linalg"), "armident.virtual_robot.cli") == "virtual"
+
+
+def test_extras_that_are_there_are_not_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    require("this", *EXTRAS)
+    monkeypatch.setitem(EXTRAS, "fleet", ("no_such_module",))
+    with pytest.raises(ConfigError, match=r"^this needs extra packages: pip install 'armident\[fleet\]'$"):
+        require("this", "identify", "fleet")
+
+
+def test_a_capture_without_compiled_loops_is_refused(tmp_path: Path) -> None:
+    done = run_without({"numba"}, armident("capture", "--config", "tx40_cell.yaml"), tmp_path)
+    assert done.returncode == 2
+    assert done.stderr.startswith("armident: this installation has no compiled code for the bus")
+    assert done.stderr.count("\n") == 1
+    checks = run_without({"numba"}, armident("doctor", "--config", "tx40_cell.yaml"), tmp_path)
+    assert checks.returncode == 2
+    assert "no compiled code for the bus" in " ".join(checks.stdout.split())

@@ -1,0 +1,206 @@
+"""Plausible parameters of a robot whose masses or friction are not known, drawn from a seed.
+
+Masses follow the geometry: a body lies between its joint and the next one, and links become lighter towards the tip.
+The total is such that gravity and acceleration take a share of the torque limits. Shapes, rotors and friction have the
+ranges of the random arms.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pinocchio
+from numpy.typing import NDArray
+
+from armident.configs import ConfigError, RobotConfig
+from armident.configs.urdf_inertials import INERTIAL
+from armident.virtual_robot.model import build_model
+from armident.virtual_robot.random_arms.arm import log_uniform, random_body
+from armident.virtual_robot.random_arms.halves import DEVELOPMENT
+
+pin: Any = pinocchio
+Floats = NDArray[np.float64]
+
+TORQUE_SHARE = 0.3
+"""Share of the torque limit that gravity and acceleration take at the joint that has the least reserve."""
+RISE_PER_S = 8.0
+"""Largest acceleration over the velocity limit for this share, 1/s; a limit of acceleration may be far above use."""
+SHORTEST = 0.06
+"""Shortest body, m."""
+POSTURES = 40
+"""Random postures over which inertia and gravity of a joint are averaged."""
+OFFSET_SHARE = 0.03
+"""Standard deviation of the torque offsets over the torque scale, as of the random arms."""
+
+
+@dataclass(frozen=True, eq=False)
+class TorqueScale:
+    """Typical loads of the joints, joint side.
+
+    Parameters
+    ----------
+    inertia
+        Diagonal of the mass matrix, rotors included, averaged over postures, kg m^2 or kg, shape (n,).
+    gravity
+        Root mean square torque of gravity over postures, N m or N, shape (n,).
+    torque
+        Typical torque of acceleration and gravity, N m or N, shape (n,).
+    """
+
+    inertia: Floats
+    gravity: Floats
+    torque: Floats
+
+
+def draw_bodies(robot: RobotConfig, seed: int) -> dict[str, float]:
+    """Draw the inertial parameters of all links.
+
+    Parameters
+    ----------
+    robot
+        Robot with limits of position, velocity and acceleration.
+    seed
+        Seed.
+
+    Returns
+    -------
+    dict
+        Parameters by name (``xx1`` ... ``m6``), SI.
+    """
+    rng, n, ranges = np.random.default_rng([seed, 1]), robot.n, DEVELOPMENT
+    mass = log_uniform(rng, ranges.mass) * np.cumprod(np.concatenate([[1.0], rng.uniform(*ranges.decay, n - 1)]))
+    ends = [_next_origin(robot, j) for j in range(n)]
+    lengths = [float(np.linalg.norm(end)) for end in ends]
+    typical = float(np.mean([length for length in lengths if length > 0.0] or [2.0 * SHORTEST]))
+    standard: dict[str, float] = {}
+    for j, end in enumerate(ends):
+        size = max(lengths[j], 0.5 * typical, SHORTEST)
+        com, second = random_body(rng, size, float(mass[j]))
+        standard |= _standard(j + 1, float(mass[j]), 0.5 * end + 0.5 * com, second)
+    limits = np.array([joint.limits.torque for joint in robot.joints])
+    share = float((needed_torque(robot, standard) / limits).max())
+    factor = TORQUE_SHARE / share if share > 0.0 else 1.0
+    return {name: value * factor for name, value in standard.items()}
+
+
+def needed_torque(robot: RobotConfig, standard: Mapping[str, float]) -> Floats:
+    """Torque for gravity and a large acceleration, N m or N, shape (n,).
+
+    Parameters
+    ----------
+    robot
+        Robot with limits of position, velocity and acceleration.
+    standard
+        Inertial parameters of the links by name; others do not count.
+    """
+    load = torque_scale(robot, {name: value for name, value in standard.items() if not name.startswith("ia")})
+    rise = np.array([min(j.limits.acceleration, RISE_PER_S * j.limits.velocity) for j in robot.joints])
+    # Rotors add to the inertia about as much as the links do.
+    return np.asarray(2.0 * load.inertia * rise + load.gravity)
+
+
+def _next_origin(robot: RobotConfig, j: int) -> Floats:
+    """Origin of frame j + 1 in frame j at zero, m; zero for the last link."""
+    if j + 1 == robot.n:
+        return np.zeros(3)
+    mdh = robot.joints[j + 1].mdh
+    return np.array([mdh.d, -np.sin(mdh.alpha) * mdh.r, np.cos(mdh.alpha) * mdh.r])
+
+
+def _standard(link: int, mass: float, com: Floats, second: Floats) -> dict[str, float]:
+    """Inertial parameters of a body about the origin of its frame, of its second moments (3, 3) about ``com``."""
+    moments = second + mass * np.outer(com, com)
+    inertia = np.trace(moments) * np.eye(3) - moments
+    values = (*inertia[np.triu_indices(3)], *(mass * com), mass)
+    return {f"{name}{link}": float(value) for name, value in zip(INERTIAL, values, strict=True)}
+
+
+def torque_scale(robot: RobotConfig, standard: Mapping[str, float]) -> TorqueScale:
+    """Typical loads of the joints over postures within their limits.
+
+    Parameters
+    ----------
+    robot
+        Robot with limits of position and velocity.
+    standard
+        Inertial parameters by name, and rotor inertias where there are any.
+
+    Raises
+    ------
+    ConfigError
+        If a joint moves no inertia.
+    """
+    n = robot.n
+    model = build_model(robot, standard)
+    data = model.createData()
+    low, high = np.array([joint.limits.position for joint in robot.joints]).T
+    rotor = np.array([standard.get(f"ia{j + 1}", 0.0) for j in range(n)])
+    inertia, gravity = np.zeros(n), np.zeros(n)
+    for q in np.random.default_rng(0).uniform(low, high, (POSTURES, n)):
+        mass = np.array(pin.crba(model, data, q)) + np.diag(rotor)
+        smallest = np.linalg.eigvalsh(mass, UPLO="U")[0]
+        if not smallest > 0.0:
+            raise ConfigError(
+                f"robot {robot.name!r}: the masses leave a joint without inertia; correct them, or draw others "
+                "(armident robot --draw-masses)"
+            )
+        inertia += np.diag(mass) / POSTURES
+        gravity += np.array(pin.computeGeneralizedGravity(model, data, q)) ** 2 / POSTURES
+    speed = np.array([joint.limits.velocity for joint in robot.joints])
+    weight = np.sqrt(gravity)
+    # A speed is reached in about a third of a second, as in the random arms.
+    return TorqueScale(inertia, weight, np.sqrt((3.0 * inertia * speed) ** 2 + weight**2))
+
+
+def draw_rotors(robot: RobotConfig, standard: Mapping[str, float], seed: int) -> dict[str, float]:
+    """Draw the rotor inertias, joint side; zero at joints without ``rotor_inertia``.
+
+    Parameters
+    ----------
+    robot
+        Robot with limits of position and velocity.
+    standard
+        Inertial parameters of the links by name.
+    seed
+        Seed.
+    """
+    factors = log_uniform(np.random.default_rng([seed, 2]), DEVELOPMENT.rotor, robot.n)
+    links = torque_scale(robot, standard).inertia
+    return {
+        f"ia{j + 1}": float(factors[j] * links[j]) if joint.rotor_inertia else 0.0
+        for j, joint in enumerate(robot.joints)
+    }
+
+
+def draw_friction(robot: RobotConfig, scale: TorqueScale, seed: int) -> dict[str, float]:
+    """Draw viscous and Coulomb friction and offset of each joint, and the parameters of couplings.
+
+    Parameters
+    ----------
+    robot
+        The robot.
+    scale
+        Typical loads of its joints.
+    seed
+        Seed.
+    """
+    rng, n, ranges = np.random.default_rng([seed, 3]), robot.n, DEVELOPMENT
+    speed = np.array([joint.limits.velocity for joint in robot.joints])
+    viscous = log_uniform(rng, ranges.viscous, n) * scale.torque / speed
+    coulomb = log_uniform(rng, ranges.dry, n) * scale.torque
+    offset = OFFSET_SHARE * scale.torque * rng.normal(size=n)
+    out: dict[str, float] = {}
+    for j in range(n):
+        out |= {f"fv{j + 1}": float(viscous[j]), f"fc{j + 1}": float(coulomb[j]), f"off{j + 1}": float(offset[j])}
+    names = [joint.name for joint in robot.joints]
+    for coupling in robot.couplings:
+        one, two = (names.index(joint) for joint in coupling.joints)
+        lighter = one if scale.inertia[one] < scale.inertia[two] else two
+        # As on the TX40: a tenth of the lighter joint's inertia, and half of its friction.
+        out |= {
+            f"ia{coupling.name}": 0.1 * float(scale.inertia[lighter]),
+            f"fv{coupling.name}": 0.5 * float(viscous[lighter]),
+            f"fc{coupling.name}": 0.5 * float(coulomb[lighter]),
+        }
+    return out
