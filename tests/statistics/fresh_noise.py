@@ -14,7 +14,7 @@ from scipy.signal import lfilter, upfirdn
 
 from armident.configs import RobotConfig
 from armident.daq.recording import Recording
-from armident.identify.monitoring.recursive.equations import Instant, StreamEquations
+from armident.identify.monitoring.recursive.equations import EARLIER, Instant, StreamEquations
 from armident.identify.monitoring.recursive.estimator import RecursiveEstimator
 from armident.identify.monitoring.recursive.replay import blocks_of
 from armident.identify.monitoring.recursive.rows import RowMatcher
@@ -87,7 +87,7 @@ class MotionRecorder:
             matcher.add(block)
         decimation = self._decimation
         # The first piece settles the live filter; the equations are delayed by that of the acceleration.
-        begin = self._first + self._equations.piece.shape[0] - self._equations.history.shape[0]
+        begin = self._first + self._equations.piece.shape[0] - self._equations.history.shape[0] + EARLIER
         size = (len(self._instants) - 1) * decimation.factor + decimation.taps.size
         torque = held(self._noise_of(recording.samples.sync.size, seed))[begin : begin + size]
         return Motion(

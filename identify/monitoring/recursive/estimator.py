@@ -151,7 +151,7 @@ class RecursiveEstimator:
         self.matcher = RowMatcher(robot, with_reference, self._on_rows)
         self.equations = StreamEquations(
             model, 1.0 / sample_rate_hz, robot.bandwidth_hz or NOMINAL_BANDWIDTH_HZ, with_reference, self.settings,
-            self.handle_instant,
+            self.handle_instant, self.reference.torque_lead,
         )  # fmt: skip
         rate = self.equations.rate_hz
         self._period = 1.0 / rate

@@ -16,10 +16,11 @@ from armident.configs.schema.robot import Effect
 from armident.daq.recording import Recording, Stream
 from armident.identify.monitoring.recursive import saved_state
 from armident.identify.monitoring.recursive.change_detection import FrictionTest
-from armident.identify.monitoring.recursive.equations import acceleration_delay
+from armident.identify.monitoring.recursive.equations import EARLIER, Instant, StreamEquations, acceleration_delay
 from armident.identify.monitoring.recursive.estimator import RecursiveEstimator
 from armident.identify.monitoring.recursive.kernels import solve, update
 from armident.identify.monitoring.recursive.noise import RunningNoise
+from armident.identify.monitoring.recursive.reference import torque_lead
 from armident.identify.monitoring.recursive.replay import RecordedBlock, blocks_of
 from armident.identify.monitoring.recursive.saved_state import state_of
 from armident.identify.monitoring.recursive.settings import RecursiveSettings
@@ -322,3 +323,38 @@ def test_the_noise_of_a_simulation_can_be_exchanged_in_its_equations() -> None:
     white, slow = amplitudes(ROBOT, 2e-4)
     expected = white**2 @ ROBOT.transmission_matrix**2 * (20.0 / (0.5 / period)) + 0.5 * slow**2
     assert np.var(fresh, axis=0) == pytest.approx(expected, rel=0.1)
+
+
+@pytest.mark.parametrize(
+    ("leads", "expected"),
+    [
+        (None, 0.5),
+        ([[0.1, 0.01]] * 6, 0.1),
+        ([[0.1, 0.01]] * 5 + [[4.0, 0.01]], 0.1),
+        ([[0.1, 0.01]] + [[0.1, 0.5]] * 5, 0.5),
+        ([[0.55, 0.01]] * 6, 0.5),
+        ([[0.7, 0.1]] * 6, 0.5),
+        ([[-1.2, 0.01]] * 6, 0.5),
+    ],
+)
+def test_a_lead_of_the_torque_is_aligned_if_the_joints_agree_on_one(
+    leads: list[list[float]] | None, expected: float
+) -> None:
+    found = None if leads is None else dict(zip((joint.name for joint in ROBOT.joints), leads, strict=True))
+    assert torque_lead(arms.tx40_baseline().model_copy(update={"torque_delay_samples": found})) == expected
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("lead", [-0.5, 0.0, 0.3, 0.5, 1.5])
+def test_equations_take_the_torque_at_the_instants_of_the_positions(lead: float) -> None:
+    """A torque that is linear in time shows the lead in every decimated equation."""
+    instants: list[Instant] = []
+    model = RecursiveEstimator(ROBOT, arms.tx40_baseline(), RATE).reference.model
+    equations = StreamEquations(model, arms.FAST, 10.0, False, RecursiveSettings(), instants.append, lead)
+    k = np.arange(2000)
+    values = np.hstack([np.zeros((k.size, ROBOT.n)), np.tile(k[:, None], (1, ROBOT.n))]).astype(float)
+    equations.add(k, values)
+    y = np.array([instant.y[0] for instant in instants])
+    begin = equations.piece.shape[0] - equations.history.shape[0] + EARLIER
+    centre = begin + equations.decimation.margin + equations.decimation.factor * np.arange(y.size)
+    np.testing.assert_allclose(y, centre - lead, rtol=1e-9)
