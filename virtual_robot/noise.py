@@ -117,7 +117,7 @@ def amplitudes(
     size
         Variances of the noise; ``None``: those of the TX40 or the EMPS.
     averaged
-        Number of samples over which a drive averages the noise that it reports.
+        Number of control periods over which a reported signal is averaged; its mean has the variance as sampled.
 
     Returns
     -------

@@ -104,7 +104,13 @@ def simulated_pieces(estimator: RecursiveEstimator, hours: float, seed: int) -> 
         recording = play(name, number, factors_at(elapsed))
         seconds = recording.samples.sync.size / recording.sample_rate_hz
         elapsed += seconds / 3600.0
-        yield Piece(seconds, lambda made=recording: [estimator.handle(b) for b in blocks_of(made, BLOCK)])  # type: ignore[misc]
+        yield Piece(seconds, partial(handle_all, estimator, recording))
+
+
+def handle_all(estimator: RecursiveEstimator, recording: Recording) -> None:
+    """Give all blocks of a recording to an estimator."""
+    for block in blocks_of(recording, BLOCK):
+        estimator.handle(block)
 
 
 def repeated_pieces(estimator: RecursiveEstimator, hours: float, seed: int) -> Iterator[Piece]:
