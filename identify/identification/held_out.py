@@ -35,26 +35,33 @@ def held_out_errors(blocks: Sequence[ExperimentEquations], theta: Array) -> tupl
     tuple of float and ndarray, or None
         ``None`` if the rest of the recordings does not determine all parameters.
     """
-    left = [np.where(block.keep, block.y - block.x @ theta, 0.0) for block in blocks]
-    used = np.sum([block.keep.sum(axis=0) for block in blocks], axis=0)
-    variance = np.sum([np.sum(each**2, axis=0) for each in left], axis=0) / np.maximum(used, 1)
-    weights = 1.0 / np.sqrt(np.maximum(variance, 1e-300))
-    parts = [part for block in blocks for part in _parts(block)]
-    folds = [parts[k::FOLDS] for k in range(FOLDS)]
-    products = [_products(fold, weights) for fold in folds]
-    gram, right = (np.sum([each[k] for each in products], axis=0) for k in (0, 1))
-    if not np.isfinite(gram).all():
+    # Blocks of a long recording are on disk: one at a time is in memory.
+    n = len(blocks[0].y[0])
+    squares, used = np.zeros(n), np.zeros(n)
+    for block in blocks:
+        squares += np.sum(np.where(block.keep, block.y - block.x @ theta, 0.0) ** 2, axis=0)
+        used += block.keep.sum(axis=0)
+    weights = 1.0 / np.sqrt(np.maximum(squares / np.maximum(used, 1), 1e-300))
+    grams, rights = np.zeros((FOLDS, theta.size, theta.size)), np.zeros((FOLDS, theta.size))
+    for block in blocks:
+        for k, part in enumerate(_parts(block)):
+            gram, right = _products(*part, weights)
+            grams[k] += gram
+            rights[k] += right
+    if not np.isfinite(grams).all():
         return None
-    scale = np.sqrt(np.maximum(np.diag(gram), 1e-300))
-    missed, power = np.zeros(weights.size), np.zeros(weights.size)
-    for fold, (own_gram, own_right) in zip(folds, products, strict=True):
-        rest = (gram - own_gram) / np.outer(scale, scale)
+    scale = np.sqrt(np.maximum(np.diag(grams.sum(axis=0)), 1e-300))
+    estimates = []
+    for gram, right in zip(grams.sum(axis=0) - grams, rights.sum(axis=0) - rights, strict=True):
+        rest = gram / np.outer(scale, scale)
         eigenvalues = linalg.eigvalsh(rest)
         if not eigenvalues[0] > SINGULAR * eigenvalues[-1]:
             return None
-        theta = linalg.solve(rest, (right - own_right) / scale, assume_a="pos") / scale
-        for x, y, keep in fold:
-            missed += np.sum(np.where(keep, y - x @ theta, 0.0) ** 2, axis=0)
+        estimates.append(linalg.solve(rest, right / scale, assume_a="pos") / scale)
+    missed, power = np.zeros(n), np.zeros(n)
+    for block in blocks:
+        for (x, y, keep), estimate in zip(_parts(block), estimates, strict=True):
+            missed += np.sum(np.where(keep, y - x @ estimate, 0.0) ** 2, axis=0)
             power += np.sum(np.where(keep, y, 0.0) ** 2, axis=0)
     overall = 100 * float(np.sqrt(missed.sum() / max(power.sum(), 1e-300)))
     return overall, 100 * np.sqrt(missed / np.maximum(power, 1e-300))
@@ -66,13 +73,7 @@ def _parts(block: ExperimentEquations) -> list[tuple[Array, Array, NDArray[np.bo
     return [(block.x[first:last], block.y[first:last], block.keep[first:last]) for first, last in pairwise(edges)]
 
 
-def _products(fold: list[tuple[Array, Array, NDArray[np.bool_]]], weights: Array) -> tuple[Array, Array]:
-    """Weighted normal equations of the stretches of one part: X'X (b, b) and X'y (b,)."""
-    size = fold[0][0].shape[2]
-    gram, right = np.zeros((size, size)), np.zeros(size)
-    for x, y, keep in fold:
-        rows = (np.where(keep, 1.0, 0.0) * weights)[:, :, None] * x
-        rows = rows.reshape(-1, size)
-        gram += rows.T @ rows
-        right += rows.T @ (np.where(keep, y, 0.0) * weights).ravel()
-    return gram, right
+def _products(x: Array, y: Array, keep: NDArray[np.bool_], weights: Array) -> tuple[Array, Array]:
+    """Weighted normal equations of one stretch: X'X (b, b) and X'y (b,)."""
+    rows = ((np.where(keep, 1.0, 0.0) * weights)[:, :, None] * x).reshape(-1, x.shape[2])
+    return rows.T @ rows, rows.T @ (np.where(keep, y, 0.0) * weights).ravel()
