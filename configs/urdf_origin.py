@@ -40,17 +40,16 @@ def rotation(roll: float, pitch: float, yaw: float) -> Floats:
     return matrix
 
 
-def angles_of(matrix: Floats) -> tuple[float, float, float]:
-    """Roll, pitch and yaw (rad) of a rotation: the inverse of `rotation`, with yaw 0 where only their sum is known.
+def fixed_axis_angles(matrix: Floats) -> tuple[float, float, float]:
+    """Return URDF's fixed-axis angles ``roll, pitch, yaw`` of a rotation, rad; yaw is 0 at a pitch of 90 degrees.
 
     Parameters
     ----------
     matrix
         Rotation matrix, shape (3, 3).
     """
-    cos_pitch = math.hypot(matrix[0, 0], matrix[1, 0])
-    pitch = math.atan2(-matrix[2, 0], cos_pitch)
-    if cos_pitch < EXACT:
+    pitch = math.atan2(-matrix[2, 0], math.hypot(matrix[0, 0], matrix[1, 0]))
+    if math.hypot(matrix[0, 0], matrix[1, 0]) < EXACT:
         return math.atan2(-matrix[1, 2], matrix[1, 1]), pitch, 0.0
     return math.atan2(matrix[2, 1], matrix[2, 2]), pitch, math.atan2(matrix[1, 0], matrix[0, 0])
 

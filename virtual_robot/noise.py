@@ -62,20 +62,28 @@ class Noise:
         Factor on the amplitudes; 0: no noise.
     size
         Variances of the noise; ``None``: those of the TX40 or the EMPS.
+    averaged
+        Number of control periods over which a reported signal is averaged; its mean has the variance as sampled.
     """
 
     def __init__(
-        self, robot: RobotConfig, period: float, seed: int, level: float = 1.0, size: NoiseSize | None = None
+        self,
+        robot: RobotConfig,
+        period: float,
+        seed: int,
+        level: float = 1.0,
+        size: NoiseSize | None = None,
+        averaged: int = 1,
     ) -> None:
         n = robot.n
         size = SIZES[robot.name] if size is None else size
         total, low = np.array(size.sampled), np.array(size.decimated)
-        white_low = DECIMATION_HZ * 2 * period
+        white_low = DECIMATION_HZ * 2 * period * averaged
         slow_low = 2 / np.pi * np.arctan(DECIMATION_HZ / DISTURBANCE_HZ)
         slow = np.clip((low - white_low * total) / (slow_low - white_low), 0.0, None)
         gain = np.array([joint.drive.gain for joint in robot.joints])
         motor = np.linalg.solve(robot.transmission_matrix.T**2, np.maximum(total - slow, 0.0))
-        self._current = level * np.sqrt(np.maximum(motor, 0.0)) / np.abs(gain)
+        self._current = level * np.sqrt(averaged * np.maximum(motor, 0.0)) / np.abs(gain)
         self._disturbance = level * np.sqrt(slow)
         self._keep = float(np.exp(-2 * np.pi * DISTURBANCE_HZ * period))
         self._random = np.random.default_rng(seed)
