@@ -136,10 +136,11 @@ def demo(
 
     Example: armident demo --config my_robot.yaml --out demo
     """
-    from armident.configs import ConfigError
     from armident.extras import require
 
+    # Before the other imports, which need the extras.
     require("armident demo", "identify", "virtual")
+    from armident.configs import ConfigError
     from armident.virtual_robot.demo import DemoOptions
     from armident.virtual_robot.demo import demo as run_demo
     from armident.virtual_robot.twin import STANDARD, ParameterChoice
