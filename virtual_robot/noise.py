@@ -76,15 +76,10 @@ class Noise:
         averaged: int = 1,
     ) -> None:
         n = robot.n
-        size = SIZES[robot.name] if size is None else size
-        total, low = np.array(size.sampled), np.array(size.decimated)
-        white_low = DECIMATION_HZ * 2 * period * averaged
-        slow_low = 2 / np.pi * np.arctan(DECIMATION_HZ / DISTURBANCE_HZ)
-        slow = np.clip((low - white_low * total) / (slow_low - white_low), 0.0, None)
+        white, slow = amplitudes(robot, period, size)
         gain = np.array([joint.drive.gain for joint in robot.joints])
-        motor = np.linalg.solve(robot.transmission_matrix.T**2, np.maximum(total - slow, 0.0))
-        self._current = level * np.sqrt(averaged * np.maximum(motor, 0.0)) / np.abs(gain)
-        self._disturbance = level * np.sqrt(slow)
+        self._current = level * white / np.abs(gain)
+        self._disturbance = level * slow
         self._keep = float(np.exp(-2 * np.pi * DISTURBANCE_HZ * period))
         self._random = np.random.default_rng(seed)
         self._last = self._disturbance * self._random.standard_normal(n)
@@ -106,3 +101,35 @@ class Noise:
         self.disturbance[:], state = lfilter([1.0], [1.0, -self._keep], fresh, axis=0, zi=self._keep * self._last[None])
         self._last = state[0] / self._keep
         self._row = 0
+
+
+def amplitudes(
+    robot: RobotConfig, period: float, size: NoiseSize | None = None, averaged: int = 1
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return standard deviations of both parts of the noise.
+
+    Parameters
+    ----------
+    robot
+        Robot with the name of a virtual arm, n joints.
+    period
+        Control period, s.
+    size
+        Variances of the noise; ``None``: those of the TX40 or the EMPS.
+    averaged
+        Number of control periods over which a reported signal is averaged; its mean has the variance as sampled.
+
+    Returns
+    -------
+    white
+        White torque noise of the motors, motor side, (n,), N m or N.
+    slow
+        Disturbance torque of the joints, (n,), N m or N; its spectrum has the corner `DISTURBANCE_HZ`.
+    """
+    size = SIZES[robot.name] if size is None else size
+    total, low = np.array(size.sampled), np.array(size.decimated)
+    white_low = DECIMATION_HZ * 2 * period * averaged
+    slow_low = 2 / np.pi * np.arctan(DECIMATION_HZ / DISTURBANCE_HZ)
+    slow = np.clip((low - white_low * total) / (slow_low - white_low), 0.0, None)
+    motor = np.linalg.solve(robot.transmission_matrix.T**2, np.maximum(total - slow, 0.0))
+    return np.sqrt(averaged * np.maximum(motor, 0.0)), np.sqrt(slow)

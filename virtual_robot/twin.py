@@ -269,7 +269,7 @@ def _with_drives(robot: RobotConfig, parameters: ArmParameters) -> tuple[RobotCo
             values["counts_per_unit"] = float(round(counts / geared))
             assumed.setdefault("drive.counts_per_unit", []).append(f"{joint.name} {values['counts_per_unit']:.0f}")
         most = limits.torque / (geared * abs(drive.gain))
-        if "rated" not in drive.model_fields_set:
+        if "rated" not in drive.model_fields_set or f"joints[{joint.name}].drive.rated" in robot.blanks:
             values["rated"] = _three_digits(RATED_SHARE * most)
             assumed.setdefault("drive.rated", []).append(f"{joint.name} {values['rated']:g}")
         elif most > BUS_RANGE * drive.rated:

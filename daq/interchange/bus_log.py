@@ -18,7 +18,7 @@ from armident.configs import ConfigError, DataError, RobotConfig, SessionConfig
 from armident.daq.interchange.log_clock import check_sync_period
 from armident.daq.interchange.log_file import SUFFIXES, read_log
 from armident.daq.matching.assembler import Assembler, Batch
-from armident.daq.matching.streams import CapturedStream, bus_numbers, captured_streams
+from armident.daq.matching.streams import CapturedStream, bus_numbers, captured_streams, unknown_phase
 from armident.daq.recording import Gap, Recording, Stream
 from armident.drivers.can.frames import Frames
 from armident.drivers.canopen.objects import COB_SYNC
@@ -81,7 +81,8 @@ def recording_from_log(path: Path, session: SessionConfig, robot: RobotConfig) -
         wanted = ", ".join(f"{cob:X}h" for cob in streams[0].bus.cob_ids)
         silent = _silent(read, streams, robot)
         raise DataError(f"{path}: no SYNC was answered by all drives; the session expects TPDOs {wanted}{silent}")
-    notes = (*log.notes, *wrong)
+    phase = None if assembler.has_counter else unknown_phase(session)
+    notes = (*log.notes, *wrong, *([phase] if phase else []))
     for note in notes:
         logging.getLogger(__name__).warning("%s: %s", path, note)
     gaps: list[Gap] = [gap for part in parts for gap in part.gaps]

@@ -76,9 +76,10 @@ def captured_streams(session: SessionConfig, robot: RobotConfig) -> tuple[Captur
 
 
 def unknown_phase(session: SessionConfig) -> str | None:
-    """Return a message about streams that are not sent on every SYNC, for SYNC of another master without a counter.
+    """Return a message about streams that are not sent on every SYNC, for SYNC without a counter.
 
-    Drives send these streams by their own count then, which is unknown. ``None`` if there is no such stream.
+    In a log, or with another master, drives send these streams by their own count then, which is unknown. ``None`` if
+    there is no such stream.
 
     Parameters
     ----------
@@ -89,7 +90,7 @@ def unknown_phase(session: SessionConfig) -> str | None:
     if not slow:
         return None
     return (
-        f"{', '.join(slow)}: SYNC of another master has no counter, so it is unknown which SYNCs are answered: times "
+        f"{', '.join(slow)}: SYNC has no counter, so it is unknown which SYNCs are answered: times "
         "may be wrong by less than one interval of the stream"
     )
 

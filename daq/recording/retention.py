@@ -10,6 +10,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 _NAME = re.compile(r"-(\d{8}T\d{6})-(\d{3})Z(?:\.\d+)?\.mcap(?:\.damaged)?$")
+LONGEST_PAUSE = datetime.timedelta(days=365)
+"""Longest time between two recordings of a robot that is a pause: an arm is identified again at least once a year."""
 EVERY_S = 60.0
 """Interval between two deletions of old recordings, s."""
 
@@ -39,7 +41,8 @@ def prune(
         Current time, with its zone.
     keep_days
         Age, by the times in the names, at which a recording is deleted, days; ``None``: no limit. It counts to the
-        newest finished recording that is not in the future: a clock that is ahead deletes nothing younger.
+        newest finished recording that is not in the future, without pauses of more than a year: a clock that is ahead
+        deletes nothing younger.
     min_free_bytes
         Free space to keep on the file system, bytes; ``None``: no limit.
     free
@@ -52,10 +55,11 @@ def prune(
     """
     deleted = []
     found = [(path, made, is_being_written(path)) for path, made in recordings_of(directory, robot)]
-    # A clock that is ahead must not make all recordings old: they are compared with the newest finished one.
+    keep = datetime.timedelta.max if keep_days is None else datetime.timedelta(days=keep_days)
     newest = max((made for _, made, written in found if not written and made <= now), default=now)
+    ages = _ages([made for _, made, _ in found if made <= newest], keep)
     for path, made, written in found:
-        old = keep_days is not None and (newest - made).total_seconds() > keep_days * 86_400
+        old = ages.get(made, datetime.timedelta(0)) > keep
         if not (old or (min_free_bytes is not None and free(directory) < min_free_bytes)):
             break
         if written:
@@ -63,6 +67,21 @@ def prune(
         path.unlink(missing_ok=True)
         deleted.append(path)
     return deleted
+
+
+def _ages(times: list[datetime.datetime], keep: datetime.timedelta) -> dict[datetime.datetime, datetime.timedelta]:
+    """Ages of recordings against the newest one, by the time of each, without steps of the clock.
+
+    A pause longer than `LONGEST_PAUSE` is taken for a clock that is ahead. Time that certainly passed is the time
+    between recordings on the same side of it: after a real pause old recordings stay for ``keep`` longer.
+    """
+    ages: dict[datetime.datetime, datetime.timedelta] = {}
+    age, later = datetime.timedelta(0), max(times, default=None)
+    for made in sorted(times, reverse=True):
+        pause = later - made if later is not None else datetime.timedelta(0)
+        age += pause if pause <= max(LONGEST_PAUSE, keep) else datetime.timedelta(0)
+        ages[made], later = age, made
+    return ages
 
 
 def recordings_of(directory: Path, robot: str) -> Iterator[tuple[Path, datetime.datetime]]:

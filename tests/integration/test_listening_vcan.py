@@ -120,7 +120,7 @@ def test_sync_without_a_counter_is_noted_where_streams_are_slower(vcan_bus: str,
     with UnknownDrives(vcan_bus, 8, counter=False):
         code, out, err = listening(vcan_bus, tmp_path, streams=streams)
     assert code == 0, err
-    assert "demand: SYNC of another master has no counter, so it is unknown which SYNCs are answered" in err
+    assert "demand: SYNC has no counter, so it is unknown which SYNCs are answered" in err
     recording = read_recording(json.loads(out)["recording"])
     assert recording.counters["samples.rows"] >= 300
     assert recording.counters["demand.rows"] == 0

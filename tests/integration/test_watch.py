@@ -117,8 +117,39 @@ def test_blocks_that_arrive_late_are_put_in_order_and_a_missing_one_is_given_up(
     assert seen == [0, 1, 2, 3, 4]
     assert not list(order.overdue(0.9 * LONGEST_HOLD_S))
     assert [block.sequence for block in order.overdue(LONGEST_HOLD_S)] == [6, 7]
+    assert order.lost == 1
     # Another capture begins anew; the late block of the earlier one is not held up by it.
     assert [block.sequence for block in order.add(replace(made[0], capture="c2"), 2.0)] == [0]
+
+
+def test_first_blocks_of_a_capture_that_was_found_late_are_counted() -> None:
+    made = [replace(block, sequence=k) for k, block in zip(range(8), published_blocks(recorded()), strict=False)]
+    order = BlockOrder()
+    assert not list(order.add(made[5], 0.0))
+    assert [block.sequence for block in order.overdue(LONGEST_HOLD_S)] == [5]
+    assert order.lost == 5
+    assert not list(order.add(replace(made[3], capture="c2"), 5.0))
+    assert [block.sequence for block in order.add(replace(made[4], capture="c2"), 6.1)] == [3, 4]
+    assert order.lost == 8
+
+
+def test_a_watch_reports_the_number_of_lost_blocks(session: SessionConfig, caplog: pytest.LogCaptureFixture) -> None:
+    recording = recorded()
+    estimator = live_estimator(session, recording.robot, reference())
+    blocks = sorted(published_blocks(recording), key=lambda block: int(block.sync[-1]))[:20]
+    with watching(session, estimator) as watch:
+        keys = Keys(session.cell, recording.robot.name)
+        publisher = Publisher(session, keys)
+        until(lambda: seen_by(publisher, keys.alive("watch")))
+        time.sleep(1.0)
+        for k, block in enumerate(blocks):
+            if k not in (8, 9, 10):
+                publisher.offer(replace(block, sequence=k))
+                time.sleep(0.02)
+        until(lambda: watch.lost > 0)
+        publisher.close()
+    assert watch.lost == 3
+    assert "3 blocks did not arrive" in caplog.text
 
 
 def test_blocks_of_strangers_end_no_watch(session: SessionConfig) -> None:

@@ -1,17 +1,18 @@
 """Healthy life of the virtual TX40 on the recursive estimator, and the time to see 10 % more friction.
 
 ``python -m tests.statistics.recursive_life --hours 50`` plays the shipped trajectories in random order, one after
-the other, with fresh noise. The friction of all joints follows a slow temperature: a sine of `SWING` with a period of
-`CYCLE_H`.
+the other, with fresh torque noise (`tests.statistics.fresh_noise`). The friction of each joint follows a slow
+temperature: a sine of `SWING` with a period of `CYCLE_H`. ``--simulate`` simulates and filters every second, which
+takes a tenth of real time.
 """
 
 import argparse
 import json
 import math
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 
@@ -23,6 +24,7 @@ from armident.identify.identification.api import identify_recording
 from armident.identify.monitoring.recursive.estimator import RecursiveEstimator
 from armident.identify.monitoring.recursive.replay import blocks_of
 from armident.virtual_robot.offline import simulate_recording
+from tests.statistics.fresh_noise import FreshNoise, MotionRecorder, held, repeat
 
 PERIOD_S = 1e-3
 """SYNC period of the recordings, s; the drives themselves run at 5 kHz."""
@@ -30,6 +32,8 @@ SWING = 0.02
 """Relative amplitude of the friction by temperature."""
 CYCLE_H = 6.0
 """Period of the temperature, h."""
+PLAYED = 3
+"""Simulations of each motion that are repeated with fresh noise."""
 MOTIONS = ("tx40_excitation", "tx40_1", "tx40_2", "tx40_3", "tx40_4")
 BLOCK = 50
 
@@ -45,7 +49,17 @@ class Life:
     largest_evidence: float
     threshold: float
     largest_change: float
+    scores_std: list[float]
+    """Standard deviation of the last windows of the pieces less the level, in their own standard deviations."""
     cpu_share: float
+
+
+@dataclass(frozen=True)
+class Piece:
+    """A few motions: their duration, s, and a function that lets the estimator take them."""
+
+    seconds: float
+    take: Callable[[], object]
 
 
 def friction(factors: dict[str, float]) -> Scenario | None:
@@ -74,42 +88,87 @@ def reference(seed: int = 100, period: float = PERIOD_S) -> IdentificationDocume
     return identify_recording(play("tx40_excitation", seed, {}, 2, period), load_robot("tx40")).document
 
 
-def healthy_pieces(hours: float, seed: int) -> Iterator[Recording]:
+def factors_at(hours: float) -> dict[str, float]:
+    """Friction of each joint relative to the reference, at a time of a life; every joint has its own phase."""
+    joints = [joint.name for joint in load_robot("tx40").joints]
+    angles = 2 * math.pi * (hours / CYCLE_H + np.arange(len(joints)) / len(joints))
+    return {name: 1.0 + SWING * math.sin(angle) for name, angle in zip(joints, angles, strict=True)}
+
+
+def simulated_pieces(estimator: RecursiveEstimator, hours: float, seed: int) -> Iterator[Piece]:
     """Yield recordings of healthy motion until they have a length."""
     random = np.random.default_rng(seed)
-    joints = [joint.name for joint in load_robot("tx40").joints]
     elapsed = 0.0
-    while elapsed < 3600.0 * hours:
-        factor = 1.0 + SWING * math.sin(2 * math.pi * elapsed / 3600.0 / CYCLE_H)
+    while elapsed < hours:
         name, number = MOTIONS[random.integers(len(MOTIONS))], int(random.integers(1 << 31))
-        piece = play(name, number, dict.fromkeys(joints, factor))
-        elapsed += piece.samples.sync.size / piece.sample_rate_hz
-        yield piece
+        recording = play(name, number, factors_at(elapsed))
+        seconds = recording.samples.sync.size / recording.sample_rate_hz
+        elapsed += seconds / 3600.0
+        yield Piece(seconds, partial(handle_all, estimator, recording))
 
 
-def healthy_life(hours: float, seed: int = 1, *, progress: bool = False) -> Life:
-    """Let a healthy arm live on the estimator."""
+def handle_all(estimator: RecursiveEstimator, recording: Recording) -> None:
+    """Give all blocks of a recording to an estimator."""
+    for block in blocks_of(recording, BLOCK):
+        estimator.handle(block)
+
+
+def repeated_pieces(estimator: RecursiveEstimator, hours: float, seed: int) -> Iterator[Piece]:
+    """Yield healthy motions with fresh noise (`tests.statistics.fresh_noise`) until they have a length."""
+    robot = load_robot("tx40")
+    random = np.random.default_rng(seed)
+    recorder = MotionRecorder(estimator, robot, PERIOD_S)
+    numbers = [(name, 1000 * seed + k) for name in MOTIONS for k in range(PLAYED)]
+    # After the first one the lags behind the reference are known.
+    recorder.record(play(*numbers[0], {}), numbers[0][1])
+    motions = [recorder.record(play(name, number, {}), number) for name, number in numbers]
+    fresh = FreshNoise(robot, PERIOD_S, random)
+    elapsed = 0.0
+    while elapsed < hours:
+        motion = motions[random.integers(len(motions))]
+        noise = recorder.filtered(held(fresh.draw(motion.samples))[1:])
+        factor = np.array(list(factors_at(elapsed).values()))
+        elapsed += motion.seconds / 3600.0
+        yield Piece(motion.seconds, partial(repeat, estimator, motion, noise, factor))
+
+
+def healthy_life(hours: float, seed: int = 1, *, simulated: bool = False, progress: bool = False) -> Life:
+    """Let a healthy arm live on the estimator.
+
+    Parameters
+    ----------
+    hours
+        Length, h.
+    seed
+        Seed of the noise and of the order of motions.
+    simulated
+        True: every second is simulated and filtered; otherwise simulated motions are repeated with fresh noise.
+    progress
+        True to print a line for every tenth of an hour.
+    """
     robot = load_robot("tx40")
     estimator = RecursiveEstimator(robot, reference(), 1.0 / PERIOD_S)
-    elapsed, cpu, evidence, change, shown = 0.0, 0.0, 0.0, 0.0, 0.0
-    for piece in healthy_pieces(hours, seed):
+    elapsed, cpu, evidence, change, shown, scores = 0.0, 0.0, 0.0, 0.0, 0.0, []
+    pieces = simulated_pieces if simulated else repeated_pieces
+    for piece in pieces(estimator, hours, seed):
         estimator.start_capture()
         began = time.process_time()
-        for block in blocks_of(piece, BLOCK):
-            estimator.handle(block)
+        piece.take()
         cpu += time.process_time() - began
-        elapsed += piece.samples.sync.size / piece.sample_rate_hz
+        elapsed += piece.seconds
         result = estimator.result()
         evidence = max(evidence, float(result.evidence.max()))
-        change = max(change, float(np.nanmax(np.abs(result.filtered))))
-        if progress and elapsed - shown > 600:
+        if result.motion_s:
+            change = max(change, float(np.nanmax(np.abs(result.filtered))))
+            scores.append((result.raw - result.level) / result.raw_std)
+        if progress and elapsed - shown > 360:
             shown = elapsed
             print(f"{elapsed / 3600:.2f} h, evidence {evidence:.2f}, alarms {result.alarm.sum()}", flush=True)
     result = estimator.result()
     alarms = [joint.name for joint, alarm in zip(robot.joints, result.alarm, strict=True) if alarm]
     return Life(
         elapsed / 3600, result.motion_s / 3600, estimator.test.windows, alarms, evidence, result.threshold, change,
-        cpu / elapsed,
+        np.nanstd(scores, axis=0).round(2).tolist(), cpu / elapsed,
     )  # fmt: skip
 
 
@@ -156,6 +215,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--period", type=float, default=PERIOD_S, help="SYNC period with --changes, s")
     parser.add_argument("--changes", action="store_true", help="time to see 10 % more friction, all joints and motions")
+    parser.add_argument("--simulate", action="store_true", help="simulate and filter every second of a life")
     parser.add_argument("--cost", action="store_true", help="CPU time of a replay at 5 kHz against real time")
     asked = parser.parse_args()
     if asked.cost:
@@ -167,7 +227,7 @@ def main() -> None:
                 seconds = seconds_to_alarm(joint.name, motion, asked.seed, period=asked.period)
                 print(motion, joint.name, seconds, flush=True)
         return
-    print(json.dumps(vars(healthy_life(asked.hours, asked.seed, progress=True)), indent=1))
+    print(json.dumps(vars(healthy_life(asked.hours, asked.seed, simulated=asked.simulate, progress=True)), indent=1))
 
 
 if __name__ == "__main__":

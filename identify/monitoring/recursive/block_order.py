@@ -12,11 +12,17 @@ class BlockOrder:
     """Hands over blocks in the order of their sequence numbers, each once.
 
     A block that is missing is waited for. After `LONGEST_HOLD_S` it is given up.
+
+    Attributes
+    ----------
+    lost
+        Number of blocks that were given up, those before the first one of a capture included.
     """
 
     def __init__(self) -> None:
         self._capture = ""
         self._next = 0
+        self.lost = 0
         self._held: dict[int, tuple[float, Block]] = {}
 
     def add(self, block: Block, now_s: float) -> Iterator[Block]:
@@ -51,6 +57,7 @@ class BlockOrder:
             if self._next not in self._held:
                 if now_s - min(at for at, _ in self._held.values()) < LONGEST_HOLD_S:
                     return
+                self.lost += min(self._held) - self._next
                 self._next = min(self._held)
             yield self._held.pop(self._next)[1]
             self._next += 1

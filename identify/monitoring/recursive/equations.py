@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from armident.configs import DataError
 from armident.identify.identification.equations import LS_CUTOFF
+from armident.identify.identification.torque_delay import HELD
 from armident.identify.monitoring.recursive.kernels import first_order_lag, low_pass
 from armident.identify.monitoring.recursive.settings import RecursiveSettings
 from armident.identify.robot.arm import ArmModel
@@ -22,6 +23,8 @@ SLOWEST_LAG_S = 0.5
 """Upper limit of the lag of a drive behind its reference, s."""
 SHORTEST_RATE = 10.0
 """Least sampling rate, in closed-loop bandwidths (thesis section 2.3.1)."""
+EARLIER = 2
+"""Rows kept before those that are computed: a torque may lead its position by up to so many samples."""
 
 
 @dataclass(frozen=True)
@@ -65,6 +68,9 @@ class StreamEquations:
         Thresholds.
     take
         Called with each `Instant`.
+    lead
+        Number of samples by which the torque leads the position, from -1 to `EARLIER`: recorded torque k belongs to
+        the instant ``k + lead``. A drive that holds its torque until the next sample has 0.5.
 
     Raises
     ------
@@ -74,7 +80,7 @@ class StreamEquations:
 
     _saved = (
         "live", "planned", "piece", "count", "next_sync", "settled", "history", "seen", "done", "rows",
-        "lag_state", "lag_sums", "last_torque", "instants", "restarts",
+        "lag_state", "lag_sums", "instants", "restarts",
     )  # fmt: skip
 
     def __init__(
@@ -85,6 +91,7 @@ class StreamEquations:
         with_reference: bool,
         settings: RecursiveSettings,
         take: Callable[[Instant], None],
+        lead: float = HELD,
     ) -> None:
         if 1.0 / dt < SHORTEST_RATE * bandwidth_hz:
             raise DataError(f"{1.0 / dt:.4g} samples/s are too few for a bandwidth of {bandwidth_hz:.4g} Hz")
@@ -97,13 +104,14 @@ class StreamEquations:
         nvr = (2 * np.pi * band * dt) ** 6
         self.live, self.planned = VelocityFilter(n, dt, nvr), VelocityFilter(n, dt, nvr)
         self.delay = acceleration_delay(nvr)
+        self._lead = lead
         self._slow = slow_velocity(model, settings)
         self._kept = _present_columns(model)
         self.piece = np.zeros((ROWS * self.decimation.factor, (3 if with_reference else 2) * n))
         open_rows = -(-self.decimation.taps.size // self.decimation.factor) + ROWS + 1
         width = self._kept.size * (2 if with_reference else 1) + 2 * n
         self.rows = np.zeros((open_rows, width))
-        self.history = np.zeros((int(self.delay) + 1, (7 if with_reference else 4) * n))
+        self.history = np.zeros((EARLIER + int(self.delay) + 1, (7 if with_reference else 4) * n))
         self._shape = (n, b)
         self.lag_sums = np.zeros((2, n))
         self.instants, self.restarts = 0, 0
@@ -117,7 +125,6 @@ class StreamEquations:
         self.count, self.next_sync, self.settled, self.seen, self.done = 0, -1, 0, 0, 0
         self.rows[:] = 0.0
         self.lag_state = np.zeros((3, n))
-        self.last_torque = np.zeros(n)
 
     @property
     def rate_hz(self) -> float:
@@ -172,11 +179,8 @@ class StreamEquations:
         n = self._model.n
         piece = self.piece
         q, tau = np.ascontiguousarray(piece[:, :n]), piece[:, n : 2 * n]
-        held = np.vstack([self.last_torque[None], tau])
-        self.last_torque = tau[-1].copy()
-        # Torque k is held over [k, k + 1): their mean belongs to position k.
         measured = self.live.handle(q)
-        parts = [q, measured.qd, 0.5 * (held[1:] + held[:-1])]
+        parts = [q, measured.qd, tau]
         accelerations = [measured.qdd]
         if self.with_reference:
             q_ref = np.ascontiguousarray(piece[:, 2 * n :])
@@ -212,8 +216,9 @@ class StreamEquations:
         whole = int(self.delay)
         share = self.delay - whole
         last = 5 if self.with_reference else 3
-        now = joined[:size]
-        later = (1 - share) * joined[whole : whole + size] + share * joined[whole + 1 : whole + 1 + size]
+        now = joined[EARLIER : EARLIER + size]
+        after = joined[EARLIER + whole :]
+        later = (1 - share) * after[:size] + share * after[1 : 1 + size]
         column = [now[:, i * n : (i + 1) * n] for i in range(last)]
         qdd = later[:, last * n : (last + 1) * n]
         x = self._regressor(column[0], column[1], qdd)
@@ -222,11 +227,19 @@ class StreamEquations:
             data.append(self._regressor(column[3], column[4], later[:, (last + 1) * n :]))
         moving = (np.abs(column[1]) > self._slow).astype(np.float64)
         low_pass(
-            np.ascontiguousarray(np.hstack([*data, column[2], moving])),
+            np.ascontiguousarray(np.hstack([*data, self._torque(joined, size), moving])),
             self.decimation.taps, self.decimation.factor, self.seen, self.done, self.rows,
         )  # fmt: skip
         self.seen += size
         self._hand_over()
+
+    def _torque(self, joined: Array, size: int) -> Array:
+        """Torque at the instants of the positions, (size, n), between two samples."""
+        n = self._model.n
+        tau = joined[:, 2 * n : 3 * n]
+        begin = EARLIER - int(np.floor(self._lead)) - 1
+        share = self._lead - np.floor(self._lead)
+        return np.asarray((1 - share) * tau[begin + 1 : begin + 1 + size] + share * tau[begin : begin + size])
 
     def _regressor(self, q: Array, qd: Array, qdd: Array) -> Array:
         full = self._model.rigid_regressor(q, qd, qdd)

@@ -151,7 +151,7 @@ class RecursiveEstimator:
         self.matcher = RowMatcher(robot, with_reference, self._on_rows)
         self.equations = StreamEquations(
             model, 1.0 / sample_rate_hz, robot.bandwidth_hz or NOMINAL_BANDWIDTH_HZ, with_reference, self.settings,
-            self._on_instant,
+            self.handle_instant, self.reference.torque_lead,
         )  # fmt: skip
         rate = self.equations.rate_hz
         self._period = 1.0 / rate
@@ -203,6 +203,36 @@ class RecursiveEstimator:
         """
         if self.matcher.add(block):
             self.start_capture(begun=True)
+
+    def handle_instant(self, instant: Instant) -> None:
+        """Process the equations of a decimated instant, which `handle` makes of the stream: noise, gates, update.
+
+        Parameters
+        ----------
+        instant
+            Regressors, instruments and torques.
+        """
+        reference, s = self.reference, self.settings
+        moving = instant.moving >= s.moving_share
+        residual = instant.y - _rows_times(instant.x, reference.theta)
+        innovation = residual - _rows_times(instant.x, self.state)
+        ready = self.noise.ready
+        variance = self._variance
+        self.noise.add(innovation, moving)
+        if self.test.windows:
+            self.window_noise.add(residual - _rows_times(instant.x, self.raw_difference), moving)
+        use = moving & ready & (variance > 0.0) & self._instruments(instant, moving)
+        if not use.any():
+            return
+        self.motion_instants += 1
+        # Only what the motion excites walks: a joint at rest does not lose its estimate.
+        walks = np.where(reference.place >= 0, use[np.maximum(reference.place, 0)], True)
+        diagonal = np.arange(self.state.size)
+        self.covariance[diagonal, diagonal] += np.where(walks, reference.walk, 0.0) * self._period
+        update(self.state, self.covariance, instant.x, instant.z, residual, variance, use)
+        self.window.add(instant, residual, variance, use)
+        if self.window.instants >= self._window_instants:
+            self._close_window()
 
     def start_capture(self, *, begun: bool = False) -> None:
         """Expect the blocks of another capture: filters start anew, estimates stay.
@@ -290,30 +320,6 @@ class RecursiveEstimator:
         """Variance (n,) of the equations: the smaller one of both residuals, as the other may contain a change."""
         variance, later = self.noise.variance, self.window_noise.variance
         return np.where(self.window_noise.ready & (later < variance), later, variance)
-
-    def _on_instant(self, instant: Instant) -> None:
-        """Gate, predict, update; the noise first."""
-        reference, s = self.reference, self.settings
-        moving = instant.moving >= s.moving_share
-        residual = instant.y - _rows_times(instant.x, reference.theta)
-        innovation = residual - _rows_times(instant.x, self.state)
-        ready = self.noise.ready
-        variance = self._variance
-        self.noise.add(innovation, moving)
-        if self.test.windows:
-            self.window_noise.add(residual - _rows_times(instant.x, self.raw_difference), moving)
-        use = moving & ready & (variance > 0.0) & self._instruments(instant, moving)
-        if not use.any():
-            return
-        self.motion_instants += 1
-        # Only what the motion excites walks: a joint at rest does not lose its estimate.
-        walks = np.where(reference.place >= 0, use[np.maximum(reference.place, 0)], True)
-        diagonal = np.arange(self.state.size)
-        self.covariance[diagonal, diagonal] += np.where(walks, reference.walk, 0.0) * self._period
-        update(self.state, self.covariance, instant.x, instant.z, residual, variance, use)
-        self.window.add(instant, residual, variance, use)
-        if self.window.instants >= self._window_instants:
-            self._close_window()
 
     def _instruments(self, instant: Instant, moving: Mask) -> Mask:
         """Mask (n,) of the joints whose velocity the reference predicts, by their viscous columns."""

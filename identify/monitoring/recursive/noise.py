@@ -79,7 +79,5 @@ class RunningNoise:
     def variance(self) -> Array:
         """Long-run variance (n,), (N m)^2 or N^2, at least the variance; NaN without residuals."""
         covariances = self.sums / np.maximum(self.counts, 1e-300)
-        total = np.zeros(self._n)
-        for lag in range(self.lags + 1):
-            total += self._weights[lag] * covariances[lag]
+        total: Array = (self._weights[:, None] * covariances).sum(axis=0)
         return np.maximum(total, self.short_run)

@@ -1,13 +1,15 @@
 """Reference of the recursive estimator: an identification of the arm, and the widths of the random walk."""
 
 import hashlib
-from dataclasses import dataclass
+import logging
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from armident.configs import ConfigError, DataError, RobotConfig
 from armident.identify.document import IdentificationDocument
+from armident.identify.identification.torque_delay import HELD
 from armident.identify.monitoring.recursive.kernels import solve
 from armident.identify.monitoring.recursive.settings import RecursiveSettings
 from armident.identify.robot.arm import ArmModel
@@ -24,6 +26,12 @@ NARROW = 0.1
 """The same for offsets and couplings: their changes show in the friction of the joints."""
 MASS_PRIOR = 0.05
 """Prior relative standard deviation of the other parameters in one window: few are determined within seconds."""
+KNOWN_LEAD = 0.25
+"""Largest standard deviation of a joint's torque lead that counts, samples: half a sample is known by a factor of 2."""
+SHORTEST_SHIFT, LONGEST_SHIFT = 0.1, 1.0
+"""Differences from a held torque that are aligned, samples. Shorter ones are errors of interpolation."""
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,6 +52,8 @@ class Reference:
         Viscous and Coulomb friction of each joint, indices (n, 2); -1 where the arm has none.
     place
         Joint of each friction parameter, (b,); -1 for other parameters.
+    torque_lead
+        Number of samples by which the torque leads the position.
     """
 
     model: ArmModel
@@ -53,16 +63,45 @@ class Reference:
     window_precision: Array
     friction: NDArray[np.int64]
     place: NDArray[np.int64]
+    torque_lead: float = HELD
 
     @property
     def digest(self) -> str:
-        """SHA-256 of the values and their covariance."""
-        return hashlib.sha256(self.theta.tobytes() + self.covariance.tobytes()).hexdigest()
+        """SHA-256 of the values, their covariance and the torque lead."""
+        lead = np.float64(self.torque_lead).tobytes()
+        return hashlib.sha256(self.theta.tobytes() + self.covariance.tobytes() + lead).hexdigest()
 
     @property
     def robot_digest(self) -> str:
         """SHA-256 of the configuration of the robot."""
         return hashlib.sha256(self.model.robot.model_dump_json(by_alias=True).encode()).hexdigest()
+
+
+def torque_lead(document: IdentificationDocument) -> float:
+    """Return the number of samples by which the torque leads the position, of all joints together.
+
+    The limits are those of the check of the set-up: a drive holds its torque until the next sample (0.5), unless joints
+    that know it to a quarter of a sample agree on another lead, by 0.1 to 1 sample, within three standard deviations.
+
+    Parameters
+    ----------
+    document
+        Identification of the arm.
+    """
+    found = np.array(list((document.torque_delay_samples or {}).values())).reshape(-1, 2)
+    samples, std = found[np.isfinite(found).all(axis=1) & (found[:, 1] <= KNOWN_LEAD) & (found[:, 1] > 0)].T
+    if samples.size < 2:
+        return HELD
+    # The median: one joint in five may have a cause of its own, such as a slow actuator.
+    lead, own = float(np.median(samples)), float(np.median(std))
+    near = np.abs(samples - lead) <= 3.0 * std
+    shift = abs(lead - HELD)
+    if 2 * near.sum() <= samples.size or shift <= 3.0 * own or shift < SHORTEST_SHIFT:
+        return HELD
+    if shift > LONGEST_SHIFT:
+        log.warning("the torque leads the position by %.2g samples: too many to be aligned on the stream", lead)
+        return HELD
+    return lead
 
 
 def reference_from(document: IdentificationDocument, robot: RobotConfig, settings: RecursiveSettings) -> Reference:
@@ -104,7 +143,8 @@ def reference_from(document: IdentificationDocument, robot: RobotConfig, setting
     order = [[p.name for p in document.parameters].index(name) for name in model.base.names]
     theta = np.array([found[name] for name in model.base.names])
     covariance = np.asarray(document.covariance, dtype=np.float64)[np.ix_(order, order)]
-    return _reference(model, theta, 0.5 * (covariance + covariance.T), settings)
+    made = _reference(model, theta, 0.5 * (covariance + covariance.T), settings)
+    return replace(made, torque_lead=torque_lead(document))
 
 
 def _reference(model: ArmModel, theta: Array, covariance: Array, settings: RecursiveSettings) -> Reference:

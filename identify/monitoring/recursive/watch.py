@@ -224,7 +224,7 @@ class LiveWatch:
         self._keys = Keys(session.cell, robot.name)
         self._waiting: queue.Queue[bytes] = queue.Queue(WAITING_BLOCKS)
         self._last: bytes | None = None
-        self.dropped = self.refused = 0
+        self.dropped = self.refused = self.lost = 0
         self.estimator = estimator
         self._rate = 1.0 / session.sync_period
         self._session = open_session(session, "observer")
@@ -289,6 +289,7 @@ class LiveWatch:
                     watch.handle(block)
                 except DataError as error:
                     self._refuse(error)
+            self._count_lost(order.lost)
             if time.monotonic() - saved > SAVED_S:
                 saved = time.monotonic()
                 save()
@@ -304,6 +305,12 @@ class LiveWatch:
             query.reply_err(b"no result yet")
         else:
             query.reply(self._keys.recursive, self._last)
+
+    def _count_lost(self, lost: int) -> None:
+        """Report blocks that never arrived: the first ones, and all at the end."""
+        if lost and not self.lost:
+            log.warning("%d blocks did not arrive: the capture began before the watch, or was found late", lost)
+        self.lost = lost
 
     def _refuse(self, error: DataError) -> None:
         """Report an invalid block: the first one, the tenth, the hundredth, and so on."""
@@ -374,4 +381,6 @@ def watch_cell(config: Path | None, options: WatchOptions) -> int:
     screen.end(result)
     if live.dropped:
         log.warning("%d blocks were dropped: this machine is too busy for the stream", live.dropped)
+    if live.lost:
+        log.warning("%d blocks did not arrive in all: armident watch RECORDING replays a whole capture", live.lost)
     return FOUND if result.alarm.any() else 0

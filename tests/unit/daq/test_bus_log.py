@@ -59,6 +59,14 @@ def test_a_recording_survives_the_round_trip_through_every_log_format(tmp_path: 
     assert [p.name for p in tmp_path.iterdir()] == [f"bus{suffix}"]
 
 
+@pytest.mark.parametrize("counter", [SESSION.sync.counter, 0])
+def test_without_a_counter_the_unknown_phase_of_slow_streams_is_said(tmp_path: Path, counter: int) -> None:
+    session = SESSION.model_copy(update={"sync": SESSION.sync.model_copy(update={"counter": counter})})
+    write_log(replace(captured(200), session=session), tmp_path / "bus.log")
+    remarks = recording_from_log(tmp_path / "bus.log", session, ROBOT).metadata.get("source_remarks", "")
+    assert ("demand: SYNC has no counter, so it is unknown which SYNCs are answered" in remarks) == (counter == 0)
+
+
 def test_a_sync_missing_from_the_log_is_a_gap(tmp_path: Path) -> None:
     write_log(captured(lost=slice(1000, 1030)), tmp_path / "bus.log")
     read = recording_from_log(tmp_path / "bus.log", SESSION, ROBOT)

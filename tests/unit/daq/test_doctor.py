@@ -106,7 +106,7 @@ def test_slow_streams_of_another_master_without_sync_counter_are_a_warning(tmp_p
     sync = {"role": "consumer", "counter": 0}
     check = checks_of(cell(tmp_path, sync=sync))["sync"]
     assert check.verdict == "warning"
-    assert check.message.startswith("demand: SYNC of another master has no counter")
+    assert check.message.startswith("demand: SYNC has no counter")
     assert "sync" not in checks_of(cell(tmp_path, sync={"counter": 0}))
 
 

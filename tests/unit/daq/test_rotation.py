@@ -210,6 +210,17 @@ def test_a_clock_that_is_ahead_deletes_nothing_younger_than_the_newest_recording
     assert prune(tmp_path, "tx40", NOW, 30.0, None) == []
 
 
+def test_finished_recordings_of_a_clock_far_ahead_delete_nothing_until_they_are_old_themselves(tmp_path: Path) -> None:
+    before = [made(tmp_path, "20261110T000000"), made(tmp_path, "20261115T000000")]
+    first, second = made(tmp_path, "20990101T000000"), made(tmp_path, "20990125T000000")
+    assert prune(tmp_path, "tx40", NOW.replace(year=2099), 30.0, None) == []
+    third = made(tmp_path, "20990201T000000")
+    # On this clock 31 days have passed: all recordings before it are older.
+    assert prune(tmp_path, "tx40", NOW.replace(year=2099), 30.0, None) == [*before, first]
+    assert second.exists()
+    assert third.exists()
+
+
 def test_after_a_step_of_the_clock_back_a_recording_is_named_after_the_newest_one(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

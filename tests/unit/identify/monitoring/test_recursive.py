@@ -16,15 +16,18 @@ from armident.configs.schema.robot import Effect
 from armident.daq.recording import Recording, Stream
 from armident.identify.monitoring.recursive import saved_state
 from armident.identify.monitoring.recursive.change_detection import FrictionTest
-from armident.identify.monitoring.recursive.equations import acceleration_delay
+from armident.identify.monitoring.recursive.equations import EARLIER, Instant, StreamEquations, acceleration_delay
 from armident.identify.monitoring.recursive.estimator import RecursiveEstimator
 from armident.identify.monitoring.recursive.kernels import solve, update
 from armident.identify.monitoring.recursive.noise import RunningNoise
+from armident.identify.monitoring.recursive.reference import torque_lead
 from armident.identify.monitoring.recursive.replay import RecordedBlock, blocks_of
 from armident.identify.monitoring.recursive.saved_state import state_of
 from armident.identify.monitoring.recursive.settings import RecursiveSettings
+from armident.virtual_robot.noise import amplitudes
 from tests.fixtures import arms
-from tests.statistics.recursive_life import healthy_life, seconds_to_alarm
+from tests.statistics.fresh_noise import FreshNoise, MotionRecorder, held
+from tests.statistics.recursive_life import healthy_life, play, seconds_to_alarm
 
 RATE = 1 / arms.FAST
 ROBOT = load_robot("tx40")
@@ -286,7 +289,7 @@ def test_ten_percent_more_friction_is_seen_within_a_minute(joint: str, motion: s
 
 @pytest.mark.slow
 def test_minutes_of_healthy_life_raise_no_alarm() -> None:
-    life = healthy_life(0.05, 4)
+    life = healthy_life(0.05, 4, simulated=True)
     assert life.alarms == []
     assert life.windows > 20
     assert life.largest_evidence < 0.5 * life.threshold
@@ -299,3 +302,59 @@ def test_hours_of_healthy_life_raise_no_alarm() -> None:
     life = healthy_life(float(os.environ.get("ARMIDENT_HEALTHY_HOURS", "50")), 5)
     assert life.alarms == []
     assert life.motion_h > 0.6 * life.hours
+
+
+@pytest.mark.slow
+def test_the_noise_of_a_simulation_can_be_exchanged_in_its_equations() -> None:
+    """What is left without its own noise is the error of the live filter, a small part of the variance."""
+    found, period = estimator(), arms.FAST
+    recorder = MotionRecorder(found, ROBOT, period)
+    recording = play("tx40_1", 7, {}, 1, period)
+    motion = [recorder.record(recording, 7) for _ in range(2)][1]
+    theta = found.reference.theta
+    residual = np.array([instant.y - instant.x @ theta for instant in motion.instants])
+    moves = np.array([instant.moving for instant in motion.instants]) >= RecursiveSettings().moving_share
+    drawn = FreshNoise(ROBOT, period, np.random.default_rng(1)).draw(40 * motion.samples)
+    fresh = recorder.filtered(held(drawn))
+    for j in range(ROBOT.n):
+        left = (residual - motion.own_noise)[moves[:, j], j]
+        assert np.var(left) < 0.1 * np.var(residual[moves[:, j], j])
+    # White noise up to half the sampling rate, and half of a disturbance with a corner of 20 Hz, behind 20 Hz.
+    white, slow = amplitudes(ROBOT, 2e-4)
+    expected = white**2 @ ROBOT.transmission_matrix**2 * (20.0 / (0.5 / period)) + 0.5 * slow**2
+    assert np.var(fresh, axis=0) == pytest.approx(expected, rel=0.1)
+
+
+@pytest.mark.parametrize(
+    ("leads", "expected"),
+    [
+        (None, 0.5),
+        ([[0.1, 0.01]] * 6, 0.1),
+        ([[0.1, 0.01]] * 5 + [[4.0, 0.01]], 0.1),
+        ([[0.1, 0.01]] + [[0.1, 0.5]] * 5, 0.5),
+        ([[0.55, 0.01]] * 6, 0.5),
+        ([[0.7, 0.1]] * 6, 0.5),
+        ([[-1.2, 0.01]] * 6, 0.5),
+    ],
+)
+def test_a_lead_of_the_torque_is_aligned_if_the_joints_agree_on_one(
+    leads: list[list[float]] | None, expected: float
+) -> None:
+    found = None if leads is None else dict(zip((joint.name for joint in ROBOT.joints), leads, strict=True))
+    assert torque_lead(arms.tx40_baseline().model_copy(update={"torque_delay_samples": found})) == expected
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("lead", [-0.5, 0.0, 0.3, 0.5, 1.5])
+def test_equations_take_the_torque_at_the_instants_of_the_positions(lead: float) -> None:
+    """A torque that is linear in time shows the lead in every decimated equation."""
+    instants: list[Instant] = []
+    model = RecursiveEstimator(ROBOT, arms.tx40_baseline(), RATE).reference.model
+    equations = StreamEquations(model, arms.FAST, 10.0, False, RecursiveSettings(), instants.append, lead)
+    k = np.arange(2000)
+    values = np.hstack([np.zeros((k.size, ROBOT.n)), np.tile(k[:, None], (1, ROBOT.n))]).astype(float)
+    equations.add(k, values)
+    y = np.array([instant.y[0] for instant in instants])
+    begin = equations.piece.shape[0] - equations.history.shape[0] + EARLIER
+    centre = begin + equations.decimation.margin + equations.decimation.factor * np.arange(y.size)
+    np.testing.assert_allclose(y, centre - lead, rtol=1e-9)
