@@ -60,6 +60,8 @@ WEAR = 0.3
 GUEST_VARIABLE = "ARMIDENT_GUEST"
 REPEATS = 3
 """Number of runs of the trajectory in the second part: one run is too short for the small hidden effect."""
+JOINT_RUNS = 9
+"""Largest number of runs times joints of a configured arm: the diagnosis of more does not fit a guest's processes."""
 UDP_GROUP = "239.74.163.2"
 """Multicast address of the bus without SocketCAN."""
 UDP_PERIOD_US = 2000
@@ -149,12 +151,15 @@ class Subject:
         Scenario of the second part.
     robot_options
         Further options of ``armident robot``.
+    repeats
+        Number of runs of the trajectory in the second part.
     """
 
     session: SessionConfig
     robot: RobotConfig
     scenario: Path
     robot_options: tuple[str, ...] = ()
+    repeats: int = REPEATS
 
     def at(self, session: SessionConfig) -> "Subject":
         """Return the same arm in another session.
@@ -224,7 +229,8 @@ def _subject(options: DemoOptions, out: Path) -> Subject:
     words = ["--arm-seed", str(options.choice.seed), *(["--draw-masses"] * options.choice.draw_masses)]
     if options.choice.model is not None:
         words += ["--model", str(options.choice.model.resolve())]
-    return Subject(session, twin.robot, scenario, tuple(words))
+    repeats = min(REPEATS, max(1, JOINT_RUNS // twin.robot.n))
+    return Subject(session, twin.robot, scenario, tuple(words), repeats)
 
 
 def worn(twin: Twin) -> Scenario:
@@ -331,7 +337,9 @@ def _diagnose_part(subject: Subject, out: Path) -> Diagnosed:
     session = subject.session
     log.info("part 2: record the same arm with a hidden effect, and let the diagnosis find the effect")
     if session.setpoints is not None:
-        session = session.model_copy(update={"setpoints": session.setpoints.model_copy(update={"repeat": REPEATS})})
+        session = session.model_copy(
+            update={"setpoints": session.setpoints.model_copy(update={"repeat": subject.repeats})}
+        )
     config = _write_session(session, out, "cell_worn")
     recorded = _record("capture_worn", config, out, [*subject.robot_options, "--scenario", str(subject.scenario)])
     log.info("diagnosing")
