@@ -1,5 +1,6 @@
 """Build of the compiled loops of `armident.drivers.compiled`; everything else of the build is in pyproject.toml."""
 
+import subprocess
 import sys
 import warnings
 from pathlib import Path
@@ -7,7 +8,9 @@ from pathlib import Path
 from setuptools import Extension, setup
 from setuptools.command.build_ext import build_ext
 
-HERE = Path(__file__).parent
+HERE = Path(__file__).resolve().parent
+COMPILE = "compile-loops"
+"""Argument with which this file compiles the loops instead of setting up the distribution."""
 
 
 class BuildKernels(build_ext):
@@ -20,25 +23,23 @@ class BuildKernels(build_ext):
 
     def build_extension(self, ext: Extension) -> None:
         """Build the extension module, or warn that it could not be built."""
-        sys.path.insert(0, str(HERE / "src"))
-        try:
-            compiler = kernels(ext.name.rpartition(".")[2])
-            target = Path(self.get_ext_fullpath(ext.name))
-            target.parent.mkdir(parents=True, exist_ok=True)
-            compiler.output_dir, compiler.output_file = str(target.parent), target.name
-            compiler.compile()
-        except Exception as error:
-            warnings.warn(f"the wheel has no compiled loops, and cannot capture without numba: {error}", stacklevel=1)
-        finally:
-            sys.path.pop(0)
+        target = Path(self.get_ext_fullpath(ext.name)).absolute()
+        # In a process of its own: numba's compiler runs a set-up, which would end this one.
+        command = [sys.executable, str(HERE / "setup.py"), COMPILE, str(target)]
+        done = subprocess.run(command, cwd=HERE / "src", capture_output=True, text=True, check=False)
+        if done.returncode != 0 or not target.exists():
+            errors = [line for line in done.stderr.splitlines() if "Error: " in line]
+            reason = (errors or [f"exit code {done.returncode}"])[-1]
+            warnings.warn(f"the wheel has no compiled loops, and cannot capture without numba: {reason}", stacklevel=1)
 
     def get_outputs(self) -> list[str]:
         """Return the files that were built."""
         return [name for name in super().get_outputs() if Path(name).exists()]
 
 
-def kernels(name: str):  # type: ignore[no-untyped-def]
-    """Return the ahead-of-time compiler of all loops, with their signatures from examples of their arguments."""
+def compile_loops(target: Path) -> None:
+    """Compile all loops into an extension module, with their signatures from examples of their arguments."""
+    sys.path.insert(0, str(HERE / "src"))
     import numpy as np
     from numba import int32, int64, typeof, types
     from numba.core.compiler import Flags
@@ -67,7 +68,7 @@ def kernels(name: str):  # type: ignore[no-untyped-def]
     samples = typeof(output_buffers(state, 1))
     row, table = types.Array(int64, 1, "C"), types.Array(int32, 2, "C")
     loop = (row, int64, int64, row, row, row, row, row, int64, table, row, row, table, int64, row)
-    ahead = CC(name, source_module=pdo_matching)
+    ahead = CC(target.name.partition(".")[0], source_module=pdo_matching)
     for function, signature in (
         (pdo_matching.count_sync, int64(*batch)),
         (pdo_matching.match, types.none(*batch, samples)),
@@ -75,7 +76,12 @@ def kernels(name: str):  # type: ignore[no-untyped-def]
         (sync_loop._run, types.none(*loop)),
     ):
         ahead.export(kernel_name(function), signature)(function.py_func)
-    return ahead
+    target.parent.mkdir(parents=True, exist_ok=True)
+    ahead.output_dir, ahead.output_file = str(target.parent), target.name
+    ahead.compile()
 
 
-setup(ext_modules=[Extension("armident._kernels", sources=[])], cmdclass={"build_ext": BuildKernels})
+if sys.argv[1:2] == [COMPILE]:
+    compile_loops(Path(sys.argv[2]))
+else:
+    setup(ext_modules=[Extension("armident._kernels", sources=[])], cmdclass={"build_ext": BuildKernels})

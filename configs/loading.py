@@ -133,6 +133,24 @@ def _robot(path: Path) -> RobotConfig:
     return robot
 
 
+def checked_robot(data: dict[str, Any], where: str) -> RobotConfig:
+    """Robot of the content of a configuration file.
+
+    Parameters
+    ----------
+    data
+        Keys and values.
+    where
+        Name of the source in messages.
+
+    Raises
+    ------
+    ConfigError
+        If the content is wrong; names ``where``, key and expected value.
+    """
+    return _checked(data, RobotConfig, where)
+
+
 def load_inertials(name: str | Path) -> UrdfInertials | None:
     """Load the masses of a robot from the URDF of its configuration.
 
@@ -189,7 +207,10 @@ def _urdf_geometry(data: dict[str, Any], path: Path) -> UrdfGeometry | None:
 def _marked(path: Path) -> dict[str, Any]:
     """Content of a file without the blanks, which are listed as ``blanks``."""
     data, blanks = without_marks(_read_mapping(_read_text(path), str(path)))
-    return {**data, "blanks": [*data.get("blanks", ()), *blanks]} if blanks else data
+    known = data.get("blanks", [])
+    if blanks and isinstance(known, list):
+        data["blanks"] = [*known, *blanks]
+    return data
 
 
 def _others(count: int) -> str:

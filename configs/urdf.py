@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import ConfigDict
-from scipy.spatial.transform import Rotation
 
 from armident.configs.errors import ConfigError
 from armident.configs.mdh import MdhChain, modified_dh
@@ -20,7 +19,7 @@ from armident.configs.schema.base import FrozenModel
 from armident.configs.schema.collision import BASE, Box, Collision, LinkCapsule
 from armident.configs.schema.limits import Positive
 from armident.configs.schema.robot import Drive
-from armident.configs.urdf_origin import rotation
+from armident.configs.urdf_origin import fixed_axis_angles, rotation
 from armident.configs.urdf_tree import MOVING, UrdfJoint, read_chain
 from armident.configs.yaml_loader import is_file
 
@@ -135,7 +134,7 @@ def geometry_from_urdf(given: UrdfGeometry, where: Path) -> dict[str, Any]:
     for name, joint, mdh in zip(names, joints, chain.parameters, strict=True):
         more = extra.get(name, JointGiven(name=name))
         limits = dict(joint.limits) | more.limits.model_dump(exclude_none=True)
-        settings = more.model_dump(include={"drive", "rotor_inertia"}, exclude_none=True)
+        settings = more.model_dump(include={"drive", "rotor_inertia"}, exclude_none=True, exclude_unset=True)
         settings |= {"source_name": joint.name} if joint.name != name else {}
         plain.append({"name": name, "type": MOVING[joint.type], "mdh": mdh.model_dump(), "limits": limits} | settings)
     gravity = chain.base[:3, :3].T @ np.array(given.gravity)
@@ -166,8 +165,8 @@ def _in_frames_of_the_chain(given: Collision, frames: dict[str, NDArray[np.float
     boxes, capsules = [], []
     for box in given.boxes:
         turn = frames[BASE][:3, :3] @ rotation(*box.rpy)
-        rpy = Rotation.from_matrix(turn).as_euler("xyz")
-        boxes.append(Box(name=box.name, center=_point(frames[BASE], box.center), size=box.size, rpy=_triple(rpy)))
+        center, rpy = _point(frames[BASE], box.center), fixed_axis_angles(turn)
+        boxes.append(Box(name=box.name, center=center, size=box.size, rpy=rpy))
     for capsule in given.capsules:
         if capsule.link not in frames:
             raise ConfigError(f"{where}: collision: no link {capsule.link!r}; links are {', '.join(frames)}")

@@ -40,6 +40,20 @@ def rotation(roll: float, pitch: float, yaw: float) -> Floats:
     return matrix
 
 
+def fixed_axis_angles(matrix: Floats) -> tuple[float, float, float]:
+    """Return URDF's fixed-axis angles ``roll, pitch, yaw`` of a rotation, rad; yaw is 0 at a pitch of 90 degrees.
+
+    Parameters
+    ----------
+    matrix
+        Rotation matrix, shape (3, 3).
+    """
+    pitch = math.atan2(-matrix[2, 0], math.hypot(matrix[0, 0], matrix[1, 0]))
+    if math.hypot(matrix[0, 0], matrix[1, 0]) < EXACT:
+        return math.atan2(-matrix[1, 2], matrix[1, 1]), pitch, 0.0
+    return math.atan2(matrix[2, 1], matrix[2, 2]), pitch, math.atan2(matrix[1, 0], matrix[0, 0])
+
+
 def _cos_sin(angle: float) -> tuple[float, float]:
     c, s = math.cos(angle), math.sin(angle)
     return (float(round(c)), float(round(s))) if min(abs(c), abs(s)) < 1e-15 else (c, s)

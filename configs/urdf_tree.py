@@ -158,7 +158,7 @@ def orientation(file: Path, link: str) -> Floats:
     turned = np.eye(3)
     element = tree.above.get(tree.known(link, "urdf.base"))
     while element is not None:
-        turned = tree.origin(element)[:3, :3] @ turned
+        turned = tree.origin(element, element.find("origin"))[:3, :3] @ turned
         element = tree.above.get(end_link(element, "parent"))
     return turned
 

@@ -9,12 +9,15 @@ import sys
 from types import ModuleType
 from typing import Any
 
+from armident.extras import named_extra
+
 
 class _CallablePackage(ModuleType):
     """A package that is called as its function `armident.identify.api.identify`."""
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
-        from armident.identify.api import identify
+        with named_extra("armident.identify", __name__):
+            from armident.identify.api import identify
 
         return identify(*args, **kwargs)
 

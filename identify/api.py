@@ -50,7 +50,7 @@ from armident.identify.tables import EffectTable, ParameterTable, Table
 if TYPE_CHECKING:
     from armident.identify.diagnosis.diagnose import Diagnosis as DiagnosisResult
     from armident.identify.excitation.design import Design as DesignResult
-    from armident.identify.excitation.safety import SafetyChecks
+    from armident.identify.excitation.safety import CheckedTrajectory, SafetyChecks
 
 Array = NDArray[np.float64]
 Progress = Callable[[str, float], None]
@@ -517,7 +517,7 @@ def diagnose(
         name = baseline if isinstance(baseline, str | Path) else "baseline"
         raise DataError(f"{name}: the baseline is of robot {numbers.robot!r}, the recording of {config.name!r}")
     training, notes = experiments_of(read, config, name_files=True)
-    held_out: list[Experiment] = []
+    held_out: Sequence[Experiment] = []
     if validate is not None:
         read = (*read, *_read(validate))
         held_out, more = experiments_of(read[-1:], config, name_files=True)
@@ -673,17 +673,26 @@ class Design:
 
     Parameters
     ----------
-    robot
-        The robot it is for.
-    result
-        Trajectory, condition number, predicted standard deviations and torques.
-    checks
-        Properties that were checked, with the results (``checked``), and those that were not (``unchecked``).
+    checked
+        Trajectory with its predicted precision and its checks.
     """
 
-    robot: RobotConfig
-    result: "DesignResult"
-    checks: "SafetyChecks"
+    checked: "CheckedTrajectory"
+
+    @property
+    def robot(self) -> RobotConfig:
+        """The robot it is for."""
+        return self.checked.robot
+
+    @property
+    def result(self) -> "DesignResult":
+        """Trajectory, condition number, predicted standard deviations and torques."""
+        return self.checked.design
+
+    @property
+    def checks(self) -> "SafetyChecks":
+        """Properties that were checked, with the results (``checked``), and those that were not (``unchecked``)."""
+        return self.checked.checks
 
     @property
     def trajectory(self) -> Trajectory:
@@ -715,6 +724,24 @@ class Design:
         """
         content = self.trajectory.model_dump(mode="json", by_alias=True, exclude_defaults=True)
         write_atomically(Path(path), yaml.safe_dump(content, sort_keys=False))
+        return Path(path)
+
+    def report(self, path: str | Path) -> Path:
+        """Write the report, one HTML file that needs nothing else.
+
+        Parameters
+        ----------
+        path
+            The file to write; its folder is made.
+
+        Returns
+        -------
+        Path
+            The file.
+        """
+        from armident.identify.report.trajectory import trajectory_report
+
+        write_atomically(Path(path), trajectory_report(self.checked))
         return Path(path)
 
     def __repr__(self) -> str:
@@ -790,7 +817,7 @@ def design_trajectory(
     from armident.identify.excitation.design import design_trajectory as run
     from armident.identify.excitation.design import with_objective
     from armident.identify.excitation.previous_estimate import physical_estimate
-    from armident.identify.excitation.safety import check_safety, safety_model
+    from armident.identify.excitation.safety import checked_trajectory, safety_model
 
     config = _robot(robot, ())
     earlier = None if known is None else physical_estimate(_document(known), config, "known")
@@ -808,7 +835,7 @@ def design_trajectory(
         collision=safety.collision,
         progress=None if progress is None else lambda share: progress("search", share),
     )
-    return Design(config, found, check_safety(config, found, safety))
+    return Design(checked_trajectory(config, found, safety, earlier))
 
 
 def effects() -> EffectTable:

@@ -308,7 +308,7 @@ def trajectory(
             look_at=look_at,
         )
     )
-    page = report or found.path.with_suffix(".html")
+    page = report or (found.path or Path(f"{found.robot.name}_trajectory")).with_suffix(".html")
     write_atomically(page, trajectory_report(found))
     print(f"report: {page}")
     found.refuse_excess()

@@ -20,7 +20,7 @@ from armident.identify.print_table import print_table
 from armident.identify.setup.result import SetupCheck
 
 if TYPE_CHECKING:
-    from armident.identify.prediction import PredictionDocument
+    from armident.identify.model_documents import PredictionDocument
 
 SHOW_AFTER_S = 2.0
 """Duration after which progress is shown, s."""
@@ -186,12 +186,13 @@ def identification_table(document: IdentificationDocument) -> None:
     print_table(table, console)
     essential = sum(p.essential for p in document.parameters)
     errors = ", ".join(f"{name} {value:.1f}" for name, value in document.relative_error_pct_by_joint.items())
+    held_out = "" if document.held_out_error_pct is None else f"; {document.held_out_error_pct:.2f} % on held-out data"
     coloured = any(reason.kind in ("residual", "uncertainty") for reason in document.reasons)
     tested = document.verdict in ("trustworthy", "doubtful")
     residuals = f"; residuals are {'not ' if coloured else ''}noise" if tested else ""
     console.print(
         f"{essential} of {len(document.parameters)} base parameters are essential; "
-        f"relative torque error {document.relative_error_pct:.4f} % ({errors})",
+        f"relative torque error {document.relative_error_pct:.4f} % ({errors}){held_out}",
         highlight=False,
         soft_wrap=True,
     )

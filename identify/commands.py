@@ -2,12 +2,13 @@
 
 import json
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from armident.configs import DataError
+from armident.configs import ConfigError, DataError
 from armident.identify.document import IdentificationDocument, load_document, to_json, write_atomically
 from armident.identify.identification.options import parse_decimation, parse_nvr
 
@@ -52,7 +53,9 @@ def identify_command(
     as_written = {"nvr": parse_nvr(chosen.get("nvr")), "decimation": parse_decimation(chosen.get("decimation"))}
     with progress(f"identify {path.name}") as report:
         result = identify(path, config, **{**chosen, **as_written}, progress=report)
-    document, html = result.save(out or _beside(path, "identification"))
+    folder = out or _beside(path, "identification")
+    with _writing(folder):
+        document, html = result.save(folder)
     if as_json:
         sys.stdout.write(to_json(result.document))
     else:
@@ -148,7 +151,8 @@ def diagnose_command(
     with progress("diagnose") as report:
         found = diagnose(list(paths), config, validate=validate, baseline=baseline, progress=report, **chosen)
     folder = out or _beside(paths[0], "diagnosis")
-    document = found.save(folder)
+    with _writing(folder):
+        document = found.save(folder)
     if as_json:
         sys.stdout.write(to_json(document))
     else:
@@ -195,13 +199,14 @@ def predict_command(path: Path, model: Path, config: Path | None, out: Path | No
 
     with progress(f"predict {path.name}") as report:
         recording = read_recording(path)
-        robot = None if config is None else load_robot(config)
+        robot = None if config is None else load_robot(config, "identify")
         loaded = load_model(model, robot, default=recording.robot, progress=report)
         found = predict_recording(recording, loaded, report)
     document, folder = found.document, out or _beside(path, "prediction")
-    write_atomically(folder / "torques.csv", found.csv())
-    write_atomically(folder / "report.html", prediction_report(found, loaded.robot, loaded.document))
-    write_atomically(folder / "prediction.json", to_json(document))
+    with _writing(folder):
+        write_atomically(folder / "torques.csv", found.csv())
+        write_atomically(folder / "report.html", prediction_report(found, loaded.robot, loaded.document))
+        write_atomically(folder / "prediction.json", to_json(document))
     if as_json:
         sys.stdout.write(to_json(document))
     else:
@@ -247,8 +252,9 @@ def compare_command(
     first, second = (load_document(file, IdentificationDocument) for file in files)
     document = compare_models((first, files[0]), (second, files[1]), common=common, false_alarms=false_alarms)
     folder = out or files[1].parent / "comparison"
-    write_atomically(folder / "report.html", comparison_report(document, second))
-    write_atomically(folder / "comparison.json", to_json(document))
+    with _writing(folder):
+        write_atomically(folder / "report.html", comparison_report(document, second))
+        write_atomically(folder / "comparison.json", to_json(document))
     if as_json:
         sys.stdout.write(to_json(document))
     else:
@@ -256,6 +262,15 @@ def compare_command(
         comparison_table(document)
         print(f"result: {folder / 'comparison.json'}\nreport: {folder / 'report.html'}")
     return FOUND if document.verdict == "changed" else 0
+
+
+@contextmanager
+def _writing(folder: Path) -> Iterator[None]:
+    """Turn an error of the file system into one line that names the folder of the results."""
+    try:
+        yield
+    except OSError as error:
+        raise ConfigError(f"--out {folder}: cannot be written: {error.strerror}") from error
 
 
 def _beside(path: Path, suffix: str) -> Path:

@@ -247,6 +247,11 @@ class IdentificationDocument(Document):
         Statistics of the residuals for later comparison; null in documents of former versions.
     configuration
         Robot configuration that the parameters belong to; null in documents of former versions.
+    held_out_error_pct
+        Torque error where each fifth of the recordings is predicted by least squares from the rest, percent; null where
+        the rest does not determine the parameters, and in documents of former versions.
+    held_out_error_pct_by_joint
+        The same of each joint, percent.
     """
 
     schema_: Literal["armident/identification/1"] = Field("armident/identification/1", alias="schema")
@@ -279,6 +284,8 @@ class IdentificationDocument(Document):
     criteria: dict[str, float] | None = None
     residual_statistics: list[ResidualStatistics] | None = None
     configuration: dict[str, Any] | None = None
+    held_out_error_pct: float | None = None
+    held_out_error_pct_by_joint: dict[str, float] | None = None
 
 
 class Alternative(Document):
@@ -633,10 +640,16 @@ def diagnosis_from_version_1(data: Mapping[str, Any]) -> dict[str, Any]:
     return {names.get(key, key): changes[key](value) if key in changes else value for key, value in data.items()}
 
 
-SCHEMA_FILES: dict[str, type[Document]] = {
-    "identification.schema.json": IdentificationDocument,
-    "diagnosis.schema.json": DiagnosisDocument,
-}
+def schema_files() -> dict[str, type[Document]]:
+    """Return the documents that have a JSON Schema in ``configs/json_schemas``, by the name of its file."""
+    from armident.identify.model_documents import ComparisonDocument, PredictionDocument
+
+    return {
+        "identification.schema.json": IdentificationDocument,
+        "diagnosis.schema.json": DiagnosisDocument,
+        "prediction.schema.json": PredictionDocument,
+        "comparison.schema.json": ComparisonDocument,
+    }
 
 
 def identification_document(
@@ -688,6 +701,10 @@ def identification_document(
         relative_error_pct_by_joint=dict(
             zip(joints, (float(v) for v in result.relative_error_pct_by_joint), strict=True)
         ),
+        held_out_error_pct=None if result.held_out is None else result.held_out[0],
+        held_out_error_pct_by_joint=None
+        if result.held_out is None
+        else dict(zip(joints, (float(v) for v in result.held_out[1]), strict=True)),
         iterations=int(result.iterations),
         converged=bool(result.converged),
         stop_reason=result.stop_reason,
@@ -862,8 +879,10 @@ def _text(path: Path) -> str:
         return path.read_text(encoding="utf-8")
     except FileNotFoundError as error:
         raise ConfigError(f"{path}: no such file") from error
-    except (OSError, UnicodeDecodeError) as error:
-        raise DataError(f"{path}: cannot be read: {error}") from error
+    except UnicodeDecodeError as error:
+        raise DataError(f"{path}: not a JSON document") from error
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read: {error.strerror}") from error
 
 
 def write_atomically(path: Path, text: str) -> None:
@@ -898,7 +917,7 @@ def schema_text(kind: type[Document]) -> str:
 
 def main() -> None:
     """Write the schema files: ``python -m armident.identify.document``."""
-    for name, kind in SCHEMA_FILES.items():
+    for name, kind in schema_files().items():
         write_atomically(Path(configs.__file__).parent / "json_schemas" / name, schema_text(kind))
 
 

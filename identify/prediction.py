@@ -4,20 +4,20 @@ import csv
 import io
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 from threadpoolctl import threadpool_limits
 
 from armident.configs import DataError
 from armident.daq.recording import Recording
-from armident.identify.document import Document, RecordingReference, reference, versions
+from armident.identify.document import reference, versions
 from armident.identify.effects.recorded import put_right
 from armident.identify.experiment import Experiment
 from armident.identify.identification.api import experiments_of
 from armident.identify.identification.equations import equations, least_rows, published_equations
+from armident.identify.identification.from_recording import NO_REFERENCE
 from armident.identify.identification.judgement import Notes
 from armident.identify.identification.options import Options
 from armident.identify.identification.pipeline import (
@@ -26,8 +26,9 @@ from armident.identify.identification.pipeline import (
     smoothed_derivatives,
 )
 from armident.identify.identification.residual_statistics import SPEED_QUANTILE
-from armident.identify.identification.result import WORTHLESS_PCT, relative_errors
+from armident.identify.identification.result import relative_errors
 from armident.identify.identification.solvers import decimation_of
+from armident.identify.model_documents import PredictionDocument
 from armident.identify.regression.equations import ExperimentEquations
 from armident.identify.saved_model import SavedModel
 from armident.identify.setup.check import check_setup
@@ -39,48 +40,6 @@ Array = NDArray[np.float64]
 
 BEYOND = 0.1
 """Share of the identified range by which a motion may leave it without a warning (as for equal motions)."""
-
-
-class PredictionDocument(Document):
-    """Content of ``prediction.json``: error of an identified model on a recording.
-
-    ``held_out`` is false if the model was identified from this recording. ``relative_error_pct`` is
-    ``||y - X theta|| / ||y||`` on torques low-passed at twice the closed-loop bandwidth; ``identification_error_pct``
-    is that of the model on its own data. ``error_rms`` and ``torque_rms`` are in the ``units`` of each joint.
-    """
-
-    schema_: Literal["armident/prediction/1"] = Field("armident/prediction/1", alias="schema")
-    robot: str
-    model: str
-    method: str
-    recording: RecordingReference
-    held_out: bool
-    relative_error_pct: float
-    relative_error_pct_by_joint: dict[str, float]
-    identification_error_pct: float
-    identification_error_pct_by_joint: dict[str, float]
-    error_rms: dict[str, float]
-    torque_rms: dict[str, float]
-    units: dict[str, str]
-    samples: int
-    rate_hz: float
-    warnings: list[str]
-    versions: dict[str, str]
-
-    @property
-    def worthless(self) -> bool:
-        """True if the model explains the torques no better than none."""
-        return not self.relative_error_pct < WORTHLESS_PCT
-
-    @property
-    def sentence(self) -> str:
-        """Result in words: the data it holds for, and the error in total."""
-        data = "held-out data: the model was not identified from this recording"
-        if not self.held_out:
-            data = "not held out: the model was identified from this recording, so the error is too favourable"
-        worse = ". The model explains these torques no better than none" if self.worthless else ""
-        own = f"on its own data {self.identification_error_pct:.2f} %"
-        return f"Torque error {self.relative_error_pct:.2f} % ({data}); {own}{worse}."
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,6 +110,8 @@ def predict_recording(
         signals, blocks = _equations(model, experiments, options)
     if not any(block.t.size for block in blocks):
         raise DataError(f"{recording.path}: too short to predict: the filters leave no sample. Next: record longer")
+    # A prediction needs no reference.
+    remarks = [remark for remark in remarks if remark != NO_REFERENCE]
     document = _document(recording, model, blocks, [*remarks, *_beyond(signals, model), *notes.warnings])
     show("done", 1.0)
     theta, covariance = model.theta, model.covariance
@@ -182,8 +143,8 @@ def _options(written: dict[str, Any]) -> Options:
 
 
 def _equations(
-    model: SavedModel, experiments: list[Experiment], options: Options
-) -> tuple[list[Derivatives], list[ExperimentEquations]]:
+    model: SavedModel, experiments: Sequence[Experiment], options: Options
+) -> tuple[Sequence[Derivatives], Sequence[ExperimentEquations]]:
     """Return the derivatives, and the equations after the filters of IDIM-LS as in an identification."""
     robot, arm = model.robot, model.arm
     dt, lengths = experiments[0].dt, [e.q.shape[0] for e in experiments]

@@ -186,13 +186,22 @@ def configuration_of(document: IdentificationDocument, path: Path) -> RobotConfi
         raise DataError(f"{path}: configuration.{key}: {first['msg']}") from error
 
 
+def _beside(document: Path, name: str | None) -> Path | None:
+    """Return a file that a document names, from the working directory or beside the document or its folder."""
+    if name is None:
+        return None
+    folder = document.absolute().parent
+    candidates = (Path(name), folder / Path(name).name, folder.parent / Path(name).name)
+    return next((file for file in candidates if file.is_file()), None)
+
+
 def _diagnosed(path: Path, robot: RobotConfig | None, progress: Callable[[str, float], None] | None) -> SavedModel:
     """Identify the structure that a diagnosis found from the recordings that it names."""
     document = load_document(path, DiagnosisDocument)
     recordings = []
     for each in document.recordings:
-        file = None if each.path is None else Path(each.path)
-        if file is None or not file.is_file():
+        file = _beside(path, each.path)
+        if file is None:
             raise DataError(
                 f"{path}: its recording {each.path or '(from the stream)'} is not here: run `armident identify` on it "
                 f"with --config {document.model or 'ROBOT'}, and give that identification.json"
@@ -204,6 +213,6 @@ def _diagnosed(path: Path, robot: RobotConfig | None, progress: Callable[[str, f
     if not recordings:
         raise DataError(f"{path}: the diagnosis names no recording")
     if robot is None and document.model is not None:
-        robot = load_robot(document.model)
+        robot = load_robot(_beside(path, document.model) or document.model)
     outcome = identify_recording(recordings, robot or recordings[0].robot, REFIT, progress)
     return model_of(outcome.document, path)

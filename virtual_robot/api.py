@@ -5,6 +5,7 @@ from pathlib import Path
 from armident.configs import RobotConfig, Scenario, Trajectory, load_robot, load_scenario, load_trajectory
 from armident.configs.loading import load_inertials
 from armident.daq.recording import Recording
+from armident.extras import named_extra
 
 
 def simulate_recording(
@@ -64,8 +65,9 @@ def simulate_recording(
     >>> recording.sample_rate_hz
     5000.0
     """
-    from armident.virtual_robot.offline import simulate_recording as simulate
-    from armident.virtual_robot.twin import complete
+    with named_extra("armident.simulate_recording", __name__):
+        from armident.virtual_robot.offline import simulate_recording as simulate
+        from armident.virtual_robot.twin import complete
 
     config = robot if isinstance(robot, RobotConfig) else load_robot(robot, "robot")
     inertials = None if isinstance(robot, RobotConfig) else load_inertials(robot)

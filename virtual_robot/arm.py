@@ -63,6 +63,9 @@ class DriveBackend(Protocol):
 class Arm:
     """Virtual arm: plant, drives and noise, with the raw numbers of the bus.
 
+    Drives of arms without a control period of their own (``servo.OWN_PERIODS``) report the position and the demand of
+    the last SYNC, and the mean of their signal since then: what moved the arm from that position to the next.
+
     Parameters
     ----------
     robot
@@ -106,9 +109,13 @@ class Arm:
             )
         parameters = arm_parameters(robot) if parameters is None else parameters
         chosen = with_scenario(parameters, robot, scenario)
+        # A signal sampled at every SYNC would miss the pulses in between that move the arm.
+        self._averages = self._periods > 1 and robot.name not in servo.OWN_PERIODS
+        self._sum = np.zeros(n)
         self.plant = Plant(robot, q, scenario, parameters)
         self._signals = Signals(hidden_effects(scenario, robot), robot, period)
-        self._noise = Noise(robot, period, seed, noise, chosen.noise)
+        averaged = self._periods if self._averages else 1
+        self._noise = Noise(robot, period, seed, noise, chosen.noise, averaged)
         self._ratio = robot.transmission_matrix
         drives = [joint.drive for joint in robot.joints]
         self._per_rad = counts_per_si(robot)
@@ -124,11 +131,16 @@ class Arm:
         self._past, self._rate, self._current = np.zeros((n, self._servo.velocity_samples)), np.zeros(n), np.zeros(n)
         self._tau = np.zeros(n)
         self.position, self.current, self.demand = np.zeros(n, np.int32), np.zeros(n, np.int16), np.zeros(n, np.int32)
-        self._own = (self.position, self.current, self.demand)
+        # Numbers at present, and as they are without hidden errors of names and signs.
+        self._now = (self.position, self.current, self.demand)
+        if self._averages:
+            self._now = (self.position.copy(), self.current.copy(), self.demand.copy())
+        self._own = self._now
         if self._signals.swapped:
             self._own = (self.position.copy(), self.current.copy(), self.demand.copy())
         self.plant.brake[:] = BRAKE
         self._control()
+        self.position[:], self.current[:], self.demand[:] = self._now
 
     def interpolation_time(self, joint: int, seconds: float) -> None:
         """Set the interpolation time of a drive (60C2h).
@@ -173,9 +185,16 @@ class Arm:
 
     def advance(self) -> None:
         """Advance by one SYNC period."""
+        position, current, demand = self._now
+        if self._averages:
+            self.position[:], self.demand[:] = position, demand
+            self._sum[:] = 0.0
         for _ in range(self._periods):
+            self._sum += current
             self.plant.advance(self._tau, self._servo.period)
             self._control()
+        if self._averages:
+            self.current[:] = np.rint(self._sum / self._periods)
 
     def _control(self) -> None:
         measured, disturbance = self._noise.next()
@@ -197,9 +216,9 @@ class Arm:
         self._tau += disturbance
         signals.on_the_bus(self._current, noise, self._permille, current)
         if signals.swapped:
-            signals.rewired_torque(current, self.current)
-            signals.rewired_position(position, self.position)
-            signals.rewired_position(demand, self.demand)
+            signals.rewired_torque(current, self._now[1])
+            signals.rewired_position(position, self._now[0])
+            signals.rewired_position(demand, self._now[2])
 
 
 def design_drives(

@@ -38,6 +38,8 @@ class ArmParameters:
         Bandwidth of the position loops, Hz, length n.
     sources
         Where the parameters come from, one sentence each.
+    sign_smoothing
+        ``g`` of each joint's smoothed sign where an identification has it, s/rad or s/m, length n.
     """
 
     standard: Mapping[str, float]
@@ -45,6 +47,7 @@ class ArmParameters:
     noise: NoiseSize
     bandwidth_hz: tuple[float, ...]
     sources: tuple[str, ...] = ()
+    sign_smoothing: tuple[float, ...] | None = None
 
 
 def arm_parameters(
@@ -76,7 +79,8 @@ def arm_parameters(
     """
     if model is not None:
         identified = read_identified(model, robot)
-        return _completed(robot, identified.standard, identified.sources, seed)
+        found = _completed(robot, identified.standard, identified.sources, seed)
+        return replace(found, sign_smoothing=identified.sign_smoothing)
     if inertials is not None and len(inertials.massless) < robot.n:
         standard, sources = _of_urdf(robot, inertials, seed)
         return _completed(robot, standard, sources, seed)
@@ -84,7 +88,9 @@ def arm_parameters(
         bandwidth = tuple(servo.BANDWIDTH_HZ[j] for j in range(robot.n))
         source = f"parameters: those of the virtual {robot.name}"
         return ArmParameters(plant_parameters(robot), rest_posture(robot), SIZES[robot.name], bandwidth, (source,))
-    return _completed(robot, draw_bodies(robot, seed), (f"masses and inertias: drawn from seed {seed}",), seed)
+    reason = "" if inertials is None else ", the URDF has none"
+    source = f"masses and inertias: drawn from seed {seed}{reason}"
+    return _completed(robot, draw_bodies(robot, seed), (source,), seed)
 
 
 def _of_urdf(robot: RobotConfig, read: UrdfInertials, seed: int) -> tuple[dict[str, float], tuple[str, ...]]:

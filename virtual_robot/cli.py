@@ -112,15 +112,40 @@ def demo(
         bool, typer.Option("--keep-going", help="Leave the virtual arm running at the end, until Ctrl-C.")
     ] = False,
     quick: Annotated[bool, typer.Option("--quick", help="Only capture and identification, no diagnosis.")] = False,
+    config: Annotated[
+        Path | None,
+        typer.Option(help="Configuration of a session, or of a robot. [default: the TX40]", show_default=False),
+    ] = None,
+    scenario: Annotated[
+        Path | None,
+        typer.Option(help="Scenario of the second part. [default: a worn bearing]", show_default=False),
+    ] = None,
+    model: Annotated[
+        Path | None, typer.Option(help="Masses and friction of the arm of --config from this identification.json.")
+    ] = None,
+    arm_seed: Annotated[int, typer.Option(min=0, help="Seed of what is drawn, see armident robot.")] = 0,
+    draw_masses: Annotated[
+        bool, typer.Option("--draw-masses", help="Draw the masses even if the URDF of the robot has some.")
+    ] = False,
 ) -> None:
     """Demonstrate capture, identification and diagnosis on this machine without hardware, and write a report.
 
     A virtual arm on a virtual bus is recorded and identified; then one with a hidden effect is recorded and diagnosed.
 
     Example: armident demo --out demo
+
+    Example: armident demo --config my_robot.yaml --out demo
     """
+    from armident.configs import ConfigError
     from armident.extras import require
+    from armident.virtual_robot.demo import DemoOptions
     from armident.virtual_robot.demo import demo as run_demo
+    from armident.virtual_robot.twin import STANDARD, ParameterChoice
 
     require("armident demo", "identify", "virtual")
-    run_demo(out=out, keep_going=keep_going, quick=quick)
+    choice = ParameterChoice(model, arm_seed, draw_masses)
+    if config is None and choice != STANDARD:
+        raise ConfigError("--model, --arm-seed and --draw-masses are for the arm of --config")
+    if model is not None and draw_masses:
+        raise ConfigError("--model has masses, and --draw-masses draws them: give only one of them")
+    run_demo(DemoOptions(out, keep_going, quick, config, scenario, choice))

@@ -3,29 +3,60 @@
 import json
 import logging
 import os
-import re
 import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Iterator, MutableMapping, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
-from html import escape
 from pathlib import Path
-from string import Template
 from typing import Any, NoReturn
 
+import numpy as np
 import yaml
 
-from armident.configs import ArmidentError, ConfigError, SessionConfig, load_session
+from armident.configs import (
+    ArmidentError,
+    ConfigError,
+    RobotConfig,
+    Scenario,
+    SessionConfig,
+    config_path,
+    load_robot,
+    load_scenario,
+    load_session,
+)
+from armident.configs.schema.scenario import HiddenEffect
 from armident.drivers.vcan import ensure_vcan, have_socketcan, launcher_command, launcher_obstacle
 from armident.processes import CommandProcess, ProcessEnded, ProcessTimeout, start_command
-from armident.virtual_robot.twin import at_period
+from armident.virtual_robot.demo_report import (
+    Diagnosed,
+    Identified,
+    print_next_steps,
+    print_table,
+    true_values,
+    write_report,
+)
+from armident.virtual_robot.drawn_parameters import torque_scale
+from armident.virtual_robot.effects import hidden_effects
+from armident.virtual_robot.twin import (
+    SHARED_HEARTBEAT_MS,
+    STANDARD,
+    ParameterChoice,
+    Twin,
+    at_period,
+    load_twin,
+    on_virtual_bus,
+    write_twin,
+)
 
 CELL = "tx40_cell.yaml"
 SCENARIO = "scenarios/tx40_worn_joint2.yaml"
+VCAN = "vcan0"
+"""Bus of a configured arm, in place of those of its session: real drives stay apart."""
+WEAR = 0.3
+"""Difference of the viscous friction from its mean, in either direction, of the worn bearing of a configured arm."""
 GUEST_VARIABLE = "ARMIDENT_GUEST"
 REPEATS = 3
 """Number of runs of the trajectory in the second part: one run is too short for the small hidden effect."""
@@ -37,8 +68,6 @@ SLOW_PERIOD_US = 1000
 """SYNC period on a machine that cannot run arm, bus, capture and worker at 5 kHz, us."""
 MAX_LOST_SHARE = 0.02
 """Largest fraction of lost samples before the recording is repeated at the lower rate."""
-HEARTBEAT_MS = 1000
-"""Heartbeat period, ms: long, because drives and master share this machine."""
 READY_S = 120.0
 """Time limit of the start of a process, s; the first compilation of its loops takes most of it."""
 PART_S = 300.0
@@ -47,7 +76,6 @@ SHOWN_CHARACTERS = 160
 """Maximum length of a process's output line that is passed on."""
 PATIENT, URGENT = 19, -10
 """Nice values of the worker, and of the virtual arm if permitted: all processes share one CPU in the guest."""
-_PART = re.compile(r"<!-- chapter begins -->(.*?)<!-- chapter ends -->", re.DOTALL)
 
 
 class _ElapsedTime(logging.LoggerAdapter[logging.Logger]):
@@ -71,8 +99,9 @@ class _ElapsedTime(logging.LoggerAdapter[logging.Logger]):
 log = _ElapsedTime(logging.getLogger(__name__), {})
 
 
-def demo(*, out: Path, keep_going: bool = False, quick: bool = False) -> None:
-    """Run both parts and write the report.
+@dataclass(frozen=True)
+class DemoOptions:
+    """Options of ``armident demo``.
 
     Parameters
     ----------
@@ -82,50 +111,137 @@ def demo(*, out: Path, keep_going: bool = False, quick: bool = False) -> None:
         Leave the virtual arm running on its bus until Ctrl-C.
     quick
         Only the first part: capture and identification.
+    config
+        Configuration of a session or of a robot; ``None``: the TX40.
+    scenario
+        Scenario of the second part; ``None``: direction-dependent friction in one joint.
+    choice
+        Where the parameters of the arm come from.
+    """
+
+    out: Path
+    keep_going: bool = False
+    quick: bool = False
+    config: Path | None = None
+    scenario: Path | None = None
+    choice: ParameterChoice = STANDARD
+
+    def words(self) -> list[str]:
+        """Return the options as words of a command line, with absolute paths."""
+        words = ["--out", str(self.out.resolve())]
+        for name, path in (("config", self.config), ("scenario", self.scenario), ("model", self.choice.model)):
+            if path is not None:
+                words += [f"--{name}", str(path.resolve() if path.exists() else path)]
+        words += ["--arm-seed", str(self.choice.seed)]
+        flags = {"keep-going": self.keep_going, "quick": self.quick, "draw-masses": self.choice.draw_masses}
+        return words + [f"--{name}" for name, given in flags.items() if given]
+
+
+@dataclass(frozen=True)
+class Subject:
+    """The arm of the demo.
+
+    Parameters
+    ----------
+    session, robot
+        Its session and robot.
+    scenario
+        Scenario of the second part.
+    robot_options
+        Further options of ``armident robot``.
+    """
+
+    session: SessionConfig
+    robot: RobotConfig
+    scenario: Path
+    robot_options: tuple[str, ...] = ()
+
+    def at(self, session: SessionConfig) -> "Subject":
+        """Return the same arm in another session.
+
+        Parameters
+        ----------
+        session
+            The session.
+        """
+        return replace(self, session=session)
+
+
+def demo(options: DemoOptions) -> None:
+    """Run both parts and write the report.
+
+    Parameters
+    ----------
+    options
+        Options of the command.
 
     Raises
     ------
     ConfigError
-        If the bus cannot be set up.
+        If a configuration is wrong, or the bus cannot be set up.
     ArmidentError
         If a process fails; contains its name and the end of its output.
     """
-    session = _session_for_this_machine(out, keep_going, quick)
-    out = out.resolve()
+    out = options.out.resolve()
+    subject = _subject(options, out)
+    subject = subject.at(_session_for_this_machine(subject.session, options))
     out.mkdir(parents=True, exist_ok=True)
     log.begin = time.monotonic()
-    first, session = _identify_part(session, out)
-    second = None if quick else _diagnose_part(session, out)
-    report = _write_report(out, first, second)
-    _print_table(first, second)
-    if keep_going:
+    first, subject = _identify_part(subject, out)
+    second = None if options.quick else _diagnose_part(subject, out)
+    report = write_report(out, subject.robot, first, second)
+    print_table(first, second)
+    if options.keep_going:
         with ExitStack() as stack:
-            robot = _start_robot(_write_session(session, out, "running"), out, stack)
+            robot = _start_robot(_write_session(subject.session, out, "running"), out, stack, subject.robot_options)
             log.info(f"the virtual arm keeps running until Ctrl-C; the report is {report}")
             robot.process.wait()
-    _print_next_steps(report)
+    print_next_steps(report)
 
 
-@dataclass(frozen=True)
-class Identified:
-    """Results of the first part.
+def _subject(options: DemoOptions, out: Path) -> Subject:
+    """Return the arm of the demo; that of a configuration is written to ``out / "twin"``."""
+    if options.config is None:
+        session = load_session(CELL).model_copy(update={"heartbeat_ms": SHARED_HEARTBEAT_MS})
+        return Subject(session, load_robot(session.robot), config_path(options.scenario or SCENARIO))
+    twin = load_twin(options.config, options.choice)
+    folder = out / "twin"
+    session = on_virtual_bus(twin.session, VCAN, f"{twin.session.cell[:50]}_demo")
+    session = load_session(write_twin(twin.with_session(session), folder))
+    if session.setpoints is None:
+        raise ConfigError(f"{options.config}: sync.role: the demo moves the arm, expected producer")
+    if options.scenario is not None:
+        scenario = config_path(options.scenario, listed=("scenarios",)).resolve()
+        hidden_effects(load_scenario(scenario), twin.robot, str(scenario))
+    else:
+        scenario = _write_yaml(
+            worn(twin).model_dump(mode="json", by_alias=True, exclude_none=True), folder / "worn.yaml"
+        )
+    if not os.environ.get(GUEST_VARIABLE):
+        for line in (*twin.parameters.sources, *(f"assumed: {entry}" for entry in twin.assumed)):
+            log.logger.info(line)
+    # The written session has no masses: they come from the same source again.
+    words = ["--arm-seed", str(options.choice.seed), *(["--draw-masses"] * options.choice.draw_masses)]
+    if options.choice.model is not None:
+        words += ["--model", str(options.choice.model.resolve())]
+    return Subject(session, twin.robot, scenario, tuple(words))
+
+
+def worn(twin: Twin) -> Scenario:
+    """Scenario of a worn bearing: viscous friction depends on the direction, in the joint where there is most of it.
 
     Parameters
     ----------
-    document
-        Content of ``identification.json``.
-    report
-        Report of the identification.
-    truth
-        Parameters of the virtual arm by name.
-    lost
-        Number of lost samples.
+    twin
+        The virtual arm.
     """
-
-    document: dict[str, Any]
-    report: Path
-    truth: dict[str, float]
-    lost: int
+    robot, standard = twin.robot, twin.parameters.standard
+    scale = torque_scale(robot, standard).torque
+    share = [standard[f"fv{j + 1}"] * joint.limits.velocity / scale[j] for j, joint in enumerate(robot.joints)]
+    joint = robot.joints[int(np.argmax(share))].name
+    hidden = HiddenEffect(effect="asymmetric_viscous_friction", joint=joint, parameters={"ratio": WEAR})
+    text = f"worn bearing in {joint}: its viscous friction depends on the direction"
+    return Scenario(schema="armident/scenario/1", description=text, effects=(hidden,))
 
 
 @dataclass(frozen=True)
@@ -145,44 +261,26 @@ class Recorded:
     lost_share: float
 
 
-@dataclass(frozen=True)
-class Diagnosed:
-    """Results of the second part.
-
-    Parameters
-    ----------
-    document
-        Content of ``diagnosis.json``.
-    report
-        Report of the diagnosis.
-    """
-
-    document: dict[str, Any]
-    report: Path
-
-
-def _session_for_this_machine(out: Path, keep_going: bool, quick: bool) -> SessionConfig:
+def _session_for_this_machine(session: SessionConfig, options: DemoOptions) -> SessionConfig:
     """Session of the demo on the best available bus; without SocketCAN the demo is restarted in a guest."""
-    session = load_session(CELL).model_copy(update={"heartbeat_ms": HEARTBEAT_MS})
     if have_socketcan():
         ensure_vcan(session.bus.channel)
         return session
     reason = "the guest has no SocketCAN" if os.environ.get(GUEST_VARIABLE) else launcher_obstacle()
     if reason is None:
         log.logger.info("this kernel has no SocketCAN: the demo runs under a User-Mode Linux guest")
-        _restart_in_guest(out, keep_going, quick)
+        _restart_in_guest(options)
     log.logger.info(f"no vcan on this machine ({reason}): using udp_multicast at a lower rate, which may lose frames")
     bus = session.bus.model_copy(update={"interface": "udp_multicast", "channel": UDP_GROUP})
     sync = session.sync.model_copy(update={"period_us": UDP_PERIOD_US})
     return session.model_copy(update={"bus": bus, "sync": sync})
 
 
-def _restart_in_guest(out: Path, keep_going: bool, quick: bool) -> NoReturn:
-    options = ["--keep-going"] * keep_going + ["--quick"] * quick
-    out = out.resolve()
+def _restart_in_guest(options: DemoOptions) -> NoReturn:
+    out = options.out.resolve()
     out.mkdir(parents=True, exist_ok=True)
     if out.is_relative_to(Path.cwd()) or out.is_relative_to("/tmp"):
-        command = launcher_command([*_armident(), "demo", "--out", str(out), *options])
+        command = launcher_command([*_armident(), "demo", *options.words()])
         raise SystemExit(subprocess.run(command, check=False).returncode)
     raise ConfigError(
         f"--out {out}: expected a folder below the working directory or /tmp, the guest writes nowhere else"
@@ -193,9 +291,10 @@ def _armident() -> list[str]:
     return [sys.executable, "-m", "armident.daq.cli"]
 
 
-def _identify_part(session: SessionConfig, out: Path) -> tuple[Identified, SessionConfig]:
-    """Record and identify, at a lower rate if this machine cannot keep up; return the session in use, too."""
-    log.info(f"part 1: record a virtual TX40 at {_rate(session)} and identify its dynamic model")
+def _identify_part(subject: Subject, out: Path) -> tuple[Identified, Subject]:
+    """Record and identify, at a lower rate if this machine cannot keep up; return the arm in its session, too."""
+    session, robot = subject.session, subject.robot
+    log.info(f"part 1: record a virtual {robot.name} at {_rate(session)} and identify its dynamic model")
     truth_file = out / "truth.json"
     while True:
         # The worker waits for the recording that follows; those of earlier attempts and runs are not its work.
@@ -206,7 +305,7 @@ def _identify_part(session: SessionConfig, out: Path) -> tuple[Identified, Sessi
         options = ["--config", str(config), "--once", "--out", str(out)]
         with _running("worker", ["worker", *options], out, "worker: ready", PATIENT) as worker:
             log.info("worker: ready")
-            recorded = _record("capture", config, out, ["--truth", str(truth_file)])
+            recorded = _record("capture", config, out, [*subject.robot_options, "--truth", str(truth_file)])
             slower = _slower(session)
             if recorded.lost_share > MAX_LOST_SHARE and slower is not None:
                 log.info(
@@ -223,17 +322,18 @@ def _identify_part(session: SessionConfig, out: Path) -> tuple[Identified, Sessi
     essential = sum(1 for p in document["parameters"] if p["essential"])
     error = document["relative_error_pct"]
     log.info(f"identified: {essential} essential parameters, relative torque error {error:.1f} %")
-    truth = json.loads(truth_file.read_text(encoding="utf-8"))
-    return Identified(document, Path(report), truth, recorded.lost), session
+    truth = true_values(document, json.loads(truth_file.read_text(encoding="utf-8")), robot)
+    return Identified(document, Path(report), truth, recorded.lost), subject.at(session)
 
 
-def _diagnose_part(session: SessionConfig, out: Path) -> Diagnosed:
+def _diagnose_part(subject: Subject, out: Path) -> Diagnosed:
     """Record the arm with a hidden effect and diagnose it."""
+    session = subject.session
     log.info("part 2: record the same arm with a hidden effect, and let the diagnosis find the effect")
     if session.setpoints is not None:
         session = session.model_copy(update={"setpoints": session.setpoints.model_copy(update={"repeat": REPEATS})})
     config = _write_session(session, out, "cell_worn")
-    recorded = _record("capture_worn", config, out, ["--scenario", SCENARIO])
+    recorded = _record("capture_worn", config, out, [*subject.robot_options, "--scenario", str(subject.scenario)])
     log.info("diagnosing")
     folder = out / "diagnosis"
     with _running("diagnose", ["diagnose", str(recorded.path), "--out", str(folder), "--json"], out) as diagnosis:
@@ -246,7 +346,9 @@ def _diagnose_part(session: SessionConfig, out: Path) -> Diagnosed:
         )
     if not document["findings"]:
         log.info(f"nothing found: verdict {document['verdict']}")
-    return Diagnosed(document, folder / "report.html")
+    effects = load_scenario(subject.scenario).effects
+    hidden = tuple(f"{effect.effect.replace('_', ' ')} in {effect.joint}" for effect in effects)
+    return Diagnosed(document, folder / "report.html", hidden)
 
 
 def _record(name: str, config: Path, out: Path, robot_options: Sequence[str]) -> Recorded:
@@ -286,8 +388,11 @@ def _start_robot(config: Path, out: Path, stack: ExitStack, options: Sequence[st
 
 def _write_session(session: SessionConfig, out: Path, name: str) -> Path:
     """Write a session file with absolute paths."""
-    path = out / f"{name}.yaml"
-    path.write_text(yaml.safe_dump(session.model_dump(mode="json", by_alias=True), sort_keys=False), encoding="utf-8")
+    return _write_yaml(session.model_dump(mode="json", by_alias=True), out / f"{name}.yaml")
+
+
+def _write_yaml(content: dict[str, Any], path: Path) -> Path:
+    path.write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
     return path
 
 
@@ -344,105 +449,3 @@ def _line_after(text: str, start: str, who: str) -> str:
         if line.startswith(start):
             return line.removeprefix(start).strip()
     raise ArmidentError(f"demo: the output of {who} has no line {start.strip()!r}")
-
-
-def _write_report(out: Path, first: Identified, second: Diagnosed | None) -> Path:
-    """Join the reports of both parts to one page."""
-    page = first.report.read_text(encoding="utf-8")
-    parts = [_part(page)] + ([] if second is None else [_part(second.report.read_text(encoding="utf-8"))])
-    head = page[: page.index("<!-- chapter begins -->")]
-    tail = page[page.index("<!-- chapter ends -->") :].removeprefix("<!-- chapter ends -->")
-    path = out / "report.html"
-    handle, temporary = tempfile.mkstemp(dir=out, prefix=".report.")
-    with os.fdopen(handle, "w", encoding="utf-8") as file:
-        file.write(head + _SUMMARY.substitute(_summary(first, second)))
-        file.write("".join(f'<section style="margin-top:56px">{part}</section>' for part in parts) + tail)
-    os.chmod(temporary, 0o644)
-    os.replace(temporary, path)
-    return path
-
-
-def _part(page: str) -> str:
-    found = _PART.search(page)
-    if found is None:
-        raise ArmidentError("demo: a report has no section between the marks of its beginning and end")
-    return found.group(1)
-
-
-_SUMMARY = Template("""
-<h1>armident: results of the demo</h1>
-<p class="sub">The Staubli TX40, its drives and its bus are virtual; all other processes are those of a real cell.</p>
-<ol>
-<li>The six drives were configured over CANopen and recorded at $rate samples per second: $rows samples of each of
-$joints joints, $gaps lost.</li>
-<li>A worker received the samples on Zenoh and identified the dynamic model. It has $essential essential parameters and
-predicts the torques with a relative error of $error %. Of $compared parameters with a known true value, $close lie
-within three standard deviations of it (largest deviation: $worst).</li>
-$second
-</ol>
-""")
-
-
-def _summary(first: Identified, second: Diagnosed | None) -> dict[str, str]:
-    document = first.document
-    compared = _against_truth(first)
-    worst = max(compared, key=lambda row: abs(row[4]), default=None)
-    line = ""
-    if second is not None:
-        found = second.document["findings"]
-        names = ", ".join(f"{f['effect'].replace('_', ' ')} in {f['joint']}" for f in found) or "nothing"
-        gap = second.document["gap"]["validation"]
-        line = (
-            f"<li>Then an effect was hidden in the arm, unknown to the diagnosis. The diagnosis found: "
-            f"<b>{escape(names)}</b>. On held-out data the relative torque error decreased from "
-            f"{gap['before']['all']:.2f} % to {gap['after']['all']:.2f} %; "
-            f"the noise floor is {second.document['noise_floor']['all']:.2f} %.</li>"
-        )
-    counters = {} if worst is None else {"worst": f"{worst[0]}, {abs(worst[4]):.1f}"}
-    return {
-        "rate": f"{document['recording']['sample_rate_hz']:.0f}",
-        "rows": str(document["recording"]["samples"]),
-        "joints": str(len(document["relative_error_pct_by_joint"])),
-        "gaps": str(first.lost or "none"),
-        "essential": str(sum(1 for p in document["parameters"] if p["essential"])),
-        "error": f"{document['relative_error_pct']:.1f}",
-        "close": str(sum(1 for row in compared if abs(row[4]) <= 3)),
-        "compared": str(len(compared)),
-        "worst": "none",
-        "second": line,
-        **counters,
-    }
-
-
-def _against_truth(first: Identified) -> list[tuple[str, float, float, float, float]]:
-    """Essential parameters: name, value, standard deviation, true value, and deviation in standard deviations."""
-    return [
-        (p["name"], p["value"], p["std"], first.truth[p["name"]], (p["value"] - first.truth[p["name"]]) / p["std"])
-        for p in first.document["parameters"]
-        if p["essential"] and p["name"] in first.truth and p["std"] > 0
-    ]
-
-
-def _print_table(first: Identified, second: Diagnosed | None) -> None:
-    print(f"\n{'parameter':>10} {'identified':>11} {'+- std':>9} {'true':>9} {'off by':>9}")
-    for name, value, std, truth, distance in _against_truth(first):
-        print(f"{name:>10} {value:11.4f} {std:9.4f} {truth:9.4f} {distance:5.1f} std")
-    if second is not None:
-        gap = second.document["gap"]["validation"]
-        print(f"\nhidden effect: {second.document['verdict'].replace('_', ' ')}")
-        for f in second.document["findings"]:
-            print(
-                f"  {f['effect']} in {f['joint']}: {f['gap_before']:.2f} % -> {f['gap_after']:.2f} % on held-out data"
-            )
-        print(f"  all joints: {gap['before']['all']:.2f} % -> {gap['after']['all']:.2f} %")
-
-
-def _print_next_steps(report: Path) -> None:
-    """Print the path of the report and the commands for a user's own robot."""
-    print(
-        "\nnext, with measurements of your own robot (or on its bus: armident capture --config CELL.yaml):\n"
-        "  armident import DATA.csv --config ROBOT.yaml --out my_robot.mcap\n"
-        "  armident identify my_robot.mcap --out results\n"
-        f"report: {report}",
-        flush=True,
-    )

@@ -20,10 +20,13 @@ class Identified:
         Standard parameters by name, SI, joint side.
     sources
         Remarks for the user.
+    sign_smoothing
+        ``g`` of each joint's smoothed sign, s/rad or s/m; ``None`` in documents without it.
     """
 
     standard: dict[str, float]
     sources: tuple[str, ...]
+    sign_smoothing: tuple[float, ...] | None = None
 
 
 def read_identified(path: Path, robot: RobotConfig) -> Identified:
@@ -64,7 +67,7 @@ def read_identified(path: Path, robot: RobotConfig) -> Identified:
         sources.append(f"they are not those of the estimate: {physical.get('verdict')}")
     if left := sorted(values.keys() - set(wanted)):
         sources.append(f"not played: {', '.join(left)} (effects of the configuration; a scenario can hide effects)")
-    return Identified(standard, tuple(sources))
+    return Identified(standard, tuple(sources), _smoothing(document, robot, path))
 
 
 def _read(path: Path) -> dict[str, Any]:
@@ -78,6 +81,19 @@ def _read(path: Path) -> dict[str, Any]:
     if not str(schema).startswith("armident/identification/"):
         raise ConfigError(f"{path}: expected an identification.json (schema armident/identification/1)")
     return dict(document)
+
+
+def _smoothing(document: dict[str, Any], robot: RobotConfig, path: Path) -> tuple[float, ...] | None:
+    given = document.get("sign_smoothing")
+    if not isinstance(given, dict):
+        return None
+    try:
+        values = tuple(float(given[joint.name]) for joint in robot.joints)
+    except (TypeError, KeyError, ValueError) as error:
+        raise ConfigError(f"{path}: sign_smoothing: expected a number for each joint") from error
+    if not all(math.isfinite(value) and value > 0.0 for value in values):
+        raise ConfigError(f"{path}: sign_smoothing: expected positive numbers")
+    return values
 
 
 def _values(physical: dict[str, Any], path: Path) -> dict[str, float]:

@@ -62,10 +62,18 @@ class Noise:
         Factor on the amplitudes; 0: no noise.
     size
         Variances of the noise; ``None``: those of the TX40 or the EMPS.
+    averaged
+        Number of control periods over which a reported signal is averaged; its mean has the variance as sampled.
     """
 
     def __init__(
-        self, robot: RobotConfig, period: float, seed: int, level: float = 1.0, size: NoiseSize | None = None
+        self,
+        robot: RobotConfig,
+        period: float,
+        seed: int,
+        level: float = 1.0,
+        size: NoiseSize | None = None,
+        averaged: int = 1,
     ) -> None:
         n = robot.n
         white, slow = amplitudes(robot, period, size)
@@ -96,7 +104,7 @@ class Noise:
 
 
 def amplitudes(
-    robot: RobotConfig, period: float, size: NoiseSize | None = None
+    robot: RobotConfig, period: float, size: NoiseSize | None = None, averaged: int = 1
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return standard deviations of both parts of the noise.
 
@@ -108,6 +116,8 @@ def amplitudes(
         Control period, s.
     size
         Variances of the noise; ``None``: those of the TX40 or the EMPS.
+    averaged
+        Number of control periods over which a reported signal is averaged; its mean has the variance as sampled.
 
     Returns
     -------
@@ -118,8 +128,8 @@ def amplitudes(
     """
     size = SIZES[robot.name] if size is None else size
     total, low = np.array(size.sampled), np.array(size.decimated)
-    white_low = DECIMATION_HZ * 2 * period
+    white_low = DECIMATION_HZ * 2 * period * averaged
     slow_low = 2 / np.pi * np.arctan(DECIMATION_HZ / DISTURBANCE_HZ)
     slow = np.clip((low - white_low * total) / (slow_low - white_low), 0.0, None)
     motor = np.linalg.solve(robot.transmission_matrix.T**2, np.maximum(total - slow, 0.0))
-    return np.sqrt(np.maximum(motor, 0.0)), np.sqrt(slow)
+    return np.sqrt(averaged * np.maximum(motor, 0.0)), np.sqrt(slow)

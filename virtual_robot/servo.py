@@ -12,10 +12,10 @@ from armident.configs import ConfigError, RobotConfig
 from armident.configs.schema.robot import Controller
 
 CONTROL_PERIOD = 200e-6
-"""Control period of position, velocity and current command, s."""
+"""Longest control period of position, velocity and current command, s; that of the TX40."""
 
-OTHER_PERIODS = {"emps": 1e-3}
-"""Control periods of virtual arms that differ from ``CONTROL_PERIOD``, s; EMPS: that of its recordings."""
+OWN_PERIODS = {"tx40": CONTROL_PERIOD, "emps": 1e-3}
+"""Control periods of arms that have their own, s; EMPS: that of its recordings."""
 
 BANDWIDTH_HZ = (5.0, 5.0, 6.0, 8.0, 8.0, 10.0)
 """Closed-loop bandwidth of each position loop, Hz; thesis appendix B.2: at most 10 Hz, reached by joint 6."""
@@ -133,17 +133,17 @@ def control(  # type: ignore[no-untyped-def]
 
 
 def control_period(robot: RobotConfig, sync_period: float | None = None) -> float:
-    """Control period of the robot's drives, s: at most ``CONTROL_PERIOD``, and a whole number of them in a SYNC period.
+    """Control period of the robot's drives, s; a SYNC period has a whole number of them.
 
     Parameters
     ----------
     robot
-        The robot; the EMPS has a period of its own.
+        The robot.
     sync_period
         SYNC period, s; ``None``: any.
     """
-    if robot.name in OTHER_PERIODS or sync_period is None:
-        return OTHER_PERIODS.get(robot.name, CONTROL_PERIOD)
+    if robot.name in OWN_PERIODS or sync_period is None:
+        return OWN_PERIODS.get(robot.name, CONTROL_PERIOD)
     return sync_period / math.ceil(sync_period / CONTROL_PERIOD - 1e-6)
 
 

@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 import yaml
 
-from armident.configs import RobotConfig, SessionConfig, Trajectory, config_path, load_robot, load_session
-from armident.configs.loading import load_inertials
+from armident.configs import ConfigError, RobotConfig, SessionConfig, Trajectory, config_path, load_robot, load_session
+from armident.configs.loading import is_session, load_inertials
+from armident.configs.schema.session import Bus, MetricsOptions, ZenohOptions
 from armident.configs.yaml_loader import read_yaml
 from armident.virtual_robot.arm_parameters import ArmParameters, arm_parameters
 from armident.virtual_robot.drawn_parameters import TORQUE_SHARE, needed_torque
@@ -30,6 +31,8 @@ RATED_SHARE = 0.25
 """Rated value of the drive's signal over that at the torque limit, where the configuration has none, as on the TX40."""
 BUS_RANGE = 32.767
 """Largest value of a signal on the bus over the rated one: 16 bits in per mille (CiA 402, 6077h and 6078h)."""
+SHARED_HEARTBEAT_MS = 1000
+"""Shortest heartbeat period where drives and master share a machine, which may be busy, ms."""
 SYNC_PERIOD_US = 1000
 """SYNC period of a session made for a robot, us."""
 
@@ -109,12 +112,9 @@ def load_twin(config: Path, choice: ParameterChoice = STANDARD) -> Twin:
         If a file is wrong, or is not of this robot.
     """
     path = config_path(config)
-    if _is_robot(path):
-        robot, session = load_robot(path), None
-    else:
-        session = load_session(path)
-        path = session.robot
-        robot = load_robot(path)
+    session = load_session(path, "robot") if is_session(path) else None
+    path = path if session is None else session.robot
+    robot = load_robot(path, "robot")
     inertials = None if choice.draw_masses else load_inertials(path)
     robot, parameters, assumed = complete(robot, model=choice.model, inertials=inertials, seed=choice.seed)
     if session is None:
@@ -146,9 +146,42 @@ def at_period(session: SessionConfig, period_us: int) -> SessionConfig:
     )
 
 
-def _is_robot(path: Path) -> bool:
-    data = read_yaml(path.read_text(encoding="utf-8", errors="replace"), str(path))
-    return isinstance(data, dict) and str(data.get("schema")).startswith("armident/robot/")
+def on_virtual_bus(session: SessionConfig, channel: str, cell: str) -> SessionConfig:
+    """Session on one virtual bus, without the cell's Zenoh, metrics and triggers: real drives and services stay apart.
+
+    Parameters
+    ----------
+    session
+        The session.
+    channel
+        Name of the vcan interface.
+    cell
+        Name of the cell in its place.
+
+    Raises
+    ------
+    ConfigError
+        If drives of several buses share a node id.
+    """
+    nodes = [drive.node_id for drive in session.drives]
+    if len(set(nodes)) < len(nodes):
+        raise ConfigError(
+            f"session of cell {session.cell!r}: drives of several buses share node ids; a virtual bus needs unique ones"
+        )
+    fd = any(bus.fd for bus in session.all_buses)
+    return session.model_copy(
+        update={
+            "cell": cell,
+            "blanks": (),
+            "bus": Bus(channel=channel, fd=fd),
+            "buses": (),
+            "drives": tuple(drive.model_copy(update={"bus": None}) for drive in session.drives),
+            "heartbeat_ms": max(session.heartbeat_ms, SHARED_HEARTBEAT_MS),
+            "recording": session.recording.model_copy(update={"trigger": None}),
+            "zenoh": ZenohOptions(commands=session.zenoh.commands),
+            "metrics": MetricsOptions(),
+        }
+    )
 
 
 def complete(robot: RobotConfig, **choice: Any) -> tuple[RobotConfig, ArmParameters, tuple[str, ...]]:
@@ -169,6 +202,7 @@ def complete(robot: RobotConfig, **choice: Any) -> tuple[RobotConfig, ArmParamet
     robot, limits = with_limits(robot)
     parameters = arm_parameters(robot, **choice)
     robot, drives = _with_drives(robot, parameters)
+    robot = robot.model_copy(update={"blanks": ()})
     return robot, parameters, (*limits, *drives)
 
 
@@ -215,6 +249,12 @@ def _with_drives(robot: RobotConfig, parameters: ArmParameters) -> tuple[RobotCo
         identity = tuple(tuple(float(i == j) for j in range(robot.n)) for i in range(robot.n))
         robot = robot.model_copy(update={"transmission": identity})
         remarks.append("transmission: the identity, counts and signals are those of the joints")
+    if robot.friction.sign_smoothing is None:
+        smoothing = parameters.sign_smoothing or tuple(float(g) for g in robot.sign_smoothing)
+        friction = robot.friction.model_copy(update={"sign_smoothing": smoothing})
+        robot = robot.model_copy(update={"friction": friction})
+        entries = [f"{joint.name} {g:g}" for joint, g in zip(robot.joints, smoothing, strict=True)]
+        assumed["friction.sign_smoothing"] = entries if parameters.sign_smoothing is None else []
     needed = needed_torque(robot, parameters.standard) if _lacks_torque(robot) else np.zeros(robot.n)
     ratio = np.abs(np.diag(robot.transmission_matrix))
     joints = []
@@ -229,7 +269,7 @@ def _with_drives(robot: RobotConfig, parameters: ArmParameters) -> tuple[RobotCo
             values["counts_per_unit"] = float(round(counts / geared))
             assumed.setdefault("drive.counts_per_unit", []).append(f"{joint.name} {values['counts_per_unit']:.0f}")
         most = limits.torque / (geared * abs(drive.gain))
-        if "rated" not in drive.model_fields_set:
+        if "rated" not in drive.model_fields_set or f"joints[{joint.name}].drive.rated" in robot.blanks:
             values["rated"] = _three_digits(RATED_SHARE * most)
             assumed.setdefault("drive.rated", []).append(f"{joint.name} {values['rated']:g}")
         elif most > BUS_RANGE * drive.rated:
@@ -237,6 +277,9 @@ def _with_drives(robot: RobotConfig, parameters: ArmParameters) -> tuple[RobotCo
                 f"drive.rated of {joint.name}: the bus holds {BUS_RANGE * drive.rated:.3g} of the {most:.3g} that the "
                 "torque limit needs; larger signals are clipped"
             )
+        if drive.saturation is None:
+            values["saturation"] = _three_digits(BUS_RANGE * values.get("rated", drive.rated))
+            assumed.setdefault("drive.saturation", []).append(f"{joint.name} {values['saturation']:g}")
         joints.append(joint.model_copy(update={"limits": limits, "drive": drive.model_copy(update=values)}))
     return robot.model_copy(update={"joints": tuple(joints)}), (*remarks, *_sentences(assumed))
 
@@ -250,7 +293,7 @@ def _three_digits(value: float) -> float:
 
 
 def _sentences(assumed: Mapping[str, Sequence[str]]) -> tuple[str, ...]:
-    return tuple(f"{key}: {', '.join(entries)}" for key, entries in assumed.items())
+    return tuple(f"{key}: {', '.join(entries)}" for key, entries in assumed.items() if entries)
 
 
 def _session_for(path: Path, robot: RobotConfig) -> SessionConfig:
@@ -287,7 +330,21 @@ def write_twin(twin: Twin, folder: Path) -> Path:
     -------
     Path
         The session file.
+
+    Raises
+    ------
+    ConfigError
+        If the files cannot be written.
     """
+    try:
+        return _write_files(twin, folder)
+    except OSError as error:
+        raise ConfigError(
+            f"{folder}: the configuration cannot be written: {error.strerror or 'output error'}"
+        ) from error
+
+
+def _write_files(twin: Twin, folder: Path) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     robot, session = folder / "robot.yaml", twin.session.model_dump(mode="json", by_alias=True)
     head = ["For a virtual arm. Assumed, to be measured before a real arm is moved:", *twin.assumed]

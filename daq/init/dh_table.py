@@ -75,8 +75,8 @@ def from_dh_table(file: Path, convention: Convention | None) -> Geometry:
         raise ConfigError(f"{file}: column r belongs to modified parameters (alpha, d, theta, r)")
     chosen = convention or ("modified" if khalil else "classical")
     made = modified(rows) if chosen == "modified" else of_classical(rows)
-    geometry = of_rows(file.name, identifier(file.stem), [(r.name, r.type, m) for r, m in zip(rows, made, strict=True)])
-    return Geometry(geometry.source, geometry.content, geometry.robot, (f"{chosen} parameters", *notes))
+    geometry = of_rows(str(file), identifier(file.stem), [(r.name, r.type, m) for r, m in zip(rows, made, strict=True)])
+    return Geometry(file.name, geometry.content, geometry.robot, (f"{chosen} parameters", *notes))
 
 
 def modified(rows: Sequence[DhRow]) -> list[Mdh]:
@@ -155,7 +155,8 @@ def _read(file: Path) -> tuple[list[DhRow], bool, list[str]]:
         if khalil:
             values = {"alpha": values["alpha"], "theta": values["theta"], "a": values["d"], "d": values["r"]}
         rows.append(DhRow(named.get("name") or f"joint_{len(rows) + 1}", kind, **values))
-    return _in_si(rows, khalil)
+    made, notes = _in_si(file, rows)
+    return made, khalil, notes
 
 
 def _plain(text: str) -> str:
@@ -179,15 +180,17 @@ def _header(cells: Sequence[str]) -> tuple[list[str], Mapping[str, float]]:
     return names, scales
 
 
-def _in_si(rows: Sequence[DhRow], khalil: bool) -> tuple[list[DhRow], bool, list[str]]:
-    """Rows in rad and m where magnitudes tell that a table without units is in degrees or millimetres."""
-    notes = []
-    angle = length = 1.0
-    if max(max(abs(row.theta), abs(row.alpha)) for row in rows) > FULL_TURN:
-        angle = math.pi / 180
-        notes.append("angles are in degrees by their magnitude")
-    if max(max(abs(row.a), abs(row.d)) for row in rows) > LONGEST_LINK:
-        length = 1e-3
-        notes.append("lengths are in millimetres by their magnitude")
-    made = [DhRow(r.name, r.type, angle * r.theta, length * r.d, length * r.a, angle * r.alpha) for r in rows]
-    return made, khalil, notes
+def _in_si(file: Path, rows: Sequence[DhRow]) -> tuple[list[DhRow], list[str]]:
+    """Rows in rad and m where magnitudes tell that a table without units is in degrees or millimetres, and notes."""
+    notes, factors = [], {}
+    for what, keys, most, factor, unit in (
+        ("angles", ("theta", "alpha"), FULL_TURN, math.pi / 180, "degrees"),
+        ("lengths", ("a", "d"), LONGEST_LINK, 1e-3, "millimetres"),
+    ):
+        largest = max(abs(getattr(row, key)) for row in rows for key in keys)
+        if not largest * factor <= most:
+            raise ConfigError(f"{file}: {what}: {largest:g} is beyond every arm, in {unit} too")
+        factors[what] = factor if largest > most else 1.0
+        notes += [f"{what} are in {unit} by their magnitude"] if largest > most else []
+    angle, length = factors["angles"], factors["lengths"]
+    return [DhRow(r.name, r.type, angle * r.theta, length * r.d, length * r.a, angle * r.alpha) for r in rows], notes

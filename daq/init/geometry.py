@@ -11,8 +11,9 @@ import numpy as np
 
 from armident.configs import ArmidentError, ConfigError, RobotConfig, config_path, load_robot
 from armident.configs.blanks import MARK, without_marks
+from armident.configs.loading import checked_robot
 from armident.configs.schema.robot import Mdh
-from armident.configs.urdf import UrdfGeometry, UrdfSource, geometry_from_urdf
+from armident.configs.urdf import UrdfGeometry, UrdfSource, geometry_from_urdf, joint_names
 from armident.configs.urdf_tree import moving_links, orientation, robot_name, serial_tips
 from armident.configs.yaml_loader import is_file, read_yaml
 
@@ -159,7 +160,7 @@ def _of_chain(file: Path, out: Path, base: str | None, tip: str | None) -> Geome
     made = geometry_from_urdf(UrdfGeometry(urdf=part), out / "robot.yaml")
     urdf = {"file": os.path.relpath(part.file, out.resolve()), **part.model_dump(exclude={"file"}, exclude_none=True)}
     name = identifier(robot_name(file) or file.stem)
-    robot = RobotConfig.model_validate({"schema": "armident/robot/1", "name": name, **made})
+    robot = checked_robot({"schema": "armident/robot/1", "name": name, **made}, str(file))
     content: dict[str, Any] = {
         "schema": "armident/robot/1",
         "name": name,
@@ -188,12 +189,16 @@ def of_rows(source: str, name: str, rows: list[tuple[str, str, Mdh]]) -> Geometr
     rows
         Name, type and parameters of each joint, base to tip.
     """
+    names = joint_names([joint for joint, _, _ in rows], Path(source))
     content = {
         "schema": "armident/robot/1",
         "name": name,
-        "joints": [{"name": joint, "type": kind, "mdh": mdh.model_dump()} for joint, kind, mdh in rows],
+        "joints": [
+            {"name": joint, "type": kind, "mdh": mdh.model_dump()}
+            for joint, (_, kind, mdh) in zip(names, rows, strict=True)
+        ],
     }
-    return Geometry(source, content, RobotConfig.model_validate(content))
+    return Geometry(source, content, checked_robot(content, source))
 
 
 def of_axes(count: int) -> Geometry:

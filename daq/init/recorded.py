@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import savgol_filter
 
 from armident.configs import DataError, RobotConfig
 from armident.daq.interchange.even_times import usual_rate
@@ -174,6 +173,8 @@ def _facts(path: Path, recording: Recording, robot: RobotConfig, options: Mappin
 
 def _largest_derivatives(q: Floats, sync: NDArray[np.int64], rate_hz: float) -> tuple[Floats, Floats]:
     """Largest velocity and acceleration (n,) by local cubics, in the pieces between gaps; zero if all are too short."""
+    from scipy.signal import savgol_filter
+
     window = max(5, round(SMOOTHED_S * rate_hz) | 1)
     pieces = [piece for piece in np.split(q, np.flatnonzero(np.diff(sync) > 1) + 1) if len(piece) > window]
 

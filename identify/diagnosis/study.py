@@ -310,7 +310,7 @@ class Study:
         measured = {s.experiment: s.measured for s in (*self.train, *self.held)}
         return {k: _seen(run.q, measured[k], self.auxiliary.dt) for k, run in zip(numbers, runs, strict=True)}
 
-    def _runs(self, theta: Array, numbers: Sequence[int], rounds: int = ROUNDS) -> list[Simulation] | None:
+    def _runs(self, theta: Array, numbers: Sequence[int], rounds: int = ROUNDS) -> Sequence[Simulation] | None:
         """Simulations of the closed loop with the model of the study by experiment; ``None`` if one diverges."""
         auxiliary = replace(
             self.auxiliary.fresh(), model=self.model.anchored(theta), anchor=None, rounds=rounds, tolerated=TOLERATED

@@ -8,6 +8,7 @@ from armident.identify.effects.drive import Correction
 from armident.identify.effects.registry import of_entry
 from armident.identify.effects.wiring import rewired
 from armident.identify.experiment import Experiment
+from armident.identify.streamed import kept
 
 
 def of_recording(entry: Entry) -> bool:
@@ -19,7 +20,7 @@ def of_recording(entry: Entry) -> bool:
     return of_entry(entry).corrects(entry)
 
 
-def put_right(experiments: Sequence[Experiment], robot: RobotConfig) -> list[Experiment]:
+def put_right(experiments: Sequence[Experiment], robot: RobotConfig) -> Sequence[Experiment]:
     """Return the experiments corrected for the effects on signals of a robot's configuration.
 
     Parameters
@@ -38,5 +39,5 @@ def put_right(experiments: Sequence[Experiment], robot: RobotConfig) -> list[Exp
     for entry in robot.effects:
         effect = of_entry(entry)
         if isinstance(effect, Correction) and effect.corrects(entry):
-            experiments = [effect.put_right(e, robot, entry) for e in experiments]
+            experiments = kept((effect.put_right(e, robot, entry) for e in experiments), like=experiments)
     return experiments

@@ -109,7 +109,7 @@ EFFECTS = (SignError, JointOrder, SignalScale)
 BY_NAME = {effect.name: effect() for effect in EFFECTS}
 
 
-def rewired(experiments: Sequence[Experiment], robot: RobotConfig) -> list[Experiment]:
+def rewired(experiments: Sequence[Experiment], robot: RobotConfig) -> Sequence[Experiment]:
     """Return the experiments corrected for the wiring errors of a robot's configuration.
 
     Parameters
@@ -126,7 +126,7 @@ def rewired(experiments: Sequence[Experiment], robot: RobotConfig) -> list[Exper
     """
     position, torque = exchanges(robot)
     if np.array_equal(position, np.eye(robot.n)) and np.array_equal(torque, np.eye(robot.n)):
-        return list(experiments)
+        return experiments
     ratios = robot.transmission_matrix
     # Signals are those of the motors: exchanged there, then converted back to the joints.
     of_position = np.linalg.solve(ratios, position @ ratios)

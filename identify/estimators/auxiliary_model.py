@@ -19,6 +19,7 @@ from armident.identify.robot.simulation import Simulation
 from armident.identify.signals.bandpass import butterworth
 from armident.identify.signals.decimate import Decimation
 from armident.identify.signals.differentiate import Derivatives
+from armident.identify.streamed import kept, mapped
 
 HALVINGS = 8
 """Step halvings towards the last estimate that could be simulated."""
@@ -32,6 +33,10 @@ it beyond three bandwidths of the closed loop."""
 
 POSTURES = 100
 """Postures of the references at which the mass matrix of an iterate that diverged is examined."""
+
+
+class _Diverged(Exception):
+    """The simulation of an experiment has diverged."""
 
 
 @dataclass(frozen=True)
@@ -175,7 +180,7 @@ class AuxiliaryModel:
 
     def simulate(
         self, theta: NDArray[np.float64], disturbances: Sequence[NDArray[np.float64]] | None = None
-    ) -> list[Simulation] | None:
+    ) -> Sequence[Simulation] | None:
         """All experiments with these base parameters, or ``None`` if one diverges or theta is not finite.
 
         Parameters
@@ -187,9 +192,10 @@ class AuxiliaryModel:
         """
         if not np.isfinite(theta).all():
             return None
-        runs = []
-        for k, (q_ref, (q0, qd0)) in enumerate(zip(self.references, self.initial, strict=True)):
-            run = simulate_with_terms(
+
+        def run(k: int, q_ref: NDArray[np.float64]) -> Simulation:
+            q0, qd0 = self.initial[k]
+            found = simulate_with_terms(
                 self.model,
                 theta,
                 self.controller,
@@ -205,10 +211,14 @@ class AuxiliaryModel:
                 qd0=qd0,
                 max_velocity=self.max_velocity,
             )
-            if run.diverged_at is not None:
-                return None
-            runs.append(run)
-        return runs
+            if found.diverged_at is not None:
+                raise _Diverged
+            return found
+
+        try:
+            return kept((run(k, q_ref) for k, q_ref in enumerate(self.references)), like=self.references)
+        except _Diverged:
+            return None
 
     def respond(self, theta: NDArray[np.float64]) -> Response | None:
         """Simulated torques and positions after the parallel filter, or ``None`` if the simulation diverges."""
@@ -220,7 +230,7 @@ class AuxiliaryModel:
         with ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
             return list(pool.map(self.respond, thetas))
 
-    def instruments(self, theta: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+    def instruments(self, theta: NDArray[np.float64]) -> Sequence[NDArray[np.float64]]:
         """Filtered regressor at simulated signals, one (M, n, b) per experiment.
 
         Raises
@@ -230,7 +240,7 @@ class AuxiliaryModel:
         """
         return self.regressors(self.motions(theta))
 
-    def motions(self, theta: NDArray[np.float64]) -> list[Derivatives]:
+    def motions(self, theta: NDArray[np.float64]) -> Sequence[Derivatives]:
         """Simulated signals of every experiment.
 
         Raises
@@ -239,14 +249,17 @@ class AuxiliaryModel:
             As `instruments`.
         """
         _, runs = self._nearest(theta)
-        return [Derivatives(run.q, run.qd, run.qdd, None, self.dt, self._start(k)) for k, run in enumerate(runs)]
+        starts = [self._start(k) for k in range(len(runs))]
+        return mapped(lambda run, start: Derivatives(run.q, run.qd, run.qdd, None, self.dt, start), runs, starts)
 
-    def regressors(self, motions: Sequence[Derivatives]) -> list[NDArray[np.float64]]:
+    def regressors(self, motions: Sequence[Derivatives]) -> Sequence[NDArray[np.float64]]:
         """Filtered regressor at noise-free motions, one (M, n, b) per experiment."""
-        seen = [self._in_band(motion, k) for k, motion in enumerate(motions)]
-        return [filtered_regressor(self.model, motion, self.decimation) for motion in seen]
+        seen = (self._in_band(motion, k) for k, motion in enumerate(motions))
+        return kept((filtered_regressor(self.model, motion, self.decimation) for motion in seen), like=motions)
 
-    def equations(self, blocks: Sequence[ExperimentEquations], theta: NDArray[np.float64]) -> list[ExperimentEquations]:
+    def equations(
+        self, blocks: Sequence[ExperimentEquations], theta: NDArray[np.float64]
+    ) -> Sequence[ExperimentEquations]:
         """Equations with the simulated regressor in place of the measured one (2.32).
 
         Parameters
@@ -261,7 +274,7 @@ class AuxiliaryModel:
         DataError
             As `instruments`.
         """
-        return [replace(block, x=zeta) for block, zeta in zip(blocks, self.instruments(theta), strict=True)]
+        return mapped(lambda block, zeta: replace(block, x=zeta), blocks, self.instruments(theta))
 
     def reachable(self, theta: NDArray[np.float64]) -> tuple[NDArray[np.float64], Response]:
         """Theta and its response, or the nearest point towards the last good estimate that has one.
@@ -292,7 +305,7 @@ class AuxiliaryModel:
             tuple(self.decimation(run.q) for run in runs),
         )
 
-    def _nearest(self, theta: NDArray[np.float64]) -> tuple[NDArray[np.float64], list[Simulation]]:
+    def _nearest(self, theta: NDArray[np.float64]) -> tuple[NDArray[np.float64], Sequence[Simulation]]:
         """Theta, or the first point on the way back from it that can be simulated."""
         runs = self.simulate(theta)
         if runs is not None:
@@ -317,7 +330,7 @@ class AuxiliaryModel:
 
     def _postures(self) -> NDArray[np.float64]:
         total = sum(q_ref.shape[0] for q_ref in self.references)
-        return np.concatenate([q_ref[:: max(1, total // POSTURES)] for q_ref in self.references])
+        return np.concatenate([q_ref[:: max(1, total // POSTURES)].copy() for q_ref in self.references])
 
 
 def _at_samples(held: NDArray[np.float64]) -> NDArray[np.float64]:

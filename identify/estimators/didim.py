@@ -68,7 +68,7 @@ def didim(
 
 def solve_didim(
     blocks: Sequence[ExperimentEquations], auxiliary: AuxiliaryModel, start: NDArray[np.float64], iterations: int
-) -> tuple[Iterations, list[ExperimentEquations]]:
+) -> tuple[Iterations, Sequence[ExperimentEquations]]:
     """Iterations of DIDIM (2.36), and the simulated equations at their end.
 
     Parameters

@@ -18,6 +18,7 @@ from armident.identify.regression.equations import (
 )
 from armident.identify.regression.iterations import ITERATIONS, iterate
 from armident.identify.regression.iv import factored, serial_covariance
+from armident.identify.streamed import mapped
 
 
 def idim_iv(
@@ -65,7 +66,7 @@ def idim_iv(
     covariance = factored(stacked(simulated, noise)[0], *stacked(blocks, noise)).covariance
     if serial_order:
         weights, keep = noise, [b.keep for b in blocks]
-        zeta, x = [b.x for b in simulated], [b.x for b in blocks]
+        zeta, x = mapped(lambda b: b.x, simulated), mapped(lambda b: b.x, blocks)
         for _ in range(COVARIANCE_PASSES):
             noise = noise_models(blocks, theta, covariance, serial_order)
             covariance = serial_covariance(zeta, x, keep, weights, noise)

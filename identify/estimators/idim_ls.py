@@ -14,6 +14,7 @@ from armident.identify.regression.equations import (
 )
 from armident.identify.regression.iv import serial_covariance
 from armident.identify.regression.least_squares import inverse_gram, least_squares, require_excitation
+from armident.identify.streamed import mapped
 
 
 def idim_ls(
@@ -49,11 +50,11 @@ def idim_ls(
         theta = least_squares(x, y)  # 2.23
         covariance = inverse_gram(x)  # 2.27
     else:
-        regressors = [b.x for b in blocks]
+        regressors = mapped(lambda b: b.x, blocks)
         covariance = serial_covariance(regressors, regressors, [b.keep for b in blocks], plain, noise)
     if serial_order:
         weights = noise if weighted else plain
-        regressors = [b.x for b in blocks]
+        regressors = mapped(lambda b: b.x, blocks)
         for _ in range(COVARIANCE_PASSES):
             noise = noise_models(blocks, theta, covariance, serial_order)
             covariance = serial_covariance(regressors, regressors, [b.keep for b in blocks], weights, noise)

@@ -20,6 +20,7 @@ from armident.identify.regression.equations import (
 )
 from armident.identify.regression.iterations import ITERATIONS, iterate
 from armident.identify.regression.iv import IvProducts, iv_products
+from armident.identify.streamed import mapped
 
 NOISE_UPDATES = 6
 """Iterations after which the noise models are held: an order that flips between two equal AICs never settles."""
@@ -73,7 +74,7 @@ def idim_piv(
     noise: list[ArModel] = scale  # step 1: H = 1, lambda from the start
 
     def solved(at: NDArray[np.float64]) -> IvProducts:
-        instruments = [block.x for block in seen(auxiliary.equations(blocks, at))]
+        instruments = mapped(lambda block: block.x, seen(auxiliary.equations(blocks, at)))
         return iv_products(instrumented(measured, instruments), noise)  # 6.30
 
     def step(previous: NDArray[np.float64], k: int) -> tuple[NDArray[np.float64], float]:

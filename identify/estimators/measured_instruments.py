@@ -13,6 +13,7 @@ from armident.identify.robot.controller import DiscreteController
 from armident.identify.robot.simulation import Simulation
 from armident.identify.signals.bandpass import central_difference
 from armident.identify.signals.decimate import Decimation
+from armident.identify.streamed import kept
 
 
 @dataclass
@@ -43,12 +44,12 @@ class MotionInstruments(AuxiliaryModel):
         """
         # Neither controller nor initial state has a part in it.
         controller = DiscreteController.fir(np.zeros((model.n, 1)), dt)
-        at_rest = [(q[0], np.zeros(model.n)) for q in motion]
+        at_rest = [(q[0].copy(), np.zeros(model.n)) for q in motion]
         return cls(model, controller, motion, at_rest, dt, decimation, np.full(model.n, np.inf), feedback=False)
 
     def simulate(
         self, theta: NDArray[np.float64], disturbances: Sequence[NDArray[np.float64]] | None = None
-    ) -> list[Simulation] | None:
+    ) -> Sequence[Simulation] | None:
         """The motion of every experiment, with the torques that these base parameters need for it.
 
         Parameters
@@ -60,13 +61,14 @@ class MotionInstruments(AuxiliaryModel):
         """
         if not np.isfinite(theta).all():
             return None
-        runs: list[Simulation] = []
-        for q in self.references:
+
+        def run(k: int, q: NDArray[np.float64]) -> Simulation:
             qd = central_difference(q, self.dt)
             qdd = central_difference(qd, self.dt)
             tau = self.model.inverse_dynamics(theta, q, qd, qdd)
             if self.model.terms:
-                motion = self.model.motion(q, qd, qdd, self.dt, self._start(len(runs)))
+                motion = self.model.motion(q, qd, qdd, self.dt, self._start(k))
                 tau = tau + self.model.term_regressor(motion) @ theta[theta.size - self.model.e :]
-            runs.append(Simulation(q, qd, qdd, tau, None))
-        return runs
+            return Simulation(q, qd, qdd, tau, None)
+
+        return kept((run(k, q) for k, q in enumerate(self.references)), like=self.references)

@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 import yaml
 
 from armident.configs import ConfigError, RobotConfig, load_robot, load_trajectory
@@ -15,15 +14,19 @@ from armident.identify.excitation.design import (
     Design,
     Shape,
     design_trajectory,
-    excesses,
     predict_precision,
     with_objective,
 )
 from armident.identify.excitation.objective import EffectObjective
 from armident.identify.excitation.plot import check_name, draw
 from armident.identify.excitation.previous_estimate import PreviousEstimate, physical_estimate
-from armident.identify.excitation.safety import SafetyChecks, SafetyModel, check_safety, safety_model
-from armident.identify.robot.chain import Floats
+from armident.identify.excitation.safety import (
+    CheckedTrajectory,
+    SafetyModel,
+    assumed_noise,
+    checked_trajectory,
+    safety_model,
+)
 
 SHAPES: tuple[Shape, ...] = ("moves", "fourier")
 """Values of ``--shape``."""
@@ -72,52 +75,6 @@ class TrajectoryOptions:
     look_at: Path | None = None
 
 
-@dataclass(frozen=True, eq=False)
-class CheckedTrajectory:
-    """Result of ``armident trajectory``.
-
-    Parameters
-    ----------
-    robot
-        Configuration of the robot.
-    path
-        File of the trajectory.
-    design
-        Trajectory with its predicted precision.
-    std
-        Predicted standard deviations of the base parameters (b,), SI.
-    prior
-        Earlier estimate; ``None``: the standard deviations are those of an assumed noise.
-    safety
-        Masses and bodies.
-    checks
-        Properties that were checked, and those that were not.
-    excess
-        Limits that an existing trajectory exceeds.
-    """
-
-    robot: RobotConfig
-    path: Path
-    design: Design
-    std: Floats
-    prior: PreviousEstimate | None
-    safety: SafetyModel
-    checks: SafetyChecks
-    excess: tuple[str, ...]
-
-    def refuse_excess(self) -> None:
-        """Refuse a trajectory that exceeds limits of torque or distance.
-
-        Raises
-        ------
-        ConfigError
-            Names each excess and the next step.
-        """
-        if self.excess:
-            next_step = "Next: design another one with --out FILE, or correct limits.torque and collision of the robot"
-            raise ConfigError(f"{self.path}: needs {'; '.join(self.excess)}. {next_step}")
-
-
 def trajectory_command(options: TrajectoryOptions) -> CheckedTrajectory:
     """Carry out ``armident trajectory`` but for its report.
 
@@ -157,19 +114,18 @@ def trajectory_command(options: TrajectoryOptions) -> CheckedTrajectory:
     if out is not None:
         content = design.trajectory.model_dump(mode="json", by_alias=True, exclude_defaults=True)
         write_atomically(out, yaml.safe_dump(content, sort_keys=False))
-    std = _print_precision(robot, design, prior)
-    path = out or look_at or Path()
+    path = out or look_at
+    found = checked_trajectory(robot, design, safety, prior, path)
+    _print_precision(found)
     summary = f"{path}: {design.trajectory.duration:.2f} s, condition number {design.condition:.0f}"
     draw(robot, design, picture, f"{robot.name}, {summary}")
     print(summary)
     print(f"picture: {picture}")
-    checks = check_safety(robot, design, safety)
-    for line in checks.checked:
+    for line in found.checks.checked:
         print(f"checked: {line}")
-    for line in checks.unchecked:
+    for line in found.checks.unchecked:
         print(f"not checked: {line}")
-    excess = tuple(excesses(robot, design, safety.collision))
-    return CheckedTrajectory(robot, path, design, std, prior, safety, checks, excess)
+    return found
 
 
 def _designed(
@@ -214,26 +170,15 @@ def _looked_at(
 ) -> Design:
     trajectory = load_trajectory(path)
     trajectory.check(robot, str(path))
-    noise = _assumed(robot) if prior is None else prior.noise
+    noise = assumed_noise(robot) if prior is None else prior.noise
     model, bodies = arm_model(robot), safety.collision
     return predict_precision(model, trajectory, noise, theta=safety.theta, aim=aim, collision=bodies)
 
 
-def _print_precision(robot: RobotConfig, design: Design, prior: PreviousEstimate | None) -> Floats:
-    """Print and return the predicted standard deviations (b,), SI."""
-    std = design.std
-    if prior is None or std is None:
-        model = arm_model(robot)
-        std = predict_precision(model, design.trajectory, _assumed(robot)).std
-        assert std is not None
+def _print_precision(found: CheckedTrajectory) -> None:
+    """Print the predicted standard deviations."""
+    if found.prior is None:
         print(f"noise unknown (no --known): assumed to be {100 * ASSUMED_NOISE:g} % of each joint's torque limit")
-        design_table(robot, None, std)
-    else:
-        design_table(robot, prior.theta, std)
-    if design.wanted is not None:
-        wanted_table(design.wanted)
-    return std
-
-
-def _assumed(robot: RobotConfig) -> Floats:
-    return ASSUMED_NOISE * np.array([joint.limits.torque for joint in robot.joints])
+    design_table(found.robot, None if found.prior is None else found.prior.theta, found.std)
+    if found.design.wanted is not None:
+        wanted_table(found.design.wanted)

@@ -6,11 +6,12 @@ from pathlib import Path
 
 import numpy as np
 
-from armident.configs import RobotConfig
+from armident.configs import ConfigError, RobotConfig
 from armident.configs.loading import load_inertials, load_shapes
+from armident.configs.urdf_inertials import UrdfInertials
 from armident.identify.effects.terms import arm_model
 from armident.identify.excitation.collision import CollisionModel
-from armident.identify.excitation.design import PERIOD, Design
+from armident.identify.excitation.design import ASSUMED_NOISE, PERIOD, Design, excesses, predict_precision
 from armident.identify.excitation.link_geometry import capsules_of
 from armident.identify.excitation.previous_estimate import PreviousEstimate
 from armident.identify.robot.chain import Floats
@@ -84,16 +85,20 @@ def safety_model(
     )
     if prior is not None:
         return SafetyModel(collision, prior.theta, prior_name, tuple(remarks))
-    theta = None if source is None else _theta_of_urdf(robot, source)
-    if theta is not None:
+    found = None if source is None else load_inertials(source)
+    theta = None if found is None else _theta_of_urdf(robot, found)
+    if found is not None and theta is not None:
+        if found.massless:
+            remarks.append(
+                f"masses moved by {_listed(robot.joints[k - 1].name for k in found.massless)}: not in the URDF"
+            )
         remarks.append("torques of rotor inertias, and of friction that the URDF does not give")
     return SafetyModel(collision, theta, "the masses of the URDF", tuple(remarks))
 
 
-def _theta_of_urdf(robot: RobotConfig, source: str | Path) -> Floats | None:
+def _theta_of_urdf(robot: RobotConfig, found: UrdfInertials) -> Floats | None:
     """Standard parameters (p,) of the masses and friction of a URDF; ``None`` if it has no masses."""
-    found = load_inertials(source)
-    if found is None or not any(value > 0.0 for name, value in found.standard.items() if name.startswith("m")):
+    if len(found.massless) == robot.n:
         return None
     values = found.standard | found.friction
     return np.array([values.get(name, 0.0) for name in arm_model(robot).names])
@@ -135,6 +140,100 @@ def check_safety(robot: RobotConfig, design: Design, safety: SafetyModel) -> Saf
         left.append(f"obstacles: {NO_BOXES}")
     left.append("cables, and a tool that neither the URDF nor collision.capsules contains")
     return SafetyChecks(tuple(done), tuple(left))
+
+
+@dataclass(frozen=True, eq=False)
+class CheckedTrajectory:
+    """Result of ``armident trajectory``.
+
+    Parameters
+    ----------
+    robot
+        Configuration of the robot.
+    path
+        File of the trajectory; ``None``: it is not in a file.
+    design
+        Trajectory with its predicted precision.
+    std
+        Predicted standard deviations of the base parameters (b,), SI.
+    prior
+        Earlier estimate; ``None``: the standard deviations are those of an assumed noise.
+    safety
+        Masses and bodies.
+    checks
+        Properties that were checked, and those that were not.
+    excess
+        Limits that an existing trajectory exceeds.
+    """
+
+    robot: RobotConfig
+    path: Path | None
+    design: Design
+    std: Floats
+    prior: PreviousEstimate | None
+    safety: SafetyModel
+    checks: SafetyChecks
+    excess: tuple[str, ...]
+
+    def refuse_excess(self) -> None:
+        """Refuse a trajectory that exceeds limits of torque or distance.
+
+        Raises
+        ------
+        ConfigError
+            Names each excess and the next step.
+        """
+        if self.excess:
+            next_step = "Next: design another one with --out FILE, or correct limits.torque and collision of the robot"
+            raise ConfigError(f"{self.path}: needs {'; '.join(self.excess)}. {next_step}")
+
+
+def checked_trajectory(
+    robot: RobotConfig, design: Design, safety: SafetyModel, prior: PreviousEstimate | None, path: Path | None = None
+) -> CheckedTrajectory:
+    """Return a trajectory with all checks.
+
+    Parameters
+    ----------
+    robot
+        Configuration with the limits.
+    design
+        The trajectory.
+    safety
+        Masses and bodies by which it was designed or checked.
+    prior
+        Earlier estimate, if there is one.
+    path
+        File of the trajectory, if there is one.
+    """
+    std, checks = expected_std(robot, design, prior), check_safety(robot, design, safety)
+    return CheckedTrajectory(
+        robot, path, design, std, prior, safety, checks, tuple(excesses(robot, design, safety.collision))
+    )
+
+
+def expected_std(robot: RobotConfig, design: Design, prior: PreviousEstimate | None) -> Floats:
+    """Return the predicted standard deviations of the base parameters (b,), SI; of an assumed noise without estimate.
+
+    Parameters
+    ----------
+    robot
+        Configuration of the robot.
+    design
+        The trajectory.
+    prior
+        Earlier estimate, if there is one.
+    """
+    std = design.std
+    if prior is None or std is None:
+        std = predict_precision(arm_model(robot), design.trajectory, assumed_noise(robot)).std
+        assert std is not None
+    return std
+
+
+def assumed_noise(robot: RobotConfig) -> Floats:
+    """Return the torque noise (n,) that is assumed where none is known, N m or N."""
+    return ASSUMED_NOISE * np.array([joint.limits.torque for joint in robot.joints])
 
 
 def _listed(names: Iterable[str], most: int = 6) -> str:

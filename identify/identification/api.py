@@ -2,18 +2,23 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import chain
 
 from armident.configs import DataError, RobotConfig
 from armident.daq.recording import Recording
 from armident.identify.document import IdentificationDocument, identification_document
 from armident.identify.experiment import Experiment
-from armident.identify.identification.from_recording import experiments_from_recording
+from armident.identify.identification.from_recording import WHOLE, StretchRule, experiments_from_recording
 from armident.identify.identification.options import Options
 from armident.identify.identification.pipeline import identify_experiment
 from armident.identify.identification.result import Identification
 from armident.identify.identification.sign_smoothing import with_numbers
 from armident.identify.identification.verdict import SetupCheck
 from armident.identify.setup.check import check_setup
+from armident.identify.streamed import OnDisk, Streamed
+
+CHECKED_VALUES = 6_000_000
+"""Number of values (samples times joints) of a long recording by which the set-up is checked."""
 
 
 @dataclass(frozen=True)
@@ -44,6 +49,7 @@ def identify_recording(
     options: Options | None = None,
     progress: Callable[[str, float], None] | None = None,
     check: Callable[[Sequence[Experiment], RobotConfig], SetupCheck] | None = check_setup,
+    stretches: StretchRule | None = None,
 ) -> IdentificationOutcome:
     """Identification of recordings, read from files or assembled from the stream.
 
@@ -59,6 +65,8 @@ def identify_recording(
         Called with the name of a stage and the share done, 0 to 1.
     check
         Check of the set-up, whose findings enter the verdict; ``None``: none.
+    stretches
+        Size from which recordings are identified in stretches; ``None``: the default.
 
     Raises
     ------
@@ -69,11 +77,13 @@ def identify_recording(
     """
     recordings = (recordings,) if isinstance(recordings, Recording) else tuple(recordings)
     robot = robot or recordings[0].robot
-    experiments, notes = experiments_of(recordings, robot, name_files=len(recordings) > 1)
+    experiments, notes = experiments_of(
+        recordings, robot, name_files=len(recordings) > 1, stretches=stretches or StretchRule()
+    )
     setup = None
     if check is not None:
         try:
-            setup = check(experiments, robot)
+            setup = check(_checked(experiments), robot)
         except DataError as error:
             # Too short for the check: the identification itself decides if it is long enough for the parameters.
             notes = [*notes, f"the set-up was not checked: {error}"]
@@ -82,9 +92,19 @@ def identify_recording(
     return IdentificationOutcome(recordings, used, result, identification_document(result, recordings, used, notes))
 
 
+def _checked(experiments: Sequence[Experiment]) -> Sequence[Experiment]:
+    """Experiments by which the set-up is checked: of a long recording the first ones."""
+    if not isinstance(experiments, Streamed):
+        return experiments
+    first: list[Experiment] = []
+    while len(first) < len(experiments) and sum(e.q.size for e in first) < CHECKED_VALUES:
+        first.append(experiments[len(first)])
+    return first
+
+
 def experiments_of(
-    recordings: Sequence[Recording], robot: RobotConfig, *, name_files: bool
-) -> tuple[list[Experiment], list[str]]:
+    recordings: Sequence[Recording], robot: RobotConfig, *, name_files: bool, stretches: StretchRule = WHOLE
+) -> tuple[Sequence[Experiment], list[str]]:
     """Return the experiments of recordings, one recording after the other, and remarks on them.
 
     Parameters
@@ -95,6 +115,8 @@ def experiments_of(
         Configuration to convert them with.
     name_files
         True to begin each remark with the name of its file.
+    stretches
+        Size from which recordings are cut into stretches; all together count.
 
     Raises
     ------
@@ -103,11 +125,16 @@ def experiments_of(
     DataError
         If a recording holds no experiment that can be used.
     """
-    experiments: list[Experiment] = []
+    found: list[Sequence[Experiment]] = []
     notes: list[str] = []
+    if sum(recording.samples.sync.size for recording in recordings) * robot.n > stretches.beyond:
+        stretches = StretchRule(0, stretches.length)
     for recording in recordings:
-        found, remarks = experiments_from_recording(recording, robot)
-        experiments += found
+        experiments, remarks = experiments_from_recording(recording, robot, stretches)
+        found.append(experiments)
         named = name_files and recording.path is not None
         notes += [f"{recording.path.name}: {remark}" if named and recording.path else remark for remark in remarks]
-    return experiments, notes
+    if len(found) == 1:
+        return found[0], notes
+    joined = chain.from_iterable(found)
+    return OnDisk(joined) if isinstance(found[0], Streamed) else list(joined), notes

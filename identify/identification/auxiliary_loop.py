@@ -24,6 +24,7 @@ from armident.identify.robot.simulation import Simulation
 from armident.identify.signals.bandpass import butterworth
 from armident.identify.signals.decimate import Decimation
 from armident.identify.signals.differentiate import Derivatives, differentiate
+from armident.identify.streamed import kept, mapped
 
 RUNAWAY = 3.0
 """Speed of a simulated joint, over the highest measured speed, beyond which the simulation has diverged."""
@@ -103,8 +104,8 @@ def closed_loop(
     fastest = RUNAWAY * np.max([np.abs(s.qd).max(axis=0) for s in signals], axis=0) + 1e-3
 
     @cache
-    def smoothed_motion() -> list[Array]:
-        return [butterworth(s.q, dt, min(PIV_CUTOFF * bandwidth, 0.4 / dt)) for s in signals]
+    def smoothed_motion() -> Sequence[Array]:
+        return kept((butterworth(s.q, dt, min(PIV_CUTOFF * bandwidth, 0.4 / dt)) for s in signals), like=signals)
 
     closest: tuple[float, ClosedLoop] | None = None
     for controller, references, description in _controllers(
@@ -115,7 +116,7 @@ def closed_loop(
                 model,
                 controller,
                 references,
-                [(s.q[0], s.qd[0]) for s in signals],
+                [(s.q[0].copy(), s.qd[0].copy()) for s in signals],
                 dt,
                 decimation,
                 fastest,
@@ -183,9 +184,9 @@ def _controllers(
     """Controllers with their references, the preferred one first, a stiff PD controller last."""
     model, experiments = prepared.model, prepared.experiments
     dt = experiments[0].dt
-    references = [e.q_ref for e in experiments if e.q_ref is not None]
     reason = NO_REFERENCE
-    if len(references) == len(experiments):
+    if all(e.q_ref is not None for e in experiments):
+        references = mapped(lambda e: e.q_ref, experiments)
         if options.controller == excluded:
             pass
         elif options.controller == "known":
@@ -193,7 +194,7 @@ def _controllers(
         else:
             yield _identified(model.robot, experiments, references, options, dt)
         reason = NOT_LIKE_THE_ROBOT
-    postures = np.concatenate([s.q[:: max(1, s.q.shape[0] // 200)] for s in prepared.signals])
+    postures = np.concatenate([s.q[:: max(1, s.q.shape[0] // 200)].copy() for s in prepared.signals])
     try:
         stiff = nominal_controller(model, ls, postures, dt, bandwidth)
     except DataError:
@@ -208,8 +209,8 @@ def _identified(
     """Controller of every motor, identified from position, reference and torque at its shaft (thesis 5.2)."""
     ratios = robot.transmission_matrix
     to_motor = np.linalg.inv(ratios)
-    q, wanted = [e.q @ ratios.T for e in experiments], [r @ ratios.T for r in references]
-    tau = [e.tau @ to_motor for e in experiments]
+    q, wanted = mapped(lambda e: e.q @ ratios.T, experiments), mapped(lambda r: r @ ratios.T, references)
+    tau = mapped(lambda e: e.tau @ to_motor, experiments)
     if options.controller == "crc":
         found = identify_crc(q, wanted, tau, dt, saturation=saturation(robot))
     else:

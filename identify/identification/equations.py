@@ -15,12 +15,16 @@ from armident.identify.signals.bandpass import butterworth, central_difference
 from armident.identify.signals.decimate import Decimation, design
 from armident.identify.signals.differentiate import Derivatives
 from armident.identify.signals.published_filters import chebyshev_decimate, kept_samples
+from armident.identify.streamed import Streamed, kept
 
 LS_CUTOFF = 2.0
 """Cut-off of the least-squares decimation in closed-loop bandwidths (thesis 2.3.1: ``w_Fp >= 2 w_dyn``)."""
 
 PIV_CUTOFF = 5.0
 """Cut-off of the rough decimation before IDIM-PIV, in closed-loop bandwidths (thesis section 7.2)."""
+
+TESTED_ROWS = 30_000
+"""Number of decimated instants of a long recording that the tests of an estimate use."""
 
 EQUATIONS_PER_PARAMETER = 10.0
 """Least number of equations per base parameter, of all joints and experiments: the rest determines the noise."""
@@ -102,7 +106,7 @@ def aligned_torque(tau: NDArray[np.float64], late: float = 0.0) -> NDArray[np.fl
 
 def equations(
     model: ArmModel, experiments: Sequence[Experiment], signals: Sequence[Derivatives], decimation: Decimation
-) -> list[ExperimentEquations]:
+) -> Sequence[ExperimentEquations]:
     """Filtered and decimated equations of every experiment.
 
     The sign of the velocity is the smoothed one of the robot's configuration, so all samples can stay, as a linear
@@ -118,16 +122,17 @@ def equations(
         Parallel filter.
     """
     threshold = model.robot.friction.velocity_threshold
-    blocks = []
-    for experiment, s in zip(experiments, signals, strict=True):
-        kept = decimation.instants(s.q.shape[0])
+
+    def of(experiment: Experiment, s: Derivatives) -> ExperimentEquations:
+        instants = decimation.instants(s.q.shape[0])
         y = decimation(aligned_torque(experiment.tau, experiment.torque_shift))
         keep = np.ones(y.shape, dtype=np.bool_)
         if threshold is not None:
-            keep = np.abs(s.qd[kept]) >= np.asarray(threshold)
-        t = np.asarray(kept * experiment.dt, dtype=np.float64)
-        blocks.append(ExperimentEquations(y, filtered_regressor(model, s, decimation), keep, t))
-    return blocks
+            keep = np.abs(s.qd[instants]) >= np.asarray(threshold)
+        t = np.asarray(instants * experiment.dt, dtype=np.float64)
+        return ExperimentEquations(y, filtered_regressor(model, s, decimation), keep, t)
+
+    return kept((of(e, s) for e, s in zip(experiments, signals, strict=True)), like=experiments)
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,18 +150,45 @@ class Prepared:
     model: ArmModel
     experiments: Sequence[Experiment]
     signals: Sequence[Derivatives]
-    _made: dict[Decimation, list[ExperimentEquations]] = field(default_factory=dict, repr=False)
+    _made: dict[Decimation, Sequence[ExperimentEquations]] = field(default_factory=dict, repr=False)
 
-    def equations(self, decimation: Decimation) -> list[ExperimentEquations]:
+    def equations(self, decimation: Decimation) -> Sequence[ExperimentEquations]:
         """:func:`equations` after a decimation; repeated calls return the same arrays."""
         if decimation not in self._made:
             self._made[decimation] = equations(self.model, self.experiments, self.signals, decimation)
         return self._made[decimation]
 
+    def part(self, numbers: Sequence[int]) -> "Prepared":
+        """Some of the experiments.
+
+        Parameters
+        ----------
+        numbers
+            Their numbers, from 0.
+        """
+        return Prepared(self.model, [self.experiments[k] for k in numbers], [self.signals[k] for k in numbers])
+
+
+def tested(blocks: Sequence[ExperimentEquations]) -> list[int]:
+    """Numbers of the experiments that tests of an estimate use: all, or evenly spaced stretches of a long recording.
+
+    The tests take several times the memory of their equations, and need no hour to reject what is wrong.
+
+    Parameters
+    ----------
+    blocks
+        Equations of every experiment.
+    """
+    if not isinstance(blocks, Streamed):
+        return list(range(len(blocks)))
+    rows = sum(block.y.shape[0] for block in blocks)
+    count = min(max(1, round(TESTED_ROWS * len(blocks) / max(rows, 1))), len(blocks))
+    return [int(k) for k in np.linspace(0, len(blocks) - 1, count).round()]
+
 
 def published_equations(
     model: ArmModel, experiments: Sequence[Experiment], preprocessing: Preprocessing
-) -> list[ExperimentEquations]:
+) -> Sequence[ExperimentEquations]:
     """Equations by the filters of a published fit: sharp ``sign``, torque as recorded, all rows.
 
     Parameters
@@ -169,8 +201,8 @@ def published_equations(
         Filters, decimation and dropped samples of the published fit.
     """
     p = preprocessing
-    blocks = []
-    for experiment in experiments:
+
+    def of(experiment: Experiment) -> ExperimentEquations:
         q = butterworth(experiment.q, experiment.dt, p.cutoff_hz, p.order, p.padlen)
         qd = central_difference(q, experiment.dt)
         qdd = central_difference(qd, experiment.dt)
@@ -178,5 +210,6 @@ def published_equations(
         filters = (p.decimation, p.decimation_order, p.decimation_ripple_db, p.decimation_padlen)
         y = chebyshev_decimate(experiment.tau[p.drop :], *filters)
         t = np.asarray((p.drop + kept_samples(x.shape[0], p.decimation)) * experiment.dt, dtype=np.float64)
-        blocks.append(ExperimentEquations(y, chebyshev_decimate(x, *filters), np.ones(y.shape, dtype=np.bool_), t))
-    return blocks
+        return ExperimentEquations(y, chebyshev_decimate(x, *filters), np.ones(y.shape, dtype=np.bool_), t)
+
+    return kept((of(e) for e in experiments), like=experiments)

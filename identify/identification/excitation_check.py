@@ -21,6 +21,7 @@ from armident.identify.regression.qr import triangularize
 from armident.identify.robot.arm import ArmModel
 from armident.identify.signals.decimate import Decimation
 from armident.identify.signals.differentiate import Derivatives
+from armident.identify.streamed import kept, mapped
 
 POSTURES = 100
 """Postures of the motion, and of the workspace, at which inertia and gravity are examined."""
@@ -216,7 +217,7 @@ def motion_postures(experiments: Sequence[Experiment], count: int = POSTURES) ->
         Number of postures.
     """
     every = max(1, sum(e.q.shape[0] for e in experiments) // count)
-    return np.concatenate([e.q[::every] for e in experiments])
+    return np.concatenate([e.q[::every].copy() for e in experiments])
 
 
 def workspace_postures(robot: RobotConfig, recorded: Array, count: int = POSTURES) -> Array:
@@ -281,20 +282,20 @@ def _moving_rows(
     noise: Sequence[ArModel] | None,
 ) -> tuple[Array, Array, NDArray[np.int64]]:
     """Regressor (R, b), torques (R,) in residual standard deviations, and joint (R,), of the joints that move."""
-    regressors = [b.x for b in blocks]
+    regressors = mapped(lambda b: b.x, blocks)
     if not moving.all():
         blocks = prepared.equations(decimation)
-        still = [_held(s, moving) for s in prepared.signals]
-        regressors = [filtered_regressor(prepared.model, s, decimation) for s in still]
+        still = (_held(s, moving) for s in prepared.signals)
+        regressors = kept((filtered_regressor(prepared.model, s, decimation) for s in still), like=blocks)
     x, y, joints = [], [], []
     for j in np.flatnonzero(moving).tolist():
         power = np.concatenate([b.y[b.keep[:, j], j] for b in blocks]).var() if noise is None else noise[j].variance
         std = max(float(np.sqrt(power)), 1e-150)
         for block, regressor in zip(blocks, regressors, strict=True):
-            kept = block.keep[:, j]
-            x.append(regressor[kept, j] / std)
-            y.append(block.y[kept, j] / std)
-            joints.append(np.full(int(kept.sum()), j))
+            rows = block.keep[:, j]
+            x.append(regressor[rows, j] / std)
+            y.append(block.y[rows, j] / std)
+            joints.append(np.full(int(rows.sum()), j))
     return np.concatenate(x), np.concatenate(y), np.concatenate(joints)
 
 

@@ -1,6 +1,7 @@
 """Experiments from a recording, read from a file or assembled from the stream."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -10,6 +11,7 @@ from armident.configs import DataError, Joint, RobotConfig
 from armident.configs.schema.limits import ENDLESS
 from armident.daq.recording import Recording, Stream
 from armident.identify.experiment import Experiment
+from armident.identify.streamed import OnDisk
 
 MAX_MISSING_SHARE = 0.05
 """Largest share of missing samples of an experiment; with more, the rest is no longer the designed motion."""
@@ -19,12 +21,37 @@ STILL_SHARE = 1e-3
 """Share of its position range below which a joint counts as not moving."""
 RATE_TOLERANCE = 0.01
 """Relative difference between the nominal rate and the receive times above which a note is added."""
+NO_REFERENCE = "no reference trajectory was recorded: identified without one"
+"""Note on a recording without demands."""
 EFFORTS: tuple[Literal["torque", "current", "voltage"], ...] = ("torque", "current", "voltage")
 
 Array = NDArray[np.float64]
 
 
-def experiments_from_recording(recording: Recording, robot: RobotConfig) -> tuple[list[Experiment], list[str]]:
+@dataclass(frozen=True)
+class StretchRule:
+    """Size from which a recording is identified in stretches, of which one is in memory at a time.
+
+    Parameters
+    ----------
+    beyond
+        Number of values (samples times joints) up to which a recording is one piece. An identification takes up to
+        260 bytes per value.
+    length
+        Largest number of values of a stretch.
+    """
+
+    beyond: int = 12_000_000
+    length: int = 3_000_000
+
+
+WHOLE = StretchRule(beyond=2**62)
+"""No recording is cut."""
+
+
+def experiments_from_recording(
+    recording: Recording, robot: RobotConfig, stretches: StretchRule = WHOLE
+) -> tuple[Sequence[Experiment], list[str]]:
     """Experiments of a recording in SI units on the joint side, cut at the experiment marks and at gaps.
 
     Joint positions are ``R^-1 q_motor`` and joint torques ``R' tau_motor`` (thesis equation 2.14 and section B.1).
@@ -36,11 +63,13 @@ def experiments_from_recording(recording: Recording, robot: RobotConfig) -> tupl
         The recording; of a torn one the readable part is used.
     robot
         The robot to identify: the recorded one, possibly with other numbers.
+    stretches
+        Size from which pieces are cut into stretches, which are kept on disk.
 
     Returns
     -------
     experiments
-        One per uninterrupted piece, in time order.
+        One per uninterrupted piece or stretch, in time order.
     notes
         Remarks for the user, one line each.
 
@@ -54,12 +83,14 @@ def experiments_from_recording(recording: Recording, robot: RobotConfig) -> tupl
     """
     try:
         robot.check_filled("identify")
-        return _converted(recording, robot)
+        return _converted(recording, robot, stretches)
     except DataError as error:
         raise error if recording.path is None else DataError(f"{recording.path}: {error}") from error
 
 
-def _converted(recording: Recording, robot: RobotConfig) -> tuple[list[Experiment], list[str]]:
+def _converted(
+    recording: Recording, robot: RobotConfig, stretches: StretchRule
+) -> tuple[Sequence[Experiment], list[str]]:
     _check_same_robot(recording.robot, robot)
     _check_counters(recording)
     notes: list[str] = []
@@ -67,13 +98,12 @@ def _converted(recording: Recording, robot: RobotConfig) -> tuple[list[Experimen
         notes.append(f"the recording is torn: {recording.missing}")
     samples = recording.samples
     dt = 1.0 / recording.sample_rate_hz
-    q = joint_positions(samples, "position", robot)
-    tau = joint_torques(samples, robot)
-    q_ref, has_ref = _reference(recording, robot)
-    if q_ref is None:
-        notes.append("no reference trajectory was recorded: identified without one")
-
-    experiments: list[Experiment] = []
+    demand = _demand_stream(recording)
+    has_ref = np.ones(samples.sync.size, dtype=bool) if demand is None else _between_knots(demand, samples.sync)[0]
+    if demand is None:
+        notes.append(NO_REFERENCE)
+    long = samples.sync.size * robot.n > stretches.beyond
+    used: list[NDArray[np.int64]] = []
     for first, last in recording.experiments():
         inside = (samples.sync >= first) & (samples.sync <= last)
         _check_missing(int(inside.sum()), first, last, dt)
@@ -90,25 +120,71 @@ def _converted(recording: Recording, robot: RobotConfig) -> tuple[list[Experimen
                 f"{lost} of {last - first + 1} samples missing: {len(pieces)} pieces, "
                 f"{len(long_enough)} of them longer than {MIN_PIECE_S} s are used"
             )
-        experiments += [
-            Experiment(
-                q=q[piece],
-                tau=tau[piece],
-                q_ref=None if q_ref is None else q_ref[piece],
-                dt=dt,
-                start=float(samples.sync[piece[0]] - samples.sync[0]) * dt,
-                source="" if recording.path is None else str(recording.path),
-            )
-            for piece in long_enough
-        ]
-    if not experiments:
+        for piece in long_enough:
+            used += np.array_split(piece, -(-piece.size * robot.n // stretches.length)) if long else [piece]
+    if not used:
         raise DataError(
             f"the recording has no uninterrupted piece of {MIN_PIECE_S} s inside its experiment marks "
             f"({samples.sync.size} samples in all{f'; {recording.missing}' if recording.missing else ''})"
         )
+    experiments: Sequence[Experiment]
+    if long:
+        for name in samples.raw:
+            if samples.raw[name].dtype.kind == "f" and not np.isfinite(samples.raw[name]).all():
+                _finite(samples, name, robot)
+        notes.append(f"a long recording: identified in {len(used)} stretches, of which one is in memory at a time")
+        begin = int(samples.sync[0])
+        experiments = OnDisk(
+            _experiments(_part(recording, rows), robot, [np.arange(rows.size)], begin)[0] for rows in used
+        )
+    else:
+        experiments = _experiments(recording, robot, used, int(samples.sync[0]))
     notes += _signal_notes(experiments, robot)
     notes += _rate_notes(recording)
     return experiments, notes
+
+
+def _experiments(
+    recording: Recording, robot: RobotConfig, pieces: Sequence[NDArray[np.int64]], begin: int
+) -> list[Experiment]:
+    """Experiments of some rows (each consecutive) of a recording that began at SYNC number ``begin``."""
+    samples, dt, demand = recording.samples, 1.0 / recording.sample_rate_hz, _demand_stream(recording)
+    q = joint_positions(samples, "position", robot)
+    tau = joint_torques(samples, robot)
+    q_ref = None if demand is None else _reference(demand, samples, robot)
+    return [
+        Experiment(
+            q=q[rows],
+            tau=tau[rows],
+            q_ref=None if q_ref is None else q_ref[rows],
+            dt=dt,
+            start=float(samples.sync[rows[0]] - begin) * dt,
+            source="" if recording.path is None else str(recording.path),
+        )
+        for rows in pieces
+    ]
+
+
+def _part(recording: Recording, rows: NDArray[np.int64]) -> Recording:
+    """Recording of consecutive rows of the samples, with the rows of other streams on both sides of each."""
+    first, last = int(rows[0]), int(rows[-1])
+    spans = {"samples": slice(first, last + 1)}
+    begin, end = recording.samples.sync[[first, last]]
+    for name, stream in recording.streams.items():
+        if name != "samples":
+            before = max(min(int(np.searchsorted(stream.sync, begin, side="right")) - 1, stream.sync.size - 2), 0)
+            after = max(int(np.searchsorted(stream.sync, end, side="left")) + 1, before + 2)
+            spans[name] = slice(before, after)
+    streams = {
+        name: replace(
+            stream,
+            sync=stream.sync[spans[name]],
+            t_ns=stream.t_ns[spans[name]],
+            raw={field: values[spans[name]] for field, values in stream.raw.items()},
+        )
+        for name, stream in recording.streams.items()
+    }
+    return replace(recording, streams=streams)
 
 
 def joint_positions(stream: Stream, quantity: Literal["position", "demand"], robot: RobotConfig) -> Array:
@@ -218,52 +294,71 @@ def _check_missing(present: int, first: int, last: int, dt: float) -> None:
         )
 
 
-def _reference(recording: Recording, robot: RobotConfig) -> tuple[Array | None, NDArray[np.bool_]]:
-    """Reference (N, n) at the rate of the samples, and the mask (N,) of samples with a reference."""
-    sync = recording.samples.sync
-    everywhere = np.ones(sync.size, dtype=bool)
+def _demand_stream(recording: Recording) -> Stream | None:
+    """Stream with the reference, the samples themselves first; ``None`` if there is none."""
     if recording.samples.named("demand") is not None:
-        demand = joint_positions(recording.samples, "demand", robot)
-        return demand, everywhere
-    stream = next((s for s in recording.streams.values() if s.named("demand") is not None and s.sync.size > 1), None)
-    if stream is None:
-        return None, everywhere
+        return recording.samples
+    return next((s for s in recording.streams.values() if s.named("demand") is not None and s.sync.size > 1), None)
+
+
+def _reference(stream: Stream, samples: Stream, robot: RobotConfig) -> Array:
+    """Reference (N, n) at the samples."""
     knots = joint_positions(stream, "demand", robot)
+    if stream is samples:
+        return knots
+    _, low, share = _between_knots(stream, samples.sync)
+    q_ref: Array = knots[low] + share[:, None] * (knots[low + 1] - knots[low])
+    return q_ref
+
+
+def _between_knots(stream: Stream, sync: NDArray[np.int64]) -> tuple[NDArray[np.bool_], NDArray[np.int64], Array]:
+    """Mask (N,) of samples with a reference, number of the knot before each, and its place between that and the next.
+
+    Parameters
+    ----------
+    stream
+        Stream with the reference.
+    sync
+        SYNC numbers of the samples, (N,).
+    """
+    if stream.sync is sync:
+        return np.ones(sync.size, dtype=bool), np.arange(sync.size), np.zeros(sync.size)
     before = np.searchsorted(stream.sync, sync, side="right") - 1
     on_knot = (before >= 0) & (stream.sync[np.maximum(before, 0)] == sync)
     between = (before >= 0) & (before < stream.sync.size - 1)
     low = np.clip(before, 0, stream.sync.size - 2)
     width = stream.sync[low + 1] - stream.sync[low]
-    share = np.clip((sync - stream.sync[low]) / width, 0.0, 1.0)[:, None]
-    q_ref = knots[low] + share * (knots[low + 1] - knots[low])
-    known = on_knot | (between & (width == stream.every))
-    return q_ref, known
+    share = np.clip((sync - stream.sync[low]) / width, 0.0, 1.0)
+    return on_knot | (between & (width == stream.every)), low, share
 
 
-def _signal_notes(experiments: list[Experiment], robot: RobotConfig) -> list[str]:
+def _signal_notes(experiments: Sequence[Experiment], robot: RobotConfig) -> list[str]:
     notes = []
-    q = np.concatenate([e.q for e in experiments])
-    tau = np.concatenate([e.tau for e in experiments])
+    ranges, torques, count = [], [], 0
+    saturation = [joint.drive.saturation for joint in robot.joints]
+    gain = np.array([joint.drive.gain for joint in robot.joints])
+    limit = np.array([np.inf if s is None or g == 0.0 else 0.999 * s for s, g in zip(saturation, gain, strict=True)])
+    saturated = np.zeros(robot.n)
+    for e in experiments:
+        ranges.append((e.q.min(axis=0), e.q.max(axis=0)))
+        torques.append((e.tau.min(axis=0), e.tau.max(axis=0)))
+        motor = np.linalg.solve(robot.transmission_matrix.T, e.tau.T).T
+        saturated += np.sum(np.abs(motor / np.where(gain == 0.0, 1.0, gain)) >= limit, axis=0)
+        count += e.q.shape[0]
     for j, joint in enumerate(robot.joints):
         low, high = joint.limits.position
-        seen = (float(q[:, j].min()), float(q[:, j].max()))
+        seen = (min(float(q[j]) for q, _ in ranges), max(float(q[j]) for _, q in ranges))
         if seen[0] < low or seen[1] > high:
             unit = "rad" if joint.type == "revolute" else "m"
             notes.append(
                 f"{joint.name} was recorded over [{seen[0]:.3g}, {seen[1]:.3g}] {unit}, outside its limits "
                 f"[{low:.3g}, {high:.3g}]: wrong unit, or wrong limits?"
             )
-        if float(np.ptp(tau[:, j])) == 0.0:
+        if max(float(tau[j]) for _, tau in torques) == min(float(tau[j]) for tau, _ in torques):
             notes.append(f"{joint.name}: the torque never changes; is its drive reporting?")
-    saturation = [joint.drive.saturation for joint in robot.joints]
-    motor = np.linalg.solve(robot.transmission_matrix.T, tau.T).T
-    for j, limit in enumerate(saturation):
-        gain = robot.joints[j].drive.gain
-        if limit is None or gain == 0.0:
-            continue
-        share = float(np.mean(np.abs(motor[:, j] / gain) >= 0.999 * limit))
+    for joint, share in zip(robot.joints, saturated / count, strict=True):
         if share > 0.01:
-            notes.append(f"{robot.joints[j].name}: its drive is saturated in {100 * share:.0f} % of the samples")
+            notes.append(f"{joint.name}: its drive is saturated in {100 * share:.0f} % of the samples")
     return notes
 
 

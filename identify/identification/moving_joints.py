@@ -9,6 +9,7 @@ from armident.configs import DataError, RobotConfig
 from armident.identify.experiment import Experiment
 from armident.identify.identification.criteria import IdentificationCriteria
 from armident.identify.signals.differentiate import encoder_resolution
+from armident.identify.streamed import mapped
 
 NOISE_SAMPLES = 100_000
 """Samples from which the position noise is estimated."""
@@ -30,7 +31,7 @@ def joint_ranges(experiments: Sequence[Experiment]) -> Array:
     experiments
         Recordings of one robot.
     """
-    return _ranges([e.q for e in experiments])
+    return _ranges(mapped(lambda e: e.q, experiments))
 
 
 def moving_joints(experiments: Sequence[Experiment], robot: RobotConfig, criteria: IdentificationCriteria) -> Mask:
@@ -56,9 +57,8 @@ def moving_joints(experiments: Sequence[Experiment], robot: RobotConfig, criteri
     if all(joint.drive.counts_per_unit is not None for joint in robot.joints):
         counts = criteria.rest_counts * encoder_resolution(robot)
     moving = ranges > np.maximum(least, counts)
-    references = [e.q_ref for e in experiments if e.q_ref is not None]
-    if len(references) == len(experiments):
-        moving &= _ranges(references) > counts
+    if all(e.q_ref is not None for e in experiments):
+        moving &= _ranges(mapped(lambda e: e.q_ref, experiments)) > counts
     kinds = np.array([joint.type for joint in robot.joints])
     for kind in set(kinds.tolist()):
         same = kinds == kind
@@ -96,9 +96,8 @@ def require_motion(experiments: Sequence[Experiment], robot: RobotConfig, moving
 
 def _ranges(signals: Sequence[Array]) -> Array:
     """Range (n,) of signals (N, n) of several experiments."""
-    low = np.min([signal.min(axis=0) for signal in signals], axis=0)
-    high = np.max([signal.max(axis=0) for signal in signals], axis=0)
-    return np.asarray(high - low, dtype=np.float64)
+    extremes = np.array([(signal.min(axis=0), signal.max(axis=0)) for signal in signals])
+    return np.asarray(extremes[:, 1].max(axis=0) - extremes[:, 0].min(axis=0), dtype=np.float64)
 
 
 def _position_noise(q: Array) -> Array:

@@ -23,6 +23,7 @@ from armident.identify.identification.equations import (
     equations,
     least_rows,
     published_equations,
+    tested,
 )
 from armident.identify.identification.excitation_check import examine_support
 from armident.identify.identification.interval_doubts import doubts_of_least_squares
@@ -42,13 +43,14 @@ from armident.identify.identification.result import (
 from armident.identify.identification.sign_smoothing import unsaturated_joints, with_sign_smoothing
 from armident.identify.identification.solvers import MEASURED, PREFILTERED, Problem, Solution, decimation_of, solve
 from armident.identify.identification.verdict import Reason, SetupCheck, judge
-from armident.identify.regression.equations import Estimate, ExperimentEquations
+from armident.identify.regression.equations import Estimate, ExperimentEquations, residuals_of
 from armident.identify.robot.arm import ArmModel
 from armident.identify.robot.consistent import nearest_consistent
 from armident.identify.setup.result import with_torque_shift
 from armident.identify.signals.bandwidth import motion_bandwidth
 from armident.identify.signals.decimate import Decimation
 from armident.identify.signals.differentiate import Derivatives, differentiate, encoder_resolution
+from armident.identify.streamed import kept, mapped
 
 TORQUE_PREDICTIONS = 2
 """Largest number of predictions of the torques on which terms depend."""
@@ -95,7 +97,8 @@ def identify_experiment(
     DataError
         If the data cannot support the request: too short, not finite, motion that leaves parameters undetermined.
     """
-    experiments = [experiments] if isinstance(experiments, Experiment) else list(experiments)
+    if isinstance(experiments, Experiment):
+        experiments = [experiments]
     _check(experiments, robot)
     clock = _Clock(progress or (lambda stage, share: None))
     try:
@@ -126,7 +129,9 @@ def _identify(
     require_motion(experiments, robot, moving)
     experiments = shifted_experiments(put_right(experiments, robot), robot, options, setup, notes)
     bandwidth = (
-        options.bandwidth_hz or robot.bandwidth_hz or motion_bandwidth([e.q for e in experiments], experiments[0].dt)
+        options.bandwidth_hz
+        or robot.bandwidth_hz
+        or motion_bandwidth(mapped(lambda e: e.q, experiments), experiments[0].dt)
     )
     given, robot = robot, with_sign_smoothing(robot, experiments, bandwidth)
     notes.reasons += [_interval_reason(line) for line in unsaturated_joints(given, robot, experiments, bandwidth)]
@@ -154,7 +159,11 @@ def _identify(
         clock.enter("statistics", 0.85)
         statistics = _statistics(prepared, found, solution)
         statistics = replace(statistics, interval_warnings=(*statistics.interval_warnings, *doubts))
-        residuals = residual_statistics(prepared, found.blocks, found.estimate)
+        numbers = tested(found.blocks)
+        residuals = residual_statistics(prepared.part(numbers), [found.blocks[k] for k in numbers], found.estimate)
+        if len(numbers) < len(found.blocks):
+            text = f"Tests use {len(numbers)} of the {len(found.blocks)} stretches; the estimate uses all."
+            notes.warnings.append(text)
         statistics = replace(statistics, residuals=residuals)
         if options.physical:
             clock.enter("physical", 0.95)
@@ -234,8 +243,8 @@ def has_published_filters(robot: RobotConfig, options: Options) -> bool:
 
 
 def shifted_experiments(
-    experiments: list[Experiment], robot: RobotConfig, options: Options, setup: SetupCheck | None, notes: Notes
-) -> list[Experiment]:
+    experiments: Sequence[Experiment], robot: RobotConfig, options: Options, setup: SetupCheck | None, notes: Notes
+) -> Sequence[Experiment]:
     """Return the experiments with the common shift of the torques that the check of the set-up found.
 
     Parameters
@@ -311,9 +320,9 @@ def _statistics(prepared: Prepared, found: MethodResult, solution: Solution | No
     essential = essential_parameters(estimate.theta, estimate.covariance, used)
     if solution is None:
         joints = [joint.name for joint in model.robot.joints]
-        return Statistics(
-            essential, diagnose_estimate(model.base.names, joints, found.blocks, estimate, essential=essential)
-        )
+        numbers = tested(found.blocks)
+        blocks, part = [found.blocks[k] for k in numbers], residuals_of(estimate, numbers)
+        return Statistics(essential, diagnose_estimate(model.base.names, joints, blocks, part, essential=essential))
     diagnostics = solution.diagnostics(essential)
     if found.controller["kind"] not in CONTROLLERS:
         return Statistics(essential, diagnostics, interval_warnings=solution.interval_warnings, bias=solution.bias)
@@ -387,7 +396,7 @@ def _memory_of_noise(prepared: Prepared, theta: Array, reasons: list[Reason]) ->
 
 def smoothed_derivatives(
     experiments: Sequence[Experiment], robot: RobotConfig, options: Options, bandwidth: float
-) -> list[Derivatives]:
+) -> Sequence[Derivatives]:
     """Smoothed positions of every experiment and their derivatives (5.1).
 
     Parameters
@@ -400,15 +409,13 @@ def smoothed_derivatives(
         Closed-loop bandwidth, Hz.
     """
     resolution = encoder_resolution(robot) if options.nvr == "tracking-error" else None
-    return [
-        replace(
-            differentiate(
-                e.q, e.dt, options.derivatives or "irwsm", options.nvr, bandwidth, q_ref=e.q_ref, resolution=resolution
-            ),
-            start=e.start,
-        )
-        for e in experiments
-    ]
+
+    def derived(e: Experiment) -> Derivatives:
+        name = options.derivatives or "irwsm"
+        found = differentiate(e.q, e.dt, name, options.nvr, bandwidth, q_ref=e.q_ref, resolution=resolution)
+        return replace(found, start=e.start)
+
+    return kept((derived(e) for e in experiments), like=experiments)
 
 
 @dataclass

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from armident.configs import RobotConfig
 from armident.identify.estimators.diagnostics import Diagnostics
 from armident.identify.identification.criteria import IdentificationCriteria
+from armident.identify.identification.held_out import held_out_errors
 from armident.identify.identification.options import Options
 from armident.identify.identification.residual_statistics import JointResidualStatistics
 from armident.identify.identification.torque_delay import TorqueDelay
@@ -91,6 +92,9 @@ class Identification:
         Options of the identification.
     idim_ls, idim_ls_relative_error_pct
         Theta and standard deviations of IDIM-LS on the same data, for comparison, and its relative error, percent.
+    held_out
+        Relative torque error of held-out parts of the recordings, percent, overall and (n,); ``None`` if the rest does
+        not determine the parameters.
     residual_statistics
         Statistics of the residuals of every joint, for a later comparison; empty: none.
     t, tau_measured, tau_predicted
@@ -132,6 +136,7 @@ class Identification:
     residual_autocorrelation: Array
     autocorrelation_bound: Array
     residual_statistics: tuple[JointResidualStatistics, ...] = ()
+    held_out: tuple[float, Array] | None = None
 
 
 @dataclass(frozen=True)
@@ -287,6 +292,7 @@ def make_result(
         residual_autocorrelation=np.stack([test.autocorrelation for test in tests]),
         autocorrelation_bound=np.array([test.bound for test in tests]),
         residual_statistics=statistics.residuals,
+        held_out=held_out_errors(ls_blocks, estimate.theta),
     )
 
 

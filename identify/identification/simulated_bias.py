@@ -35,6 +35,7 @@ from armident.identify.signals.bandpass import central_difference
 from armident.identify.signals.bandwidth import position_noise
 from armident.identify.signals.decimate import Decimation
 from armident.identify.signals.differentiate import Derivatives, differentiate
+from armident.identify.streamed import kept, mapped
 
 RELEVANT_BIAS = 0.5
 """Bias in standard deviations above which an estimate is corrected: a 2-sigma interval with this bias holds the truth
@@ -128,10 +129,8 @@ def simulated_bias(
     clean = auxiliary.simulate(theta)
     if clean is None:
         return None
-    motions = [
-        Derivatives(run.q, run.qd, run.qdd, None, auxiliary.dt, e.start)
-        for run, e in zip(clean, prepared.experiments, strict=True)
-    ]
+    starts = [e.start for e in prepared.experiments]
+    motions = mapped(lambda run, at: Derivatives(run.q, run.qd, run.qdd, None, auxiliary.dt, at), clean, starts)
     instruments = auxiliary.regressors(motions)
     rng = np.random.default_rng(0)
     errors: list[Array] = []
@@ -139,9 +138,9 @@ def simulated_bias(
         recorded = _recorded(prepared, auxiliary, theta, rng, derivatives)
         if recorded is None:
             return None
-        kept = [replace(new, keep=block.keep, t=block.t) for new, block in zip(recorded, blocks, strict=True)]
+        rows = mapped(lambda new, block: replace(new, keep=block.keep, t=block.t), recorded, blocks)
         try:
-            found = iv_products(instrumented(kept, instruments), weights).theta
+            found = iv_products(instrumented(rows, instruments), weights).theta
         except np.linalg.LinAlgError:
             return None
         if not np.isfinite(found).all():
@@ -189,20 +188,19 @@ def _recorded(
     theta: Array,
     rng: np.random.Generator,
     derivatives: DerivativesName,
-) -> list[ExperimentEquations] | None:
+) -> Sequence[ExperimentEquations] | None:
     """Equations of one simulated recording per experiment; ``None`` if a simulation diverges."""
-    noise = [position_noise(e.q, e.dt) * rng.normal(size=e.q.shape) for e in prepared.experiments]
+    experiments = prepared.experiments
+    noise = kept((position_noise(e.q, e.dt) * rng.normal(size=e.q.shape) for e in experiments), like=experiments)
     pushes = None
     if auxiliary.feedback:
         ratios = auxiliary.model.robot.transmission_matrix
-        pushes = [_torque_of_noise(auxiliary.controller, n @ ratios.T) for n in noise]
+        pushes = mapped(lambda n: _torque_of_noise(auxiliary.controller, n @ ratios.T), noise)
     runs = auxiliary.simulate(theta, pushes)
     if runs is None:
         return None
-    return [
-        _equations(prepared, auxiliary, run, n, s, e, derivatives)
-        for run, n, s, e in zip(runs, noise, prepared.signals, prepared.experiments, strict=True)
-    ]
+    parts = zip(runs, noise, prepared.signals, experiments, strict=True)
+    return kept((_equations(prepared, auxiliary, *part, derivatives) for part in parts), like=experiments)
 
 
 def _equations(
@@ -289,11 +287,13 @@ def least_squares_bias(
         truths.append(filtered_regressor(model, motion, decimation) @ theta)
     rng, errors = np.random.default_rng(0), list[Array]()
     for _ in range(FEW):
-        recorded = []
-        for k, (e, s) in enumerate(zip(prepared.experiments, prepared.signals, strict=True)):
+
+        def of(k: int, e: Experiment, s: Derivatives) -> ExperimentEquations:
             noise = position_noise(e.q, e.dt) * rng.normal(size=e.q.shape)
             x = filtered_regressor(model, replace(smooth(s.q + noise, k), start=e.start), decimation)
-            recorded.append(replace(blocks[k], y=truths[k], x=x))
-        x, y = stacked(recorded, weights)
+            return replace(blocks[k], y=truths[k], x=x)
+
+        pairs = enumerate(zip(prepared.experiments, prepared.signals, strict=True))
+        x, y = stacked(kept((of(k, *pair) for k, pair in pairs), like=prepared.experiments), weights)
         errors.append(least_squares(x, y) - theta)
     return SimulatedBias(np.mean(errors, axis=0), np.std(errors, axis=0, ddof=1), FEW)

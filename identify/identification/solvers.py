@@ -15,7 +15,14 @@ from armident.identify.estimators.didim import didim
 from armident.identify.estimators.idim_iv import idim_iv
 from armident.identify.estimators.idim_piv import idim_piv
 from armident.identify.estimators.sep_pem import sep_pem
-from armident.identify.identification.equations import LS_CUTOFF, PIV_CUTOFF, Prepared, decimated_rows, sufficient
+from armident.identify.identification.equations import (
+    LS_CUTOFF,
+    PIV_CUTOFF,
+    Prepared,
+    decimated_rows,
+    sufficient,
+    tested,
+)
 from armident.identify.identification.interval_doubts import doubts_of_serial_correlation
 from armident.identify.identification.options import Method, Options
 from armident.identify.identification.simulated_bias import (
@@ -28,7 +35,13 @@ from armident.identify.identification.simulated_bias import (
 )
 from armident.identify.identification.torque_delay import TorqueDelay, torque_delay
 from armident.identify.identification.verdict import Reason
-from armident.identify.regression.equations import Estimate, ExperimentEquations, joint_variances, noise_models
+from armident.identify.regression.equations import (
+    Estimate,
+    ExperimentEquations,
+    joint_variances,
+    noise_models,
+    residuals_of,
+)
 from armident.identify.regression.iv import serial_covariance
 from armident.identify.robot.simulation import Simulation
 from armident.identify.signals.decimate import Decimation, design
@@ -130,7 +143,7 @@ class Problem:
     options: Options
 
     @cached_property
-    def blocks(self) -> list[ExperimentEquations]:
+    def blocks(self) -> Sequence[ExperimentEquations]:
         """Equations at measured signals with the decimation of the method."""
         return self.prepared.equations(self.auxiliary.decimation)
 
@@ -180,12 +193,12 @@ class Solution:
     bias: Array | None = None
 
     @cached_property
-    def runs(self) -> list[Simulation] | None:
+    def runs(self) -> Sequence[Simulation] | None:
         """Simulated closed loop with the estimate, one run per experiment; ``None`` if it diverges."""
         return self.problem.auxiliary.simulate(self.estimate.theta)
 
     @cached_property
-    def motions(self) -> list[Derivatives]:
+    def motions(self) -> Sequence[Derivatives]:
         """Simulated motion of the estimate along the recorded references, without the disturbances of the recordings.
 
         Raises
@@ -196,15 +209,16 @@ class Solution:
         return self.problem.auxiliary.fresh().motions(self.estimate.theta)
 
     @cached_property
-    def instruments(self) -> list[Array]:
+    def instruments(self) -> Sequence[Array]:
         """Regressors at these motions, decimated to the band of the instruments, one (M, n, b) per experiment."""
         return self.problem.in_band.auxiliary.regressors(self.motions)
 
     def diagnostics(self, essential: NDArray[np.bool_]) -> Diagnostics:
-        """Tests of the estimate on its equations, decimated to the band of its instruments."""
-        problem, estimate = self.problem.in_band, self.estimate
-        instruments = self.instruments
-        blocks, method = problem.blocks, problem.options.method
+        """Tests of the estimate on its equations, decimated to the band of its instruments; see `tested`."""
+        problem = self.problem.in_band
+        numbers = tested(problem.blocks)
+        estimate, instruments = residuals_of(self.estimate, numbers), [self.instruments[k] for k in numbers]
+        blocks, method = [problem.blocks[k] for k in numbers], problem.options.method
         if method not in MEASURED:
             blocks = [replace(b, x=z) for b, z in zip(blocks, instruments, strict=True)]
         as_weighed = self.prefiltered and problem is self.problem
@@ -225,12 +239,15 @@ class Solution:
         ``None`` if its equations have no finite solution.
         """
         problem, prepared = self.problem, self.problem.prepared
-        x = [block.x for block in prepared.equations(problem.plain)]
+        blocks = prepared.equations(problem.plain)
+        numbers = tested(blocks)
+        x = [blocks[k].x for k in numbers]
+        motions = [self.motions[k] for k in numbers]
         thinned = problem.in_band.auxiliary.decimation == problem.plain
-        z = self.instruments if thinned else problem.plain_problem.auxiliary.regressors(self.motions)
-        data = prepared.model, prepared.experiments, prepared.signals
+        z = [self.instruments[k] for k in numbers] if thinned else problem.plain_problem.auxiliary.regressors(motions)
+        part = prepared.part(numbers)
         try:
-            found = torque_delay(*data, problem.plain, self.motions, (x, z))
+            found = torque_delay(part.model, part.experiments, part.signals, problem.plain, motions, (x, z))
         except (np.linalg.LinAlgError, ValueError) as error:
             if not is_singular(error):
                 raise
@@ -283,14 +300,12 @@ def _idim_piv(problem: Problem) -> Solution:
             difference = difference - _difference_without_model_error(problem, estimate, without)
         shift = np.nan_to_num(np.abs(difference) / without.std, nan=np.inf)
     worst = int(np.argmax(shift))
-    pairs = zip(problem.auxiliary.references, problem.prepared.experiments, strict=True)
-    referenced = all(reference is e.q_ref for reference, e in pairs)
     if shift[worst] > CONTRADICTION:
         name = problem.auxiliary.model.base.names[worst]
         reason = Reason(
             "doubtful",
             f"a noise model would move {name} by {shift[worst]:.0f} standard deviations (result: idim-iv), so "
-            + (CONTRADICTION_CAUSE if referenced else NO_REFERENCE_CAUSE),
+            + (CONTRADICTION_CAUSE if problem.auxiliary.feedback else NO_REFERENCE_CAUSE),
             "armident diagnose RECORDING",
             kind="residual",
         )

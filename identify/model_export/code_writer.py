@@ -176,6 +176,7 @@ def _head(model: ExportedModel, sheet: LimitationSheet) -> list[str]:
         f"Written by armident {versions().get('armident', '')} from {model.source.name}.",
         f"Parameters: method {document.method}, torque error {document.relative_error_pct:.2f} %, verdict "
         f"{document.verdict or 'not judged'}, made physically consistent. Recording: {recorded}.",
+        f"Physical consistency of the estimate: {model.consistent.verdict}.",
         *(f"Not in this file: {o.part}. {o.reason}".strip() for o in sheet.omitted),
     ]
     if sheet.undetermined:

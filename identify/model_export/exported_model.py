@@ -13,10 +13,11 @@ from armident.identify.effects.registry import of_entry
 from armident.identify.effects.terms import effect_terms
 from armident.identify.identification.excitation_check import workspace_postures
 from armident.identify.model_export.link_frames import LinkFrames, mdh_link_frames
-from armident.identify.model_export.source_urdf import SourceUrdf, source_for, source_frames, source_of
+from armident.identify.model_export.source_urdf import SourceUrdf, known_bodies, source_for, source_frames, source_of
 from armident.identify.robot.arm import ArmModel
 from armident.identify.robot.chain import Floats
-from armident.identify.robot.consistent import ConsistentParameters, nearest_consistent
+from armident.identify.robot.consistent import ConsistentParameters, nearest_consistent, pseudo_inertias
+from armident.identify.robot.known_bodies import nearest_to_known
 from armident.identify.robot_model import RobotModel
 from armident.identify.saved_model import SavedModel, load_model
 
@@ -169,6 +170,8 @@ class ExportedModel:
         URDF whose link frames these are; ``None``: modified Denavit-Hartenberg frames.
     configuration
         Path or name of the robot configuration that was given; empty: that of the document.
+    choice
+        Rule for the parameters that torques leave open, in words.
     """
 
     source: Path
@@ -185,6 +188,7 @@ class ExportedModel:
     effects: tuple[ExportedEffect, ...]
     source_urdf: SourceUrdf | None = None
     configuration: str = ""
+    choice: str = "the lightest physical arm"
 
     @property
     def theta(self) -> Floats:
@@ -237,9 +241,15 @@ class ExportedModel:
             If the URDF cannot be read, or has another geometry than the configuration.
         """
         frames = source_frames(source, self.robot)
-        joints = tuple(replace(j, name=name) for j, name in zip(self.joints, frames.joints, strict=True))
-        links = _bodies(self.arm, self.theta, frames)
-        return replace(self, frames=frames, links=links, joints=joints, source_urdf=source)
+        moved, known = self, known_bodies(source, self.arm, frames)
+        if known is not None:
+            theta = nearest_to_known(self.arm, self.theta, known, SMALLEST_LINK)
+            smallest = np.asarray(np.linalg.eigvalsh(pseudo_inertias(self.arm, theta))[:, 0], dtype=np.float64)
+            consistent = replace(self.consistent, theta=theta, smallest_eigenvalues=smallest)
+            choice = f"the physical arm nearest to the masses in {source.file.name}"
+            moved = replace(self, consistent=consistent, couplings=_couplings(self.arm, theta), choice=choice)
+        links, joints = _bodies(self.arm, moved.theta, frames), _joints(self.arm, moved.theta, frames)
+        return replace(moved, frames=frames, links=links, joints=joints, source_urdf=source)
 
 
 def load_exported_model(
@@ -274,7 +284,7 @@ def load_exported_model(
     DataError
         If the identification is unusable or of another configuration, or no physical arm has these parameters.
     """
-    given = load_robot(robot) if isinstance(robot, str | Path) else robot
+    given = load_robot(robot, "identify") if isinstance(robot, str | Path) else robot
     saved = load_model(Path(path), given, progress=progress)
     source = source_of(robot) if isinstance(robot, str | Path) and urdf is None else None
     if urdf is not None:
@@ -306,7 +316,6 @@ def exported_model(saved: SavedModel, *, nearest: bool = False) -> ExportedModel
         raise DataError(f"{saved.path}: {consistent.verdict}; next: {IMPOSSIBLE}")
     _refuse_negative_inertia(arm, consistent.theta, saved.path)
     frames = mdh_link_frames(robot)
-    values = arm.values(consistent.theta)
     return ExportedModel(
         source=saved.path,
         robot=robot,
@@ -317,14 +326,8 @@ def exported_model(saved: SavedModel, *, nearest: bool = False) -> ExportedModel
         consistent=consistent,
         frames=frames,
         links=_bodies(arm, consistent.theta, frames),
-        joints=tuple(
-            JointFriction(name, joint.type, float(values.ia[k]), float(values.fv[k]), float(values.fc[k]), off)
-            for k, (name, joint, off) in enumerate(zip(frames.joints, robot.joints, values.off.tolist(), strict=True))
-        ),
-        couplings=tuple(
-            JointCoupling(coupling.name, (int(i), int(j)), *(float(v) for v in three))
-            for coupling, (i, j), three in zip(robot.couplings, values.coupling_joints, values.coupling, strict=True)
-        ),
+        joints=_joints(arm, consistent.theta, frames),
+        couplings=_couplings(arm, consistent.theta),
         effects=_effects(arm, consistent.theta),
     )
 
@@ -340,6 +343,21 @@ def _refuse_negative_inertia(arm: ArmModel, theta: Floats, source: Path) -> None
             f"positive definite at {100 * np.mean(smallest <= 0.0):.0f} % of the postures; next: record a motion with "
             "more acceleration of both joints, or identify without the coupling"
         )
+
+
+def _joints(arm: ArmModel, theta: Floats, frames: LinkFrames) -> tuple[JointFriction, ...]:
+    """Return rotor inertias and friction of the joints, with their names in the file."""
+    values = arm.values(theta)
+    rows = np.stack([values.ia, values.fv, values.fc, values.off], axis=1).tolist()
+    types = [joint.type for joint in arm.robot.joints]
+    return tuple(JointFriction(name, kind, *row) for name, kind, row in zip(frames.joints, types, rows, strict=True))
+
+
+def _couplings(arm: ArmModel, theta: Floats) -> tuple[JointCoupling, ...]:
+    """Return the couplings of the configuration."""
+    values = arm.values(theta)
+    rows = zip(arm.robot.couplings, values.coupling_joints.tolist(), values.coupling.tolist(), strict=True)
+    return tuple(JointCoupling(coupling.name, (i, j), *three) for coupling, (i, j), three in rows)
 
 
 def _bodies(arm: ArmModel, theta: Floats, frames: LinkFrames) -> tuple[LinkBody, ...]:

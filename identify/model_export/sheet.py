@@ -202,6 +202,7 @@ def _about_estimate(model: ExportedModel) -> Iterator[str]:
         reasons = [reason.message for reason in model.document.reasons]
         more = f" (and {len(reasons) - 1} more in {model.source.name})" if len(reasons) > 1 else ""
         yield f"verdict of the identification: {': '.join([model.document.verdict, *reasons[:1]])}{more}"
+    yield f"parameters that torques leave open: those of {model.choice}"
     yield f"physical consistency: {model.consistent.verdict}"
     moved = np.abs(model.consistent.shifts)
     worst = int(np.argmax(moved))

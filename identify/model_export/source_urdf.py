@@ -12,9 +12,11 @@ from armident.configs import ConfigError, RobotConfig
 from armident.configs.loading import config_path
 from armident.configs.mdh import PARALLEL
 from armident.configs.urdf import UrdfSource, joint_name, mdh_of
+from armident.configs.urdf_inertials import INERTIAL, read_inertials
 from armident.configs.urdf_tree import MOVING, UrdfJoint, read_chain
 from armident.configs.yaml_loader import read_yaml
 from armident.identify.model_export.link_frames import LinkFrames, mdh_transform
+from armident.identify.robot.arm import ArmModel
 from armident.identify.robot.chain import Floats
 
 SAME_GEOMETRY = 1e-5
@@ -122,6 +124,46 @@ def source_frames(source: SourceUrdf, robot: RobotConfig) -> LinkFrames:
         gravity=frame_0[:3, :3] @ np.array(robot.gravity),
         endless=tuple(joint.type == "continuous" for joint in joints),
     )
+
+
+def known_bodies(source: SourceUrdf, arm: ArmModel, frames: LinkFrames) -> Floats | None:
+    """Return the masses of the URDF as standard parameters (p,) of the arm, the others zero.
+
+    Parameters
+    ----------
+    source
+        URDF and chain.
+    arm
+        Model of the arm.
+    frames
+        Frames of this URDF.
+
+    Returns
+    -------
+    ndarray or None
+        ``None`` if a link has no mass, or one that no body has.
+    """
+    try:
+        given = read_inertials(source.file, source.base, source.tip)
+    except ConfigError:
+        return None
+    if given.massless or given.impossible:
+        return None
+    joints = read_chain(source.file, source.base, source.tip)
+    theirs = mdh_of(joints, source.file).frames
+    known = np.zeros(len(arm.names))
+    for k, (joint, columns) in enumerate(zip(joints, arm.columns.inertial, strict=True)):
+        xx, xy, xz, yy, yz, zz, mx, my, mz, m = (given.standard[f"{name}{k + 1}"] for name in INERTIAL)
+        inertia = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+        body = np.zeros((4, 4))
+        body[:3, :3] = 0.5 * np.trace(inertia) * np.eye(3) - inertia
+        body[:3, 3] = body[3, :3] = mx, my, mz
+        body[3, 3] = m
+        frame = np.linalg.solve(joint.placement @ frames.from_mdh[k], theirs[k])
+        body = frame @ body @ frame.T
+        inertia = np.trace(body[:3, :3]) * np.eye(3) - body[:3, :3]
+        known[columns] = [*inertia[np.triu_indices(3)], *body[:3, 3], body[3, 3]]
+    return known
 
 
 def _frame_0(source: SourceUrdf, joints: tuple[UrdfJoint, ...], robot: RobotConfig, ours: Floats) -> Floats:

@@ -3,93 +3,24 @@
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Any
 
 import numpy as np
-from pydantic import Field
 
 from armident.configs import DataError
-from armident.identify.document import Document, IdentificationDocument, Parameter, RecordingReference
+from armident.identify.document import IdentificationDocument, Parameter
+from armident.identify.effects.terms import terms_of
+from armident.identify.model_documents import ComparedModel, ComparedParameter, ComparisonDocument
 from armident.identify.monitoring.change_test import FALSE_ALARMS, ParameterChangeTest, compare
-from armident.identify.print_table import print_table
 from armident.identify.report.glossary import identification_entries
 from armident.identify.report.page import BAND, MODEL, MUTED, RESIDUAL, figure, render
+from armident.identify.saved_model import configuration_of
 
 LEVEL_95 = 1.959964
 """Half width of a 95 % interval of a normal distribution, standard deviations."""
 
 SHOWN_PER_ROW = 18
 """Most parameters in one row of the plot: their names stay readable."""
-
-
-class ComparedModel(Document):
-    """One of the two identifications."""
-
-    path: str
-    method: str
-    recording: RecordingReference
-    relative_error_pct: float
-
-
-class ComparedParameter(Document):
-    """One parameter in both identifications, SI.
-
-    ``std_of_difference`` is that of ``now - before``, ``p_value`` the probability of such a difference without a change
-    (Holm), ``joint`` the joint or coupling that it belongs to.
-    """
-
-    name: str
-    joint: str
-    unit: str
-    before: float
-    before_std: float
-    now: float
-    now_std: float
-    std_of_difference: float
-    p_value: float
-    changed: bool
-    essential: bool
-
-
-class ComparisonDocument(Document):
-    """Content of ``comparison.json``: the change test of two identifications of one robot.
-
-    ``left_out`` are parameters that only one of them has; they are not compared. ``changed_groups`` are friction or
-    masses of a joint that changed together, ``changed_residuals`` changes of structure, in words.
-    """
-
-    schema_: Literal["armident/comparison/1"] = Field("armident/comparison/1", alias="schema")
-    robot: str
-    verdict: Literal["changed", "unchanged"]
-    baseline: ComparedModel
-    now: ComparedModel
-    parameters: list[ComparedParameter]
-    changed_groups: list[str]
-    changed_residuals: list[str]
-    chi_square: float
-    degrees: int
-    p_value: float
-    false_alarm_rate: float
-    left_out: list[str]
-    warnings: list[str]
-
-    @property
-    def by_joint(self) -> dict[str, list[ComparedParameter]]:
-        """Parameters by joint or coupling, in the order of the document."""
-        found: dict[str, list[ComparedParameter]] = {}
-        for each in self.parameters:
-            found.setdefault(each.joint, []).append(each)
-        return found
-
-    @property
-    def sentence(self) -> str:
-        """Verdict in one sentence."""
-        test = f"chi-square {self.chi_square:.1f} of {self.degrees} degrees of freedom, p = {self.p_value:.2g}"
-        names = [each.name for each in self.parameters if each.changed]
-        parts = [*names, *self.changed_groups, *self.changed_residuals] or ["no single parameter significantly"]
-        if self.verdict == "changed":
-            return f"{self.robot} has changed: {', '.join(parts)} ({test})"
-        return f"{self.robot} has not changed significantly ({test})"
 
 
 def compare_models(
@@ -116,7 +47,7 @@ def compare_models(
         If they are of different robots or models, or cannot confirm or exclude a change.
     """
     (first, first_path), (second, second_path) = baseline, now
-    left_out = _different(first, second)
+    left_out = _different(baseline, now)
     if left_out and first.robot == second.robot:
         if not common:
             raise DataError(
@@ -128,10 +59,20 @@ def compare_models(
     return _document(result, (first, first_path), (second, second_path), left_out)
 
 
-def _different(first: IdentificationDocument, second: IdentificationDocument) -> list[str]:
-    """Return the names of the parameters that are not the same combination of standard parameters in both."""
-    one, other = ({p.name: p.formula or p.name for p in document.parameters} for document in (first, second))
+def _different(baseline: tuple[IdentificationDocument, Path], now: tuple[IdentificationDocument, Path]) -> list[str]:
+    """Return the names of the parameters that do not mean the same in both."""
+    one, other = _meanings(*baseline), _meanings(*now)
+    if baseline[0].configuration is None or now[0].configuration is None:
+        # A document of a former version does not say which curve an effect has.
+        one, other = ({name: meaning[0] for name, meaning in each.items()} for each in (one, other))
     return sorted(name for name in one.keys() | other.keys() if one.get(name) != other.get(name))
+
+
+def _meanings(document: IdentificationDocument, path: Path) -> dict[str, Any]:
+    """Return for each parameter what it groups; for one of an effect, the law and its nonlinear parameters, too."""
+    robot = configuration_of(document, path)
+    terms = {} if robot is None else {n: (t.effect.key, t.place, t.shapes) for t in terms_of(robot) for n in t.names}
+    return {p.name: (p.formula or p.name, terms.get(p.name)) for p in document.parameters}
 
 
 def _restricted(document: IdentificationDocument, without: Sequence[str]) -> IdentificationDocument:
@@ -267,34 +208,37 @@ def comparison_report(document: ComparisonDocument, glossary_of: IdentificationD
 def comparison_table(document: ComparisonDocument) -> None:
     """Print the verdict of a comparison, and the essential and the changed parameters with 95 % intervals by joint."""
     from rich.console import Console
-    from rich.table import Table
 
     console = Console()
     colour = "red" if document.verdict == "changed" else "green"
     console.print(f"verdict: {document.verdict}", style=f"bold {colour}", highlight=False)
     console.print(f"{document.sentence}.", highlight=False, soft_wrap=True, markup=False)
-    table = Table(title=f"{document.robot}: parameters with 95 % intervals", title_justify="left")
-    for heading in ("joint", "parameter", "before", "now", "difference", "p", "unit", ""):
-        left = heading in ("joint", "parameter", "unit", "")
-        table.add_column(heading, justify="left" if left else "right", no_wrap=True)
-    hidden = 0
+    rows = {p.name: _row(p) for p in document.parameters if p.essential or p.changed}
+    # Lines of plain text: a table that does not fit into the terminal would break names.
+    head = ("parameter", "before", "now", "difference", "unit")
+    widths = [max(len(row[k]) for row in (head, *rows.values())) for k in range(len(head))]
+
+    def line(cells: Sequence[str]) -> str:
+        middle = [cell.rjust(width) for cell, width in zip(cells[1:-1], widths[1:-1], strict=True)]
+        return "  ".join([cells[0].ljust(widths[0]), *middle, cells[-1]])
+
+    print(f"parameters with 95 % intervals\n  {line(head)}")
     for joint, parameters in document.by_joint.items():
-        shown = [p for p in parameters if p.essential or p.changed]
-        hidden += len(parameters) - len(shown)
-        for k, p in enumerate(shown):
-            values = (
-                f"{value:.4g} ± {LEVEL_95 * std:.2g}"
-                for value, std in (
-                    (p.before, p.before_std),
-                    (p.now, p.now_std),
-                    (p.now - p.before, p.std_of_difference),
-                )
-            )
-            mark = "changed" if p.changed else ""
-            table.add_row(joint if k == 0 else "", p.name, *values, f"{p.p_value:.2g}", p.unit, mark)
-    print_table(table, console)
+        shown = [p for p in parameters if p.name in rows]
+        if shown:
+            print(joint)
+        for p in shown:
+            print(f"  {line(rows[p.name])}{f'  changed, p = {p.p_value:.2g}' if p.changed else ''}")
+    hidden = len(document.parameters) - len(rows)
     if hidden:
         print(f"{hidden} parameters that are not essential and have not changed are in the report")
+
+
+def _row(p: ComparedParameter) -> tuple[str, str, str, str, str]:
+    """Return name, both values and their difference with 95 % intervals, and unit."""
+    values = ((p.before, p.before_std), (p.now, p.now_std), (p.now - p.before, p.std_of_difference))
+    before, now, difference = (f"{value:.4g} ± {LEVEL_95 * std:.2g}" for value, std in values)
+    return p.name, before, now, difference, p.unit
 
 
 def _picture(document: ComparisonDocument) -> str:

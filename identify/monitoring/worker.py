@@ -39,7 +39,7 @@ RETRY_S, LONGEST_RETRY_S = 1.0, 30.0
 """First and longest wait before a write is tried again, s."""
 MOST_STREAMS = 8
 """Largest number of streams without a file that wait in memory."""
-LONGEST_STAGE_S = 1800.0
+LONGEST_STAGE_S = 7200.0
 """Time after which an identification that reports no further stage counts as hung, s."""
 
 T = TypeVar("T")

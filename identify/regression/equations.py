@@ -3,7 +3,7 @@
 import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,7 @@ from armident.identify.robot.arm import ArmModel
 from armident.identify.robot.kernels import fill_regressor
 from armident.identify.signals.decimate import Decimation
 from armident.identify.signals.differentiate import Derivatives
+from armident.identify.streamed import mapped
 
 MAX_AR_ORDER = 60
 """Highest order tried for the noise models."""
@@ -186,12 +187,12 @@ def stacked(
         Noise model of each joint.
     """
     keep = [b.keep for b in blocks]
-    return whitened([b.x for b in blocks], noise, keep), whitened([b.y for b in blocks], noise, keep)
+    return whitened(mapped(lambda b: b.x, blocks), noise, keep), whitened([b.y for b in blocks], noise, keep)
 
 
 def instrumented(
     blocks: Sequence[ExperimentEquations], instruments: Sequence[NDArray[np.float64]]
-) -> list[InstrumentedEquations]:
+) -> Sequence[InstrumentedEquations]:
     """Equations with instruments.
 
     Parameters
@@ -201,7 +202,7 @@ def instrumented(
     instruments
         Regressor at simulated signals, one (M, n, b) array per experiment.
     """
-    return [InstrumentedEquations(b.y, b.x, b.keep, b.t, z) for b, z in zip(blocks, instruments, strict=True)]
+    return mapped(lambda b, z: InstrumentedEquations(b.y, b.x, b.keep, b.t, z), blocks, instruments)
 
 
 def applied(columns: NDArray[np.float64], values: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -229,6 +230,19 @@ def residuals(blocks: Sequence[ExperimentEquations], theta: NDArray[np.float64])
         Base parameters, shape (b,).
     """
     return [block.y - applied(block.x, theta) for block in blocks]
+
+
+def residuals_of(estimate: Estimate, numbers: Sequence[int]) -> Estimate:
+    """Estimate with the residuals of some of its experiments.
+
+    Parameters
+    ----------
+    estimate
+        The estimate.
+    numbers
+        Numbers of the experiments, from 0.
+    """
+    return replace(estimate, residuals=tuple(tuple(series[k] for k in numbers) for series in estimate.residuals))
 
 
 def joint_variances(blocks: Sequence[ExperimentEquations], theta: NDArray[np.float64]) -> list[ArModel]:

@@ -312,12 +312,12 @@ def iv_products(blocks: Sequence[InstrumentedEquations], noise: Sequence[ArModel
     """
     combine, scale = _combinations(blocks, noise)
 
-    def of_series(joint_and_block: tuple[int, InstrumentedEquations]) -> tuple[JointEquations, Array]:
-        j, block = joint_and_block
-        joint = JointEquations.of([block], j, copied=False)
+    def of_series(joint_and_block: tuple[int, int]) -> tuple[JointEquations, Array]:
+        j, k = joint_and_block
+        joint = JointEquations.of([blocks[k]], j, copied=False)
         return joint, joint.products(joint.whitened(noise[j]), combine)
 
-    series = [(j, block) for j in range(len(noise)) for block in blocks]
+    series = [(j, k) for j in range(len(noise)) for k in range(len(blocks))]
     with ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
         # Summed in the order of the joints, so that the same data give the same bits.
         return together(pool.map(of_series, series), scale.size, combined=combine is not None, scale=scale)

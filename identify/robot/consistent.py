@@ -330,14 +330,14 @@ class _Projection:
         b, p = model.base.regroup.shape
         whitened = linalg.solve_triangular(factor, model.base.regroup, lower=True) / scale
         signed = non_negative(model)
-        length = _length(model)
+        length = mean_length(model)
         equal = np.hstack([whitened, -np.eye(b)])
         above = np.zeros((signed.size, p + b))
         above[np.arange(signed.size), signed] = -1.0
         rows, cones = [equal, above], [clarabel.ZeroConeT(b), clarabel.NonnegativeConeT(signed.size)]
         for columns in model.columns.inertial:
             lmi = np.zeros((10, p + b))
-            lmi[:, columns] = -_triangles(length)
+            lmi[:, columns] = -triangles(length)
             rows.append(lmi)
             cones.append(clarabel.PSDTriangleConeT(4))
         self._rows, self._cones = np.vstack(rows), cones
@@ -349,7 +349,7 @@ class _Projection:
         rotors = model.columns.ia[model.columns.ia >= 0]
         self._weight[rotors] = 1 / length**2
         self._p, self._b, self._scale = p, b, scale
-        smallest = np.zeros(10) if smallest_link is None else _triangle(smallest_link, length)
+        smallest = np.zeros(10) if smallest_link is None else triangle(smallest_link, length)
         self._limits = np.concatenate([np.zeros(b + signed.size), np.tile(-smallest, model.n)])
 
     def nearest(self, whitened: Floats, price: float = REGULARISATION) -> tuple[Floats, Floats]:
@@ -369,7 +369,7 @@ class _Projection:
         """
         right = self._limits.copy()
         right[: self._b] = whitened / self._scale
-        x = _solve(self._quadratic, price * self._weight, self._rows, right, self._cones)
+        x = minimise_in_cones(self._quadratic, price * self._weight, self._rows, right, self._cones)
         return x[: self._p], self._scale * x[self._p :]
 
     def lightest(self, whitened: Floats, nearest: Floats, distance: float) -> Floats:
@@ -411,8 +411,22 @@ class _Projection:
         return float(np.clip(lost, 1.0, self._b))
 
 
-def _solve(quadratic: Floats, linear: Floats, rows: Floats, right: Floats, cones: Sequence[Any]) -> Floats:
+def minimise_in_cones(quadratic: Floats, linear: Floats, rows: Floats, right: Floats, cones: Sequence[Any]) -> Floats:
     """Minimise ``x'Qx/2 + c'x`` subject to ``right - rows x`` in the cones.
+
+    Parameters
+    ----------
+    quadratic, linear
+        Q, (k, k), and c, (k,).
+    rows, right
+        Rows of all cones one after the other, (m, k) and (m,).
+    cones
+        Cones of the solver in the order of the rows.
+
+    Returns
+    -------
+    ndarray
+        The minimum x, (k,).
 
     Raises
     ------
@@ -460,11 +474,16 @@ def _inside(model: ArmModel, theta: Floats, smallest_link: Floats | None = None)
     return inside
 
 
-def _triangles(length: float) -> Floats:
+def triangles(length: float) -> Floats:
     """Upper triangles of the pseudo-inertia of each unit inertial parameter, shape (10, 10).
 
     Lengths are in units of ``length`` (m). Triangles are stored column by column with off-diagonals times sqrt(2), an
-    isometry, in the format of the solver.
+    isometry, in the format of the solver (`clarabel.PSDTriangleConeT`).
+
+    Parameters
+    ----------
+    length
+        Unit of length, m.
     """
     out = np.empty((10, 10))
     for k, ten in enumerate(np.eye(10)):
@@ -474,18 +493,26 @@ def _triangles(length: float) -> Floats:
         matrix[:3, :3] = 0.5 * np.trace(inertia) * np.eye(3) - inertia
         matrix[:3, 3] = matrix[3, :3] = mx, my, mz
         matrix[3, 3] = m
-        out[:, k] = _triangle(matrix, length)
+        out[:, k] = triangle(matrix, length)
     return out
 
 
-def _triangle(matrix: Floats, length: float) -> Floats:
-    """Upper triangle of a pseudo-inertia in the units and the order of `_triangles`, shape (10,)."""
+def triangle(matrix: Floats, length: float) -> Floats:
+    """Upper triangle of a pseudo-inertia in the units and the order of `triangles`, shape (10,).
+
+    Parameters
+    ----------
+    matrix
+        Pseudo-inertia, (4, 4), kg and kg m^2.
+    length
+        Unit of length, m.
+    """
     scale = np.array([1 / length, 1 / length, 1 / length, 1.0])
     scaled = matrix * np.outer(scale, scale)
     return np.array([scaled[i, j] * (1.0 if i == j else np.sqrt(2.0)) for j in range(4) for i in range(j + 1)])
 
 
-def _length(model: ArmModel) -> float:
+def mean_length(model: ArmModel) -> float:
     """Mean of the nonzero lengths ``d`` and ``r`` of the arm, m; 1 if all are zero."""
     lengths = np.abs(np.concatenate([model.chain.d, model.chain.r]))
     return float(lengths[lengths > 0].mean()) if lengths.any() else 1.0

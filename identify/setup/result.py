@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 
 from armident.configs import RobotConfig
 from armident.identify.experiment import Experiment
+from armident.identify.streamed import mapped
 
 SIGNIFICANT = 3.0
 """Standard deviations between a shift and a convention from which they differ: one false alarm in 370."""
@@ -172,7 +173,7 @@ class SetupCheck:
     torque_shift: TorqueShift | None = None
 
 
-def with_torque_shift(experiments: Sequence[Experiment], shift: TorqueShift | None) -> list[Experiment]:
+def with_torque_shift(experiments: Sequence[Experiment], shift: TorqueShift | None) -> Sequence[Experiment]:
     """Return the experiments with a shift of their torques that the equations of motion allow for.
 
     Parameters
@@ -183,5 +184,5 @@ def with_torque_shift(experiments: Sequence[Experiment], shift: TorqueShift | No
         Common shift; ``None``, or one that is not applied: no change.
     """
     if shift is None or not shift.applied:
-        return list(experiments)
-    return [replace(e, torque_shift=e.torque_shift + shift.correction) for e in experiments]
+        return experiments
+    return mapped(lambda e: replace(e, torque_shift=e.torque_shift + shift.correction), experiments)

@@ -120,12 +120,12 @@ class CountingModel(AuxiliaryModel):
     asked: list[int] = field(default_factory=list)
     midway: bool = False
 
-    def instruments(self, theta: Array) -> list[Array]:
+    def instruments(self, theta: Array) -> Sequence[Array]:
         """Return the instruments (N, n, b) per experiment, midway between the samples if ``midway``."""
         zeta = super().instruments(theta)
         return [between(z) for z in zeta] if self.midway else zeta
 
-    def simulate(self, theta: Array, disturbances: Sequence[Array] | None = None) -> list[Simulation] | None:
+    def simulate(self, theta: Array, disturbances: Sequence[Array] | None = None) -> Sequence[Simulation] | None:
         """Simulate the closed loop and count the simulation; ``None`` if it diverges.
 
         Parameters
@@ -204,7 +204,7 @@ class Laboratory:
         dt = self.recording(case).experiment.dt
         return design(dt, GOOD_CUTOFF_HZ, 1) if case.cutoff_hz is None else design(dt, case.cutoff_hz)
 
-    def equations(self, case: Case) -> list[ExperimentEquations]:
+    def equations(self, case: Case) -> Sequence[ExperimentEquations]:
         """Return the filtered equations of a case; not cached, as they are large at 5 kHz."""
         experiment = self.recording(case).experiment
         blocks = equations(self.model, [experiment], [self.derivatives(case)], self.decimation(case))
@@ -276,7 +276,7 @@ class Laboratory:
         return Run(estimate, relative_errors(blocks, estimate.theta)[0], seconds, simulations)
 
     def _iterate(
-        self, method: Method, case: Case, blocks: list[ExperimentEquations], auxiliary: AuxiliaryModel
+        self, method: Method, case: Case, blocks: Sequence[ExperimentEquations], auxiliary: AuxiliaryModel
     ) -> Estimate:
         if case.start == "rotors":
             start = initial_parameters(self.model)
@@ -299,7 +299,7 @@ class Laboratory:
             case _:
                 raise ValueError(f"{method} does not iterate")
 
-    def simulated(self, run: Run, case: Case) -> list[ExperimentEquations]:
+    def simulated(self, run: Run, case: Case) -> Sequence[ExperimentEquations]:
         """Return the equations of a case with the regressor simulated with the parameters of a run.
 
         Parameters

@@ -64,15 +64,10 @@ def __getattr__(name: str) -> Any:
         return importlib.import_module("armident.identify")
     if name not in _MODULES:
         raise AttributeError(f"module 'armident' has no attribute {name!r}")
-    try:
-        value = getattr(importlib.import_module(_MODULES[name]), name)
-    except ImportError as error:
-        from armident.extras import install_line, needed_extra
+    from armident.extras import named_extra
 
-        extra = needed_extra(error, _MODULES[name])
-        if extra is None:
-            raise
-        raise ImportError(install_line(f"armident.{name}", [extra]), name=error.name) from error
+    with named_extra(f"armident.{name}", _MODULES[name]):
+        value = getattr(importlib.import_module(_MODULES[name]), name)
     globals()[name] = value
     return value
 

@@ -1,12 +1,12 @@
 """Optional parts of the distribution, and the command that installs one that is missing."""
 
-from collections.abc import Iterable
-
-from armident.configs.errors import ConfigError
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 
 EXTRAS: dict[str, tuple[str, ...]] = {
     "identify": (
-        "clarabel", "filterpy", "jinja2", "markupsafe", "matplotlib", "numba", "scipy", "sqlalchemy", "threadpoolctl",
+        "clarabel", "coal", "filterpy", "jinja2", "markupsafe", "matplotlib", "numba", "scipy", "sqlalchemy",
+        "threadpoolctl",
     ),
     "virtual": ("clarabel", "numba", "pinocchio", "scipy"),
     "fleet": ("distributed",),
@@ -46,6 +46,31 @@ def install_line(what: str, extras: Iterable[str]) -> str:
     return f"{what} needs extra packages: pip install 'armident[{','.join(extras)}]'"
 
 
+@contextmanager
+def named_extra(what: str, package: str) -> Iterator[None]:
+    """Give the error of an import that lacks an extra the command that installs it.
+
+    Parameters
+    ----------
+    what
+        What is imported, for example a function of the public API.
+    package
+        Package that imports.
+
+    Raises
+    ------
+    ImportError
+        With the command, if a module of an extra is missing.
+    """
+    try:
+        yield
+    except ImportError as error:
+        extra = needed_extra(error, package)
+        if extra is None:
+            raise
+        raise ImportError(install_line(what, [extra]), name=error.name) from error
+
+
 def require(what: str, *extras: str) -> None:
     """Check that the modules of extras can be found, without importing them.
 
@@ -62,6 +87,8 @@ def require(what: str, *extras: str) -> None:
         If modules are missing; names the command that installs all the extras that lack one.
     """
     from importlib.util import find_spec
+
+    from armident.configs.errors import ConfigError
 
     missing = [extra for extra in extras if any(find_spec(module) is None for module in EXTRAS[extra])]
     if missing:

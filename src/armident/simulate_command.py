@@ -1,9 +1,12 @@
 """Command ``armident simulate``: the closed loop along a trajectory, of the virtual arm or of an identified model."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
+
+if TYPE_CHECKING:
+    from armident.configs import RobotConfig
 
 
 def simulate(
@@ -13,7 +16,15 @@ def simulate(
         Path | None, typer.Option("--config", help="Robot configuration. [default: that of --model]")
     ] = None,
     model: Annotated[
-        Path | None, typer.Option("--model", help="Result whose identified dynamics move, in place of the virtual arm.")
+        Path | None, typer.Option("--model", help="Result whose identified arm moves. [default: the virtual arm]")
+    ] = None,
+    physics: Annotated[
+        Literal["virtual", "identified"] | None,
+        typer.Option(
+            "--physics",
+            help="virtual (Pinocchio) or identified (equations of the identification). "
+            "[default: identified with --model, else virtual]",
+        ),
     ] = None,
     scenario: Annotated[
         Path | None, typer.Option("--scenario", help="Scenario: effects hidden in the virtual arm.")
@@ -33,8 +44,10 @@ def simulate(
 ) -> None:
     """Simulate the closed loop along a trajectory, and write a recording or arrays.
 
-    Without --model, the virtual arm moves: its physics are those of Pinocchio, with drives, noise and hidden effects.
-    With --model, the identified model moves: the equations of the identification, its effects included, without noise.
+    virtual: the physics are those of Pinocchio, with drives, noise and hidden effects. Masses are those of the virtual
+    arm, or with --model its physically consistent ones (identify --physical).
+
+    identified: the equations and parameters of --model, its effects included, without noise.
 
     Arrays are in SI units at the joints: t, q1.., tau1.., qr1.. (reference).
 
@@ -51,34 +64,45 @@ def simulate(
         raise ConfigError(f"--out {out}: expected a name that ends in .mcap or .npz")
     if out.exists():
         raise ConfigError(f"--out {out}: the file exists already")
-    robot, reference = None if config is None else load_robot(config), load_trajectory(trajectory)
-    if model is not None:
+    if config is None and model is None:
+        raise ConfigError("--config: give the robot whose virtual arm moves, or --model")
+    reference = load_trajectory(trajectory)
+    if physics == "identified" or (physics is None and model is not None):
         from armident.identify.saved_model import load_model
         from armident.identify.simulated_recording import simulate_model
 
+        if model is None:
+            raise ConfigError("--physics identified: give the identified arm by --model")
         if scenario is not None or seed is not None or noise is not None:
-            raise ConfigError(
-                "--scenario, --seed and --noise belong to the virtual arm: they have no meaning with --model"
-            )
+            raise ConfigError("--scenario, --seed and --noise belong to --physics virtual")
+        robot = None if config is None else load_robot(config, "identify")
         recording = simulate_model(load_model(model, robot), reference, rate)
     else:
         from armident.virtual_robot.api import simulate_recording
 
-        if robot is None:
-            raise ConfigError("--config: give the robot whose virtual arm moves, or --model")
         hidden = None if scenario is None else load_scenario(scenario)
         if hidden is not None and hidden.drives:
             raise ConfigError(f"{scenario}: drives: a simulation has no bus, on which drives could be odd")
+        document = None if model is None else model / "identification.json" if model.is_dir() else model
         recording = simulate_recording(
-            robot,
+            config or _robot_of(document),
             reference,
             scenario=hidden,
             seed=seed or 0,
             noise=1.0 if noise is None else noise,
             period=None if rate is None else 1.0 / rate,
+            model=document,
         )
     if out.suffix.lower() == ".mcap":
         write_recording(recording, out)
     else:
         export_recording(recording, out)
     print(out)
+
+
+def _robot_of(document: Path | None) -> "RobotConfig":
+    """Return the robot of an identification."""
+    from armident.identify.saved_model import load_model
+
+    assert document is not None
+    return load_model(document).robot

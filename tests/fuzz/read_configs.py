@@ -13,6 +13,7 @@ from pydantic import BaseModel
 from armident.configs import load_robot, load_session, load_suite, load_trajectory
 from armident.configs.loading import HERE, load_scenario
 from armident.configs.yaml_loader import read_yaml
+from armident.daq.init.dh_table import from_dh_table
 from tests.fuzz.harness import MisreadError, Target
 from tests.fuzz.mutate import either, spoil_text, spoil_tree
 from tests.urdf_chains import random_urdf
@@ -106,6 +107,23 @@ def _check_urdf(data: bytes, folder: Path) -> bool:
     return True
 
 
+DH_TABLES = (
+    "name; theta [deg]; d [mm]; a [mm]; alpha [deg]\na; 0; 162.5; 0; 90\nb; 0; 0; -425; 0\nc; 0; 0; -392.2; 0\n",
+    "theta,d,a,alpha\n0,0.1,0,pi/2\n-pi/2,0,0.3,0\n0,0.2,0.05,-pi/2\n",
+    "type,alpha,d,theta,r\nprismatic,0,0,0,0\nrevolute,90,0,0,0.3\n",
+)
+
+
+def _check_dh_table(data: bytes, folder: Path) -> bool:
+    path = folder / "table.csv"
+    path.write_bytes(data)
+    robot = from_dh_table(path, None).robot
+    for joint in robot.joints:
+        if not np.isfinite([*joint.mdh.model_dump().values()]).all():
+            raise MisreadError(f"{joint.name} has no finite geometry")
+    return True
+
+
 def _target(name: str, seeds: Callable[[], list[bytes]], load: Load) -> Target:
     return Target(name, seeds, either(spoil_text, spoil_tree), _check(load))
 
@@ -117,4 +135,5 @@ TARGETS = (
     _target("suite", _shipped("suites/*.yaml"), load_suite),
     _target("scenario", _shipped("scenarios/*.yaml"), load_scenario),
     Target("urdf", _urdf_seeds, spoil_text, _check_urdf),
+    Target("dh-table", lambda: [table.encode() for table in DH_TABLES], spoil_text, _check_dh_table),
 )

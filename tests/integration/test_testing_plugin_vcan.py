@@ -30,8 +30,6 @@ def test_fixtures(virtual_bus, virtual_arm, capture, tmp_path):
     arm.stop()
     with pytest.raises(ArmidentError, match="did not start.*no effect.*is not an effect of the virtual arm"):
         virtual_arm("emps_cell.yaml", scenario={"effects": [{"effect": "no_effect", "joint": "joint_1"}]})
-    with pytest.raises(ArmidentError, match="several buses"):
-        virtual_arm("tx40_six_buses.yaml")
     with pytest.raises(ArmidentError, match="capture: "):
         capture(arm, duration_s=1.0)
 """

@@ -104,11 +104,11 @@ def simulated_pieces(estimator: RecursiveEstimator, hours: float, seed: int) -> 
         recording = play(name, number, factors_at(elapsed))
         seconds = recording.samples.sync.size / recording.sample_rate_hz
         elapsed += seconds / 3600.0
-        yield Piece(seconds, partial(take_all, estimator, recording))
+        yield Piece(seconds, partial(handle_all, estimator, recording))
 
 
-def take_all(estimator: RecursiveEstimator, recording: Recording) -> None:
-    """Let an estimator take a recording."""
+def handle_all(estimator: RecursiveEstimator, recording: Recording) -> None:
+    """Give all blocks of a recording to an estimator."""
     for block in blocks_of(recording, BLOCK):
         estimator.handle(block)
 

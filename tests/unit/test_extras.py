@@ -58,10 +58,19 @@ def test_a_command_without_its_extra_names_the_installation(words: tuple[str, ..
     assert (done.returncode, done.stdout, done.stderr) == (2, "", line)
 
 
-def test_a_name_of_the_api_without_its_extra_names_the_installation(tmp_path: Path) -> None:
-    program = "import armident\ntry:\n    armident.compare\nexcept ImportError as error:\n    print(error)\n"
-    done = run_without({"scipy"}, program, tmp_path)
-    assert done.stdout == "armident.compare needs extra packages: pip install 'armident[identify]'\n"
+@pytest.mark.parametrize(
+    ("use", "extra"),
+    [
+        ("compare", "identify"),
+        ("identify('run.mcap')", "identify"),
+        ("simulate_recording('emps', 'emps_excitation')", "virtual"),
+    ],
+)
+def test_a_name_of_the_api_without_its_extra_names_the_installation(use: str, extra: str, tmp_path: Path) -> None:
+    program = f"import armident\ntry:\n    armident.{use}\nexcept ImportError as error:\n    print(error)\n"
+    done = run_without({"scipy", "numba", "pinocchio"}, program, tmp_path)
+    name = use.partition("(")[0]
+    assert done.stdout == f"armident.{name} needs extra packages: pip install 'armident[{extra}]'\n", done.stderr
 
 
 def test_a_missing_module_of_no_extra_is_not_taken_for_one() -> None:
@@ -85,3 +94,19 @@ def test_a_capture_without_compiled_loops_is_refused(tmp_path: Path) -> None:
     checks = run_without({"numba"}, armident("doctor", "--config", "tx40_cell.yaml"), tmp_path)
     assert checks.returncode == 2
     assert "no compiled code for the bus" in " ".join(checks.stdout.split())
+
+
+def test_the_packages_of_a_capture_machine_import_no_module_of_an_extra(tmp_path: Path) -> None:
+    """Only the guard does: it checks every frame of a moving arm in loops that numba compiles."""
+    program = (
+        "import armident.configs, armident.daq, armident.drivers, importlib, pkgutil\n"
+        "for package in (armident.configs, armident.daq, armident.drivers):\n"
+        "    for found in pkgutil.walk_packages(package.__path__, package.__name__ + '.'):\n"
+        "        try:\n"
+        "            found.name.endswith('__main__') or importlib.import_module(found.name)\n"
+        "        except ImportError as error:\n"
+        "            print(found.name, error.name)\n"
+    )
+    done = run_without({module for modules in EXTRAS.values() for module in modules}, program, tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert all(line.startswith("armident.daq.guard.") for line in done.stdout.splitlines()), done.stdout

@@ -137,6 +137,9 @@ def virtual_arm(virtual_bus: str, tmp_path: Path) -> "Iterator[VirtualArms]":
     VirtualArms
         Called with a session or robot configuration, see `armident.testing.virtual_arm.VirtualArms`.
     """
+    from armident.extras import require
+
+    require("armident.testing", "virtual")
     from armident.testing.virtual_arm import VirtualArms
 
     arms = VirtualArms(virtual_bus, tmp_path)

@@ -12,17 +12,14 @@ from typing import Any
 import yaml
 
 from armident.configs import ArmidentError, RobotConfig, SessionConfig, load_robot, load_session
-from armident.configs.schema.session import MetricsOptions, ZenohOptions
 from armident.daq.recording import Recording, read_recording
 from armident.processes import CommandProcess
-from armident.virtual_robot.twin import ParameterChoice, at_period, load_twin, write_twin
+from armident.virtual_robot.twin import ParameterChoice, at_period, load_twin, on_virtual_bus, write_twin
 
 READY_S = 180.0
 """Longest start of a virtual arm, s: the compilation of its loops takes most of it."""
 CAPTURE_S = 300.0
 """Longest capture after the motion and its preparation, s."""
-HEARTBEAT_MS = 1000
-"""Shortest heartbeat period, ms: drives and master share a machine, which may be busy."""
 
 _numbers = itertools.count()
 
@@ -114,7 +111,11 @@ class VirtualArms:
         choice = ParameterChoice(None if model is None else Path(model), arm_seed, draw_masses)
         twin = load_twin(Path(config), choice)
         session = twin.session if sync_period_us is None else at_period(twin.session, sync_period_us)
-        file = write_twin(twin.with_session(self._isolated(session, folder, number)), folder)
+        session = on_virtual_bus(session, self._bus, f"{session.cell[:40]}_test_{os.getpid()}_{number}")
+        session = session.model_copy(
+            update={"recording": session.recording.model_copy(update={"directory": folder / "recordings"})}
+        )
+        file = write_twin(twin.with_session(session), folder)
         words = ["robot", "--config", str(file), "--seed", str(seed), "--noise", str(noise)]
         words += ["--arm-seed", str(arm_seed), "--truth", str(folder / "truth.json")]
         words += [] if model is None else ["--model", str(Path(model).resolve())]
@@ -129,27 +130,6 @@ class VirtualArms:
         truth = json.loads((folder / "truth.json").read_text(encoding="utf-8"))
         self._arm = VirtualArm(file, loaded, load_robot(loaded.robot), truth, process)
         return self._arm
-
-    def _isolated(self, session: SessionConfig, folder: Path, number: int) -> SessionConfig:
-        """Session on the bus of the test that no other process of this machine hears."""
-        bus = session.all_buses[0].model_copy(update={"interface": "socketcan", "channel": self._bus})
-        if len(session.all_buses) > 1:
-            raise ArmidentError(
-                "virtual_arm: the session has several buses, a test has one; put the drives on one bus "
-                "(node ids 1, 2, ...), at a longer sync_period_us if need be"
-            )
-        return session.model_copy(
-            update={
-                "cell": f"{session.cell[:40]}_test_{os.getpid()}_{number}",
-                "bus": bus,
-                "buses": (),
-                "drives": tuple(drive.model_copy(update={"bus": None}) for drive in session.drives),
-                "heartbeat_ms": max(session.heartbeat_ms, HEARTBEAT_MS),
-                "recording": session.recording.model_copy(update={"directory": folder / "recordings"}),
-                "zenoh": ZenohOptions(commands=session.zenoh.commands),
-                "metrics": MetricsOptions(),
-            }
-        )
 
     def stop(self) -> None:
         """Switch the arm off, if there is one."""

@@ -350,7 +350,12 @@ ODD_NUMBERS = [
     ],
 )
 def test_an_odd_number_is_one_line(tmp_path: Path, kind: str, line: str, number: str) -> None:
-    load = {"robot": load_robot, "session": load_session, "trajectory": load_trajectory}[kind]
+    loaders: dict[str, Callable[[Path], object]] = {
+        "robot": load_robot,
+        "session": load_session,
+        "trajectory": load_trajectory,
+    }
+    load = loaders[kind]
     path = tmp_path / "odd.yaml"
     path.write_text(f"schema: armident/{kind}/1\n{line.format(number)}\n")
     with pytest.raises(ConfigError) as caught:

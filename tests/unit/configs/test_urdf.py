@@ -15,7 +15,7 @@ from armident.configs import ConfigError, Limits, RobotConfig, Trajectory, load_
 from armident.configs.loading import parse
 from armident.configs.mdh import modified_dh
 from armident.configs.urdf import mdh_of
-from armident.configs.urdf_origin import rotation, rotation_of_quaternion
+from armident.configs.urdf_origin import fixed_axis_angles, rotation, rotation_of_quaternion
 from armident.configs.urdf_tree import read_chain
 from armident.daq.guard.limits import limits_of
 from armident.daq.recording import Recording, Stream, read_recording, write_recording
@@ -488,3 +488,8 @@ def test_an_arm_without_limits_is_identified_from_a_recording(tmp_path: Path) ->
     result = identify(tmp_path / "r.mcap", method="idim-ls")
     np.testing.assert_allclose(result.theta, theta, rtol=0.05, atol=0.05)
     assert motor_limit(robot, 0) == NOMINAL_TORQUE
+
+
+@pytest.mark.parametrize("angles", [(0.3, -0.4, 2.9), (-3.0, 1.2, -0.1), (0.7, np.pi / 2, 0.0), (0.2, -np.pi / 2, 0.0)])
+def test_fixed_axis_angles_of_a_rotation_are_those_that_made_it(angles: tuple[float, float, float]) -> None:
+    np.testing.assert_allclose(fixed_axis_angles(rotation(*angles)), angles, atol=1e-12)

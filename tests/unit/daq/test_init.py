@@ -18,6 +18,7 @@ from armident.daq.init.command import InitOptions, run_init
 from armident.daq.init.questionnaire import questionnaire
 from armident.daq.interchange.exporting import export_recording
 from armident.daq.recording import read_recording, write_recording
+from armident.virtual_robot.twin import load_twin
 from tests.fixtures import arms
 from tests.unit.configs.test_urdf import transform
 
@@ -354,6 +355,8 @@ def test_a_table_of_parameters_gives_the_geometry(
         ("theta,d,a,alpha\n0,0,0\n", "line 2: 3 values, the header has 4"),
         ("theta,d,a,alpha\n0,0,0,north\n", "line 2, column alpha: .*north"),
         ("theta,d,a [inch],alpha\n0,0,0,0\n", "unknown unit; expected rad, deg, m or mm"),
+        ("theta,d,a,alpha\n0,0,1e9,0\n", "lengths: 1e\\+09 is beyond every arm"),
+        ("name,theta,d,a,alpha\nx,0,0,1,0\nX,0,0,1,0\n", "joint names differ only in case"),
         ("theta,d,a,alpha,type\n0,0,0,0,screw\n", "type 'screw'; expected revolute or prismatic"),
         ("", "expected a header line"),
     ],
@@ -463,3 +466,14 @@ def test_joints_that_were_not_recorded_are_left_out(tmp_path: Path, arm: Path) -
     refused = run("init", str(arm), "--recording", str(path), "--out", str(tmp_path / "x"))
     assert refused.exit_code == 3
     assert "no column q5, the robot has 6 joints" in refused.stderr
+
+
+def test_the_virtual_arm_assumes_what_is_blank(tmp_path: Path, arm: Path) -> None:
+    path = table(tmp_path / "d.csv")
+    assert run("init", str(arm), "--recording", str(path), "--out", str(tmp_path)).exit_code == 0
+    twin = load_twin(tmp_path / "robot.yaml")
+    assert twin.robot.blanks == ()
+    assert all("drive.rated" in text or "drive.counts" in text or "session" in text for text in twin.assumed)
+    assert all(joint.drive.counts_per_unit is not None for joint in twin.robot.joints)
+    with pytest.raises(ConfigError, match="armident robot needs values"):
+        load_twin(tmp_path / "session.yaml")

@@ -160,6 +160,7 @@ def test_the_units_agree_with_the_account_and_the_folders(image: Path) -> None:
         keys = unit["Service"]
         assert (keys["User"], keys["Group"]) == (ACCOUNT, ACCOUNT)
         assert keys["StateDirectory"] == "armident/%i"
+        assert keys["WorkingDirectory"] == f"/{STATE}/%i"
         assert keys["CacheDirectory"] == "armident"
         assert keys.get("StateDirectoryMode", "0755") == "0755"
     names = [step.name for step in steps(System(image, Path("/x")), "%i")]

@@ -128,6 +128,20 @@ def test_a_model_that_cannot_be_used_is_refused_in_one_line(
         load_model(tmp_path)
 
 
+@pytest.mark.parametrize("words", [("predict", "two.mcap", "--model", "one"), ("compare", "one", "two")])
+def test_results_that_cannot_be_written_are_one_line(folder: Path, tmp_path: Path, words: tuple[str, ...]) -> None:
+    (tmp_path / "file").write_text("")
+    given = [word if word in ("predict", "compare", "--model") else folder / word for word in words]
+    result = call(*given, "--out", tmp_path / "file")
+    assert result.exit_code == 2
+    assert "file: cannot be written: " in result.stderr
+
+
+def test_a_recording_is_no_model(folder: Path) -> None:
+    with pytest.raises(DataError, match=r"one\.mcap: not a JSON document"):
+        load_model(folder / "one.mcap")
+
+
 def test_a_configuration_is_no_model(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="no identified parameters: run `armident identify RECORDING"):
         load_model(tmp_path / "model.yaml")
@@ -190,6 +204,19 @@ def test_models_with_other_parameters_are_refused_or_compared_on_the_common_ones
     assert "without" in found["warnings"][0]
 
 
+def test_an_effect_of_another_shape_is_another_parameter(folder: Path, tmp_path: Path) -> None:
+    robot = armident.load_robot("emps")
+    for name, velocity in (("one", 0.02), ("two", 0.04)):
+        stribeck = {"effect": "stribeck_friction", "joint": "joint_1", "parameters": {"velocity": velocity}}
+        shaped = type(robot).model_validate({**robot.model_dump(by_alias=True), "effects": [stribeck]})
+        armident.identify(folder / f"{name}.mcap", shaped, method="idim-ls").save(tmp_path / name)
+    refused = call("compare", tmp_path / "one", tmp_path / "two")
+    assert refused.exit_code == 3
+    assert "(fst1)" in refused.stderr
+    found = call("compare", tmp_path / "one", tmp_path / "two", "--common", "--json")
+    assert json.loads(found.stdout)["left_out"] == ["fst1"]
+
+
 def test_models_of_one_recording_carry_a_warning(folder: Path, tmp_path: Path) -> None:
     result = call("compare", folder / "one", folder / "one", "--out", tmp_path, "--json")
     assert any("same recording" in line for line in json.loads(result.stdout)["warnings"])
@@ -212,6 +239,20 @@ def test_a_simulated_model_is_identified_again(folder: Path, tmp_path: Path) -> 
     assert again.relative_error_pct < 1.0
 
 
+def test_the_virtual_arm_takes_the_masses_of_a_model(folder: Path, tmp_path: Path) -> None:
+    armident.identify(folder / "one.mcap", method="idim-ls", physical=True).save(tmp_path / "model")
+    words = ("simulate", "--model", str(tmp_path / "model"), "--trajectory", "emps_2.yaml", "--rate", "1000")
+    for physics, more in (("virtual", ("--noise", "0")), ("identified", ())):
+        out = tmp_path / f"{physics}.mcap"
+        assert call(*words, "--physics", physics, "--out", out, *more).exit_code == 0
+    virtual, identified = (
+        armident.identify(tmp_path / f"{physics}.mcap", method="idim-ls", derivatives="irwsm").theta
+        for physics in ("virtual", "identified")
+    )
+    # The same parameters in two engines and two control loops.
+    assert virtual == pytest.approx(identified, rel=0.05)
+
+
 def test_the_virtual_arm_is_simulated_with_its_hidden_effect(tmp_path: Path) -> None:
     words = ["simulate", "--config", "emps.yaml", "--trajectory", "emps_1.yaml", "--seed", "3"]
     assert call(*words, "--out", tmp_path / "a.npz").exit_code == 0
@@ -227,7 +268,8 @@ def test_the_virtual_arm_is_simulated_with_its_hidden_effect(tmp_path: Path) -> 
     [
         (["--out", "x.csv", "--config", "emps.yaml"], "ends in .mcap or .npz"),
         (["--out", "x.npz"], "--config: give the robot"),
-        (["--out", "x.npz", "--model", "m.json", "--seed", "1"], "belong to the virtual arm"),
+        (["--out", "x.npz", "--model", "m.json", "--seed", "1"], "belong to --physics virtual"),
+        (["--out", "x.npz", "--config", "emps.yaml", "--physics", "identified"], "by --model"),
         (["--out", "x.npz", "--config", "emps.yaml", "--trajectory", "tx40_1.yaml"], "emps"),
     ],
 )
@@ -241,3 +283,15 @@ def test_contradictory_options_of_a_simulation_are_one_line(
     assert expected in result.stderr
     assert result.stderr.count("\n") == 1
     assert not (tmp_path / "x.npz").exists()
+
+
+def test_the_measured_emps_is_predicted_with_the_published_errors(shared_data: Path) -> None:
+    """Janot, Gautier, Brunot 2019: the fit has an error of 4.0834 %, and of 5.9824 % on the recording with pulses."""
+    files = [shared_data / "emps" / name for name in ("DATA_EMPS.mat", "DATA_EMPS_PULSES.mat")]
+    if not all(file.is_file() for file in files):
+        pytest.skip("no recordings of the EMPS in the measured data")
+    seen, pulses = (armident.import_recording(file, "emps") for file in files)
+    found = armident.predict(pulses, armident.identify(seen, method="idim-ls")).document
+    assert found.held_out
+    assert round(found.identification_error_pct, 4) == 4.0834
+    assert round(found.relative_error_pct, 4) == 5.9824

@@ -59,7 +59,7 @@ SIZES: dict[str, Callable[[Limits], dict[str, float]]] = {
     "joint_order": lambda j: {},
     "time_delay": lambda j: {"delay": 0.02},
     "encoder_eccentricity": lambda j: {"amplitude": 2e-3 * span(j)},
-    "actuator_bandwidth": lambda j: {"time_constant": 5e-3},
+    "actuator_bandwidth": lambda j: {"time_constant": 2e-3},
     "torque_offset": lambda j: {"torque": 0.03 * j.torque},
     "torque_bump": lambda j: {"torque": 0.05 * j.torque, "position": 0.5 * sum(j.position), "width": 0.3 * span(j)},
     "mains_ripple": lambda j: {"amplitude": 0.02 * j.torque},

@@ -9,7 +9,7 @@ import pytest
 
 import armident
 from armident.configs import ConfigError, RobotConfig, Scenario, load_robot, load_session, load_trajectory
-from armident.configs.loading import parse
+from armident.configs.loading import HERE, parse
 from armident.configs.units import counts_per_si
 from armident.daq.recording import read_recording
 from armident.virtual_robot import servo
@@ -17,10 +17,19 @@ from armident.virtual_robot.arm import Arm
 from armident.virtual_robot.arm_parameters import arm_parameters, with_scenario
 from armident.virtual_robot.drawn_parameters import TORQUE_SHARE, draw_bodies, torque_scale
 from armident.virtual_robot.inertias import pseudo_inertia
+from armident.virtual_robot.offline import effort_of, simulate_recording
 from armident.virtual_robot.plant import Plant
 from armident.virtual_robot.plausible_motion import plausible_trajectory
 from armident.virtual_robot.run import record_robot
-from armident.virtual_robot.twin import BUS_RANGE, ParameterChoice, complete, load_twin, write_twin
+from armident.virtual_robot.twin import (
+    BUS_RANGE,
+    ParameterChoice,
+    at_period,
+    complete,
+    load_twin,
+    on_virtual_bus,
+    write_twin,
+)
 from tests.fixtures.other_arms import write_scara
 
 
@@ -116,9 +125,21 @@ def test_an_identification_gives_the_parameters(panda: RobotConfig, tmp_path: Pa
     assert parameters.sources == (f"parameters: the physically consistent ones of {file}",)
 
 
+def test_the_reversal_of_friction_is_that_of_the_identification(panda: RobotConfig, tmp_path: Path) -> None:
+    file = tmp_path / "identification.json"
+    smoothing = {joint.name: 100.0 + k for k, joint in enumerate(panda.joints)}
+    file.write_text(json.dumps(document(panda, sign_smoothing=smoothing)))
+    free = panda.model_copy(update={"friction": type(panda.friction)()})
+    robot, _, assumed = complete(free, model=file)
+    assert robot.friction.sign_smoothing == tuple(smoothing.values())
+    assert not any("sign_smoothing" in entry for entry in assumed)
+    assert complete(panda, model=file)[0].friction == panda.friction, "that of the configuration counts"
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
+        ({"sign_smoothing": {"joint_1": 5.0}}, "sign_smoothing: expected a number for each joint"),
         ({"robot": "tx40"}, "is of robot 'tx40', the configuration is of 'panda'"),
         ({"physical": None}, r"no physically consistent parameters; identify again: .* --physical"),
         ({"physical": {"parameters": []}}, "physical.parameters: no xx1; identify again with this configuration"),
@@ -221,6 +242,30 @@ def test_drives_keep_time_with_any_sync_period(period_us: int, panda: RobotConfi
     assert period_us * 1e-6 / period == pytest.approx(round(period_us * 1e-6 / period))
 
 
+def test_the_reported_signal_moves_the_arm_from_the_reported_position_to_the_next() -> None:
+    """An axis without friction: second differences of the position are the signal over the mass."""
+    emps = load_robot("emps").model_copy(update={"name": "axis", "controller": None})
+    quiet = scenario("friction: {joint_1: {viscous: 0.0, coulomb: 0.0, offset: 0.0}}\n")
+    robot, parameters, _ = complete(emps)
+    arm = Arm(robot, [0.0], 1e-3, noise=0.0, scenario=quiet, parameters=parameters)
+    arm.enable(0, True)
+    arm.interpolation_time(0, 5e-3)
+    position, signal = [], []
+    for k in range(60):
+        position.append(float(arm.position[0]))
+        signal.append(float(arm.current[0]))
+        arm.set_targets(np.array([20_000 if k == 10 else 0], np.int32), np.array([k == 10]))
+        arm.advance()
+    drive = robot.joints[0].drive
+    force = np.array(signal) * drive.rated / 1000 * drive.gain
+    mass = parameters.standard["m1"] + parameters.standard["ia1"]
+    bends = np.diff(position, 2) / counts_per_si(robot)[0] / 1e-6 * mass
+    # Within a period the force changes: 8 % of the largest. Forces at the instants of SYNC are 48 % and 4 % off.
+    means = np.convolve(force, [0.5, 0.5])[1 : bends.size + 1]
+    np.testing.assert_allclose(means, bends, atol=0.15 * np.abs(bends).max())
+    assert abs(np.sum(force) - np.sum(bends)) < 0.01 * np.abs(force).sum()
+
+
 @pytest.mark.parametrize("name", ["panda", "kuka_lwr4", "tx40", "emps"])
 def test_the_motion_keeps_the_limits_and_uses_them(name: str) -> None:
     robot, _, _ = complete(load_robot(name))
@@ -246,11 +291,54 @@ def test_the_written_configuration_is_that_of_the_arm(tmp_path: Path) -> None:
     assert session.setpoints is not None
     load_trajectory(session.setpoints.trajectory).check(robot)
     text = (tmp_path / "twin" / "robot.yaml").read_text()
+    assert "# friction.sign_smoothing: turn 150, elbow 150, lift 5000, spin 150" in text
     assert "# limits.acceleration: turn 20, elbow 25, lift 4, spin 60" in text
     again = load_twin(tmp_path / "twin" / "cell.yaml")
     assert again.assumed == ()
     assert again.trajectory is None
     assert again.parameters.standard == pytest.approx(twin.parameters.standard)
+
+
+def test_a_virtual_bus_has_all_drives_and_nothing_of_the_cell() -> None:
+    real = load_session("tx40_six_buses")
+    session = on_virtual_bus(real, "vcan7", "cell_test")
+    assert [bus.channel for bus in session.all_buses] == ["vcan7"]
+    assert session.all_buses[0].bitrate is None
+    assert len(session.drives_on(session.all_buses[0])) == 6
+    assert (session.cell, session.zenoh.config, session.zenoh.connect) == ("cell_test", None, ())
+    assert session.heartbeat_ms >= 1000
+    twins = tuple(drive.model_copy(update={"node_id": 1}) for drive in real.drives)
+    with pytest.raises(ConfigError, match="drives of several buses share node ids"):
+        on_virtual_bus(real.model_copy(update={"drives": twins}), "vcan7", "cell_test")
+
+
+def test_a_folder_that_cannot_be_written_is_named(tmp_path: Path) -> None:
+    twin = load_twin(write_scara(tmp_path))
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ConfigError, match=r"file/twin: the configuration cannot be written: Not a directory"):
+        write_twin(twin, tmp_path / "file" / "twin")
+
+
+def test_a_slower_cell_sends_everything_at_every_sync() -> None:
+    session = at_period(load_session("tx40_cell"), 2000)
+    assert session.sync_period == pytest.approx(2e-3)
+    assert {stream.every for stream in session.streams.values()} == {1}
+    assert session.setpoints is not None
+    assert session.setpoints.every == 1
+
+
+def test_blanks_are_assumed_and_said(tmp_path: Path) -> None:
+    config = write_scara(tmp_path)
+    config.write_text(
+        config.read_text() + "joints:\n- {name: lift, limits: {acceleration: FILL_IN}, "
+        "drive: {rated: FILL_IN, counts_per_unit: FILL_IN}}\n"
+    )
+    twin = load_twin(config)
+    text = "\n".join(twin.assumed)
+    for key in ("limits.acceleration", "drive.rated", "drive.counts_per_unit"):
+        assert next(line for line in twin.assumed if line.startswith(key)).count("lift ") == 1, text
+    assert twin.robot.joints[2].drive.rated == pytest.approx(0.25 * 150.0)
+    assert load_robot(load_session(write_twin(twin, tmp_path / "twin")).robot) == twin.robot
 
 
 def test_a_robot_file_is_enough_for_a_recording(tmp_path: Path) -> None:
@@ -262,6 +350,20 @@ def test_a_robot_file_is_enough_for_a_recording(tmp_path: Path) -> None:
     values = json.loads(truth.read_text())
     assert values["m3"] == pytest.approx(1.2)
     assert "zz1r" not in values, "groups of the TX40 are not those of this arm"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("path", sorted((HERE / "robots").glob("*.yaml")), ids=lambda path: path.stem)
+def test_every_shipped_robot_follows_a_motion_within_its_torque_limits(path: Path) -> None:
+    twin = load_twin(path)
+    robot, motion = twin.robot, plausible_trajectory(twin.robot)
+    recording = simulate_recording(robot, motion, 0, 0.0, period=twin.session.sync_period, parameters=twin.parameters)
+    inverse, stream = np.linalg.inv(robot.transmission_matrix).T, recording.streams["demand"]
+    error = (recording.samples.si("position")[stream.sync] - stream.si("demand")) @ inverse
+    assert np.abs(error).max() < 0.1
+    gain = np.array([joint.drive.gain for joint in robot.joints])
+    torque = recording.samples.si(effort_of(robot)) * gain @ robot.transmission_matrix
+    assert (np.abs(torque).max(axis=0) < [joint.limits.torque for joint in robot.joints]).all()
 
 
 def test_the_api_simulates_any_robot(panda: RobotConfig) -> None:

@@ -141,7 +141,7 @@ def test_noise_is_what_the_measured_axis_does_not_repeat(shared_data: Path) -> N
 
 def test_every_virtual_arm_has_a_noise_and_a_name() -> None:
     assert set(noise.SIZES) == {path.name.removesuffix("_inertias.yaml") for path in HERE.glob("*_inertias.yaml")}
-    assert set(servo.OTHER_PERIODS) <= set(noise.SIZES)
+    assert set(servo.OWN_PERIODS) <= set(noise.SIZES)
 
 
 @pytest.mark.parametrize("method", ["idim-piv", "idim-iv", "didim"])

@@ -23,7 +23,7 @@ SLOW = 0.002
 @pytest.fixture(scope="module")
 def at_500_hz() -> list[Experiment]:
     slow = recording("tx40", "tx40_excitation", 2, period=SLOW, setpoint_every=1)
-    return experiments_from_recording(slow, load_robot("tx40.yaml"))[0]
+    return list(experiments_from_recording(slow, load_robot("tx40.yaml"))[0])
 
 
 @pytest.mark.parametrize("method", ["idim-iv", "idim-piv"])

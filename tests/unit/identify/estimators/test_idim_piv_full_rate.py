@@ -68,7 +68,7 @@ def loop(factor: int | None, band_hz: float) -> tuple[list[ExperimentEquations],
     options = Options(method="idim-piv", decimation=factor)
     prepared = Prepared(model(), [experiment], [motion])
     auxiliary, start, _, _ = closed_loop(prepared, options, ls.theta, decimation, BANDWIDTH_HZ)
-    return equations(model(), [experiment], [motion], decimation), replace(auxiliary, band_hz=band_hz), start
+    return list(equations(model(), [experiment], [motion], decimation)), replace(auxiliary, band_hz=band_hz), start
 
 
 @cache

@@ -98,7 +98,7 @@ def recorded(noise: float, steps: int = 1) -> Recorded:
     initial = [(s.q[0], s.qd[0]) for s in signals]
     loop = AuxiliaryModel(model(), drives(), references, initial, dt, decimation, fastest, anchor=cad())
     ls = idim_ls(blocks, model().base.names).theta
-    return Recorded(blocks, [decimation(e.q) for e in experiments], loop, ls)
+    return Recorded(list(blocks), [decimation(e.q) for e in experiments], loop, ls)
 
 
 def drives() -> DiscreteController:

@@ -42,7 +42,7 @@ def truth() -> NDArray[np.float64]:
 
 def recorded() -> list[Experiment]:
     """Seed 1 with the noise of the thesis."""
-    return experiments_from_recording(arms.recording("tx40", "tx40_excitation", 1, noise=1.0), robot())[0]
+    return list(experiments_from_recording(arms.recording("tx40", "tx40_excitation", 1, noise=1.0), robot())[0])
 
 
 def identified(seed: int = 1, noise: float = 1.0, method: Method = "idim-piv") -> Identification:

@@ -62,7 +62,7 @@ def need(folder: Path, *names: str) -> list[Path]:
 @pytest.fixture(scope="module")
 def kuka(shared_data: Path) -> list[Experiment]:
     """The three recordings, without their targets, which are in a wrong unit."""
-    experiments = []
+    experiments: list[Experiment] = []
     for file in need(shared_data / "kuka_lwr4", *(f"measurements_{k}.npz" for k in (1, 2, 3))):
         recording = import_recording(file, KUKA, rate_hz=200.0, names={"demand": "-"})
         experiments += experiments_from_recording(recording, KUKA)[0]
@@ -109,7 +109,7 @@ def prepared(
     signals = [differentiate(e.q, dt) for e in experiments]
     model = arm_model(robot)
     model = model if theta is None else model.anchored(theta)
-    return equations(model, experiments, signals, decimation), signals, decimation
+    return list(equations(model, experiments, signals, decimation)), signals, decimation
 
 
 def prediction_error(theta: np.ndarray, robot: RobotConfig, experiments: Sequence[Experiment]) -> float:

@@ -51,7 +51,7 @@ def arm() -> RobotConfig:
 
 @pytest.fixture(scope="module")
 def healthy(arm: RobotConfig) -> list[Experiment]:
-    return experiments_from_recording(recording("tx40", "tx40_excitation", 1, repeats=1, period=FAST), arm)[0]
+    return list(experiments_from_recording(recording("tx40", "tx40_excitation", 1, repeats=1, period=FAST), arm)[0])
 
 
 def changed(experiments: list[Experiment], change: Callable[[Experiment], Experiment]) -> list[Experiment]:
@@ -59,7 +59,7 @@ def changed(experiments: list[Experiment], change: Callable[[Experiment], Experi
 
 
 def recorded(robot: RobotConfig, motion: Trajectory) -> list[Experiment]:
-    return experiments_from_recording(simulate_recording(robot, motion, 1, period=FAST), robot)[0]
+    return list(experiments_from_recording(simulate_recording(robot, motion, 1, period=FAST), robot)[0])
 
 
 def motion(*targets: list[float]) -> Trajectory:

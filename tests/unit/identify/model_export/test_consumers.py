@@ -1,5 +1,6 @@
 """Exported models in the programs that read them: their inverse dynamics are those of our model."""
 
+import re
 import xml.etree.ElementTree as ET
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ from armident.configs import load_robot
 from armident.identify.effects.terms import arm_model
 from armident.identify.model_export.exported_model import ExportedModel
 from armident.identify.model_export.formats import export_model
-from armident.identify.model_export.source_urdf import source_for, source_of
+from armident.identify.model_export.source_urdf import SourceUrdf, known_bodies, source_for, source_frames, source_of
 from tests.model_exports import (
     Motion,
     exported,
@@ -56,6 +57,35 @@ def model(request: pytest.FixtureRequest, tmp_path: Path) -> ExportedModel:
 @pytest.fixture
 def motion(model: ExportedModel) -> Motion:
     return random_motion(model.robot, np.random.default_rng(7))
+
+
+@pytest.mark.parametrize("right_angles", [True, False])
+def test_masses_that_torques_leave_open_are_those_of_the_urdf(right_angles: bool, tmp_path: Path) -> None:
+    urdf, config = tmp_path / "arm.urdf", tmp_path / "arm.yaml"
+    urdf.write_text(random_urdf(np.random.default_rng(11), 5, right_angles))
+    config.write_text(configuration(urdf, 5, np.array(TILTED)))
+    robot, source = load_robot(config), SourceUrdf(urdf)
+    arm, frames = arm_model(robot), source_frames(source, robot)
+    maker = known_bodies(source, arm, frames)
+    assert maker is not None
+    lightest = exported(robot, maker)
+    model = lightest.in_frames_of(source)
+    assert arm.base.regroup @ model.theta == pytest.approx(arm.base.regroup @ lightest.theta, rel=1e-9, abs=1e-9)
+    masses = pin.buildModelFromUrdf(str(urdf)).inertias
+    assert [link.mass for link in model.links] == pytest.approx([body.mass for body in list(masses)[1:]], rel=1e-3)
+    assert [link.mass for link in lightest.links] != pytest.approx([link.mass for link in model.links], rel=0.1)
+    assert model.choice == "the physical arm nearest to the masses in arm.urdf"
+
+
+@pytest.mark.parametrize("mass", ["-1", "heavy"])
+def test_masses_that_no_body_has_are_not_taken(mass: str, tmp_path: Path) -> None:
+    urdf, config = tmp_path / "arm.urdf", tmp_path / "arm.yaml"
+    text = random_urdf(np.random.default_rng(11), 3, right_angles=True)
+    urdf.write_text(re.sub(r'(<link name="link_2"><inertial><mass value=)"[^"]*"', rf'\1"{mass}"', text))
+    config.write_text(configuration(urdf, 3, np.array(TILTED)))
+    robot = load_robot(config)
+    model = exported(robot, random_theta(arm_model(robot), 1)).in_frames_of(SourceUrdf(urdf))
+    assert model.choice == "the lightest physical arm"
 
 
 @pytest.mark.parametrize("right_angles", [True, False])

@@ -120,6 +120,7 @@ def test_bodies_fixed_to_a_link_are_part_of_it_and_joints_after_the_tip_are_fixe
         for q, qd, qdd in zip(*motion, strict=True)
     ]
     assert relative_error(np.array(torque), rigid_torque(model, motion)) < 1e-9
+    assert model.choice == "the lightest physical arm"  # the upper arm has no mass in the URDF
     remarks = " ".join(sheet.remarks)
     assert "masses of plate, hand, tip" in remarks
     assert "joints finger after the tip are fixed" in remarks

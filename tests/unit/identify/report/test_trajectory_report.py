@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+import armident
 from armident.configs import ConfigError
 from armident.identify.cli import trajectory as trajectory_command
 from tests.unit.identify.excitation.test_collision import write_urdf
@@ -64,3 +65,10 @@ def test_a_refused_trajectory_has_its_reasons_in_the_report(tmp_path: Path) -> N
     page = text_of(tmp_path / "page.html")
     assert "<b>exceeds limits</b>" in page
     assert re.search(r"It needs a distance of -0\.\d+ m between link of .* and box &#39;shelf&#39;", page)
+
+
+def test_a_design_in_python_has_its_checks_and_its_report(tmp_path: Path) -> None:
+    design = armident.design_trajectory(write_urdf(tmp_path, 100.0, SHELF), duration=6.0, evaluations=30)
+    assert any("torque by the masses of the URDF" in line for line in design.checks.checked)
+    assert any("cables" in line for line in design.checks.unchecked)
+    assert "<b>keeps all checked limits</b>" in text_of(design.report(tmp_path / "pages" / "design.html"))

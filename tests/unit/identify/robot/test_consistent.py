@@ -171,7 +171,7 @@ def test_what_is_determined_alone_does_not_depend_on_the_regularisation(
     covariance = covariance_of(base, np.random.default_rng(2))
     light = nearest_consistent(tx40, base, covariance)
     # Second moments count for less beside masses.
-    monkeypatch.setattr(consistent, "_length", lambda model: 10.0)
+    monkeypatch.setattr(consistent, "mean_length", lambda model: 10.0)
     other = nearest_consistent(tx40, base, covariance)
     alone = np.array(light.identifiable) == "alone"
     np.testing.assert_allclose(other.theta[alone], light.theta[alone], atol=1e-6)

@@ -33,7 +33,7 @@ def tx40() -> RobotConfig:
 
 @pytest.fixture(scope="module")
 def virtual(tx40: RobotConfig) -> list[Experiment]:
-    return experiments_from_recording(recording("tx40", "tx40_excitation", 3, period=FAST), tx40)[0]
+    return list(experiments_from_recording(recording("tx40", "tx40_excitation", 3, period=FAST), tx40)[0])
 
 
 def late(experiments: list[Experiment], seconds: float) -> list[Experiment]:

@@ -1,5 +1,6 @@
 """Common shift of all torques: it is estimated and aligned, and the delay of one joint is none."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -42,7 +43,7 @@ def healthy(arm: RobotConfig) -> list[Experiment]:
     return setups.record(arm, 0, noise=0.003, dt=4e-3)
 
 
-def estimate(experiments: list[Experiment], robot: RobotConfig) -> TorqueShift:
+def estimate(experiments: Sequence[Experiment], robot: RobotConfig) -> TorqueShift:
     found = check_setup(experiments, robot).torque_shift
     assert found is not None
     return found

@@ -1,0 +1,77 @@
+"""Choice among arms of equal base parameters: the one nearest to known bodies, by semidefinite programming."""
+
+from typing import Any
+
+import clarabel as untyped_clarabel
+import numpy as np
+from scipy import linalg
+
+from armident.configs import ArmidentError
+from armident.identify.robot.arm import ArmModel
+from armident.identify.robot.chain import INERTIAL, Floats
+from armident.identify.robot.consistent import (
+    mean_length,
+    minimise_in_cones,
+    non_negative,
+    pseudo_inertias,
+    triangle,
+    triangles,
+)
+
+clarabel: Any = untyped_clarabel
+
+SHARES = (1.0, 0.999, 0.99, 0.9, 0.5)
+"""Shares of the change that are tried: the solver may leave the cones by its tolerance."""
+
+INSIDE = -1e-12
+"""Smallest eigenvalue of a pseudo-inertia (kg and kg m^2), and smallest coefficient, that rounding may leave."""
+
+
+def nearest_to_known(model: ArmModel, theta: Floats, known: Floats, smallest_link: Floats) -> Floats:
+    """Return the consistent standard parameters nearest to known ones, with the same base parameters.
+
+    Base parameters determine the torques; the other combinations of standard parameters are free. Distances are in
+    kilograms: first moments are divided by the arm's mean length, moments of inertia by its square.
+
+    Parameters
+    ----------
+    model
+        Arm with p standard and b base parameters.
+    theta
+        Consistent standard parameters (p,), SI; every link contains ``smallest_link``.
+    known
+        Known standard parameters (p,), SI, for example of the maker; only those of links count.
+    smallest_link
+        Pseudo-inertia (4, 4) that every link contains, kg and kg m^2.
+
+    Returns
+    -------
+    ndarray
+        Shape (p,); ``theta`` itself where the solver finds nothing nearer.
+    """
+    free = linalg.null_space(model.base.regroup)
+    if not free.shape[1]:
+        return theta
+    length, columns = mean_length(model), model.columns.inertial
+    weight = np.zeros(theta.size)
+    for column, kind in zip(columns.T, INERTIAL, strict=True):
+        weight[column] = 1 / length ** (2 if kind[0] != "m" else len(kind) - 1)
+    signed, unit = non_negative(model), triangles(length)
+    rows, right = [-free[signed]], [theta[signed]]
+    for link in columns:
+        rows.append(-unit @ free[link])
+        right.append(unit @ theta[link] - triangle(smallest_link, length))
+    cones = [clarabel.NonnegativeConeT(signed.size), *(clarabel.PSDTriangleConeT(4) for _ in columns)]
+    weighted = weight[:, None] * free
+    linear = weighted.T @ (weight * (theta - known))
+    try:
+        change = free @ minimise_in_cones(weighted.T @ weighted, linear, np.vstack(rows), np.concatenate(right), cones)
+    except ArmidentError:
+        return theta
+    for share in SHARES:
+        moved = theta + share * change
+        smallest = np.linalg.eigvalsh(pseudo_inertias(model, moved) - smallest_link)[:, 0].min()
+        if min(smallest, moved[signed].min(initial=0.0)) >= INSIDE:
+            moved[signed] = np.maximum(moved[signed], 0.0)
+            return np.asarray(moved, dtype=np.float64)
+    return theta
