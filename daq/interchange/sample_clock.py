@@ -6,19 +6,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armident.configs import DataError
+from armident.daq.interchange.time_stamps import RATE_TOLERANCE
 from armident.daq.recording import Gap, Stream
-
-RATE_TOLERANCE = 0.01
-"""Largest relative difference of a stated sampling rate from that of the stamps."""
 
 AMBIGUOUS = 0.25
 """Distance, periods, of a step from a whole number of periods above which missing samples cannot be counted."""
 
 JITTER = 0.01
 """Largest deviation of a step from the period, relative, without a stated rate."""
-
-HOLE = 20
-"""Longest step of polled samples, periods of the controller; interpolation across longer ones is no measurement."""
 
 
 def sample_numbers(t_ns: NDArray[np.int64], rate_hz: float | None = None) -> tuple[NDArray[np.int64], float]:

@@ -20,7 +20,7 @@ from tests.fuzz.targets import IMPORTERS, TARGETS
 STUCK_S = 30.0
 """A process that computes for so long without another input is killed, s of its processor time."""
 WAITING_S = 600.0
-"""So is one that waits for so long, s; a process of low priority may have to."""
+"""So is one that sleeps after so long, s; a process of low priority may wait longer for the processor."""
 NOTE_S = 0.25
 FOUND = 3
 """What the process of the inputs returns where it found something."""
@@ -91,7 +91,7 @@ def _supervise(target: Target, seconds: float, seed: int) -> int:
                 if touched not in (last[0], begun):
                     last = touched, time.monotonic(), _computed_s(process.pid)
                 waited, computed = time.monotonic() - last[1], _computed_s(process.pid) - last[2]
-                if waited > WAITING_S or (last[0] and computed > STUCK_S):
+                if (waited > WAITING_S and _sleeps(process.pid)) or (last[0] and computed > STUCK_S):
                     process.send_signal(signal.SIGKILL)
                     process.wait()
             if process.returncode in (0, FOUND):
@@ -108,11 +108,21 @@ def _supervise(target: Target, seconds: float, seed: int) -> int:
 
 def _computed_s(process: int) -> float:
     """Processor time of a process, s; that of its ended children is not in it."""
+    values = _stat(process)
+    return (int(values[11]) + int(values[12])) / os.sysconf("SC_CLK_TCK") if values else 0.0
+
+
+def _sleeps(process: int) -> bool:
+    """True if a process neither runs nor waits for a processor."""
+    return _stat(process)[:1] != ["R"]
+
+
+def _stat(process: int) -> list[str]:
+    """State and numbers of a process; none if it has ended."""
     try:
-        values = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
+        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
     except OSError:
-        return 0.0
-    return (int(values[11]) + int(values[12])) / os.sysconf("SC_CLK_TCK")
+        return []
 
 
 if __name__ == "__main__":

@@ -223,9 +223,7 @@ def forge_parquet(rng: random.Random, seeds: Sequence[bytes]) -> bytes:
     import pyarrow.parquet
 
     try:
-        table = pyarrow.parquet.read_table(  # type: ignore[no-untyped-call]
-            io.BytesIO(rng.choice(seeds))
-        )
+        table = pyarrow.parquet.read_table(io.BytesIO(rng.choice(seeds)))  # type: ignore[no-untyped-call]
     except (pyarrow.ArrowException, OSError, ValueError):
         return spoil_bytes(rng, seeds)
     columns = {name: table.column(name).to_pylist() for name in table.column_names}

@@ -94,11 +94,13 @@ def check_consistent(recording: Recording, folder: Path) -> None:
 
 def _check_table(suffix: str) -> Callable[[bytes, Path], bool]:
     robot = load_robot("tx40.yaml")
+    seeds = cache(_exported(suffix))
 
     def check(data: bytes, folder: Path) -> bool:
         path = folder / f"x{suffix}"
         path.write_bytes(data)
-        options = OPTIONS[hashlib.sha256(data).digest()[0] % len(OPTIONS)]
+        choice = hashlib.sha256(data).digest()[0] % len(OPTIONS) if data not in seeds() else 0
+        options = OPTIONS[choice]
         check_consistent(import_recording(path, robot, **options), folder)
         return True
 

@@ -1,6 +1,5 @@
 """Every importer reads a damaged file, or refuses it in one line of the program's own words."""
 
-import re
 import tempfile
 from functools import cache
 from pathlib import Path
@@ -13,15 +12,15 @@ from armident.configs import ArmidentError
 from armident.daq.interchange.bus_log import SUFFIXES, recording_from_log, write_log
 from armident.daq.interchange.importing import import_recording
 from armident.daq.recording import Recording, write_recording
+from tests.fuzz.harness import FOREIGN_WORDS
+from tests.unit.daq.bags import mcap_bag, sqlite_bag, states
 from tests.unit.daq.test_bus_log import ROBOT, SESSION, captured
 from tests.unit.daq.test_importing import TX40
 from tests.unit.daq.test_tables import motion, written
 
 TABLES = (".csv", ".npz", ".mat", ".parquet")
-FOREIGN_WORDS = re.compile(
-    r"Traceback|Error\b|Exception|object has no|codec can't|invalid literal|could not convert|NoneType"
-)
-"""Words of Python in a message."""
+BAGS = {".mcap": mcap_bag, ".db3": sqlite_bag}
+FORMATS = [*TABLES, *BAGS, *SUFFIXES]
 INSERTED = (b"", b"\n", b",", b";", b"nan", b"1e999", b"-", b"\0", b"\xff\xfe", b"9" * 400, b"#", b"(", b'"', b"0,5")
 
 
@@ -33,6 +32,8 @@ def valid(suffix: str) -> bytes:
         if suffix in SUFFIXES:
             write_log(captured(40), path)
             return path.read_bytes()
+        if suffix in BAGS:
+            return BAGS[suffix](path, states()[:40]).read_bytes()
         table = written(Path(folder, "t.csv"), motion(40))
         if suffix == ".csv":
             return table.read_bytes()
@@ -91,7 +92,7 @@ def check(suffix: str, data: bytes) -> None:
         write_recording(found, Path(folder, "out.mcap"))
 
 
-@pytest.mark.parametrize("suffix", [*TABLES, *SUFFIXES])
+@pytest.mark.parametrize("suffix", FORMATS)
 @settings(suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large], deadline=None)
 @given(changes=edits, cut=st.sampled_from([1.0, 1.0, 0.97, 0.6, 0.1]))
 def test_a_damaged_file_is_read_or_refused_in_one_line(
@@ -101,7 +102,7 @@ def test_a_damaged_file_is_read_or_refused_in_one_line(
 
 
 @pytest.mark.proof
-@pytest.mark.parametrize("suffix", [*TABLES, *SUFFIXES])
+@pytest.mark.parametrize("suffix", FORMATS)
 @settings(max_examples=3000, suppress_health_check=list(HealthCheck), deadline=None)
 @given(changes=edits, cut=st.floats(0, 1))
 def test_thousands_of_damaged_files_are_read_or_refused_in_one_line(
@@ -110,7 +111,7 @@ def test_thousands_of_damaged_files_are_read_or_refused_in_one_line(
     check(suffix, damaged(valid(suffix), changes, cut))
 
 
-@pytest.mark.parametrize("suffix", [*TABLES, *SUFFIXES])
+@pytest.mark.parametrize("suffix", FORMATS)
 def test_the_undamaged_file_is_read(suffix: str) -> None:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, f"a{suffix}")

@@ -24,7 +24,7 @@ from armident.identify.identification.api import identify_recording
 from armident.identify.monitoring.recursive.estimator import RecursiveEstimator
 from armident.identify.monitoring.recursive.replay import blocks_of
 from armident.virtual_robot.offline import simulate_recording
-from tests.statistics.fresh_noise import FreshNoise, MotionRecorder, held, repeat
+from tests.statistics.fresh_noise import FreshNoise, Motion, MotionRecorder, held, repeat
 
 PERIOD_S = 1e-3
 """SYNC period of the recordings, s; the drives themselves run at 5 kHz."""
@@ -118,14 +118,16 @@ def repeated_pieces(estimator: RecursiveEstimator, hours: float, seed: int) -> I
     robot = load_robot("tx40")
     random = np.random.default_rng(seed)
     recorder = MotionRecorder(estimator, robot, PERIOD_S)
-    numbers = [(name, 1000 * seed + k) for name in MOTIONS for k in range(PLAYED)]
     # After the first one the lags behind the reference are known.
-    recorder.record(play(*numbers[0], {}), numbers[0][1])
-    motions = [recorder.record(play(name, number, {}), number) for name, number in numbers]
+    recorder.record(play(MOTIONS[0], seed, {}), seed)
+    motions: dict[tuple[str, int], Motion] = {}
     fresh = FreshNoise(robot, PERIOD_S, random)
     elapsed = 0.0
     while elapsed < hours:
-        motion = motions[random.integers(len(motions))]
+        name, number = MOTIONS[random.integers(len(MOTIONS))], 1000 * seed + int(random.integers(PLAYED))
+        if (name, number) not in motions:
+            motions[name, number] = recorder.record(play(name, number, {}), number)
+        motion = motions[name, number]
         noise = recorder.filtered(held(fresh.draw(motion.samples))[1:])
         factor = np.array(list(factors_at(elapsed).values()))
         elapsed += motion.seconds / 3600.0

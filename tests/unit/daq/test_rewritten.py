@@ -1,17 +1,22 @@
 """Recordings that other MCAP tools have rewritten: the same numbers, and damage judged by contents."""
 
+import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from mcap.reader import make_reader
 from mcap.records import Channel, Message, Metadata, Schema
 from mcap.writer import CompressionType, IndexType, Writer
+from typer.testing import CliRunner
 
 from armident.configs import DataError
-from armident.daq.recording import Recording, read_recording, recover_recording
+from armident.daq.cli import application
+from armident.daq.recording import Recording, read_recording, recover_recording, write_recording
 from armident.daq.recording.names import CHECK, COUNTERS
 from armident.daq.recording.reader import is_recording
+from tests.fixtures import arms
 from tests.unit.daq.test_recording import make_recording, write_chunked
 
 Record = tuple[Schema | None, Channel, Message]
@@ -158,3 +163,25 @@ def test_a_copy_without_metadata_says_what_to_copy(recording: Recording, tmp_pat
     copy = rewritten(source_of(recording), tmp_path / "copy.mcap", metadata=lambda entry: False)
     with pytest.raises(DataError, match="another tool left out its metadata; copy them too, as mcap filter"):
         read_recording(copy)
+
+
+@pytest.mark.slow
+def test_a_copy_is_exported_and_identified_as_the_recording_itself(tmp_path: Path) -> None:
+    made = arms.recording("emps", "emps_excitation", 1)
+    rows = {f"{name}.rows": int(stream.sync.size) for name, stream in made.streams.items()}
+    write_recording(replace(made, counters=rows), tmp_path / "own.mcap")
+    rewritten(tmp_path / "own.mcap", tmp_path / "copy.mcap", compression=CompressionType.LZ4, chunk_size=50_000)
+    tables, parameters = [], []
+    for name in ("own", "copy"):
+        recording, out = tmp_path / f"{name}.mcap", tmp_path / f"{name}.identification"
+        for command in (
+            ["export", recording, "--out", tmp_path / f"{name}.csv"],
+            ["identify", recording, "--out", out],
+        ):
+            words = [str(word) for word in command]
+            done = CliRunner().invoke(application(words), words)
+            assert done.exit_code == 0, done.output
+        tables.append((tmp_path / f"{name}.csv").read_bytes())
+        parameters.append(json.loads((out / "identification.json").read_text())["parameters"])
+    assert tables[0] == tables[1]
+    assert parameters[0] == parameters[1]

@@ -296,6 +296,14 @@ def test_minutes_of_healthy_life_raise_no_alarm() -> None:
 
 
 @pytest.mark.slow
+def test_a_life_of_repeated_motions_raises_no_alarm() -> None:
+    life = healthy_life(0.03, 6)
+    assert life.alarms == []
+    assert life.windows > 10
+    assert life.largest_evidence < 0.5 * life.threshold
+
+
+@pytest.mark.slow
 @pytest.mark.proof
 @pytest.mark.timeout(50 * 3600)
 def test_hours_of_healthy_life_raise_no_alarm() -> None:
