@@ -17,7 +17,7 @@ WITH_VCAN := $(PY) -m armident.drivers.vcan -n 2 --
 PARALLEL := -n auto --dist worksteal
 LINT := $(PY) -m ruff check $(SOURCES) && $(PY) -m ruff format --check $(SOURCES) && $(PY) -m mypy && $(VENV)/bin/lint-imports
 
-.PHONY: help install demo check test proof off-bus on-bus coverage lint vcan suite bench lock clean
+.PHONY: help install demo check test proof off-bus on-bus coverage lint vcan suite docs bench lock clean
 
 help: ## what there is to do
 	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "make %-8s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -93,6 +93,10 @@ vcan: install ## fetch what the vcan guest needs, where this kernel has no Socke
 
 suite: install ## hide effects in virtual arms and count what is found (SUITE="--quick" passes options), two hours
 	@$(VENV)/bin/armident diagnose-suite $(SUITE)
+
+docs: install ## the documentation as a site, .cache/site/index.html
+	@$(PY) -m sphinx -q -W --keep-going -b html docs .cache/site
+	echo "site: .cache/site/index.html"
 
 bench: install ## figures of ours beside those of named alternatives
 	@$(PY) -m tests.benchmarks.run
