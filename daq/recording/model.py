@@ -191,7 +191,7 @@ def join_parts(parts: "Sequence[Recording]") -> "Recording":
     return replace(last, streams=streams, gaps=gaps, marks=marks, missing=missing)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Recording:
     """Recording of a robot's motion, read from a file or assembled from published blocks.
 
@@ -229,6 +229,15 @@ class Recording:
     counters: dict[str, int] = field(default_factory=dict)
     metadata: dict[str, str] = field(default_factory=dict)
     missing: str | None = None
+
+    def __repr__(self) -> str:
+        """Return robot, length, rate, quantities and losses on one line."""
+        quantities = sorted({entry.quantity for stream in self.streams.values() for entry in stream.fields.values()})
+        losses = f", {len(self.gaps)} gaps" if self.gaps else ""
+        return (
+            f"<Recording of {self.robot.name}: {self.samples.sync.size} samples at {self.sample_rate_hz:g} Hz, "
+            f"{', '.join(quantities)}{losses}{', torn' if self.missing else ''}>"
+        )
 
     @property
     def samples(self) -> Stream:
