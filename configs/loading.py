@@ -368,14 +368,17 @@ def parse(text: str, kind: type[T], where: str) -> T:
 def _read_text(path: Path) -> str:
     try:
         return path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: cannot be read: {error}") from error
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{path}: byte {error.start + 1} is no UTF-8 text") from error
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
 
 
 def _read_mapping(text: str, where: str) -> dict[str, Any]:
     data = read_yaml(text, where)
     if not isinstance(data, dict):
-        raise ConfigError(f"{where}: expected keys and values, found {type(data).__name__}")
+        found = "nothing" if data is None else "a list" if isinstance(data, list) else _shown(data)
+        raise ConfigError(f"{where}: expected keys and values, found {found}")
     for key in data:
         if not isinstance(key, str):
             raise ConfigError(f"{where}: {_shown(key)}: expected a word as key")

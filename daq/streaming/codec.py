@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from armident.configs import DataError, RobotConfig, SessionConfig
 from armident.daq.recording import Gap, Mark, Recording, Stream, StreamLayout
+from armident.daq.recording.layout import short_reason
 from armident.daq.recording.model import gap_from, mark_from
 
 VERSION = 2
@@ -112,7 +113,7 @@ def decode_block(data: bytes) -> Block:
             raise TypeError(f"a capture named {capture!r:.60}")
         layout = StreamLayout.from_json(json.dumps(head["layout"]))
     except (ValueError, KeyError, TypeError, RecursionError) as error:
-        raise DataError(f"a block with an invalid head: {_short(error)}") from error
+        raise DataError(f"a block with an invalid head: {short_reason(error)}") from error
     shape = rows, len(layout.joints)
     dtypes = [np.dtype(dtype).newbyteorder("<") for dtype in layout.dtypes]
     size = rows * (16 + sum(dtype.itemsize for dtype in dtypes) * len(layout.joints))
@@ -154,7 +155,7 @@ def decode_event(data: bytes) -> dict[str, Any]:
     try:
         event = json.loads(data)
     except (ValueError, RecursionError) as error:
-        raise DataError(f"an event that is not JSON: {_short(error)}") from error
+        raise DataError(f"an event that is not JSON: {short_reason(error)}") from error
     if not isinstance(event, dict) or event.get("schema") != EVENT_SCHEMA or not isinstance(event.get("kind"), str):
         raise DataError(f"not an event of schema {EVENT_SCHEMA}")
     needed = _NEEDED.get(event["kind"], {})
@@ -268,7 +269,7 @@ def assemble(start: Mapping[str, Any], blocks: Iterable[Block], end: Mapping[str
         metadata = {str(key): str(value) for key, value in start["metadata"].items()}
         path = Path(end["paths"][-1]) if end["paths"] else None
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError, RecursionError) as error:
-        raise DataError(f"an invalid event: {_short(error)}") from error
+        raise DataError(f"an invalid event: {short_reason(error)}") from error
     if not 0.0 < rate < math.inf:
         raise DataError(f"an invalid event: a rate of {rate} samples/s")
     joints = tuple(joint.name for joint in robot.joints)
@@ -306,10 +307,6 @@ def _count(value: object) -> int:
     if type(value) is not int or value < 0:
         raise TypeError(f"expected a count, found {value!r:.60}")
     return value
-
-
-def _short(error: Exception) -> str:
-    return f"{type(error).__name__}: {str(error)[:160]}".replace("\n", " ")
 
 
 def _stream(layout: StreamLayout, blocks: list[Block]) -> Stream:

@@ -122,7 +122,7 @@ def test_motor_six_turns_with_joint_five_as_on_the_tx40() -> None:
         ),
         (robot_with(schema="armident/robot/2"), "schema: input should be 'armident/robot/1'"),
         ("joints: [", "line 1"),
-        ("- a\n- b\n", "expected keys and values, found list"),
+        ("- a\n- b\n", "expected keys and values, found a list"),
     ],
 )
 def test_a_mistake_is_named_in_one_line_with_file_key_and_expectation(text: str, expected: str) -> None:
