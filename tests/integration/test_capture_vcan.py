@@ -146,12 +146,13 @@ def test_the_end_does_not_wait_for_dead_drives(vcan_bus: str, robot: ForkedProce
 @pytest.mark.usefixtures("robot")
 def test_no_sample_is_lost_between_files(vcan_bus: str, tmp_path: Path) -> None:
     """Every SYNC of 6 s at 5 kHz is in exactly one file; an old recording is deleted meanwhile."""
-    options = {"rotate_minutes": 0.02, "keep_days": 300}
+    options = {"rotate_minutes": 0.02, "keep_days": 30}
     session = session_file(tmp_path, vcan_bus, "rotated", setpoints=None, recording=options)
     (tmp_path / "out").mkdir()
-    old = tmp_path / "out" / "tx40-20200101T000000-000Z.mcap"
-    yesterday = datetime.datetime.now(datetime.UTC) - datetime.timedelta(days=1)
-    young = tmp_path / "out" / f"tx40-{yesterday:%Y%m%dT%H%M%S}-000Z.mcap"
+    now = datetime.datetime.now(datetime.UTC)
+    old, young = (
+        tmp_path / "out" / f"tx40-{now - datetime.timedelta(days=days):%Y%m%dT%H%M%S}-000Z.mcap" for days in (100, 1)
+    )
     for path in (old, young):
         path.write_bytes(b"a recording")
     process = armident("capture", "--config", session, "--duration", "6", "--out", tmp_path / "out", "--json")
