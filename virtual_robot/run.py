@@ -144,8 +144,9 @@ def record_robot(
     twin = load_twin(config, choice)
     session, robot, setpoints = twin.session, twin.robot, twin.session.setpoints
     _describe(twin, config, None)
-    if trajectory is not None or setpoints is not None:
-        motion = load_trajectory(trajectory or setpoints.trajectory)  # type: ignore[union-attr]
+    file = trajectory if trajectory is not None or setpoints is None else setpoints.trajectory
+    if file is not None:
+        motion = load_trajectory(file)
     elif twin.trajectory is not None:
         motion = twin.trajectory
     else:
