@@ -32,6 +32,8 @@ BLOCK = re.compile(
     re.MULTILINE | re.DOTALL,
 )
 LANGUAGES = {"sh", "python", "yaml", "toml", "json", "text", "ini"}
+LONG = ("diagnosis.md", "using-a-model.md")
+"""Pages that take 40 s and more and have commands that other tests run, too."""
 PAGE_S = 900.0
 """Time limit of a page, s: ten times what the slowest one takes on an idle machine."""
 TRAP = "trap 'code=$?; [ $code -eq 4 ] || { echo \"exit code $code: $BASH_COMMAND\" >&2; exit $code; }' ERR\n"
@@ -82,7 +84,9 @@ RUNNING = [page for page in PAGES if (read := read_page(REPOSITORY / page)).comm
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("page", RUNNING, ids=str)
+@pytest.mark.parametrize(
+    "page", [pytest.param(p, marks=[pytest.mark.proof] if p.name in LONG else [], id=str(p)) for p in RUNNING]
+)
 def test_the_blocks_of_a_page_run(page: Path, tmp_path: Path) -> None:
     blocks = read_page(REPOSITORY / page)
     environment = {

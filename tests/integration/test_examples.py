@@ -8,10 +8,10 @@ REPOSITORY = Path(__file__).resolve().parents[2]
 EXAMPLES = {
     "emps": pytest.mark.proof,
     "tx40": pytest.mark.proof,
-    "kuka_lwr4": pytest.mark.slow,
+    "kuka_lwr4": pytest.mark.proof,
     "panda": pytest.mark.slow,
 }
-"""Names of the notebooks; those with a diagnosis take a minute and more."""
+"""Names of the notebooks; three of them take 40 s and more."""
 LONGEST_CELL_S = 900
 
 
