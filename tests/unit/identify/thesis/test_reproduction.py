@@ -117,8 +117,11 @@ def test_recording_to_a_file_is_the_simulation_of_the_sessions_set_points(tmp_pa
     ("options", "message"),
     [
         ({"encoder_counts": 3600}, "--trajectory and --encoder-counts belong to --to-file"),
-        ({"to_file": Path("new.mcap"), "duration": 3.0}, "--replay and --duration have no meaning"),
-        ({"to_file": Path("new.mcap"), "replay": Path("old.mcap")}, "--replay and --duration have no meaning"),
+        ({"to_file": Path("new.mcap"), "duration": 3.0}, "--replay, --duration and --write-config have no meaning"),
+        (
+            {"to_file": Path("new.mcap"), "replay": Path("old.mcap")},
+            "--replay, --duration and --write-config have no meaning",
+        ),
     ],
 )
 def test_options_that_do_not_go_together_are_refused(options: dict[str, Any], message: str) -> None:
