@@ -75,7 +75,7 @@ class Twin:
 
 @dataclass(frozen=True)
 class ParameterChoice:
-    """Where the parameters of a virtual arm come from.
+    """Source of the parameters of a virtual arm.
 
     Parameters
     ----------

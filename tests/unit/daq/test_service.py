@@ -145,7 +145,7 @@ def test_without_the_rights_of_root_the_command_with_sudo_is_named(
         install("line3", image)
 
 
-@pytest.mark.parametrize("folder", ["/root/venv", "/home/alice/venv", "/tmp/venv"])
+@pytest.mark.parametrize("folder", [f"{hidden}/venv" for hidden in service.HIDDEN])
 def test_a_command_that_the_units_would_not_see_is_refused(folder: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "executable", f"{folder}/bin/python")
     monkeypatch.setattr(Path, "is_file", lambda self: True)

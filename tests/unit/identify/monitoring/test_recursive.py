@@ -314,7 +314,7 @@ def test_hours_of_healthy_life_raise_no_alarm() -> None:
 
 @pytest.mark.slow
 def test_the_noise_of_a_simulation_can_be_exchanged_in_its_equations() -> None:
-    """What is left without its own noise is the error of the live filter, a small part of the variance."""
+    """The rest without its own noise is the error of the live filter, a small part of the variance."""
     found, period = estimator(), arms.FAST
     recorder = MotionRecorder(found, ROBOT, period)
     recording = play("tx40_1", 7, {}, 1, period)

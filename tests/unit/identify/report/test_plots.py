@@ -42,7 +42,7 @@ global.window = {devicePixelRatio: 1, addEventListener() {}};
 
 
 def node(code: str, *groups: str) -> object:
-    """What the code prints, after the script of the plots, with some groups of plots in the page."""
+    """Output of the code, after the script of the plots, with some groups of plots in the page."""
     assert NODE is not None
     program = f"const groups = {json.dumps(groups)};{PAGE}const p = require({json.dumps(str(SCRIPT))});{code}"
     done = subprocess.run([NODE, "-e", program], capture_output=True, text=True, timeout=60, check=False)
