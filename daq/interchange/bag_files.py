@@ -39,7 +39,6 @@ _SIDECARS = ("-wal", "-journal")
 """Suffixes of the files in which SQLite keeps what is not in the database yet."""
 _DAMAGED = (sqlite3.Error, UnicodeDecodeError)
 """Errors of SQLite for damaged databases, whose names may be no text."""
-_DECODED: dict[int, type[McapRecord]] = {Opcode.SCHEMA: Schema, Opcode.CHANNEL: Channel, Opcode.MESSAGE: Message}
 
 
 class BagMessage(NamedTuple):
@@ -266,11 +265,14 @@ class BagReader:
 def _records(opcode: int, body: memoryview) -> list[McapRecord]:
     """Return the schemas, channels and messages in a record of the data section; others give none."""
     stream = ReadDataStream(BytesIO(body))
+    if opcode == Opcode.SCHEMA:
+        return [Schema.read(stream)]
+    if opcode == Opcode.CHANNEL:
+        return [Channel.read(stream)]
+    if opcode == Opcode.MESSAGE:
+        return [Message.read(stream, len(body))]
     if opcode != Opcode.CHUNK:
-        kind = _DECODED.get(opcode)
-        if kind is None:
-            return []
-        return [Message.read(stream, len(body)) if kind is Message else kind.read(stream)]  # type: ignore[attr-defined]
+        return []
     chunk = Chunk.read(stream)
     if chunk.uncompressed_size > _LARGEST:
         raise ValueError(f"{chunk.uncompressed_size} bytes uncompressed")

@@ -291,7 +291,7 @@ def lerobot(folder: Path, names: list[str] | None, extra: str = "observation.eff
         "timestamp": np.append(values[:200, 0], values[:100, 0]).astype(np.float32),
         "episode_index": np.append(np.zeros(200, int), np.ones(100, int)),
     }
-    pyarrow.parquet.write_table(pyarrow.table(columns), data)  # type: ignore[no-untyped-call]
+    pyarrow.parquet.write_table(pyarrow.table(columns), data)
     return data
 
 
@@ -323,10 +323,10 @@ def test_times_of_a_lerobot_data_set_that_are_no_numbers_are_refused(tmp_path: P
     import pyarrow.parquet
 
     data = lerobot(tmp_path, None)
-    table = pyarrow.parquet.read_table(data)  # type: ignore[no-untyped-call]
+    table = pyarrow.parquet.read_table(data)
     times = pyarrow.array([{"s": 1}] * len(table))
     table = table.set_column(table.column_names.index("timestamp"), "timestamp", times)
-    pyarrow.parquet.write_table(table, data)  # type: ignore[no-untyped-call]
+    pyarrow.parquet.write_table(table, data)
     with pytest.raises(DataError, match="timestamp has rows of unequal lengths, or values that are no numbers"):
         import_recording(data, TX40)
 

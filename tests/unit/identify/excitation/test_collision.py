@@ -1,6 +1,7 @@
 """Designed trajectories keep links apart, avoid boxes and spare motors whose loads the URDF knows."""
 
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -119,12 +120,14 @@ def test_the_smallest_distance_of_a_motion_is_found_although_most_samples_are_sk
 
 @pytest.mark.slow
 @pytest.mark.parametrize("shape", ["moves", "fourier"])
-def test_a_design_avoids_a_box_and_itself_where_one_without_bodies_does_not(shape: str) -> None:
+def test_a_design_avoids_a_box_and_itself_where_one_without_bodies_does_not(
+    shape: Literal["moves", "fourier"],
+) -> None:
     box = Box(name="post", center=(0.8, 0.3, 0.0), size=(0.2, 0.2, 1.0))
     robot = planar_arm(bodies(box))
     model = CollisionModel(robot)
-    careless = design_trajectory(robot, 6.0, 1, evaluations=60, shape=shape)  # type: ignore[arg-type]
-    careful = design_trajectory(robot, 6.0, 1, evaluations=60, shape=shape, collision=model)  # type: ignore[arg-type]
+    careless = design_trajectory(robot, 6.0, 1, evaluations=60, shape=shape)
+    careful = design_trajectory(robot, 6.0, 1, evaluations=60, shape=shape, collision=model)
     assert model.shortfall(careless.trajectory.sample(1e-3)) > 0.0
     assert careful.closest is not None
     assert careful.closest.distance >= model.clearance

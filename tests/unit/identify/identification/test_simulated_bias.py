@@ -1,6 +1,7 @@
 """Bias by derivatives and encoder noise: subtracted from IDIM-IV and IDIM-PIV, reported by IDIM-LS."""
 
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from armident.identify.identification.simulated_bias import RELEVANT_BIAS
 from armident.identify.signals.differentiate import differentiate
 from tests.fixtures.arms import identified
 from tests.statistics import axis
-from tests.statistics.noise import METHODS, ROBOTS, SETTINGS, row
+from tests.statistics.noise import METHODS, ROBOTS, SETTINGS, Setting, row
 
 ENCODER = 20e-6
 """Encoder noise, m, at 1 kHz."""
@@ -84,9 +85,9 @@ def test_document_holds_the_bias_that_was_subtracted() -> None:
 def test_instruments_pass_the_bandpass_of_the_measured_positions(monkeypatch: pytest.MonkeyPatch) -> None:
     seen = []
 
-    def noted(*arguments: object, **options: object) -> object:
+    def noted(*arguments: Any, **options: Any) -> object:
         seen.append(arguments[2])
-        return differentiate(*arguments, **options)  # type: ignore[arg-type]
+        return differentiate(*arguments, **options)
 
     monkeypatch.setattr("armident.identify.identification.auxiliary_loop.differentiate", noted)
     experiment = axis.recorded(0, torque=1.0)
@@ -101,9 +102,9 @@ def test_instruments_pass_the_bandpass_of_the_measured_positions(monkeypatch: py
 @pytest.mark.proof
 @pytest.mark.parametrize("setting", SETTINGS, ids=lambda s: s.name)
 @pytest.mark.parametrize("name", list(ROBOTS))
-def test_intervals_hold_or_are_called_doubtful_under_every_noise(name: str, setting: object) -> None:
+def test_intervals_hold_or_are_called_doubtful_under_every_noise(name: str, setting: Setting) -> None:
     robot, record = ROBOTS[name]
     for method in METHODS:
-        found = row(name, robot(), record, setting, method, 20)  # type: ignore[arg-type]
+        found = row(name, robot(), record, setting, method, 20)
         # 80 correlated intervals of the axis, 560 of the TX40.
         assert found.covered >= 0.90 or found.doubtful > 0.9, found
