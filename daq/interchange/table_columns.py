@@ -183,7 +183,7 @@ def _numbered(table: Table, base: str, n: int) -> Columns | None:
     if any(table[label].ndim != 1 for label in labels):
         raise DataError(f"{labels[0]} has {table[labels[0]].ndim} dimensions, expected a column")
     note = (f"columns are counted from 0: {labels[0]} is {_FIRST}",) if first == 0 else ()
-    return Columns(np.stack([table[label] for label in labels], axis=1), tuple(labels), note)
+    return Columns(_side_by_side(table, labels), tuple(labels), note)
 
 
 _FIRST = "the first joint"
@@ -207,7 +207,7 @@ def _by_joint(
                   for rest, name in of_joint.items()}  # fmt: skip
     match = match_joints(list(chosen), robot.joints, by_position=by_position, joints=joints)
     labels = tuple(chosen[each] for each in match.names)
-    return Columns(np.stack([table[label] for label in labels], axis=1), labels, match.remarks)
+    return Columns(_side_by_side(table, labels), labels, match.remarks)
 
 
 def _joint_of(name: str, quantity: str) -> str | None:
@@ -223,3 +223,12 @@ def _joint_of(name: str, quantity: str) -> str | None:
     if words[0][0] in _WORDS[wanted]:
         return name[words[0][2] :].strip(" ./_-:[]")
     return None
+
+
+def _side_by_side(table: Table, labels: Sequence[str]) -> NDArray[np.float64]:
+    """Return columns as one array (N, n); refuse columns of different lengths."""
+    first = labels[0]
+    for label in labels:
+        if table[label].shape != table[first].shape:
+            raise DataError(f"{label} has {table[label].size} values, {first} has {table[first].size}")
+    return np.stack([table[label] for label in labels], axis=1)

@@ -1,6 +1,7 @@
 """Import and export: numbers survive the round trip, and every error has one clear line."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -233,3 +234,11 @@ def test_a_recording_without_samples_is_not_exported(tmp_path: Path) -> None:
     )
     with pytest.raises(DataError, match="no samples"):
         columns(Recording(None, TX40, None, 1000.0, {"samples": empty}))
+
+
+def test_columns_of_different_lengths_are_refused_by_name(tmp_path: Path) -> None:
+    path = tmp_path / "a.npz"
+    columns: dict[str, Any] = {f"{name}{j}": np.zeros(60) for name in ("q", "tau") for j in range(1, 7)}
+    np.savez(path, **{"t": np.arange(60) / 100, **columns, "q6": np.zeros(64)})
+    with pytest.raises(DataError, match="q6 has 64 values, q1 has 60"):
+        import_recording(path, load_robot("tx40"))
