@@ -242,3 +242,11 @@ def test_columns_of_different_lengths_are_refused_by_name(tmp_path: Path) -> Non
     np.savez(path, **{"t": np.arange(60) / 100, **columns, "q6": np.zeros(64)})
     with pytest.raises(DataError, match="q6 has 64 values, q1 has 60"):
         import_recording(path, load_robot("tx40"))
+
+
+def test_times_that_no_clock_can_have_are_refused(tmp_path: Path) -> None:
+    values = table()
+    values[-1, 0] = 1e300
+    path = write_csv(tmp_path / "a.csv", values, HEADER)
+    with pytest.raises(DataError, match=r"1e\+300 s in steps of 0\.\d+ s are no recording of 50 samples"):
+        import_recording(path, TX40)
