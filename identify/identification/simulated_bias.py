@@ -24,11 +24,11 @@ from armident.identify.regression.equations import (
     filtered_regressor,
     instrumented,
     joint_variances,
-    stacked,
+    stacked_parts,
     whitened_residuals,
 )
 from armident.identify.regression.iv import iv_products
-from armident.identify.regression.least_squares import least_squares
+from armident.identify.regression.least_squares import Triangle
 from armident.identify.robot.controller import DiscreteController
 from armident.identify.robot.simulation import Simulation
 from armident.identify.signals.bandpass import central_difference
@@ -294,6 +294,6 @@ def least_squares_bias(
             return replace(blocks[k], y=truths[k], x=x)
 
         pairs = enumerate(zip(prepared.experiments, prepared.signals, strict=True))
-        x, y = stacked(kept((of(k, *pair) for k, pair in pairs), like=prepared.experiments), weights)
-        errors.append(least_squares(x, y) - theta)
+        rows = (of(k, *pair) for k, pair in pairs)
+        errors.append(Triangle.of(stacked_parts(rows, weights)).theta - theta)
     return SimulatedBias(np.mean(errors, axis=0), np.std(errors, axis=0, ddof=1), FEW)
