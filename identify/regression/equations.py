@@ -235,6 +235,19 @@ def applied(columns: NDArray[np.float64], values: NDArray[np.float64]) -> NDArra
     return product
 
 
+def instants(blocks: Sequence[ExperimentEquations], dt: float) -> list[NDArray[np.int64]]:
+    """Numbers of the samples of the equations, (M,) per experiment.
+
+    Parameters
+    ----------
+    blocks
+        Equations of every experiment.
+    dt
+        Sampling period, s.
+    """
+    return [np.rint(block.t / dt).astype(np.int64) for block in blocks]
+
+
 def residuals(blocks: Sequence[ExperimentEquations], theta: NDArray[np.float64]) -> list[NDArray[np.float64]]:
     """``tau - phi theta`` of each experiment, shape (M, n).
 
