@@ -158,9 +158,9 @@ def mark_from(entries: object) -> Mark:
     return mark
 
 
-def _bytes(values: NDArray[Any]) -> NDArray[np.uint8]:
+def _bytes(values: NDArray[Any]) -> memoryview:
     """Return the bytes of an array, without a copy where it is contiguous."""
-    return np.ascontiguousarray(values).reshape(-1).view(np.uint8)
+    return np.ascontiguousarray(values).reshape(-1).view(np.uint8).data
 
 
 _NO_SYNC = 2**63
