@@ -127,6 +127,21 @@ def mapped(function: Callable[..., T], *sequences: Sequence[Any]) -> Sequence[T]
     return [function(*items) for items in zip(*sequences, strict=True)]
 
 
+def chosen(items: Sequence[T], numbers: Sequence[int]) -> Sequence[T]:
+    """Return some of the items as a list, or read again at every use where the sequence is streamed.
+
+    Parameters
+    ----------
+    items
+        The items.
+    numbers
+        Numbers of those to choose, from 0.
+    """
+    if isinstance(items, Streamed):
+        return Mapped(items.__getitem__, numbers)
+    return [items[k] for k in numbers]
+
+
 def scratch_folder() -> Path:
     """Return the folder of files that do not fit in memory: ``TMPDIR``, or ``/var/tmp``, which is no memory disk."""
     return Path(os.environ.get("TMPDIR") or "/var/tmp")
