@@ -41,6 +41,10 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     arguments
         The command and its arguments; default: those of the process.
     """
+    if "ARMIDENT_PARENT" in os.environ:
+        from armident.processes import end_with_parent
+
+        end_with_parent()
     words = list(sys.argv[1:] if arguments is None else arguments)
     application(words)(args=words, prog_name="armident")
     raise SystemExit(0)

@@ -61,6 +61,10 @@ class LedgerError(ArmidentError):
     """The ledger cannot be read or written at present: locked, or the disk is full. Try again."""
 
 
+class LedgerUnusable(ArmidentError):
+    """The ledger is damaged, or of a newer version."""
+
+
 @dataclass(frozen=True)
 class Entry:
     """Recording in the ledger.
@@ -117,7 +121,7 @@ class Ledger:
     ------
     LedgerError
         If the file is locked or the disk is full.
-    ArmidentError
+    LedgerUnusable
         If the file is damaged or of a newer version.
     """
 
@@ -132,7 +136,10 @@ class Ledger:
         with self._transaction() as db:
             version = int(db.execute("PRAGMA user_version").fetchone()[0])
             if version > len(_MIGRATIONS):
-                raise ArmidentError(f"{path}: ledger of version {version}, this program knows {len(_MIGRATIONS)}")
+                raise LedgerUnusable(
+                    f"{path}: ledger of version {version}, this program knows {len(_MIGRATIONS)}; "
+                    "use the newer armident"
+                )
             for number, script in enumerate(_MIGRATIONS[version:], start=version + 1):
                 for statement in script.split(";"):
                     db.execute(statement)
@@ -343,7 +350,7 @@ class Ledger:
         except (sqlite3.OperationalError, OSError) as error:
             raise LedgerError(f"{self.path}: {_reason(error)}") from error
         except sqlite3.DatabaseError as error:
-            raise ArmidentError(
+            raise LedgerUnusable(
                 f"{self.path}: the ledger is damaged ({error}); move it away and start again, results are found"
             ) from error
 
