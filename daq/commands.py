@@ -114,11 +114,12 @@ def import_(
 ) -> None:
     """Convert measurements of other tools to a recording.
 
-    CSV columns: t (s), q1..qn, tau1..taun or current1..currentn, optionally the reference qr1..qrn; SI units. Columns
-    may be named after joints, such as elbow/position and elbow/effort. MAT, NPZ and Parquet: the same names, or
-    positions, torques, times. LeRobot data sets (file or folder): observation.state, and an effort or current. ROS 2
-    bags (.mcap, .db3, or the folder): sensor_msgs/msg/JointState, joints by their names. Logs of a bus (candump -l,
-    .asc, .blf, .trc): SYNC and TPDOs, as the session configuration maps them.
+    CSV columns: t (s), q1..qn, tau1..taun or current1..currentn, optionally the demand qr1..qrn, also as ref1,
+    q_ref1, setpoint1, target_position1 or elbow_cmd; SI units. Columns may be named after joints, such as
+    elbow/position and elbow/effort. MAT, NPZ and Parquet: the same names, or positions, torques, times. LeRobot data
+    sets (file or folder): observation.state, and an effort or current. ROS 2 bags (.mcap, .db3, or the folder):
+    sensor_msgs/msg/JointState, joints by their names. Logs of a bus (candump -l, .asc, .blf, .trc): SYNC and TPDOs,
+    as the session configuration maps them.
 
     Missing samples are gaps. Damaged lines are left out, counted and named.
 

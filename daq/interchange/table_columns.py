@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armident.configs import DataError, RobotConfig
+from armident.daq.interchange.demand_names import of_another_quantity, without_demand
 from armident.daq.interchange.joint_names import match_joints
 from armident.daq.interchange.text_files import listed, shortened
 
@@ -17,9 +18,10 @@ NAMES: Mapping[str, tuple[str, ...]] = {
     "torque": ("tau", "torque", "torques", "effort", "efforts"),
     "current": ("current", "currents", "actual_current"),
     "voltage": ("voltage", "vir"),
-    "demand": ("qr", "qg", "target_positions", "target_q"),
+    "demand": ("qr", "qg"),
 }
-"""Accepted names of each quantity; ``q`` also stands for columns ``q1..qn`` and ``q0..q(n-1)``."""
+"""Accepted names of each quantity; ``q`` also stands for columns ``q1..qn`` and ``q0..q(n-1)``. A demand is also a
+position with a word for a demand in its name (`armident.daq.interchange.demand_names`)."""
 
 _WORDS: Mapping[str, frozenset[str]] = {
     "position": frozenset({"position", "positions", "pos", "q"}),
@@ -28,8 +30,6 @@ _WORDS: Mapping[str, frozenset[str]] = {
     "voltage": frozenset({"voltage", "voltages"}),
 }
 """Words of a column name, beside the name of a joint, that tell its quantity."""
-_DEMANDED = frozenset({"desired", "reference", "target", "setpoint", "command", "commanded", "demand", "goal"})
-"""Words of a column name that tell a demand."""
 _WORD = re.compile(r"[^\W_]+")
 _UNIT = re.compile(r"^(.*?)\s*[\[(]([^\])]*)[\])]$")
 _TIME_UNIT = re.compile(r"^(.*?)_(s|sec|ms|us|ns)$", re.IGNORECASE)
@@ -80,7 +80,7 @@ def without_units(table: Table, units: Sequence[str] = ()) -> tuple[dict[str, ND
     time_unit, converted = "", []
     for k, (name, values) in enumerate(table.items()):
         bare, unit = name, units[k].strip("[]() ") if k < len(units) else ""
-        if found := _UNIT.match(name):
+        if (found := _UNIT.match(name)) and not found[2].strip().isdigit():  # q[1] is a number of a joint
             bare, unit = found[1].strip(), found[2].strip()
         if (found := _TIME_UNIT.match(name)) and found[1].lower() in NAMES["time"]:
             bare, unit = found[1], found[2]
@@ -153,7 +153,61 @@ def find_columns(
             return found
     if name is not None:
         raise DataError(f"no array named {name!r}; found {listed(list(table))}")
+    if quantity == "demand":
+        return _demand(table, robot, by_position, joints)
     return _by_joint(table, quantity, robot, by_position, joints)
+
+
+def unused_demand(table: Table) -> str:
+    """Return a sentence on columns that name a demand, for a table in which no demand was found; empty without any.
+
+    Parameters
+    ----------
+    table
+        Columns by name.
+    """
+    named = [name for name in table if without_demand(name) is not None]
+    if not named:
+        return ""
+    return (
+        f"without a demand: {listed(named)} cannot be assigned to the joints as positions; "
+        "--map demand=NAME takes NAME1..NAMEn"
+    )
+
+
+def _demand(table: Table, robot: RobotConfig, by_position: bool, joints: Sequence[str] | None) -> Columns | None:
+    """Return the positions with a word for a demand in their names, such as ``q1_ref``, ``reference1``, ``elbow_cmd``.
+
+    Names alone decide here, so that columns which do not fit the joints are no error (`unused_demand`).
+    """
+    origin: dict[str, str] = {}
+    twice = []
+    for name in table:
+        rest = without_demand(name)
+        if rest is None or of_another_quantity(rest):
+            continue
+        if origin.setdefault(rest, name) != name:
+            twice.append(name)
+    positions = {rest: table[name] for rest, name in origin.items()}
+    found = None
+    for base in ("", *NAMES["position"]):
+        try:
+            found = found or _numbered(positions, base, robot.n)
+        except DataError:
+            continue
+    try:
+        found = found or _by_joint(positions, "position", robot, by_position, joints)
+        columns = [rest for rest, values in positions.items() if values.ndim == 1]
+        if found is None and columns:
+            match = match_joints(columns, robot.joints, joints=joints)
+            found = Columns(np.stack([positions[one] for one in match.names], axis=1), match.names, match.remarks)
+    except (DataError, ValueError):
+        return None
+    if found is None:
+        return None
+    labels = tuple(origin.get(label, label) for label in found.labels)
+    notes = [*found.notes] + ([f"demand taken from {listed(labels)}, not from {listed(twice)}"] if twice else [])
+    return Columns(found.values, labels, tuple(notes))
 
 
 def _numbered(table: Table, base: str, n: int) -> Columns | None:
@@ -211,16 +265,13 @@ def _by_joint(
 
 
 def _joint_of(name: str, quantity: str) -> str | None:
-    """Return the part of a column's name that tells its joint, if the column is of a quantity."""
+    """Return the part of a column's name that tells its joint, if the column is of a quantity and no demand."""
     words = [(found[0].lower(), found.start(), found.end()) for found in _WORD.finditer(name)]
-    demanded = any(word in _DEMANDED for word, _, _ in words)
-    wanted = "position" if quantity == "demand" else quantity
-    if len(words) < 2 or wanted not in _WORDS or demanded != (quantity == "demand"):
+    if len(words) < 2 or quantity not in _WORDS or without_demand(name) is not None:
         return None
-    if words[-1][0] in _WORDS[wanted]:
-        end = words[-2][1] if words[-2][0] in _DEMANDED and len(words) > 2 else words[-1][1]
-        return name[:end].strip(" ./_-:[]")
-    if words[0][0] in _WORDS[wanted]:
+    if words[-1][0] in _WORDS[quantity]:
+        return name[: words[-1][1]].strip(" ./_-:[]")
+    if words[0][0] in _WORDS[quantity]:
         return name[words[0][2] :].strip(" ./_-:[]")
     return None
 

@@ -84,7 +84,7 @@ def test_urdf_and_csv_become_a_model_without_an_edit(tmp_path: Path, arm: Path) 
     made = run("init", str(arm), "--recording", str(tmp_path / "data.csv"), "--out", str(tmp_path / "cell"))
     assert made.exit_code == 0, made.output
     assert "1000 Hz, 8.1" in made.output
-    assert " s, torques, with reference" in made.output
+    assert " s, torques, with demand" in made.output
     lines = [line.strip() for line in made.output.splitlines()]
     commands = [line.split()[1:] for line in lines[lines.index("next:") + 1 :]]
     assert [words[0] for words in commands] == ["import", "check", "identify"]
