@@ -250,3 +250,11 @@ def test_times_that_no_clock_can_have_are_refused(tmp_path: Path) -> None:
     path = write_csv(tmp_path / "a.csv", values, HEADER)
     with pytest.raises(DataError, match=r"1e\+300 s in steps of 0\.\d+ s are no recording of 50 samples"):
         import_recording(path, TX40)
+
+
+def test_values_whose_squares_are_no_numbers_are_refused(tmp_path: Path) -> None:
+    values = table()
+    values[7, 9] = -1e308
+    path = write_csv(tmp_path / "a.csv", values, HEADER)
+    with pytest.raises(DataError, match=r"a\.csv: line 9, column tau3: -1e\+308 is no measurement"):
+        import_recording(path, TX40, resample_hz=1000.0)
