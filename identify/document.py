@@ -894,6 +894,11 @@ def write_atomically(path: Path, text: str) -> None:
         File to write.
     text
         Its content, written as UTF-8.
+
+    Raises
+    ------
+    OSError
+        If it cannot be written; its file name is ``path``.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
@@ -905,6 +910,9 @@ def write_atomically(path: Path, text: str) -> None:
         # mkstemp restricts the file to its owner; results are readable like any other file.
         os.chmod(temporary, 0o644)
         os.replace(temporary, path)
+    except OSError as error:
+        Path(temporary).unlink(missing_ok=True)
+        raise OSError(error.errno, error.strerror, str(path)) from error
     except BaseException:
         Path(temporary).unlink(missing_ok=True)
         raise

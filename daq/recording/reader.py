@@ -13,6 +13,7 @@ from mcap.reader import make_reader
 from pydantic import ValidationError
 
 from armident.configs import ConfigError, DataError, RobotConfig, SessionConfig
+from armident.configs.yaml_loader import is_file
 from armident.daq.recording import mcap_records as mcap
 from armident.daq.recording.layout import StreamLayout
 from armident.daq.recording.model import Gap, Mark, Recording, Stream, gap_from, mark_from
@@ -80,6 +81,9 @@ def is_recording(path: Path) -> bool:
     path
         The file.
     """
+    if not is_file(path):
+        # A named pipe would be waited for.
+        return False
     try:
         with path.open("rb") as file:
             head = file.read(_HEAD)

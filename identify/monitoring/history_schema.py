@@ -13,6 +13,7 @@ from typing import Any
 import sqlalchemy as sa
 
 from armident.configs import ConfigError
+from armident.identify.monitoring.sqlite_reason import sqlite_reason
 
 BUSY_S = 15.0
 """Longest wait for another process that writes to the database, s."""
@@ -227,18 +228,13 @@ def reason(error: Exception) -> str:
     state = getattr(cause, "sqlstate", None)
     if state in _STATES:
         return _STATES[state].format(busy=BUSY_S, text=text)
-    if isinstance(error, sa.exc.OperationalError) and not isinstance(cause, sqlite3.DatabaseError):
+    if isinstance(error, sa.exc.OperationalError) and not isinstance(cause, sqlite3.Error):
         text = text.removeprefix("connection failed: ")
         return f"no connection to the server ({text}); check that it runs, and host, port, user and database of the URL"
-    if isinstance(cause, sqlite3.DatabaseError):
-        if "locked" in text:
-            return f"locked by another process for more than {BUSY_S:g} s; try again when that has ended"
-        if "malformed" in text or "not a database" in text:
-            return f"damaged ({text}); restore a copy, or begin a new history and add the results to it"
-        if "readonly" in text:
-            return "it may not be written (read-only)"
-        if "unable to open" in text:
-            return "the file cannot be opened; check the folder and its permissions"
+    if isinstance(cause, sqlite3.Error):
+        text = sqlite_reason(cause, BUSY_S)
+        damaged = "; restore a copy, or begin a new history and add the results to it"
+        return text + damaged if text.startswith("damaged") else text
     return text
 
 

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Literal
 
 from armident.configs import ArmidentError
+from armident.identify.monitoring.sqlite_reason import sqlite_reason
 
 FILE = "worker.sqlite"
 """Name of the ledger in the folder of the results."""
@@ -375,8 +376,10 @@ def _use_write_ahead_log(db: sqlite3.Connection) -> None:
             time.sleep(0.02)
 
 
-def _reason(error: Exception) -> str:
-    return (error.strerror or str(error)) if isinstance(error, OSError) else str(error)
+def _reason(error: OSError | sqlite3.Error) -> str:
+    if isinstance(error, OSError):
+        return error.strerror or str(error)
+    return sqlite_reason(error, BUSY_S)
 
 
 def _entry(row: tuple[str, str, str, State, int, str | None, str | None, int]) -> Entry:

@@ -254,7 +254,13 @@ class Worker:
             known = ledger.file_hash(first, stamp)
             if announced and known == (None,):
                 known = None
-            digest = known[0] if known else self._read_and_enter(ledger, captured, announced)
+            try:
+                digest = known[0] if known else self._read_and_enter(ledger, captured, announced)
+            except OSError as error:
+                # Other recordings are not held up; this one is tried again.
+                with self._lock:
+                    self._buffer.refuse("files", f"{first}: cannot be read: {_reason(error)}; trying again")
+                continue
             self._known[first] = stamp
             if known is None:
                 ledger.enter_file(first, stamp, digest)
@@ -269,6 +275,12 @@ class Worker:
                 return None
         except ArmidentError as error:
             log.warning("%s", error)
+            return None
+        except OSError:
+            raise
+        except Exception as error:
+            log.warning("%s: internal error (%s); it is not identified", captured.paths[0], type(error).__name__)
+            log.debug("internal error", exc_info=True)
             return None
         digest = recording.sha256
         found = result_of(digest, self._folder(captured.name))

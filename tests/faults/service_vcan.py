@@ -24,8 +24,10 @@ from typing import IO
 
 import yaml
 
-from armident.configs import load_session
+from armident.configs import ArmidentError, load_session
+from armident.daq.recording import read_recording
 from armident.drivers.vcan import ensure_vcan, remove_vcan
+from armident.identify.monitoring.recorded import captured_in
 from tests.faults.service import Audience, recorded, store_of, violations, wait_for_results
 from tests.fixtures.processes import ForkedProcess, armident
 from tests.statistics.weeks import cell_file, robot_on
@@ -202,6 +204,19 @@ def commands_of(config: Path) -> dict[int, str]:
     return found
 
 
+def unreadable(folder: Path) -> list[str]:
+    """Return the recordings that cannot be read, not even as empty ones, or that belong to no capture."""
+    files = {path.resolve() for path in folder.glob("*.mcap")}
+    known = {path for captured in captured_in((folder,), "emps") for path in captured.paths}
+    wrong = [f"{path.name}: of no capture" for path in files - known]
+    for path in files:
+        try:
+            read_recording(path)
+        except ArmidentError as error:
+            wrong.append(f"{path.name}: {error}")
+    return wrong
+
+
 def _content(file: IO[bytes]) -> str:
     return os.pread(file.fileno(), os.fstat(file.fileno()).st_size, 0).decode(errors="replace")
 
@@ -219,7 +234,7 @@ def run_rounds(rounds: int, seed: int, folder: Path, bus: str, minutes: float = 
             print(f"round {number}: {time.monotonic() - begin:.0f} s, {dict(service.kills)}", flush=True)
         service.finish()
         wrong, recordings, results = violations(folder, audience)
-    wrong = service.wrong + wrong
+    wrong = service.wrong + wrong + unreadable(folder)
     if 3 * recordings < done:
         wrong.append(f"only {recordings} recordings with samples in {done} rounds")
     parts = sum(len(captured.paths) > 1 for captured in recorded(folder))

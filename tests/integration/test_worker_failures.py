@@ -3,6 +3,7 @@
 import errno
 import json
 import os
+import shutil
 import threading
 import time
 from dataclasses import replace
@@ -21,6 +22,7 @@ from armident.identify.document import IdentificationDocument, load_document
 from armident.identify.identification.api import identify_recording
 from armident.identify.monitoring import worker as module
 from armident.identify.monitoring.ledger import FILE, Ledger
+from armident.identify.monitoring.recorded import Captured
 from armident.identify.monitoring.stream_buffer import (
     LARGEST_BLOCK,
     MOST_CAPTURES,
@@ -74,6 +76,28 @@ def test_recordings_of_the_time_without_a_worker_are_identified_once(session: Se
     with Worker(session, first.robot, tmp_path) as worker:
         assert worker.result(8.0) is None
     assert states(tmp_path) == {"emps-a": ("done", True), "emps-b": ("done", True)}
+
+
+def test_files_that_cannot_be_read_do_not_hold_up_others(
+    session: SessionConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    made = recorded(session, "c")
+    for name in ("a", "b"):
+        shutil.copy(tmp_path / "emps-c.mcap", tmp_path / f"emps-{name}.mcap")
+    read = Captured.read
+    errors = {"emps-a": OSError(errno.EIO, os.strerror(errno.EIO)), "emps-b": RuntimeError("unforeseen")}
+
+    def refused(captured: Captured) -> Recording:
+        if captured.name in errors:
+            raise errors[captured.name]
+        return read(captured)
+
+    monkeypatch.setattr(Captured, "read", refused)
+    with Worker(session, made.robot, tmp_path) as worker:
+        assert worker.result(LONGEST_S) == 0
+    assert states(tmp_path) == {"emps-c": ("done", True)}
+    assert "emps-a.mcap: cannot be read: Input/output error; trying again" in caplog.text
+    assert "emps-b.mcap: internal error (RuntimeError); it is not identified" in caplog.text
 
 
 def test_two_workers_share_the_recordings(session: SessionConfig, tmp_path: Path) -> None:

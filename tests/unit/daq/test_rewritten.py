@@ -1,6 +1,7 @@
 """Recordings that other MCAP tools have rewritten: the same numbers, and damage judged by contents."""
 
 import json
+import os
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -186,3 +187,9 @@ def test_a_copy_is_exported_and_identified_as_the_recording_itself(tmp_path: Pat
         parameters.append(json.loads((out / "identification.json").read_text())["parameters"])
     assert tables[0] == tables[1]
     assert parameters[0] == parameters[1]
+
+
+def test_a_named_pipe_in_a_folder_of_recordings_is_not_waited_for(tmp_path: Path) -> None:
+    path = tmp_path / "emps-20260101T000000-000Z.mcap"
+    os.mkfifo(path)
+    assert not is_recording(path)

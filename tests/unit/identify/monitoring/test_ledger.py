@@ -124,7 +124,7 @@ def test_a_ledger_that_is_locked_damaged_or_newer_is_one_line(tmp_path: Path, mo
     Ledger(path, "one")
     with sqlite3.connect(path) as db:
         db.execute("BEGIN IMMEDIATE")
-        with pytest.raises(LedgerError, match=r"worker\.sqlite: database is locked$"):
+        with pytest.raises(LedgerError, match=r"worker\.sqlite: locked by another process for more than"):
             Ledger(path, "two").add(A, "x", [])
     db.execute("PRAGMA user_version = 99")
     db.close()
