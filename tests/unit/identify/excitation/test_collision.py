@@ -42,6 +42,12 @@ URDF = """<robot name="two_links">
 </robot>"""
 
 
+@pytest.fixture(autouse=True)
+def own_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The command writes its picture into the working directory."""
+    monkeypatch.chdir(tmp_path)
+
+
 def planar_arm(collision: Collision | None) -> RobotConfig:
     """Two links of 0.5 m that turn about parallel axes; the second one can fold onto the first."""
     limits = {"position": [-3.0, 3.0], "velocity": 3.0, "acceleration": 20.0, "torque": 100.0}
