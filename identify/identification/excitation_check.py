@@ -29,6 +29,10 @@ POSTURES = 100
 NEGLIGIBLE = 1e-6
 """Torque per SI unit of a parameter, relative to the greatest of all, below which a motion does not show it."""
 
+TIE = 1e-6
+"""Relative advantage, in the order of pivoted QR, of the parameter with most torque per SI unit: among those that the
+motion cannot separate at all, rounding would decide."""
+
 NON_NEGATIVE = ("fv", "fc", "ia")
 """First letters of the parameters that cannot be negative: viscous and Coulomb friction, rotor inertia."""
 
@@ -138,7 +142,8 @@ def examine_support(
     top, norms = triangularize_parts(joint_by_joint(), columns=b + 1)
     # Rounding errors, such as that of cos(pi / 2), give columns that no real parameter fills.
     scale = np.where(norms[:b] > NEGLIGIBLE * norms[:b].max(), norms[:b], np.inf)
-    factor, order = linalg.qr(top[:, :b] / scale, mode="r", pivoting=True)
+    preferred = 1.0 + TIE * norms[:b] / norms[:b].max()
+    factor, order = linalg.qr(top[:, :b] * (preferred / scale), mode="r", pivoting=True)
     limit = criteria.max_relative_std * np.sqrt(powers[:, b] @ (powers[:, :b] / scale**2))[order]
     pivots = np.abs(np.diag(factor))
     count = int(np.sum(pivots > RANK_TOLERANCE * max(float(pivots[0]), 1e-300)))
