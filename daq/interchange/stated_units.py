@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armident.configs import ConfigError, RobotConfig
-from armident.daq.interchange.table_columns import SCALES
+from armident.daq.interchange.column_units import SCALES
 from armident.daq.interchange.table_rows import Rows
 from armident.daq.recording.model import Quantity
 

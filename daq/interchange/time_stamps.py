@@ -91,6 +91,8 @@ def in_seconds(
     """
     if stated is not None and stated not in UNITS:
         raise ConfigError(f"--time-unit: expected one of {', '.join(UNITS)}, found {stated}")
+    if named and named not in UNITS and stated is None:
+        raise DataError(f"the column of times states the unit {named!r}, expected s, ms, us or ns: convert the times")
     named = named if named in UNITS else ""
     if stated is not None and named and stated != named:
         raise DataError(f"--time-unit {stated} contradicts the name of the column, which says {named}")
