@@ -29,13 +29,14 @@ POSTURES = 100
 NEGLIGIBLE = 1e-6
 """Torque per SI unit of a parameter, relative to the greatest of all, below which a motion does not show it."""
 
+TIE = 1e-6
+"""Relative advantage, in the order of pivoted QR, of the parameter with most torque per SI unit: among those that the
+motion cannot separate at all, rounding would decide."""
+
 NON_NEGATIVE = ("fv", "fc", "ia")
 """First letters of the parameters that cannot be negative: viscous and Coulomb friction, rotor inertia."""
 
 Array = NDArray[np.float64]
-TIE = 1e-9
-"""Relative difference of two normalised columns per place in the order of their norms: far above rounding errors."""
-
 Mask = NDArray[np.bool_]
 
 
@@ -141,9 +142,8 @@ def examine_support(
     top, norms = triangularize_parts(joint_by_joint(), columns=b + 1)
     # Rounding errors, such as that of cos(pi / 2), give columns that no real parameter fills.
     scale = np.where(norms[:b] > NEGLIGIBLE * norms[:b].max(), norms[:b], np.inf)
-    # Of columns that are multiples of each other, the one with more torque per unit comes first, not the rounding.
-    place = np.argsort(np.argsort(-norms[:b], kind="stable"))
-    factor, order = linalg.qr(top[:, :b] / scale * (1.0 - TIE * place), mode="r", pivoting=True)
+    preferred = 1.0 + TIE * norms[:b] / norms[:b].max()
+    factor, order = linalg.qr(top[:, :b] * (preferred / scale), mode="r", pivoting=True)
     limit = criteria.max_relative_std * np.sqrt(powers[:, b] @ (powers[:, :b] / scale**2))[order]
     pivots = np.abs(np.diag(factor))
     count = int(np.sum(pivots > RANK_TOLERANCE * max(float(pivots[0]), 1e-300)))
