@@ -161,11 +161,11 @@ def test_blocks_of_strangers_end_no_watch(session: SessionConfig) -> None:
         (block, *_) = published_blocks(recording)
         others = replace(block.layout, joints=tuple(f"other_{joint}" for joint in block.layout.joints))
         for message in (b"no block", encode_block(replace(block, layout=others)), bytes(LARGEST_BLOCK + 1)):
-            before, end = watch.refused, time.monotonic() + 20.0
-            while watch.refused < before + 3 and time.monotonic() < end:
+            before, end = watch.refused, time.monotonic() + 60.0
+            while watch.refused == before and time.monotonic() < end:
                 stranger.put(key, message)
-                time.sleep(0.05)
-            assert watch.refused >= before + 3
+                time.sleep(0.2)
+            assert watch.refused > before
     assert estimator.result().sync == -1
     # Blocks of another robot are not waited for.
     assert watch.lost == 0

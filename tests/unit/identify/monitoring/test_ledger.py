@@ -88,7 +88,7 @@ def test_the_newest_result_is_the_last_one_also_after_a_step_of_the_clock_back(
 ) -> None:
     one, _ = two
     for now, digest, result in ((2000.0, A, "first.json"), (1000.0, B, "second.json")):
-        monkeypatch.setattr("time.time", lambda now=now: now)
+        monkeypatch.setattr(time, "time", lambda now=now: now)
         one.add(digest, digest[:1], [Path(f"{digest[:1]}.mcap")])
         assert one.claim(digest) is not None
         assert one.finish(digest, "done", Path(result), "trustworthy")
