@@ -101,6 +101,8 @@ def import_recording(
     if robot is None:
         raise ConfigError(f"{path}: needs the configuration of the robot")
     _check_rates(rate_hz, polled, resample_hz)
+    if time_unit is not None and is_bag(path) and not data_files(path):
+        raise ConfigError(f"{path}: --time-unit is an option of tables; the stamps of a bag are in s and ns")
     source, rows = read_rows(
         path, robot, effort=effort, names=names, topic=topic, joints=joints, by_position=by_position
     )

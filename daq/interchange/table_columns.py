@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armident.configs import DataError, RobotConfig
+from armident.daq.interchange.column_units import SCALES, plain_unit
 from armident.daq.interchange.demand_names import of_another_quantity, without_demand
 from armident.daq.interchange.joint_names import match_joints
 from armident.daq.interchange.text_files import listed, shortened
@@ -25,19 +26,18 @@ position with a word for a demand in its name (`armident.daq.interchange.demand_
 
 _WORDS: Mapping[str, frozenset[str]] = {
     "position": frozenset({"position", "positions", "pos", "q"}),
-    "torque": frozenset({"effort", "efforts", "torque", "torques", "tau"}),
+    "torque": frozenset({"effort", "efforts", "eff", "torque", "torques", "tau"}),
     "current": frozenset({"current", "currents"}),
     "voltage": frozenset({"voltage", "voltages"}),
 }
 """Words of a column name, beside the name of a joint, that tell its quantity."""
+_MEASURED = frozenset({"actual", "measured", "feedback"})
+"""Words of a column name that tell a measurement, as others do without them."""
 _WORD = re.compile(r"[^\W_]+")
-_UNIT = re.compile(r"^(.*?)\s*[\[(]([^\])]*)[\])]$")
+_UNIT = re.compile(r"^(.*?)\s*[\[(]([^\])]*[^\])\d\s][^\])]*)[\])]$")
+"""A unit in brackets; digits alone are the number of a joint."""
 _TIME_UNIT = re.compile(r"^(.*?)_(s|sec|ms|us|ns)$", re.IGNORECASE)
-SCALES: Mapping[str, float] = {
-    "deg": np.pi / 180, "degree": np.pi / 180, "degrees": np.pi / 180, "°": np.pi / 180,
-    "mm": 1e-3, "ma": 1e-3, "mnm": 1e-3, "nmm": 1e-3, "mv": 1e-3,
-}  # fmt: skip
-"""Factors to SI of units in brackets after a name."""
+_UNIT_AT_END = re.compile(r"^(.*[^\W_])[_ /](rad|mrad|deg|mm|nm|mnm|ma)$", re.IGNORECASE)
 
 Table = Mapping[str, NDArray[np.float64]]
 
@@ -54,15 +54,22 @@ class Columns:
         Name of each column in the file.
     notes
         Sentences on what was assumed.
+    joints
+        Name of the joint of each column; empty if the columns are numbered.
     """
 
     values: NDArray[np.float64]
     labels: tuple[str, ...]
     notes: tuple[str, ...] = ()
+    joints: tuple[str, ...] = ()
 
 
-def without_units(table: Table, units: Sequence[str] = ()) -> tuple[dict[str, NDArray[np.float64]], str, list[str]]:
-    """Return the table without units in its names and in SI, the unit of its time, and notes on conversions.
+def without_units(
+    table: Table, units: Sequence[str] = ()
+) -> tuple[dict[str, NDArray[np.float64]], dict[str, str], list[str]]:
+    """Return the table without units in its names and in SI, the units by name, and notes on conversions.
+
+    Units that are not known are kept, for `armident.daq.interchange.column_units.check_unit`.
 
     Parameters
     ----------
@@ -77,22 +84,24 @@ def without_units(table: Table, units: Sequence[str] = ()) -> tuple[dict[str, ND
         If two names are equal without their units.
     """
     made: dict[str, NDArray[np.float64]] = {}
-    time_unit, converted = "", []
+    stated: dict[str, str] = {}
+    converted = []
     for k, (name, values) in enumerate(table.items()):
         bare, unit = name, units[k].strip("[]() ") if k < len(units) else ""
-        if (found := _UNIT.match(name)) and not found[2].strip().isdigit():  # q[1] is a number of a joint
+        if found := _UNIT.match(name) or _UNIT_AT_END.match(name):
             bare, unit = found[1].strip(), found[2].strip()
         if (found := _TIME_UNIT.match(name)) and found[1].lower() in NAMES["time"]:
             bare, unit = found[1], found[2]
-        if bare.lower() in NAMES["time"]:
-            time_unit = "s" if unit.lower() == "sec" else unit.lower().replace("µ", "u")
-        elif unit.lower() in SCALES:
-            values = values * SCALES[unit.lower()]
+        factor = SCALES.get(plain_unit(unit), 1.0)
+        if bare.lower() not in NAMES["time"] and factor != 1.0:
+            values = values * factor
             converted.append(f"{name} from {unit}")
         if bare in made:
             raise DataError(f"two columns are named {shortened(bare)}; found {listed(list(table))}")
         made[bare] = values
-    return made, time_unit, [f"converted to SI units: {listed(converted)}"] if converted else []
+        if unit:
+            stated[bare] = unit
+    return made, stated, [f"converted to SI units: {listed(converted)}"] if converted else []
 
 
 def find_time(table: Table, name: str | None = None) -> tuple[str, NDArray[np.float64]] | None:
@@ -261,7 +270,7 @@ def _by_joint(
                   for rest, name in of_joint.items()}  # fmt: skip
     match = match_joints(list(chosen), robot.joints, by_position=by_position, joints=joints)
     labels = tuple(chosen[each] for each in match.names)
-    return Columns(_side_by_side(table, labels), labels, match.remarks)
+    return Columns(_side_by_side(table, labels), labels, match.remarks, match.names)
 
 
 def _joint_of(name: str, quantity: str) -> str | None:
@@ -270,7 +279,8 @@ def _joint_of(name: str, quantity: str) -> str | None:
     if len(words) < 2 or quantity not in _WORDS or without_demand(name) is not None:
         return None
     if words[-1][0] in _WORDS[quantity]:
-        return name[: words[-1][1]].strip(" ./_-:[]")
+        end = words[-2][1] if words[-2][0] in _MEASURED and len(words) > 2 else words[-1][1]
+        return name[:end].strip(" ./_-:[]")
     if words[0][0] in _WORDS[quantity]:
         return name[words[0][2] :].strip(" ./_-:[]")
     return None

@@ -101,6 +101,8 @@ class Entry:
 
 
 _COLUMNS = "sha256, name, paths, state, attempts, result, message, announced"
+_LATER = "max(:time, coalesce((SELECT max(finished) FROM experiments), 0) + 0.001)"
+"""Time of a result: later than all others, also after a step of the clock back."""
 _FREE = "(owner IS NULL OR boot IS NOT :boot OR lease_until < :now OR owner = :owner)"
 
 
@@ -186,8 +188,10 @@ class Ledger:
         with self._transaction() as db:
             done = db.execute(
                 "INSERT INTO experiments (sha256, name, paths, added, state, result, message, finished, announced) "
-                "VALUES (?, ?, ?, ?, 'done', ?, ?, ?, 1) ON CONFLICT DO NOTHING",
-                (sha256, name, _texts(paths), time.time(), str(result), message, time.time()),
+                f"VALUES (:sha256, :name, :paths, :time, 'done', :result, :message, {_LATER}, 1) "
+                "ON CONFLICT DO NOTHING",
+                {"sha256": sha256, "name": name, "paths": _texts(paths), "time": time.time()}
+                | {"result": str(result), "message": message},
             )
             return bool(done.rowcount)
 
@@ -251,7 +255,7 @@ class Ledger:
         values = {"sha256": sha256, "state": state, "result": None if result is None else str(result)}
         with self._transaction() as db:
             done = db.execute(
-                "UPDATE experiments SET state = :state, result = :result, message = :message, finished = :time "
+                f"UPDATE experiments SET state = :state, result = :result, message = :message, finished = {_LATER} "
                 "WHERE sha256 = :sha256 AND owner = :owner AND state = 'waiting'",
                 values | {"message": message, "time": time.time()} | self._me(),
             )

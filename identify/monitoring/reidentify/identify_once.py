@@ -1,8 +1,9 @@
 """Identification of a recording that a worker of the cell may identify, too: one of them does it and announces it."""
 
+import math
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +21,8 @@ from armident.identify.report.files import write_identification
 
 RENEW_S = 1.0
 """Interval at which the lease is renewed, s."""
+RETRY_S = 60.0
+"""Time for which a ledger that is locked or cannot be written is tried again, s."""
 POLL_S = 0.5
 """Interval at which the result of a worker is waited for, s."""
 
@@ -112,14 +115,30 @@ def identify_once(
     name = files[0].name if files else "recording" if path is None else path.name.removesuffix(".mcap")
     folder = out / f"{name}.identification"
     recorded = _Recorded(recording.sha256, name, lambda: _identified(recording, robot, options, folder), publisher)
-    try:
-        ledger = Ledger(out / FILE, unique_owner())
-        with _renewed(ledger):
-            ledger.add(recorded.digest, name, files[0].paths if files else ())
-            return _claimed(ledger, recorded, say)
-    except (LedgerError, LedgerUnusable) as error:
-        say(f"warning: {error}; workers of this cell may identify and announce the recording, too")
+    paths = files[0].paths if files else ()
+    problem: ArmidentError | None = None
+    until = math.inf
+    while problem is None or time.monotonic() < until:
+        try:
+            return _shared(out / FILE, recorded, paths, say)
+        except LedgerUnusable as error:
+            problem, until = error, 0.0
+        except LedgerError as error:
+            if problem is None:
+                until = time.monotonic() + RETRY_S
+                say(f"warning: {error}; trying again for {RETRY_S:g} s")
+            problem = error
+            time.sleep(POLL_S)
+    say(f"warning: {problem}; workers of this cell may identify and announce the recording, too")
     return _alone(recorded)
+
+
+def _shared(file: Path, recorded: _Recorded, paths: Sequence[Path], say: Say) -> OnceIdentified:
+    """Identify and publish, or wait for a worker that does, by the ledger in a file."""
+    ledger = Ledger(file, unique_owner())
+    with _renewed(ledger):
+        ledger.add(recorded.digest, recorded.name, paths)
+        return _claimed(ledger, recorded, say)
 
 
 def _alone(recorded: _Recorded) -> OnceIdentified:

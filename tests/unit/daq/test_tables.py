@@ -55,7 +55,7 @@ BY_JOINT = [
         ["# t", *NAMES[1:]], ["t", *(f"q[{j + 1}]" for j in range(N)), *(f"effort[{j}]" for j in range(N))],
     ],
 )  # fmt: skip
-@pytest.mark.parametrize("sep", [",", ";", "\t"])
+@pytest.mark.parametrize("sep", [",", ";", "\t", "|"])
 def test_columns_are_found_by_the_names_of_other_tools(tmp_path: Path, names: list[str], sep: str) -> None:
     found = import_recording(written(tmp_path / "a.csv", motion(), names, sep), TX40)
     assert same(found, motion())
@@ -94,6 +94,117 @@ def test_units_in_names_are_converted_and_said(tmp_path: Path) -> None:
     assert "q1 [deg] from deg" in found.metadata["source_remarks"]
     with pytest.raises(DataError, match="--time-unit us contradicts the name of the column, which says ms"):
         import_recording(tmp_path / "a.csv", TX40, time_unit="us")
+
+
+@pytest.mark.parametrize(
+    ("quantity", "unit", "per_si"),
+    [
+        ("q", "mrad", 1e3), ("q", "rev", 1 / (2 * np.pi)), ("q", "\u00b0", 180 / np.pi), ("q", "rad", 1.0),
+        ("tau", "mN\u00b7m", 1e3), ("tau", "N cm", 100.0), ("tau", "kNm", 1e-3), ("tau", "N*m", 1.0),
+        ("tau", "measured", 1.0),
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize("place", ["name", "line"])
+def test_units_of_columns_are_converted_in_any_spelling(
+    tmp_path: Path, quantity: str, unit: str, per_si: float, place: str
+) -> None:
+    values = motion()
+    first = 1 if quantity == "q" else N + 1
+    values[:, first : first + N] *= per_si
+    path = written(tmp_path / "a.csv", values)
+    names, *rows = path.read_text().splitlines()
+    cells = names.split(",")
+    line = [unit if name.startswith(quantity) else "s" if name == "t" else "" for name in cells]
+    head = [f"{name} [{u}]" if u else name for name, u in zip(cells, line, strict=True)]
+    path.write_text("\n".join([",".join(head), *rows] if place == "name" else [names, ",".join(line), *rows]) + "\n")
+    found = import_recording(path, TX40)
+    assert np.allclose(found.samples.raw["position" if quantity == "q" else "torque"], motion()[:, first : first + N])
+
+
+@pytest.mark.parametrize(
+    ("quantity", "unit"), [("q", "grad"), ("q", "Nm"), ("tau", "%"), ("tau", "lbf ft"), ("tau", "A")]
+)
+def test_units_that_are_not_known_or_of_another_quantity_are_refused(tmp_path: Path, quantity: str, unit: str) -> None:
+    names = [f"{name} [{unit}]" if name.startswith(quantity) else name for name in NAMES]
+    with pytest.raises(DataError, match=rf"column {quantity}1 states the unit '{unit}', expected one of (rad|N m), "):
+        import_recording(written(tmp_path / "a.csv", motion(), names), TX40)
+
+
+@pytest.mark.parametrize("unit", ["min", "h", "ticks"])
+def test_a_unit_of_times_that_is_not_read_is_refused(tmp_path: Path, unit: str) -> None:
+    values = motion() * np.append(1 / 60, np.ones(2 * N))
+    path = written(tmp_path / "a.csv", values, [f"time [{unit}]", *NAMES[1:]])
+    with pytest.raises(DataError, match=f"the column of times states the unit '{unit}', expected s, ms, us or ns"):
+        import_recording(path, TX40)
+
+
+@pytest.mark.parametrize(("unit", "factor"), [("msec", 1e3), ("\u03bcs", 1e6), ("milliseconds", 1e3), ("sec.", 1.0)])
+def test_units_of_times_have_many_spellings(tmp_path: Path, unit: str, factor: float) -> None:
+    values = motion() * np.append(factor, np.ones(2 * N))
+    found = import_recording(written(tmp_path / "a.csv", values, [f"Time ({unit})", *NAMES[1:]]), TX40)
+    assert found.sample_rate_hz == pytest.approx(1000)
+
+
+def test_each_column_of_times_has_the_unit_of_its_own_name(tmp_path: Path) -> None:
+    values = np.insert(motion(200, 100.0), 1, 0.0, axis=1)
+    values[:, 1] = 1e6 * values[:, 0]
+    values[:, 0] *= 1e3
+    found = import_recording(written(tmp_path / "a.csv", values, ["t [ms]", "timestamp_us", *NAMES[1:]]), TX40)
+    assert found.sample_rate_hz == pytest.approx(100)
+
+
+@pytest.mark.parametrize("name", ["{base}[{zero}]", "{base}({one})", "{base}{one}_rad|{base}{one}_Nm"])
+def test_brackets_around_numbers_and_units_behind_underscores_are_read(tmp_path: Path, name: str) -> None:
+    of_q, of_tau = (name.split("|") * 2)[:2]
+    names = ["t", *(of_q.format(base="q", zero=j, one=j + 1) for j in range(N))]
+    names += [of_tau.format(base="tau", zero=j, one=j + 1) for j in range(N)]
+    assert same(import_recording(written(tmp_path / "a.csv", motion(), names), TX40), motion())
+
+
+def test_positions_and_efforts_of_different_arms_are_refused(tmp_path: Path) -> None:
+    names = [*(f"left_joint_{j + 1}/position" for j in range(N)), *(f"right_joint_{j + 1}/effort" for j in range(N))]
+    path = written(tmp_path / "a.csv", motion(), ["t", *names])
+    with pytest.raises(DataError, match=r"positions are those of left_joint_1, .* but torques those of right_joint_1"):
+        import_recording(path, TX40)
+    names = [*(f"/state/joint_{j + 1}/position" for j in range(N)), *(f"/drive/joint_{j + 1}/effort" for j in range(N))]
+    path = written(tmp_path / "b.csv", motion(), ["t", *names])
+    with pytest.raises(DataError, match=r"positions are those of state/joint_1, .* --joints"):
+        import_recording(path, TX40)
+    assert same(import_recording(path, TX40, joints=[joint.name for joint in TX40.joints]), motion())
+
+
+def test_measured_columns_beside_desired_ones_are_told_by_their_words(tmp_path: Path) -> None:
+    q, tau = motion()[:, 1 : N + 1], motion()[:, N + 1 :]
+    names = ["t"] + [
+        f"joint_{j + 1}/{kind}/{word}"
+        for kind, word in (("actual", "position"), ("target", "position"), ("actual", "effort"), ("target", "effort"))
+        for j in range(N)
+    ]
+    path = written(tmp_path / "a.csv", np.hstack([motion()[:, :1], q, 1.01 * q, tau, 2 * tau]), names)
+    found = import_recording(path, TX40)
+    assert same(found, motion())
+    assert np.allclose(found.samples.raw["demand"], 1.01 * q)
+
+
+def test_a_column_with_two_decimal_signs_is_refused_with_both(tmp_path: Path) -> None:
+    path = written(tmp_path / "a.csv", motion(), sep=";", cell="{:.6f}")
+    lines = path.read_text().splitlines()
+    lines[10:] = [line.replace(".", ",") for line in lines[10:]]
+    path.write_text("\n".join(lines) + "\n")
+    with pytest.raises(
+        DataError, match=r"column 1 has '0\.000000' in line 2 and '0,009000' in line 11: decimal commas"
+    ):
+        import_recording(path, TX40)
+
+
+def test_a_date_of_another_form_is_named(tmp_path: Path) -> None:
+    path = written(tmp_path / "a.csv", motion(), sep=";")
+    names, *rows = path.read_text().splitlines()
+    path.write_text("\n".join([names, *(f"06.03.2026 15:00:{row}" for row in rows)]) + "\n")
+    with pytest.raises(
+        DataError, match=r"line 2 has '06\.03\.2026 .*expected numbers; dates are read in the form 2026"
+    ):
+        import_recording(path, TX40)
 
 
 def test_decimal_commas_are_read_between_semicolons_and_named_between_commas(tmp_path: Path) -> None:
@@ -345,7 +456,7 @@ def test_values_that_overflow_are_refused_without_warnings(tmp_path: Path) -> No
     path = written(tmp_path / "a.csv", values)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        with pytest.raises(DataError, match=r"position of .* reaches"):
+        with pytest.raises(DataError, match=r"line 9, column q3: 1e\+308 is no measurement"):
             import_recording(path, TX40)
 
 

@@ -105,6 +105,7 @@ def test_a_ledger_that_locks_or_is_damaged_stops_neither_verdict_nor_announcemen
     tmp_path: Path, recorded: Recording, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(ledger_module, "BUSY_S", 0.1)
+    monkeypatch.setattr(identify_once, "RETRY_S", 0.5)
     work = job(tmp_path, arms.recording("emps", "emps_excitation", 1))
     Ledger(tmp_path / FILE, "worker")
     db = sqlite3.connect(tmp_path / FILE)
