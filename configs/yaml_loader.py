@@ -1,5 +1,6 @@
 """Strict YAML: duplicate keys are errors, numbers follow YAML 1.2, and there are no dates."""
 
+import math
 import os.path
 import re
 from pathlib import Path
@@ -16,6 +17,9 @@ _FLOAT = re.compile(
     r"|^[-+]?\.(?:inf|Inf|INF)$|^\.(?:nan|NaN|NAN)$"
 )
 """Numbers of YAML 1.2; YAML 1.1 reads 010 as 8, 1:30 as 90, and 1e-3 as a string."""
+
+LARGEST = 1_000_000
+"""Largest number of values that aliases may repeat: far more than in any configuration, and read in a second."""
 
 
 def is_file(path: Path) -> bool:
@@ -51,6 +55,17 @@ class _Loader(yaml.SafeLoader):
         return node
 
 
+def _finite(loader: yaml.SafeLoader, node: yaml.ScalarNode) -> float:
+    """Return a number; refuse one that is too large for a double and does not say that it is infinite."""
+    value = float(loader.construct_yaml_float(node))
+    if math.isinf(value) and not node.value.lower().endswith("inf"):
+        raise yaml.constructor.ConstructorError(
+            None, None, f"the number {node.value[:40]} is too large", node.start_mark
+        )
+    return value
+
+
+_Loader.add_constructor("tag:yaml.org,2002:float", _finite)
 _Loader.yaml_implicit_resolvers = {
     first: [(tag, pattern) for tag, pattern in known if tag not in _NOT_MEANT]
     for first, known in yaml.SafeLoader.yaml_implicit_resolvers.items()
@@ -60,6 +75,31 @@ for _tag, _pattern, _first in (
     ("tag:yaml.org,2002:float", _FLOAT, "-+0123456789."),
 ):
     _Loader.add_implicit_resolver(_tag, _pattern, list(_first))
+
+
+class _SelfReference(Exception):
+    """A value that contains itself."""
+
+
+def _expanded(value: Any, known: dict[int, int]) -> int:
+    """Return the number of values in a value, each as often as aliases repeat it.
+
+    Parameters
+    ----------
+    value
+        Value of a YAML document.
+    known
+        Numbers of the lists and mappings so far, by identity; 0 within their own value.
+    """
+    if not isinstance(value, dict | list):
+        return 1
+    if id(value) not in known:
+        known[id(value)] = 0
+        parts = value.values() if isinstance(value, dict) else value
+        known[id(value)] = 1 + sum(_expanded(part, known) for part in parts)
+    elif not known[id(value)]:
+        raise _SelfReference
+    return known[id(value)]
 
 
 def read_yaml(text: str, where: str) -> Any:
@@ -78,7 +118,12 @@ def read_yaml(text: str, where: str) -> Any:
         If the text is not valid YAML; one line that names the line of the file.
     """
     try:
-        return yaml.load(text, _Loader)
+        data = yaml.load(text, _Loader)
+        if _expanded(data, {}) > len(text) + LARGEST:
+            raise ConfigError(f"{where}: aliases (*name) repeat more than {LARGEST} values")
+        return data
+    except _SelfReference as error:
+        raise ConfigError(f"{where}: not valid YAML: an alias (*name) within the value that it names") from error
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         line = f" line {mark.line + 1}" if mark is not None else ""

@@ -642,13 +642,20 @@ def diagnosis_from_version_1(data: Mapping[str, Any]) -> dict[str, Any]:
 
 def schema_files() -> dict[str, type[Document]]:
     """Return the documents that have a JSON Schema in ``configs/json_schemas``, by the name of its file."""
-    from armident.identify.model_documents import ComparisonDocument, PredictionDocument
+    from armident.identify.model_documents import (
+        ComparisonDocument,
+        PredictionDocument,
+        PredictionsDocument,
+        SimulationDocument,
+    )
 
     return {
         "identification.schema.json": IdentificationDocument,
         "diagnosis.schema.json": DiagnosisDocument,
         "prediction.schema.json": PredictionDocument,
+        "predictions.schema.json": PredictionsDocument,
         "comparison.schema.json": ComparisonDocument,
+        "simulation.schema.json": SimulationDocument,
     }
 
 

@@ -17,8 +17,12 @@ BURST = (0x8611, 0xFF05)
 """Error codes of the emergency messages of a burst, in turn."""
 
 
+BUSY = (0x08000020, 0x08000021, ABORT_DEVICE_STATE)
+"""Abort codes of transfers that a drive cannot carry out now (CiA 301), in turn."""
+
+
 class AbortBusy(Oddity):
-    """Every 7th SDO request is aborted.
+    """Every 7th SDO request is aborted, with another code each time.
 
     Parameters
     ----------
@@ -30,11 +34,12 @@ class AbortBusy(Oddity):
         self._drive, self._count = drive, 0
 
     def request(self, data: bytes) -> bool:
-        """Abort a request for the device state."""
+        """Abort a request that a repetition fulfils."""
         self._count += 1
         if self._count % 7:
             return True
-        self._drive.sdo.send_response(b"\x80" + data[1:4] + struct.pack("<L", ABORT_DEVICE_STATE))
+        code = BUSY[self._count // 7 % len(BUSY)]
+        self._drive.sdo.send_response(b"\x80" + data[1:4] + struct.pack("<L", code))
         return False
 
 

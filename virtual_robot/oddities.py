@@ -29,7 +29,7 @@ ODDITIES: Mapping[str, str] = {
     "mode_when_enabled": "mode of operation (6061h) is 0 until 50 ms after enabling",
     "mode_unknown": "mode of operation (6061h) is -1 until 1.5 s after enabling",
     "target_follows": "target position (607Ah) follows the position until the drive is enabled",
-    "abort_busy": "every 7th SDO request is aborted for the present device state (08000022h)",
+    "abort_busy": "every 7th SDO request is aborted (08000020h, 08000021h and 08000022h in turn)",
     "twice": "every SDO answer comes twice",
     "twice_late": "every SDO answer comes again 20 ms later",
     "slow_sdo": "SDO answers take 50 ms",

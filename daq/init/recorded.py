@@ -45,7 +45,7 @@ class RecordedFacts:
     signal
         Kind of effort: ``torque``, ``current`` or ``voltage``.
     has_demand
-        True if the recording has reference positions.
+        True if the recording has a demand (reference positions).
     position
         Lowest and highest position, (n, 2), rad or m.
     velocity, acceleration
@@ -94,11 +94,11 @@ def examine(path: Path, robot: RobotConfig, stated: Mapping[str, Any]) -> Record
     if is_recording(path):
         return _facts(path, read_recording(path), robot, {})
     options = dict(stated)
-    source, rows = read_rows(path, robot, **{key: options[key] for key in _OF_ROWS if options.get(key)})
+    _, rows = read_rows(path, robot, **{key: options[key] for key in _OF_ROWS if options.get(key)})
     if not options.get("units"):
         options["units"] = suspected(rows, robot)
     if not options.get("time_unit") and rows.times is not None:
-        options["time_unit"] = _time_unit(in_si(rows, robot, options["units"]), robot, source.time_unit)
+        options["time_unit"] = _time_unit(in_si(rows, robot, options["units"]), robot, rows.time_unit)
     options = {key: value for key, value in options.items() if value}
     with _quiet():
         try:
@@ -107,7 +107,7 @@ def examine(path: Path, robot: RobotConfig, stated: Mapping[str, Any]) -> Record
             if rows.times is None or "rate_hz" in options:
                 raise
             times = rows.times[np.append(True, np.diff(rows.times) > 0)]
-            rate = usual_rate(times) / UNITS[options.get("time_unit") or source.time_unit or "s"]
+            rate = usual_rate(times) / UNITS[options.get("time_unit") or rows.time_unit or "s"]
             options["resample_hz"] = float(f"{rate:.2g}")
             recording = import_recording(path, robot, **options)
     return _facts(path, recording, robot, options)

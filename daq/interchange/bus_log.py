@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armident.configs import ConfigError, DataError, RobotConfig, SessionConfig
-from armident.daq.interchange.log_clock import check_sync_period
+from armident.daq.interchange.log_clock import check_sync_period, clock_steps
 from armident.daq.interchange.log_file import SUFFIXES, read_log
 from armident.daq.matching.assembler import Assembler, Batch
 from armident.daq.matching.streams import CapturedStream, bus_numbers, captured_streams, unknown_phase
@@ -82,7 +82,8 @@ def recording_from_log(path: Path, session: SessionConfig, robot: RobotConfig) -
         silent = _silent(read, streams, robot)
         raise DataError(f"{path}: no SYNC was answered by all drives; the session expects TPDOs {wanted}{silent}")
     phase = None if assembler.has_counter else unknown_phase(session)
-    notes = (*log.notes, *wrong, *([phase] if phase else []))
+    stepped = clock_steps(found["samples"].sync, found["samples"].t_ns, session)
+    notes = (*log.notes, *wrong, *stepped, *([phase] if phase else []))
     for note in notes:
         logging.getLogger(__name__).warning("%s: %s", path, note)
     gaps: list[Gap] = [gap for part in parts for gap in part.gaps]

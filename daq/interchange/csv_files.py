@@ -15,7 +15,7 @@ from armident.configs import ConfigError, DataError
 from armident.daq.interchange.text_files import encoding_of, excerpt
 
 _COMMENTS = ("#", "%", "//")
-_DELIMITERS = (";", "\t", ",")
+_DELIMITERS = (";", "\t", "|", ",")
 _MOST_BAD_SHARE = 0.05
 """Share of lines with damaged values above which a file is refused; a single line is always left out."""
 _LONGEST_HEAD = 100
@@ -23,6 +23,7 @@ _LONGEST_HEAD = 100
 _TAIL = 50
 """Lines whose last value is compared with that of a last line without an end."""
 _DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+(?:[eE][-+]?\d+)?$")
+_OTHER_DATE = re.compile(r"\d{1,4}[./-]\d{1,2}[./-]\d{1,4}|\d{1,2}:\d\d:\d\d")
 _UNIT = re.compile(
     r"[\[(]?\s*(?:s|sec|ms|us|ns|µs|rad|deg|°|m|mm|n\.?\s?m|nm|a|ma|v|-|rad/s|m/s)\s*[\])]?$", re.IGNORECASE
 )
@@ -157,8 +158,17 @@ def _head(path: Path, lines: Iterator[str]) -> _Head:
             before.append((number, text.lstrip("#%/ ") if comment else text, comment))
             continue
         return _with_header(_Head(delimiter, len(cells), number), before)
-    shown = f": line {before[0][0]} is {excerpt(before[0][1])}" if before else ""
-    raise DataError(f"{path}: no values in it{shown}")
+    raise DataError(f"{path}: no values in it{_no_values(before)}")
+
+
+def _no_values(before: Sequence[tuple[int, str, bool]]) -> str:
+    """Return the first line that may be one of values, and the cell of it that is no number, for messages."""
+    if not before:
+        return ""
+    number, text, _ = before[min(1, len(before) - 1)]
+    odd = next((cell for cell in cells_of(text, _delimiter(text)) if cell and _number(cell) is None), text)
+    dates = "; dates are read in the form 2026-03-25T10:00:00.5" if _OTHER_DATE.search(text) else ""
+    return f": line {number} has {excerpt(odd)}, expected numbers{dates}"
 
 
 def _with_header(head: _Head, before: Sequence[tuple[int, str, bool]]) -> _Head:
@@ -169,6 +179,9 @@ def _with_header(head: _Head, before: Sequence[tuple[int, str, bool]]) -> _Head:
         fits = [cells_of(before[-1][1], head.delimiter)]
     fits = [cells[: head.columns] if not any(cells[head.columns :]) else cells for cells in fits]
     named = [cells for cells in fits if not all(not cell or _UNIT.match(cell) for cell in cells)]
+    if len(named) > 1 and _repeats(named[-1]) and not _repeats(named[-2]):
+        # Names of columns differ, units below them do not.
+        named.pop()
     if head.columns > 1 or (fits and not before[-1][2]):
         if named:
             head.header = named[-1]
@@ -176,6 +189,10 @@ def _with_header(head: _Head, before: Sequence[tuple[int, str, bool]]) -> _Head:
         elif fits:
             head.header = fits[-1]
     return head
+
+
+def _repeats(cells: Sequence[str]) -> bool:
+    return len(set(cells)) < len(cells)
 
 
 def _widths(columns: int) -> tuple[int, int]:
@@ -234,11 +251,45 @@ class _Bad:
         self.first = self.first or text
 
 
+@dataclass
+class _DecimalSigns:
+    """Decimal signs of each column: both in one are a sign of thousands, or two tools."""
+
+    clash: str = ""
+    _first: dict[tuple[int, str], tuple[int, str]] = field(default_factory=dict)
+
+    def add(self, number: int, cells: Sequence[str]) -> bool:
+        """Take the cells of a line; return ``True`` if one has a decimal comma.
+
+        Parameters
+        ----------
+        number
+            Number of the line.
+        cells
+            Its cells.
+        """
+        found = False
+        for k, cell in enumerate(cells, start=1):
+            sign = "," if _DECIMAL_COMMA.match(cell) else "." if "." in cell and ":" not in cell else ""
+            found = found or sign == ","
+            if not sign:
+                continue
+            self._first.setdefault((k, sign), (number, cell))
+            other = self._first.get((k, "." if sign == "," else ","))
+            if other is not None and not self.clash:
+                self.clash = (
+                    f"column {k} has {excerpt(other[1])} in line {other[0]} and {excerpt(cell)} in line {number}: "
+                    "decimal commas and points; write numbers with one decimal sign, and none for thousands"
+                )
+        return found
+
+
 def _slow(path: Path, encoding: str, head: _Head) -> CsvTable:
     """Return the table of a file with empty cells, dates, decimal commas, comments or damaged lines."""
     rows: list[list[float]] = []
     numbers: list[int] = []
     bad = _Bad()
+    signs = _DecimalSigns()
     commas = repeated = 0
     cells: list[str] = []
     ends: list[int] = []
@@ -253,7 +304,8 @@ def _slow(path: Path, encoding: str, head: _Head) -> CsvTable:
                 repeated += 1
                 continue
             row, problem = _row(cells, head)
-            commas += any(_DECIMAL_COMMA.match(cell) is not None for cell in cells) and not problem
+            if not problem:
+                commas += signs.add(number, cells)
             if problem:
                 bad.add(f"line {number}{problem}")
             rows.append(row)
@@ -275,6 +327,8 @@ def _slow(path: Path, encoding: str, head: _Head) -> CsvTable:
     if bad.count:
         one = f"1 line of {len(rows)} is" if bad.count == 1 else f"{bad.count} of {len(rows)} lines are"
         notes.append(f"{one} damaged and left out{', the first' if bad.count > 1 else ''}: {bad.first}")
+    if signs.clash:
+        raise DataError(f"{path}: {signs.clash}")
     if commas:
         notes.append(f"decimal commas are read as decimal points ({commas} lines)")
     if repeated:

@@ -16,8 +16,37 @@ Clocks of computers and adapters agree to 0.1 %; the next period that a session 
 """
 _FEWEST = 10
 """SYNCs below which a log tells no period."""
+_CLOCK_STEP_NS = 20_000_000
+"""Difference of times and SYNC numbers above which a clock was set: masters are late by less on an idle machine, ns."""
 _HOLE_PERIODS = 10
 """Steps longer than this number of usual ones are not counted: SYNCs may be lacking there."""
+
+
+def clock_steps(numbers: NDArray[np.int64], t_ns: NDArray[np.int64], session: SessionConfig) -> list[str]:
+    """Return a sentence if the times of SYNCs step where their numbers do not.
+
+    Parameters
+    ----------
+    numbers
+        Numbers of the SYNCs, (N,), increasing.
+    t_ns
+        Their times, ns, (N,).
+    session
+        The session, with SYNC period and counter.
+    """
+    period = session.sync.period_us * 1000
+    late = np.diff(t_ns) - np.diff(numbers) * period
+    limit = max(_CLOCK_STEP_NS, (session.sync.counter or 0) * period * 0.9)
+    steps = np.flatnonzero(np.abs(late) > limit)
+    if not steps.size:
+        return []
+    k = int(steps[0])
+    more = f" (and at {steps.size - 1} more)" if steps.size > 1 else ""
+    turns = ", or whole turns of the counter are missing there" if session.sync.counter and late[k] > 0 else ""
+    return [
+        f"times step by {late[k] * 1e-9:+.4g} s at SYNC {numbers[k + 1]}{more}, where the SYNCs go on: "
+        f"the clock was set{turns}"
+    ]
 
 
 def check_sync_period(path: Path, frames: Frames, session: SessionConfig) -> None:

@@ -112,7 +112,8 @@ def _check_lines(
         )
     if bad > frames.count + frames.foreign:
         number, line = malformed[0]
-        raise DataError(f"{path}: not a {parser.name} log: line {number} is {excerpt(line)}")
+        hint = "; `candump -l` or `candump -L` writes the format that is read" if parser.name == "candump" else ""
+        raise DataError(f"{path}: not a {parser.name} log: line {number} is {excerpt(line)}{hint}")
     if bad or untimed:
         frames.skipped += bad + untimed
     if bad == 1:

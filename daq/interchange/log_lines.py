@@ -55,7 +55,8 @@ def _stamp(text: str) -> int | None:
 
 def _date_ns(parts: list[int], fraction: str | None) -> int | None:
     try:
-        seconds = int(datetime(*parts).timestamp())  # type: ignore[arg-type]
+        year, month, day, hour, minute, second = parts
+        seconds = int(datetime(year, month, day, hour, minute, second).timestamp())
     except (ValueError, OverflowError, OSError):
         return None
     return nanoseconds(str(seconds), fraction) if seconds >= 0 else None
@@ -147,7 +148,7 @@ _MONTHS = {
     for name in names.split()
 }  # fmt: skip
 """Beginnings of the names of months: English, German, French, Spanish, Italian, Portuguese."""
-_ASC_EVENT = re.compile("(-?)" + _DIGITS + r"\s+(\S+)\s*(.*)$")
+_ASC_EVENT = re.compile(r"(-?)(\d+)(?:[.,](\d+))?\s+(\S+)\s*(.*)$")
 _ASC_CLOCK = re.compile(r"(\d{1,2}):(\d\d):(\d\d)(?:[.,:](\d+))?(?:\s*([ap])\.?m\.?\b)?", re.IGNORECASE)
 _ASC_BASE = re.compile(r"base\s+(hex|dec)(?:\s+timestamps\s+(absolute|relative))?", re.IGNORECASE)
 
@@ -175,7 +176,9 @@ def asc_date_ns(text: str) -> int | None:
     month = next((number for word in reversed(words) if (number := _month(word)) is not None), None)
     day = numbers[0] if numbers else None
     if month is None and len(numbers) > 1:
-        day, month = numbers[0], numbers[1]
+        # Day before month, but for the order of ISO 8601, and where only the first number can be a month.
+        year_first = re.match(r"\D*(19|20)\d\d\D", text) is not None
+        day, month = (numbers[1], numbers[0]) if year_first or numbers[1] > 12 else (numbers[0], numbers[1])
     if year is None or month is None or day is None:
         return None
     hour = int(clock[1])

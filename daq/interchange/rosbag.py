@@ -12,6 +12,7 @@ from armident.configs import DataError, RobotConfig
 from armident.daq.interchange.bag_files import BagReader
 from armident.daq.interchange.joint_messages import DEFINITION, MESSAGE_TYPE, MessageTable, TopicMessages
 from armident.daq.interchange.joint_names import JointMatch, match_joints
+from armident.daq.interchange.time_stamps import FASTEST_HZ, SLOWEST_HZ
 
 TOPIC = "/joint_states"
 _NS = 1_000_000_000
@@ -21,6 +22,9 @@ LATEST_S = 0.1
 
 CLOCKS_DIFFER = 0.1
 """Relative difference of stamps and times of recording above which they are not of one clock, as in a simulation."""
+
+ANOTHER_UNIT = 100.0
+"""Ratio of the steps of stamps and of times of recording above which the stamps are in another unit than s and ns."""
 
 SIMULATED_S = 1e8
 """Stamps below this time, s, are those of a simulation, whose clock begins at 0."""
@@ -185,6 +189,8 @@ def _times(topic: str, tables: Sequence[MessageTable]) -> tuple[list[NDArray[np.
         stamps, remarks = logged, [f"stamps on {topic} are not set: times are those of recording"]
     elif unset and stamps.max() > SIMULATED_S * _NS:
         raise DataError(f"{unset} of {stamps.size} messages on {topic} have no stamp: their times are unknown")
+    else:
+        _refuse_other_unit(topic, stamps, logged)
     if (stamps < 0).any():
         raise DataError(f"message {number[stamps < 0][0]} on {topic} has a stamp before 1970")
     for order in (np.argsort(number), np.lexsort((number, logged))):
@@ -200,6 +206,21 @@ def _times(topic: str, tables: Sequence[MessageTable]) -> tuple[list[NDArray[np.
     _refuse_jump(topic, stamps[order], logged[order], number[order])
     ends = np.cumsum([table.number.size for table in tables])[:-1]
     return np.split(stamps, ends), remarks
+
+
+def _refuse_other_unit(topic: str, stamps: NDArray[np.int64], logged: NDArray[np.int64]) -> None:
+    """Refuse stamps at a rate that no arm has, where the times of recording tell another one by orders of magnitude."""
+    steps = [np.diff(np.unique(times)) / _NS for times in (stamps, logged)]
+    if any(each.size < 2 for each in steps):
+        return
+    own, wall = (float(np.median(each)) for each in steps)
+    if SLOWEST_HZ * own <= 1.0 <= FASTEST_HZ * own or not SLOWEST_HZ * wall <= 1.0 <= FASTEST_HZ * wall:
+        return
+    if max(own / wall, wall / own) > ANOTHER_UNIT:
+        raise DataError(
+            f"stamps on {topic} are {own:.6g} s apart ({1 / own:.6g} Hz), but were recorded every {wall:.6g} s "
+            f"({1 / wall:.6g} Hz): they are not in s and ns; correct them where they are published"
+        )
 
 
 def _refuse_jump(topic: str, stamps: NDArray[np.int64], logged: NDArray[np.int64], number: NDArray[np.int64]) -> None:

@@ -55,7 +55,8 @@ def sample_numbers(t_ns: NDArray[np.int64], rate_hz: float | None = None) -> tup
         k = int(uneven[0])
         raise DataError(
             f"the step of {steps[k]:.6g} s before sample {k + 2} is not a whole number of periods of {period:.6g} s "
-            f"({uneven.size} of {steps.size} steps): the times jitter"
+            f"({uneven.size} of {steps.size} steps): the times jitter; "
+            f"--resample {float(f'{measured:.2g}'):g} puts the samples on an even clock"
         )
     numbers = np.append(0, np.cumsum(advance)).astype(np.int64)
     return numbers, measured if rate_hz is None else rate_hz

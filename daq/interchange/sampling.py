@@ -126,7 +126,7 @@ def _times(source: Source, rows: Rows, robot: RobotConfig, unit: str | None) -> 
     if backward.size:
         where = source.place(int(rows.row[backward[0] + 1]), rows.time_name)
         raise DataError(f"{where}: time does not increase")
-    times, notes = in_seconds(rows.times, rows.values["position"], robot, named=source.time_unit, stated=unit)
+    times, notes = in_seconds(rows.times, rows.values["position"], robot, named=rows.time_unit, stated=unit)
     return times, list(notes)
 
 

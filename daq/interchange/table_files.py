@@ -1,7 +1,7 @@
 """Reading of tables of measurements: CSV, NPZ, MAT, Parquet, and data sets of LeRobot."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -33,8 +33,8 @@ class Source:
         Arrays by name, (N,) or (N, n).
     lines
         Line number of each row in a text file, (N,); ``None`` for other formats.
-    time_unit
-        Unit in the name of the column of times; empty if there is none.
+    units
+        Units that the file states, by name of the array.
     notes
         Sentences on what was left out or assumed.
     t_ns
@@ -44,7 +44,7 @@ class Source:
     path: Path
     table: Table
     lines: NDArray[np.int64] | None = None
-    time_unit: str = ""
+    units: Mapping[str, str] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     t_ns: NDArray[np.int64] | None = None
 
@@ -161,10 +161,10 @@ def _from_arrays(path: Path, arrays: Mapping[str, Any]) -> Source:
 
 def _converted(source: Source, units: list[str]) -> Source:
     try:
-        table, time_unit, notes = without_units(source.table, units)
+        table, stated, notes = without_units(source.table, units)
     except DataError as error:
         raise DataError(f"{source.path}: {error}") from error
-    return replace(source, table=table, time_unit=time_unit, notes=(*source.notes, *notes))
+    return replace(source, table=table, units=stated, notes=(*source.notes, *notes))
 
 
 def _numeric(arrays: Mapping[str, Any]) -> Table:
@@ -196,7 +196,7 @@ def _parquet(path: Path) -> dict[str, Any]:
     except ImportError as error:
         raise ConfigError(install_line(f"{path}: Parquet", ["parquet"])) from error
     try:
-        table = pyarrow.parquet.read_table(path)  # type: ignore[no-untyped-call]
+        table = pyarrow.parquet.read_table(path)
         return {name: table.column(name).to_numpy() for name in table.column_names}
     except Exception as error:  # pyarrow raises various errors for damaged files
         raise DataError(f"{path}: not a readable Parquet file: damaged, or cut off") from error

@@ -1,14 +1,15 @@
 """Rows of a table: quantities of the joints, complete rows, and the numbers of their samples."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from armident.configs import DataError, RobotConfig
+from armident.daq.interchange.column_units import check_unit, time_unit
 from armident.daq.interchange.si_checks import OMITTED
-from armident.daq.interchange.table_columns import Columns, find_columns, find_time
+from armident.daq.interchange.table_columns import Columns, find_columns, find_time, unused_demand
 from armident.daq.interchange.table_files import Source
 from armident.daq.interchange.text_files import listed
 from armident.daq.recording.model import Quantity
@@ -36,6 +37,8 @@ class Rows:
         Times (N,), in the unit of the file; ``None`` if there is no column of times.
     time_name
         Name of that column.
+    time_unit
+        Unit that the file states for them; empty if it states none.
     notes
         Sentences on what was left out or assumed.
     """
@@ -45,6 +48,7 @@ class Rows:
     row: NDArray[np.int64]
     times: Floats | None
     time_name: str = "t"
+    time_unit: str = ""
     notes: tuple[str, ...] = ()
 
     def taken(self, chosen: NDArray[np.int64] | NDArray[np.bool_]) -> "Rows":
@@ -99,7 +103,9 @@ def complete_rows(
                 source.table, quantity, robot, names.get(quantity), by_position=by_position, joints=joints
             )
             if columns is not None:
+                _check_units(source, quantity, columns.labels)
                 found[quantity] = columns
+        _check_same_joints(found)
         time = None if names.get("time") == OMITTED else find_time(source.table, names.get("time"))
     except DataError as error:
         raise DataError(f"{source.path}: {error}") from error
@@ -112,15 +118,37 @@ def complete_rows(
     if len(lengths) > 1:
         raise DataError(f"{source.path}: its arrays have {' and '.join(map(str, sorted(lengths)))} rows")
     notes = [note for columns in found.values() for note in columns.notes]
+    if "demand" not in found and names.get("demand") != OMITTED and (unused := unused_demand(source.table)):
+        notes.append(unused)
     rows = Rows(
         {quantity: np.array(columns.values, np.float64) for quantity, columns in found.items()},
         {quantity: columns.labels for quantity, columns in found.items()},
         np.arange(lengths.pop(), dtype=np.int64),
         None if time is None else time[1],
         "t" if time is None else time[0],
+        "" if time is None else time_unit(source.units.get(time[0], "")),
         tuple(dict.fromkeys(notes)),
     )
     return _single(_without_odd_times(source, _complete(source, _joined(rows))))
+
+
+def _check_same_joints(found: Mapping[Quantity, Columns]) -> None:
+    """Refuse efforts of other joints than those of the positions."""
+    position = found.get("position")
+    for quantity in EFFORTS:
+        effort = found.get(quantity)
+        if position and effort and position.joints and effort.joints and position.joints != effort.joints:
+            raise DataError(
+                f"positions are those of {listed(position.joints)}, but {quantity}s those of {listed(effort.joints)}: "
+                "columns of several arms; name them alike, or give the names behind the last slash: --joints NAME,..."
+            )
+
+
+def _check_units(source: Source, quantity: Quantity, labels: Sequence[str]) -> None:
+    """Refuse columns in units that are not those of their quantity; an array has one unit for all of its columns."""
+    for label in labels:
+        array = label.rstrip("0123456789")
+        check_unit(label, quantity, source.units.get(label, source.units.get(array, "")))
 
 
 def _without_odd_times(source: Source, rows: Rows) -> Rows:
@@ -191,6 +219,9 @@ def _complete(source: Source, rows: Rows) -> Rows:
         first = int(np.flatnonzero(partial)[0])
         of = f"{count} row{'s' if count > 1 else ''} left out"
         notes.append(f"{of}, the first: {_first_missing(source, rows, first)}")
+    zero = [label for name in EFFORTS if name in rows.values for label in _zero(rows, name, whole)]
+    if zero:
+        notes.append(f"0 in every row, as of drives that do not measure it: {listed(zero)}")
     if passed:
         notes.append(f"{passed} rows without positions and efforts passed over")
     return replace(rows.taken(whole), notes=tuple(notes))
@@ -199,6 +230,8 @@ def _complete(source: Source, rows: Rows) -> Rows:
 def _incomplete(source: Source, rows: Rows, partial: NDArray[np.bool_], whole: NDArray[np.bool_]) -> str:
     """Return the message for a table with too many incomplete rows."""
     count = int(partial.sum())
+    if empty := _empty(rows):
+        return f"{source.path}: no number in any row of {listed(empty)}"
     if not whole.any() and rows.times is not None:
         return (
             f"{source.path}: no row has both positions and efforts of all joints ({count} rows have some of them): "
@@ -206,6 +239,23 @@ def _incomplete(source: Source, rows: Rows, partial: NDArray[np.bool_], whole: N
         )
     first = int(np.flatnonzero(partial)[0])
     return f"{_first_missing(source, rows, first)} (and {count - 1} more of {partial.size} rows)"
+
+
+def _zero(rows: Rows, name: Quantity, whole: NDArray[np.bool_]) -> list[str]:
+    """Return the labels of the columns of a quantity that are 0 in all complete rows."""
+    zero = (rows.values[name][whole] == 0).all(axis=0)
+    return [label for label, is_zero in zip(rows.labels[name], zero, strict=True) if is_zero]
+
+
+def _empty(rows: Rows) -> list[str]:
+    """Return the labels of the columns without any number."""
+    return [
+        label
+        for name, values in rows.values.items()
+        if name != "demand"
+        for label, column in zip(rows.labels[name], values.T, strict=True)
+        if not np.isfinite(column).any()
+    ]
 
 
 def _first_missing(source: Source, rows: Rows, row: int) -> str:

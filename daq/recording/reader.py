@@ -97,8 +97,8 @@ def _is_listed(file: BinaryIO) -> bool:
     file.seek(0)
     try:
         summary = make_reader(file).get_summary()
-    except (McapError, ValueError, struct.error, EOFError, MemoryError):
-        # A damaged length asks for any amount of memory.
+    except (McapError, ValueError, struct.error, EOFError, MemoryError, OverflowError):
+        # A damaged length asks for any amount of memory, or for more than there can be.
         return False
     return summary is not None and any(index.name == RECORDING for index in summary.metadata_indexes)
 

@@ -304,7 +304,7 @@ class _Cleaner:
         """
         if not text:
             return None
-        word = _NODE_ID.sub("", text).replace(" ", "")
+        word = _NODE_ID.sub("", text).replace(" ", "").strip("(){}\"'")
         relative = _NODE_ID.search(text) is not None
         number = _flag(word.strip("+") or "0") if relative else _flag(word)
         if number is None:

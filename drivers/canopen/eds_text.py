@@ -36,7 +36,7 @@ KEYS = {
 }
 """Key words that are read, by their lower-case form."""
 
-_OBJECT = re.compile(r"([0-9a-f]{1,4})(?:sub([0-9a-f]{1,2})|(name|value))?", re.IGNORECASE)
+_OBJECT = re.compile(r"(?:0x)?([0-9a-f]{1,4})h?(?:sub(?:0x)?([0-9a-f]{1,2})h?|(name|value))?", re.IGNORECASE)
 
 Section = dict[str, str]
 
@@ -165,7 +165,7 @@ def _key(text: str) -> str:
 
 def _value(text: str) -> str:
     """Value without a comment behind it."""
-    return re.split(r"\s;", f" {text}", maxsplit=1)[0].strip()
+    return re.split(r"\s(?:;|//)", f" {text}", maxsplit=1)[0].strip()
 
 
 def _section_name(text: str) -> str:

@@ -133,6 +133,30 @@ def test_an_arm_with_an_odd_drive_is_moved_and_recorded(
     assert np.ptp(demand.raw["demand"][:, 0]) > 1000
 
 
+COMBINED = [
+    ("no1019", "mode_unknown", "abort_busy"),
+    ("slow_boot", "no1017"),
+    ("pdo_fixed", "target_follows"),
+    ("no60c0", "no60c2", "no608f", "no6075", "no_product_code", "no_supervision"),
+    ("bit30_kept", "write_late", "heartbeat_rounds"),
+    ("bit30_demanded", "autostart", "short_answer", "slow_sdo"),
+    ("pdo_fixed", "cob_fixed", "mode_when_enabled", "twice_late", "abort_busy"),
+]
+"""Oddities of one drive that meet in the same steps of its configuration."""
+
+
+@pytest.mark.parametrize("oddities", COMBINED, ids="-".join)
+def test_an_arm_with_a_drive_of_several_oddities_is_moved_and_recorded(
+    vcan_bus: str, tmp_path: Path, oddities: tuple[str, ...]
+) -> None:
+    session = odd_session(tmp_path, vcan_bus, "combined")
+    with robot(session, *oddities):
+        done = recorded(session)
+    expected = [ODD + said for oddity in oddities if (said := SAID.get(oddity)) is not None]
+    assert all(any(text.startswith(said) for text in remarks(done)) for said in expected), remarks(done)
+    assert len(remarks(done)) == len(expected)
+
+
 def test_thousands_of_emergency_messages_cost_no_sample(vcan_bus: str, tmp_path: Path) -> None:
     session = odd_session(tmp_path, vcan_bus, "burst", setpoints=None)
     with robot(session, "emcy_burst"):

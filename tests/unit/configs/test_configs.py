@@ -3,6 +3,7 @@
 import math
 import re
 from collections.abc import Callable
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -307,6 +308,29 @@ def test_values_that_yaml_reads_as_another_type_are_refused(line: str, expected:
     with pytest.raises(ConfigError) as caught:
         parse(f"{text}\n{line}\n", RobotConfig, "robot.yaml")
     assert expected in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (
+            "a: &a [1]\n" + "".join(f"{b}: &{b} [{', '.join(9 * [f'*{a}'])}]\n" for a, b in pairwise("abcdefghij")),
+            "aliases .* repeat more than",
+        ),
+        ("a: &a [*a]", "an alias .* within the value that it names"),
+        ("a: &a {b: {c: *a}}", "an alias .* within the value that it names"),
+        ("a: 1e999", "line 1 not valid YAML: the number 1e999 is too large"),
+        ("b: 2\na: [-1.5e+400]", r"line 2 not valid YAML: the number -1.5e\+400 is too large"),
+    ],
+)  # fmt: skip
+def test_values_that_grow_without_bound_are_refused_in_one_line(text: str, said: str) -> None:
+    with pytest.raises(ConfigError, match=said) as caught:
+        read_yaml(text, "x.yaml")
+    assert "\n" not in str(caught.value)
+
+
+def test_aliases_and_infinities_that_are_written_are_read() -> None:
+    assert read_yaml("a: &a [1, .inf, -.INF]\nb: [*a, *a]", "x")["b"][1] == [1, float("inf"), -float("inf")]
 
 
 def test_numbers_are_those_of_yaml_1_2() -> None:

@@ -200,6 +200,28 @@ def test_differences_of_times_in_candump_are_added_up(tmp_path: Path, screen: bo
     assert found.samples.t_ns[-1] - found.samples.t_ns[0] == pytest.approx((ROWS - 1) * PERIOD_NS, rel=0.02)
 
 
+@pytest.mark.parametrize("step_s", [3600, -3600])
+def test_a_clock_that_was_set_while_the_syncs_went_on_is_said(tmp_path: Path, step_s: int) -> None:
+    path, lines = lines_of(tmp_path, ".log")
+    stamps = [float(line.split(")")[0][1:]) + (step_s if k >= len(lines) // 2 else 0) for k, line in enumerate(lines)]
+    path.write_text("".join(f"({t + 7200:.6f}){line.split(')')[1]}" for t, line in zip(stamps, lines, strict=True)))
+    found = read(path)
+    assert f"times step by {step_s:+d} s at SYNC" in found.metadata["source_remarks"]
+
+
+def test_an_asc_log_may_have_decimal_commas(tmp_path: Path) -> None:
+    path, lines = lines_of(tmp_path, ".asc")
+    path.write_text("".join(line.replace(".", ",", 1) if " Rx " in line else line for line in lines))
+    assert same(read(path))
+
+
+def test_lines_of_another_candump_format_name_the_one_that_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "bus.log"
+    path.write_text(" (1.0)  can0  181   [2]  00010000 00010000\n" * 9)
+    with pytest.raises(DataError, match=r"line 1 is .*; `candump -l` or `candump -L` writes"):
+        read(path)
+
+
 def test_times_from_zero_in_candump_stay_as_they_are(tmp_path: Path) -> None:
     path, lines = lines_of(tmp_path, ".log")
     zero = float(lines[0].split()[0][1:-1])
@@ -246,6 +268,13 @@ def test_a_date_in_another_language_is_understood(tmp_path: Path, date: str) -> 
         text = "".join(f"date {date}\n" if line.startswith("date") else line for line in lines)
         path.write_text(text, encoding=encoding)
         assert same(read(path))
+
+
+@pytest.mark.parametrize(
+    "date", ["2026-03-25 15:00:01.500", "3/25/2026 3:00:01.500 PM", "25.03.2026 15:00:01.500", "2026/03/25 15:00:01.5"]
+)
+def test_dates_in_numbers_are_understood_in_their_order(date: str) -> None:
+    assert asc_date_ns(f"date {date}") == asc_date_ns("date Wed Mar 25 15:00:01.500 2026")
 
 
 def test_a_date_that_is_not_understood_is_not_needed(tmp_path: Path) -> None:

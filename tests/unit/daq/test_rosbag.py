@@ -171,6 +171,51 @@ def test_times_that_contradict_each_other_are_refused(tmp_path: Path) -> None:
         import_recording(mcap_bag(tmp_path / "e.mcap", uneven), TX40)
 
 
+@pytest.mark.parametrize("factor", [500, 500_000, 1e-4])
+def test_stamps_in_another_unit_than_the_times_of_recording_are_refused_with_both(
+    tmp_path: Path, factor: float
+) -> None:
+    step = int(STEP_NS * factor)
+    messages = [State(T0 + k * step, NAMES, Q[k], TAU[k], delay=k * (STEP_NS - step)) for k in range(ROWS)]
+    path = mcap_bag(tmp_path / "a.mcap", messages)
+    with pytest.raises(DataError, match=rf"are {step / 1e9:g} s apart .* recorded every 0.002 s \(500 Hz\)"):
+        read_joint_states(path, TX40)
+
+
+def test_a_slow_simulation_keeps_its_stamps(tmp_path: Path) -> None:
+    messages = [State(k * STEP_NS + 1, NAMES, Q[k], TAU[k], delay=T0 + 20 * k * STEP_NS) for k in range(ROWS)]
+    assert import_recording(mcap_bag(tmp_path / "a.mcap", messages), TX40).sample_rate_hz == pytest.approx(500)
+
+
+def test_stamps_that_jitter_name_the_option_that_resamples_them(tmp_path: Path) -> None:
+    late = np.random.default_rng(1).integers(0, STEP_NS // 8, ROWS).tolist()
+    messages = [State(T0 + k * STEP_NS + late[k], NAMES, Q[k], TAU[k]) for k in range(ROWS)]
+    path = mcap_bag(tmp_path / "a.mcap", messages)
+    with pytest.raises(DataError, match="the times jitter; --resample 500 puts the samples on an even clock"):
+        import_recording(path, TX40)
+    assert import_recording(path, TX40, resample_hz=500.0).sample_rate_hz == 500.0
+
+
+def test_efforts_that_are_not_measured_are_named(tmp_path: Path) -> None:
+    tau = TAU.copy()
+    tau[:, 3] = 0.0
+    path = mcap_bag(tmp_path / "a.mcap", [replace(m, tau=tau[k]) for k, m in enumerate(states())])
+    assert (
+        "0 in every row, as of drives that do not measure it: tau4"
+        in import_recording(path, TX40).metadata["source_remarks"]
+    )
+    tau[:, [1, 3]] = np.nan
+    path = mcap_bag(tmp_path / "b.mcap", [replace(m, tau=tau[k]) for k, m in enumerate(states())])
+    with pytest.raises(DataError, match=r"no number in any row of tau2, tau4$"):
+        import_recording(path, TX40)
+
+
+def test_a_unit_of_times_is_no_option_of_a_bag(tmp_path: Path) -> None:
+    path = mcap_bag(tmp_path / "a.mcap", states())
+    with pytest.raises(ConfigError, match="--time-unit is an option of tables"):
+        import_recording(path, TX40, time_unit="ms")
+
+
 def test_repeated_messages_are_passed_over(tmp_path: Path) -> None:
     found = read_joint_states(mcap_bag(tmp_path / "a.mcap", states() + states()[7:9]), TX40)
     assert_motion(found)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from armident.configs import ConfigError, DataError
+from armident.configs import ConfigError, DataError, load_robot
 from armident.daq.cli import application
 from armident.daq.interchange.importing import import_recording
 from armident.daq.recording import Recording
@@ -52,10 +52,10 @@ BY_JOINT = [
         ["Time [s]", *(f"q_{j + 1} [rad]" for j in range(N)), *(f"tau_{j + 1} (Nm)" for j in range(N))],
         ["timestamp", *(f"joint_{j + 1}_pos" for j in range(N)), *(f"joint_{j + 1}_torque" for j in range(N))],
         ["timestamp", *(f"actual_q_{j}" for j in range(N)), *(f"effort.joint_{j + 1}" for j in range(N))],
-        ["# t", *NAMES[1:]],
+        ["# t", *NAMES[1:]], ["t", *(f"q[{j + 1}]" for j in range(N)), *(f"effort[{j}]" for j in range(N))],
     ],
 )  # fmt: skip
-@pytest.mark.parametrize("sep", [",", ";", "\t"])
+@pytest.mark.parametrize("sep", [",", ";", "\t", "|"])
 def test_columns_are_found_by_the_names_of_other_tools(tmp_path: Path, names: list[str], sep: str) -> None:
     found = import_recording(written(tmp_path / "a.csv", motion(), names, sep), TX40)
     assert same(found, motion())
@@ -94,6 +94,117 @@ def test_units_in_names_are_converted_and_said(tmp_path: Path) -> None:
     assert "q1 [deg] from deg" in found.metadata["source_remarks"]
     with pytest.raises(DataError, match="--time-unit us contradicts the name of the column, which says ms"):
         import_recording(tmp_path / "a.csv", TX40, time_unit="us")
+
+
+@pytest.mark.parametrize(
+    ("quantity", "unit", "per_si"),
+    [
+        ("q", "mrad", 1e3), ("q", "rev", 1 / (2 * np.pi)), ("q", "\u00b0", 180 / np.pi), ("q", "rad", 1.0),
+        ("tau", "mN\u00b7m", 1e3), ("tau", "N cm", 100.0), ("tau", "kNm", 1e-3), ("tau", "N*m", 1.0),
+        ("tau", "measured", 1.0),
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize("place", ["name", "line"])
+def test_units_of_columns_are_converted_in_any_spelling(
+    tmp_path: Path, quantity: str, unit: str, per_si: float, place: str
+) -> None:
+    values = motion()
+    first = 1 if quantity == "q" else N + 1
+    values[:, first : first + N] *= per_si
+    path = written(tmp_path / "a.csv", values)
+    names, *rows = path.read_text().splitlines()
+    cells = names.split(",")
+    line = [unit if name.startswith(quantity) else "s" if name == "t" else "" for name in cells]
+    head = [f"{name} [{u}]" if u else name for name, u in zip(cells, line, strict=True)]
+    path.write_text("\n".join([",".join(head), *rows] if place == "name" else [names, ",".join(line), *rows]) + "\n")
+    found = import_recording(path, TX40)
+    assert np.allclose(found.samples.raw["position" if quantity == "q" else "torque"], motion()[:, first : first + N])
+
+
+@pytest.mark.parametrize(
+    ("quantity", "unit"), [("q", "grad"), ("q", "Nm"), ("tau", "%"), ("tau", "lbf ft"), ("tau", "A")]
+)
+def test_units_that_are_not_known_or_of_another_quantity_are_refused(tmp_path: Path, quantity: str, unit: str) -> None:
+    names = [f"{name} [{unit}]" if name.startswith(quantity) else name for name in NAMES]
+    with pytest.raises(DataError, match=rf"column {quantity}1 states the unit '{unit}', expected one of (rad|N m), "):
+        import_recording(written(tmp_path / "a.csv", motion(), names), TX40)
+
+
+@pytest.mark.parametrize("unit", ["min", "h", "ticks"])
+def test_a_unit_of_times_that_is_not_read_is_refused(tmp_path: Path, unit: str) -> None:
+    values = motion() * np.append(1 / 60, np.ones(2 * N))
+    path = written(tmp_path / "a.csv", values, [f"time [{unit}]", *NAMES[1:]])
+    with pytest.raises(DataError, match=f"the column of times states the unit '{unit}', expected s, ms, us or ns"):
+        import_recording(path, TX40)
+
+
+@pytest.mark.parametrize(("unit", "factor"), [("msec", 1e3), ("\u03bcs", 1e6), ("milliseconds", 1e3), ("sec.", 1.0)])
+def test_units_of_times_have_many_spellings(tmp_path: Path, unit: str, factor: float) -> None:
+    values = motion() * np.append(factor, np.ones(2 * N))
+    found = import_recording(written(tmp_path / "a.csv", values, [f"Time ({unit})", *NAMES[1:]]), TX40)
+    assert found.sample_rate_hz == pytest.approx(1000)
+
+
+def test_each_column_of_times_has_the_unit_of_its_own_name(tmp_path: Path) -> None:
+    values = np.insert(motion(200, 100.0), 1, 0.0, axis=1)
+    values[:, 1] = 1e6 * values[:, 0]
+    values[:, 0] *= 1e3
+    found = import_recording(written(tmp_path / "a.csv", values, ["t [ms]", "timestamp_us", *NAMES[1:]]), TX40)
+    assert found.sample_rate_hz == pytest.approx(100)
+
+
+@pytest.mark.parametrize("name", ["{base}[{zero}]", "{base}({one})", "{base}{one}_rad|{base}{one}_Nm"])
+def test_brackets_around_numbers_and_units_behind_underscores_are_read(tmp_path: Path, name: str) -> None:
+    of_q, of_tau = (name.split("|") * 2)[:2]
+    names = ["t", *(of_q.format(base="q", zero=j, one=j + 1) for j in range(N))]
+    names += [of_tau.format(base="tau", zero=j, one=j + 1) for j in range(N)]
+    assert same(import_recording(written(tmp_path / "a.csv", motion(), names), TX40), motion())
+
+
+def test_positions_and_efforts_of_different_arms_are_refused(tmp_path: Path) -> None:
+    names = [*(f"left_joint_{j + 1}/position" for j in range(N)), *(f"right_joint_{j + 1}/effort" for j in range(N))]
+    path = written(tmp_path / "a.csv", motion(), ["t", *names])
+    with pytest.raises(DataError, match=r"positions are those of left_joint_1, .* but torques those of right_joint_1"):
+        import_recording(path, TX40)
+    names = [*(f"/state/joint_{j + 1}/position" for j in range(N)), *(f"/drive/joint_{j + 1}/effort" for j in range(N))]
+    path = written(tmp_path / "b.csv", motion(), ["t", *names])
+    with pytest.raises(DataError, match=r"positions are those of state/joint_1, .* --joints"):
+        import_recording(path, TX40)
+    assert same(import_recording(path, TX40, joints=[joint.name for joint in TX40.joints]), motion())
+
+
+def test_measured_columns_beside_desired_ones_are_told_by_their_words(tmp_path: Path) -> None:
+    q, tau = motion()[:, 1 : N + 1], motion()[:, N + 1 :]
+    names = ["t"] + [
+        f"joint_{j + 1}/{kind}/{word}"
+        for kind, word in (("actual", "position"), ("target", "position"), ("actual", "effort"), ("target", "effort"))
+        for j in range(N)
+    ]
+    path = written(tmp_path / "a.csv", np.hstack([motion()[:, :1], q, 1.01 * q, tau, 2 * tau]), names)
+    found = import_recording(path, TX40)
+    assert same(found, motion())
+    assert np.allclose(found.samples.raw["demand"], 1.01 * q)
+
+
+def test_a_column_with_two_decimal_signs_is_refused_with_both(tmp_path: Path) -> None:
+    path = written(tmp_path / "a.csv", motion(), sep=";", cell="{:.6f}")
+    lines = path.read_text().splitlines()
+    lines[10:] = [line.replace(".", ",") for line in lines[10:]]
+    path.write_text("\n".join(lines) + "\n")
+    with pytest.raises(
+        DataError, match=r"column 1 has '0\.000000' in line 2 and '0,009000' in line 11: decimal commas"
+    ):
+        import_recording(path, TX40)
+
+
+def test_a_date_of_another_form_is_named(tmp_path: Path) -> None:
+    path = written(tmp_path / "a.csv", motion(), sep=";")
+    names, *rows = path.read_text().splitlines()
+    path.write_text("\n".join([names, *(f"06.03.2026 15:00:{row}" for row in rows)]) + "\n")
+    with pytest.raises(
+        DataError, match=r"line 2 has '06\.03\.2026 .*expected numbers; dates are read in the form 2026"
+    ):
+        import_recording(path, TX40)
 
 
 def test_decimal_commas_are_read_between_semicolons_and_named_between_commas(tmp_path: Path) -> None:
@@ -291,7 +402,7 @@ def lerobot(folder: Path, names: list[str] | None, extra: str = "observation.eff
         "timestamp": np.append(values[:200, 0], values[:100, 0]).astype(np.float32),
         "episode_index": np.append(np.zeros(200, int), np.ones(100, int)),
     }
-    pyarrow.parquet.write_table(pyarrow.table(columns), data)  # type: ignore[no-untyped-call]
+    pyarrow.parquet.write_table(pyarrow.table(columns), data)
     return data
 
 
@@ -323,10 +434,10 @@ def test_times_of_a_lerobot_data_set_that_are_no_numbers_are_refused(tmp_path: P
     import pyarrow.parquet
 
     data = lerobot(tmp_path, None)
-    table = pyarrow.parquet.read_table(data)  # type: ignore[no-untyped-call]
+    table = pyarrow.parquet.read_table(data)
     times = pyarrow.array([{"s": 1}] * len(table))
     table = table.set_column(table.column_names.index("timestamp"), "timestamp", times)
-    pyarrow.parquet.write_table(table, data)  # type: ignore[no-untyped-call]
+    pyarrow.parquet.write_table(table, data)
     with pytest.raises(DataError, match="timestamp has rows of unequal lengths, or values that are no numbers"):
         import_recording(data, TX40)
 
@@ -345,5 +456,60 @@ def test_values_that_overflow_are_refused_without_warnings(tmp_path: Path) -> No
     path = written(tmp_path / "a.csv", values)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        with pytest.raises(DataError, match=r"position of .* reaches"):
+        with pytest.raises(DataError, match=r"line 9, column q3: 1e\+308 is no measurement"):
             import_recording(path, TX40)
+
+
+def with_columns(path: Path, names: list[str], values: np.ndarray) -> Path:
+    """Write the motion of `motion` with further columns."""
+    return written(path, np.hstack([motion(), values]), [*NAMES, *names])
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "qr{j}", "reference{j}", "ref_{j}", "q_ref{j}", "q{j}_ref", "qref{j}", "q_des[{j}]", "setpoint_{j}",
+        "set point {j}", "target{j}", "target_q_{i}", "targetPosition{j}", "desired_position_{j} [rad]", "command{j}",
+        "commanded_pos_{j}", "posCmd{j}", "demand{j}", "joint_{j}_ref", "/arm/joint_{j}/reference/position",
+        "goal_position.joint_{j}", "JOINT {j} setpoint",
+    ],
+)  # fmt: skip
+def test_a_demand_is_found_by_the_words_of_other_tools(tmp_path: Path, name: str) -> None:
+    demand = motion()[:, 1 : N + 1] + 0.001
+    names = [name.format(j=j + 1, i=j) for j in range(N)]
+    found = import_recording(with_columns(tmp_path / "a.csv", names, demand), TX40)
+    assert np.allclose(found.samples.raw["demand"], demand, rtol=0, atol=1e-8)
+    assert same(found, motion())
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        [f"target_qd_{j}" for j in range(N)], [f"joint_{j + 1}_torque_ref" for j in range(N)],
+        [f"reference{j + 1}" for j in range(N - 1)], ["setpoint"], ["ref_velocity_joint_1"],
+    ],
+)  # fmt: skip
+def test_a_demand_of_no_joint_positions_is_named_once_and_left_out(tmp_path: Path, names: list[str]) -> None:
+    table = with_columns(tmp_path / "a.csv", names, np.ones((400, len(names))))
+    found = import_recording(table, TX40)
+    assert "demand" not in found.samples.fields
+    remarks = found.metadata["source_remarks"]
+    assert f"without a demand: {names[0]}" in remarks
+    assert "--map demand=NAME" in remarks
+    assert "source_remarks" not in import_recording(table, TX40, names={"demand": "-"}).metadata
+
+
+def test_one_of_two_demands_is_taken_and_the_other_is_named(tmp_path: Path) -> None:
+    demand = motion()[:, 1 : N + 1]
+    names = [f"{word}_q_{j}" for word in ("target", "command") for j in range(N)]
+    found = import_recording(with_columns(tmp_path / "a.csv", names, np.hstack([demand + 0.001, demand])), TX40)
+    assert np.allclose(found.samples.raw["demand"], demand + 0.001, rtol=0, atol=1e-8)
+    assert "not from command_q_0" in found.metadata["source_remarks"]
+
+
+def test_a_demand_of_a_single_joint_needs_no_number(tmp_path: Path) -> None:
+    robot = load_robot("emps.yaml")
+    t = np.arange(400) / 1000.0
+    q = 0.01 * np.sin(6 * t)
+    table = written(tmp_path / "a.csv", np.column_stack([t, q, np.cos(t), q + 1e-4]), ["t", "q", "tau", "reference"])
+    assert np.allclose(import_recording(table, robot).samples.raw["demand"][:, 0], q + 1e-4, rtol=0, atol=1e-8)
