@@ -4,6 +4,7 @@ A command is an entry point of group ``armident.commands`` that names a function
 must import quickly: heavy imports belong into the function.
 """
 
+import errno
 import functools
 import importlib.metadata
 import logging
@@ -41,6 +42,10 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     arguments
         The command and its arguments; default: those of the process.
     """
+    if "ARMIDENT_PARENT" in os.environ:
+        from armident.processes import end_with_parent
+
+        end_with_parent()
     words = list(sys.argv[1:] if arguments is None else arguments)
     application(words)(args=words, prog_name="armident")
     raise SystemExit(0)
@@ -119,6 +124,9 @@ def _reported(function: Callable[..., Any], name: str) -> Callable[..., Any]:
             if isinstance(error, ArmidentError):
                 print(f"armident: {_one_line(error)}", file=sys.stderr)
                 raise typer.Exit(error.exit_code) from None
+            if isinstance(error, OSError) and error.strerror:
+                print(f"armident: {_reason_of(error)}", file=sys.stderr)
+                raise typer.Exit(1) from None
             hint = f" (--debug or {DEBUG_VARIABLE}=1 prints the traceback)"
             print(f"armident: {type(error).__name__}: {_one_line(error)}{hint}", file=sys.stderr)
             raise typer.Exit(1) from None
@@ -143,6 +151,20 @@ def _noted(interrupts: list[int]) -> Iterator[None]:
     finally:
         if usual and signal.getsignal(signal.SIGINT) is note:
             signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def _reason_of(error: OSError) -> str:
+    """Return file, reason and next step of a refused file operation."""
+    where = f"{os.fspath(error.filename)!s}: " if error.filename else ""
+    steps = {
+        errno.ENOSPC: "free space on the disk, or choose another folder",
+        errno.EDQUOT: "free space on the disk, or choose another folder",
+        errno.EROFS: "choose another folder",
+        errno.EACCES: "check its permissions, or choose another folder",
+        errno.ENOTDIR: "choose another folder",
+    }
+    step = f"; {steps[error.errno]}" if error.errno in steps else ""
+    return f"{where}{error.strerror}{step}"
 
 
 def _one_line(error: BaseException) -> str:

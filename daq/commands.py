@@ -114,11 +114,12 @@ def import_(
 ) -> None:
     """Convert measurements of other tools to a recording.
 
-    CSV columns: t (s), q1..qn, tau1..taun or current1..currentn, optionally the reference qr1..qrn; SI units. Columns
-    may be named after joints, such as elbow/position and elbow/effort. MAT, NPZ and Parquet: the same names, or
-    positions, torques, times. LeRobot data sets (file or folder): observation.state, and an effort or current. ROS 2
-    bags (.mcap, .db3, or the folder): sensor_msgs/msg/JointState, joints by their names. Logs of a bus (candump -l,
-    .asc, .blf, .trc): SYNC and TPDOs, as the session configuration maps them.
+    CSV columns: t (s), q1..qn, tau1..taun or current1..currentn, optionally the demand qr1..qrn, also as ref1,
+    q_ref1, setpoint1, target_position1 or elbow_cmd; SI units. Columns may be named after joints, such as
+    elbow/position and elbow/effort. MAT, NPZ and Parquet: the same names, or positions, torques, times. LeRobot data
+    sets (file or folder): observation.state, and an effort or current. ROS 2 bags (.mcap, .db3, or the folder):
+    sensor_msgs/msg/JointState, joints by their names. Logs of a bus (candump -l, .asc, .blf, .trc): SYNC and TPDOs,
+    as the session configuration maps them.
 
     Missing samples are gaps. Damaged lines are left out, counted and named.
 
@@ -221,7 +222,7 @@ def doctor(
 
 
 def service(
-    action: Annotated[str, typer.Argument(help="install.")],
+    action: Annotated[str, typer.Argument(help="install, status or uninstall.")],
     cell: Annotated[str, typer.Argument(help="Name of the cell, whose session is /etc/armident/CELL.yaml.")],
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Print what is to be done, and change nothing.")] = False,
     root: Annotated[
@@ -234,19 +235,30 @@ def service(
         ),
     ] = None,
 ) -> None:
-    """Install the services of a cell on a machine with systemd: user, folders, permissions and units.
+    """Install, list or remove the services of a cell on a machine with systemd: user, folders, permissions and units.
 
-    What is there already is left alone; a second run does nothing. No service is enabled or started.
+    install: what is there already is left alone; a second run does nothing. No service is enabled or started.
+
+    status: every part, whether its units are enabled and active, and the recordings. Exit code 4 if a part is missing.
+
+    uninstall: stops and disables the units of the cell. Recordings, results and configurations are never deleted.
 
     Example: armident service install line3 --dry-run
     """
     from armident.configs import ConfigError
     from armident.daq.service import install
+    from armident.daq.service_state import status, uninstall
 
-    if action != "install":
-        raise ConfigError(f"no action {action!r}; expected: armident service install CELL")
-    for line in install(cell, root, executable, dry_run):
-        print(line)
+    if action == "status":
+        lines, complete = status(cell, root, executable)
+    elif action in ("install", "uninstall"):
+        complete = True
+        lines = uninstall(cell, root, dry_run) if action == "uninstall" else install(cell, root, executable, dry_run)
+    else:
+        raise ConfigError(f"no action {action!r}; expected: armident service install, status or uninstall CELL")
+    print(*lines, sep="\n")
+    if not complete:
+        raise typer.Exit(4)
 
 
 def recover(

@@ -7,7 +7,7 @@ import re
 import stat
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,6 +22,7 @@ HEADER = "# Written by `armident service install`. Put changes into a drop-in (s
 UNITS = Path("etc/systemd/system")
 STATE = Path("var/lib/armident")
 SETTINGS = Path("etc/armident")
+CACHE = Path("var/cache/armident")
 HIDDEN = ("/home", "/root", "/run/user", "/tmp", "/var/tmp")
 """Folders that the units do not see: ``ProtectHome``, ``PrivateTmp``."""
 _CELL = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
@@ -72,6 +73,11 @@ class System:
         """True for the running system, false for an image."""
         return self.root == Path("/")
 
+    @property
+    def has_systemd(self) -> bool:
+        """True if the running system was started by systemd."""
+        return self.is_running and Path("/run/systemd/system").is_dir()
+
     def user_id(self) -> int | None:
         """Return the id of the user of the units, ``None`` if there is none."""
         if not self.is_running:
@@ -95,8 +101,15 @@ class System:
         fields = (line.split(":") for line in lines)
         return next((int(found[2]) for found in fields if found[0] == ACCOUNT and len(found) > 2), None)
 
-    def run(self, *words: str) -> None:
+    def run(self, *words: str, timeout_s: float = 60.0) -> None:
         """Run a command of the package ``passwd`` or of systemd.
+
+        Parameters
+        ----------
+        *words
+            The command.
+        timeout_s
+            Longest time for it, s.
 
         Raises
         ------
@@ -106,17 +119,34 @@ class System:
         prefix = () if self.is_running else ("--prefix", str(self.root))
         command = (words[0], *prefix, *words[1:]) if words[0] != "systemctl" else words
         try:
-            subprocess.run(command, check=True, capture_output=True, text=True, timeout=60)
+            subprocess.run(command, check=True, capture_output=True, text=True, timeout=timeout_s)
         except FileNotFoundError:
             raise ArmidentError(f"{words[0]}: no such command; is /usr/sbin in PATH?") from None
         except subprocess.TimeoutExpired:
-            raise ArmidentError(f"{' '.join(command)}: no answer in 60 s") from None
+            raise ArmidentError(f"{' '.join(command)}: no answer in {timeout_s:g} s") from None
         except subprocess.CalledProcessError as error:
             reason = " ".join(error.stderr.split()) or f"exit code {error.returncode}"
             raise ArmidentError(f"{' '.join(command)}: {reason}") from None
 
 
 def steps(system: System, cell: str) -> Iterator[Step]:
+    """Return the steps of the installation of a cell, in their order: its parts, and a reload of systemd.
+
+    Parameters
+    ----------
+    system
+        The system.
+    cell
+        Name of the cell: its session configuration is ``/etc/armident/CELL.yaml``.
+    """
+    found = list(parts(system, cell))
+    changed = not all(step.is_done() for step in found if step.name.startswith("unit "))
+    yield from found
+    if changed and system.has_systemd:
+        yield Step("units known to systemd", lambda: False, lambda: system.run("systemctl", "daemon-reload"))
+
+
+def parts(system: System, cell: str) -> Iterator[Step]:
     """Return the parts of the installation of a cell, in their order.
 
     Parameters
@@ -143,15 +173,12 @@ def steps(system: System, cell: str) -> Iterator[Step]:
     yield _folder(system, SETTINGS, 0o750, owner="root")
     yield _folder(system, STATE, 0o755, owner="root", group="root")
     yield _folder(system, STATE / cell, 0o755)
-    yield _folder(system, Path("var/cache/armident"), 0o755)
+    yield _folder(system, CACHE, 0o755)
     session = SETTINGS / f"{cell}.yaml"
     if (system.root / session).is_file():
         yield _permissions(system, f"/{session}", session, 0o640, "root", ACCOUNT)
-    units = [_unit(system, file) for file in sorted((CONFIGS / "systemd").glob("armident-*@.*"))]
-    changed = not all(step.is_done() for step in units)
-    yield from units
-    if changed and system.is_running and Path("/run/systemd/system").is_dir():
-        yield Step("units known to systemd", lambda: False, lambda: system.run("systemctl", "daemon-reload"))
+    for file in sorted((CONFIGS / "systemd").glob("armident-*@.*")):
+        yield _unit(system, file)
 
 
 def _folder(system: System, path: Path, mode: int, owner: str = ACCOUNT, group: str = ACCOUNT) -> Step:
@@ -190,7 +217,7 @@ def _permissions(system: System, name: str, path: Path, mode: int, owner: str, g
 def _unit(system: System, file: Path) -> Step:
     """Return the step that writes a unit with the path of the installed command."""
     target = system.root / UNITS / file.name
-    plain = file.read_text(encoding="utf-8").replace(SHIPPED_EXECUTABLE, str(system.executable))
+    plain = shipped_text(file.name).replace(SHIPPED_EXECUTABLE, str(system.executable))
     wanted = HEADER + plain
 
     def is_done() -> bool:
@@ -212,6 +239,35 @@ def _unit(system: System, file: Path) -> Step:
         whole.replace(target)
 
     return Step(f"unit /{UNITS / file.name}", is_done, apply)
+
+
+def shipped_text(name: str) -> str:
+    """Return the text of a shipped unit.
+
+    Parameters
+    ----------
+    name
+        Name of its file.
+    """
+    return (CONFIGS / "systemd" / name).read_text(encoding="utf-8")
+
+
+def named_cell(cell: str) -> str:
+    """Return the name of a cell, after a check that a unit and a folder can have it.
+
+    Parameters
+    ----------
+    cell
+        The name.
+
+    Raises
+    ------
+    ConfigError
+        If it cannot be the name of a unit.
+    """
+    if _CELL.fullmatch(cell) is None:
+        raise ConfigError(f"{cell!r}: expected letters, digits, '_', '-' and '.' as the name of a cell, at most 64")
+    return cell
 
 
 def installed_executable() -> Path:
@@ -262,8 +318,7 @@ def install(cell: str, root: Path = Path("/"), executable: Path | None = None, d
         If the name of the cell cannot be that of a unit, without the rights of root, or if there is a unit of other
         origin.
     """
-    if _CELL.fullmatch(cell) is None:
-        raise ConfigError(f"{cell!r}: expected letters, digits, '_', '-' and '.' as the name of a cell, at most 64")
+    named_cell(cell)
     root = root.resolve()
     if executable is None:
         executable = installed_executable() if root == Path("/") else Path(SHIPPED_EXECUTABLE)
@@ -276,6 +331,25 @@ def install(cell: str, root: Path = Path("/"), executable: Path | None = None, d
         raise ConfigError(f"{error.filename}: only root may read it: {with_sudo}") from None
     if open_steps and not dry_run and os.geteuid() != 0:
         raise ConfigError(f"only root can install a service: {with_sudo}")
+    lines = carry_out(open_steps, dry_run=dry_run)
+    return [*(lines or [f"nothing to do: the service of cell {cell} is installed"]), *remaining]
+
+
+def carry_out(open_steps: Sequence[Step], *, dry_run: bool) -> list[str]:
+    """Carry out steps, and return one line for each.
+
+    Parameters
+    ----------
+    open_steps
+        The steps.
+    dry_run
+        Change nothing.
+
+    Raises
+    ------
+    ArmidentError
+        If a step fails.
+    """
     lines = []
     for step in open_steps:
         if not dry_run:
@@ -284,7 +358,7 @@ def install(cell: str, root: Path = Path("/"), executable: Path | None = None, d
             except OSError as error:
                 raise ArmidentError(f"{step.name}: {error.strerror}: {error.filename}") from None
         lines.append(f"{'to do' if dry_run else 'done'}: {step.name}")
-    return [*(lines or [f"nothing to do: the service of cell {cell} is installed"]), *remaining]
+    return lines
 
 
 def _next(system: System, cell: str) -> Iterator[str]:

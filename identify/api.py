@@ -760,6 +760,7 @@ def design_trajectory(
     shape: Literal["moves", "fourier"] = "moves",
     harmonics: int | None = None,
     known: Identification | IdentificationDocument | str | Path | None = None,
+    masses: str | Path | None = None,
     effect: str | None = None,
     joint: str | None = None,
     against: str | None = None,
@@ -767,8 +768,8 @@ def design_trajectory(
 ) -> Design:
     """Design an exciting trajectory within the limits of a robot (thesis section 2.3.5).
 
-    It keeps the bodies of ``collision`` in the configuration apart. Torques stay within their limits if ``known`` or
-    the URDF of the robot has masses.
+    It keeps the bodies of ``collision`` in the configuration apart. Torques stay within their limits if ``known``,
+    ``masses`` or the URDF of the robot has masses.
 
     Parameters
     ----------
@@ -786,6 +787,8 @@ def design_trajectory(
         Number of harmonics of a Fourier series.
     known
         An earlier identification: torques stay within their limits, and the noise weights the joints.
+    masses
+        JSON file of standard parameters (SI), as ``armident robot --truth`` writes it; used without ``known``.
     effect
         Name of an effect that the trajectory is to show; by default the base parameters count.
     joint
@@ -821,7 +824,13 @@ def design_trajectory(
 
     config = _robot(robot, ())
     earlier = None if known is None else physical_estimate(_document(known), config, "known")
-    safety = safety_model(config, None if isinstance(robot, RobotConfig) else robot, earlier, "known")
+    safety = safety_model(
+        config,
+        None if isinstance(robot, RobotConfig) else robot,
+        earlier,
+        "known",
+        None if masses is None else Path(masses),
+    )
     found = run(
         config,
         duration,

@@ -152,7 +152,9 @@ def diagnose(
 
 
 def predict(
-    recording: Annotated[Path, typer.Argument(help="Recording (.mcap), best one that the model has not seen.")],
+    recordings: Annotated[
+        list[Path], typer.Argument(help="Recordings (.mcap), best ones that the model has not seen.")
+    ],
     model: Annotated[Path, typer.Option("--model", help="identification.json, diagnosis.json, or the folder of one.")],
     config: Annotated[
         Path | None, typer.Option("--config", help="Robot configuration. [default: that of the model]")
@@ -160,16 +162,17 @@ def predict(
     out: OutDirectory = None,
     json: Json = False,
 ) -> None:
-    """Predict the torques of a recording with an identified model, and report its error in total and by joint.
+    """Predict the torques of recordings with an identified model, and report its error in total and by joint.
 
-    Says if the recording is held out, or one that the model was identified from. Writes prediction.json, torques.csv
-    and report.html. Exit code 4 if the model explains the torques no better than none.
+    Says if a recording is held out, or one that the model was identified from. Writes prediction.json, torques.csv and
+    report.html. Of several recordings, a table shows the worst. Exit code 4 if the model explains the torques of one no
+    better than none.
 
     Example: armident predict tuesday.mcap --model monday.identification
     """
     from armident.identify.commands import predict_command
 
-    code = predict_command(recording, model, config, out, as_json=json)
+    code = predict_command(recordings, model, config, out, as_json=json)
     if code:
         raise typer.Exit(code)
 
@@ -257,7 +260,7 @@ def trajectory(
         Path | None,
         typer.Option(
             help="identification.json of the robot: keeps torques within limits, predicts standard deviations. "
-            "[default: masses of the URDF]"
+            "[default: --masses, else masses of the URDF]"
         ),
     ] = None,
     evaluations: Annotated[int, typer.Option(min=1, help="Number of candidates to try.")] = 2000,
@@ -278,6 +281,13 @@ def trajectory(
         typer.Option(help="Check and plot an existing trajectory instead, and predict its standard deviations."),
     ] = None,
     report: Annotated[Path | None, typer.Option(help="Report (.html). [default: beside the trajectory]")] = None,
+    masses: Annotated[
+        Path | None,
+        typer.Option(
+            help="JSON file of standard parameters (m1, mx1, ...), as armident robot --truth writes it: keeps torques "
+            "within limits. [default: masses of the URDF]"
+        ),
+    ] = None,
 ) -> None:
     """Design an exciting trajectory inside the limits of a robot, for the base parameters or for one effect.
 
@@ -306,6 +316,7 @@ def trajectory(
             harmonics=harmonics,
             picture=picture,
             look_at=look_at,
+            masses=masses,
         )
     )
     page = report or (found.path or Path(f"{found.robot.name}_trajectory")).with_suffix(".html")

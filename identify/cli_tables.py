@@ -20,7 +20,7 @@ from armident.identify.print_table import print_table
 from armident.identify.setup.result import SetupCheck
 
 if TYPE_CHECKING:
-    from armident.identify.model_documents import PredictionDocument
+    from armident.identify.model_documents import PredictionDocument, PredictionsDocument
 
 SHOW_AFTER_S = 2.0
 """Duration after which progress is shown, s."""
@@ -268,6 +268,30 @@ def prediction_table(document: "PredictionDocument") -> None:
         row = [name, f"{error:.2f}", "" if own is None else f"{own:.2f}"]
         table.add_row(*row, f"{document.error_rms[name]:.4g}", f"{document.torque_rms[name]:.4g}", document.units[name])
     print_table(table, console)
+
+
+def predictions_table(document: "PredictionsDocument") -> None:
+    """Print the errors of a model on several recordings, and the worst one."""
+    console = Console()
+    table = Table(title=f"{document.robot}: torque errors by recording", title_justify="left")
+    headings = ("recording", "error %", "worst joint", "its error %", "held out", "samples")
+    for heading in headings:
+        table.add_column(heading, justify="right" if "%" in heading or heading == "samples" else "left", no_wrap=True)
+    for each in document.predictions:
+        joint, error = max(each.relative_error_pct_by_joint.items(), key=lambda pair: pair[1])
+        held_out = "yes" if each.held_out else "no"
+        name = each.recording.path or "(in memory)"
+        table.add_row(name, f"{each.relative_error_pct:.2f}", joint, f"{error:.2f}", held_out, str(each.samples))
+    print_table(table, console)
+    own = document.predictions[0].identification_error_pct
+    worse = "; the model explains the torques of a recording no better than none" if document.worthless else ""
+    console.print(
+        f"Worst torque error {document.worst_error_pct:.2f} % ({document.worst_recording}); "
+        f"on its own data {own:.2f} %{worse}.",
+        highlight=False,
+        soft_wrap=True,
+        markup=False,
+    )
 
 
 def _plain_lines(what: str, begin: float) -> Report:

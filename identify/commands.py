@@ -164,57 +164,87 @@ def diagnose_command(
     return 0 if document.verdict == "no_gap" else FOUND
 
 
-def predict_command(path: Path, model: Path, config: Path | None, out: Path | None, *, as_json: bool) -> int:
+def predict_command(paths: Sequence[Path], model: Path, config: Path | None, out: Path | None, *, as_json: bool) -> int:
     """Carry out ``armident predict``.
 
     Parameters
     ----------
-    path
-        Recording.
+    paths
+        Recordings.
     model
         Result with the identified parameters.
     config
         Robot configuration; ``None``: that of the model.
     out
-        Folder of the results; ``None``: beside the recording.
+        Folder of the results, of several recordings with a folder for each; ``None``: beside each recording.
     as_json
         Print the document on stdout instead of a table.
 
     Returns
     -------
     int
-        Exit code: `FOUND` if the model explains the torques no better than none, otherwise 0.
+        Exit code: `FOUND` if the model explains the torques of a recording no better than none, otherwise 0.
 
     Raises
     ------
     ConfigError, DataError
-        If a file is wrong, the model is unusable, or the recording cannot be used.
+        If a file is wrong, the model is unusable, or a recording cannot be used.
     """
     from armident.configs import load_robot
     from armident.daq.recording import read_recording
-    from armident.identify.cli_tables import prediction_table, progress, warn
+    from armident.identify.cli_tables import prediction_table, predictions_table, progress, warn
+    from armident.identify.model_documents import predictions_document
     from armident.identify.prediction import predict_recording
     from armident.identify.report.prediction import prediction_report
     from armident.identify.saved_model import load_model
 
-    with progress(f"predict {path.name}") as report:
-        recording = read_recording(path)
-        robot = None if config is None else load_robot(config, "identify")
-        loaded = load_model(model, robot, default=recording.robot, progress=report)
-        found = predict_recording(recording, loaded, report)
-    document, folder = found.document, out or _beside(path, "prediction")
-    with _writing(folder):
-        write_atomically(folder / "torques.csv", found.csv())
-        write_atomically(folder / "report.html", prediction_report(found, loaded.robot, loaded.document))
-        write_atomically(folder / "prediction.json", to_json(document))
+    folders = _prediction_folders(paths, out)
+    robot = None if config is None else load_robot(config, "identify")
+    loaded, found = None, []
+    for path, folder in zip(paths, folders, strict=True):
+        with progress(f"predict {path.name}") as report:
+            recording = read_recording(path)
+            loaded = loaded or load_model(model, robot, default=recording.robot, progress=report)
+            prediction = predict_recording(recording, loaded, report)
+        with _writing(folder):
+            write_atomically(folder / "torques.csv", prediction.csv())
+            write_atomically(folder / "report.html", prediction_report(prediction, loaded.robot, loaded.document))
+            write_atomically(folder / "prediction.json", to_json(prediction.document))
+        found.append(prediction.document)
+        if not as_json:
+            warn([line if len(paths) == 1 else f"{path}: {line}" for line in prediction.document.warnings])
+    if len(paths) == 1:
+        if as_json:
+            sys.stdout.write(to_json(found[0]))
+        else:
+            prediction_table(found[0])
+            print(f"result: {folders[0] / 'prediction.json'}\ntorques: {folders[0] / 'torques.csv'}")
+            print(f"report: {folders[0] / 'report.html'}")
+        return FOUND if found[0].worthless else 0
+    together = predictions_document(found)
+    if out is not None:
+        with _writing(out):
+            write_atomically(out / "predictions.json", to_json(together))
     if as_json:
-        sys.stdout.write(to_json(document))
+        sys.stdout.write(to_json(together))
     else:
-        warn(document.warnings)
-        prediction_table(document)
-        print(f"result: {folder / 'prediction.json'}\ntorques: {folder / 'torques.csv'}")
-        print(f"report: {folder / 'report.html'}")
-    return FOUND if document.worthless else 0
+        predictions_table(together)
+        print(*(f"report: {folder / 'report.html'}" for folder in folders), sep="\n")
+        if out is not None:
+            print(f"result: {out / 'predictions.json'}")
+    return FOUND if together.worthless else 0
+
+
+def _prediction_folders(paths: Sequence[Path], out: Path | None) -> list[Path]:
+    """Return the folder for the results of each recording, all different."""
+    if out is None:
+        folders = [_beside(path, "prediction") for path in paths]
+    else:
+        folders = [out] if len(paths) == 1 else [out / path.stem for path in paths]
+    twice = next((path for path, folder in zip(paths, folders, strict=True) if folders.count(folder) > 1), None)
+    if twice is not None:
+        raise ConfigError(f"{twice}: given twice, or two recordings have this name; leave --out out, or rename one")
+    return folders
 
 
 def compare_command(
@@ -246,7 +276,8 @@ def compare_command(
         If a file is wrong, or the two cannot be compared.
     """
     from armident.identify.cli_tables import warn
-    from armident.identify.monitoring.comparison import compare_models, comparison_report, comparison_table
+    from armident.identify.monitoring.comparison import compare_models, comparison_table
+    from armident.identify.report.comparison import comparison_report
 
     files = [each / "identification.json" if each.is_dir() else each for each in (baseline, now)]
     first, second = (load_document(file, IdentificationDocument) for file in files)

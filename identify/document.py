@@ -642,13 +642,20 @@ def diagnosis_from_version_1(data: Mapping[str, Any]) -> dict[str, Any]:
 
 def schema_files() -> dict[str, type[Document]]:
     """Return the documents that have a JSON Schema in ``configs/json_schemas``, by the name of its file."""
-    from armident.identify.model_documents import ComparisonDocument, PredictionDocument
+    from armident.identify.model_documents import (
+        ComparisonDocument,
+        PredictionDocument,
+        PredictionsDocument,
+        SimulationDocument,
+    )
 
     return {
         "identification.schema.json": IdentificationDocument,
         "diagnosis.schema.json": DiagnosisDocument,
         "prediction.schema.json": PredictionDocument,
+        "predictions.schema.json": PredictionsDocument,
         "comparison.schema.json": ComparisonDocument,
+        "simulation.schema.json": SimulationDocument,
     }
 
 
@@ -894,6 +901,11 @@ def write_atomically(path: Path, text: str) -> None:
         File to write.
     text
         Its content, written as UTF-8.
+
+    Raises
+    ------
+    OSError
+        If it cannot be written; its file name is ``path``.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
@@ -905,6 +917,9 @@ def write_atomically(path: Path, text: str) -> None:
         # mkstemp restricts the file to its owner; results are readable like any other file.
         os.chmod(temporary, 0o644)
         os.replace(temporary, path)
+    except OSError as error:
+        Path(temporary).unlink(missing_ok=True)
+        raise OSError(error.errno, error.strerror, str(path)) from error
     except BaseException:
         Path(temporary).unlink(missing_ok=True)
         raise

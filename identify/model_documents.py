@@ -1,5 +1,6 @@
 """The documents ``prediction.json`` and ``comparison.json``: a model on a recording, and beside another model."""
 
+from collections.abc import Sequence
 from typing import Literal
 
 from pydantic import Field
@@ -8,6 +9,9 @@ from armident.identify.document import Document, RecordingReference
 
 ALL_PCT = 100.0
 """Torque error of no model at all, percent."""
+
+LEVEL_95 = 1.959964
+"""Half width of a 95 % interval of a normal distribution, standard deviations."""
 
 
 class PredictionDocument(Document):
@@ -79,6 +83,89 @@ class PredictionDocument(Document):
         worse = ". The model explains these torques no better than none" if self.worthless else ""
         own = f"on its own data {self.identification_error_pct:.2f} %"
         return f"Torque error {self.relative_error_pct:.2f} % ({data}); {own}{worse}."
+
+
+class PredictionsDocument(Document):
+    """Content of ``predictions.json``: errors of an identified model on several recordings.
+
+    Parameters
+    ----------
+    schema_
+        Key ``schema``: version of the document.
+    robot
+        Name of the robot.
+    model
+        File of the model.
+    worst_recording
+        Recording with the largest torque error.
+    worst_error_pct
+        Its torque error, percent.
+    predictions
+        Prediction of each recording, in the given order.
+    """
+
+    schema_: Literal["armident/predictions/1"] = Field("armident/predictions/1", alias="schema")
+    robot: str
+    model: str
+    worst_recording: str | None
+    worst_error_pct: float
+    predictions: list[PredictionDocument]
+
+    @property
+    def worthless(self) -> bool:
+        """True if the model explains the torques of a recording no better than none."""
+        return any(each.worthless for each in self.predictions)
+
+
+def predictions_document(predictions: Sequence[PredictionDocument]) -> PredictionsDocument:
+    """Return the document of several predictions by one model.
+
+    Parameters
+    ----------
+    predictions
+        Predictions, at least one.
+    """
+    worst = max(predictions, key=lambda each: each.relative_error_pct)
+    return PredictionsDocument(
+        robot=worst.robot,
+        model=worst.model,
+        worst_recording=worst.recording.path,
+        worst_error_pct=worst.relative_error_pct,
+        predictions=list(predictions),
+    )
+
+
+class SimulationDocument(Document):
+    """Output of ``armident simulate --json``: the file that was written and what it was simulated from.
+
+    Parameters
+    ----------
+    schema_
+        Key ``schema``: version of the document.
+    robot
+        Name of the robot.
+    physics
+        ``virtual`` (Pinocchio) or ``identified`` (equations of the identification).
+    trajectory, model, scenario
+        Files of the reference, of the model and of the hidden effects; null without.
+    seed, noise
+        Seed, and factor on the noise, of the virtual arm; null for an identified model, which has no noise.
+    recording
+        File that was written, hash of the samples, sampling rate and number of samples.
+    duration_s
+        Time from the first to the last sample, s.
+    """
+
+    schema_: Literal["armident/simulation/1"] = Field("armident/simulation/1", alias="schema")
+    robot: str
+    physics: Literal["virtual", "identified"]
+    trajectory: str
+    model: str | None
+    scenario: str | None
+    seed: int | None
+    noise: float | None
+    recording: RecordingReference
+    duration_s: float
 
 
 class ComparedModel(Document):

@@ -106,7 +106,7 @@ def predict_recording(
     options = _options(model.document.options)
     experiments = shifted_experiments(put_right(experiments, robot), robot, options, setup, notes)
     show("torques", 0.5)
-    with threadpool_limits(1):  # type: ignore[no-untyped-call]
+    with threadpool_limits(1):
         signals, blocks = _equations(model, experiments, options)
     if not any(block.t.size for block in blocks):
         raise DataError(f"{recording.path}: too short to predict: the filters leave no sample. Next: record longer")

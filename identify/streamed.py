@@ -7,6 +7,8 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, TypeVar, overload
 
+import numpy as np
+
 from armident.configs import ConfigError
 
 T = TypeVar("T")
@@ -46,30 +48,38 @@ class OnDisk(Streamed[T]):
 
     def __init__(self, items: Iterable[T]) -> None:
         folder = scratch_folder()
-        self._ends = [0]
+        self._places: list[tuple[int, list[int]]] = []
+        end = 0
         try:
             self._file = tempfile.TemporaryFile(dir=folder, prefix="armident-", buffering=0)  # noqa: SIM115
         except OSError as error:
             raise _not_written(folder, error) from error
         for item in items:
-            data = memoryview(pickle.dumps(item, protocol=pickle.HIGHEST_PROTOCOL))
-            begin = self._ends[-1]
+            # Arrays follow their item as they are: neither writing nor reading copies them.
+            arrays: list[pickle.PickleBuffer] = []
+            head = pickle.dumps(item, protocol=5, buffer_callback=arrays.append)
+            parts = [memoryview(head), *(array.raw() for array in arrays)]
+            sizes = [part.nbytes for part in parts]
             try:
-                while data:
-                    data = data[self._file.write(data) :]
+                for part in parts:
+                    while part:
+                        part = part[self._file.write(part) :]
             except OSError as error:
                 self._file.close()
                 raise _not_written(folder, error) from error
-            self._ends.append(self._file.tell())
-            assert self._ends[-1] > begin
+            self._places.append((end, sizes))
+            end += sum(sizes)
 
     def __len__(self) -> int:
-        return len(self._ends) - 1
+        return len(self._places)
 
     def _item(self, k: int) -> T:
         # Threads read at the same time, so the position of the file is not used.
-        begin, end = self._ends[k : k + 2]
-        item: T = pickle.loads(os.pread(self._file.fileno(), end - begin, begin))
+        begin, sizes = self._places[k]
+        head, *arrays = (np.empty(size, dtype=np.uint8).data for size in sizes)
+        read = os.preadv(self._file.fileno(), [head, *arrays], begin)
+        assert read == sum(sizes)
+        item: T = pickle.loads(head, buffers=arrays)
         return item
 
 
@@ -125,6 +135,21 @@ def mapped(function: Callable[..., T], *sequences: Sequence[Any]) -> Sequence[T]
     if any(isinstance(sequence, Streamed) for sequence in sequences):
         return Mapped(function, *sequences)
     return [function(*items) for items in zip(*sequences, strict=True)]
+
+
+def chosen(items: Sequence[T], numbers: Sequence[int]) -> Sequence[T]:
+    """Return some of the items as a list, or read again at every use where the sequence is streamed.
+
+    Parameters
+    ----------
+    items
+        The items.
+    numbers
+        Numbers of those to choose, from 0.
+    """
+    if isinstance(items, Streamed):
+        return Mapped(items.__getitem__, numbers)
+    return [items[k] for k in numbers]
 
 
 def scratch_folder() -> Path:

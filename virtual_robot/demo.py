@@ -61,7 +61,8 @@ GUEST_VARIABLE = "ARMIDENT_GUEST"
 REPEATS = 3
 """Number of runs of the trajectory in the second part: one run is too short for the small hidden effect."""
 JOINT_RUNS = 9
-"""Largest number of runs times joints of a configured arm: the diagnosis of more does not fit a guest's processes."""
+"""Largest number of runs times joints of a configured arm: the diagnosis of more takes more memory than a process of
+the guest has where the launcher may not raise the limit of mappings (`armident.drivers.vcan.guest`)."""
 UDP_GROUP = "239.74.163.2"
 """Multicast address of the bus without SocketCAN."""
 UDP_PERIOD_US = 2000

@@ -191,9 +191,9 @@ def _blank_lines(file: str, keys: Sequence[str], n: int) -> list[str]:
 
 
 def _found(facts: RecordedFacts) -> list[str]:
-    reference = "with" if facts.has_demand else "without"
+    demand = "with" if facts.has_demand else "without"
     sampled = f"{facts.rate_hz:.6g} Hz, {facts.duration_s:.4g} s"
-    lines = [f"found in {facts.path}: {sampled}, {facts.signal}s, {reference} reference"]
+    lines = [f"found in {facts.path}: {sampled}, {facts.signal}s, {demand} demand"]
     if facts.options:
         lines.append(f"read with {_words(facts)}")
     return lines + [f"note: {note}" for note in facts.notes]

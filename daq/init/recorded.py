@@ -45,7 +45,7 @@ class RecordedFacts:
     signal
         Kind of effort: ``torque``, ``current`` or ``voltage``.
     has_demand
-        True if the recording has reference positions.
+        True if the recording has a demand (reference positions).
     position
         Lowest and highest position, (n, 2), rad or m.
     velocity, acceleration

@@ -39,7 +39,6 @@ _SIDECARS = ("-wal", "-journal")
 """Suffixes of the files in which SQLite keeps what is not in the database yet."""
 _DAMAGED = (sqlite3.Error, UnicodeDecodeError)
 """Errors of SQLite for damaged databases, whose names may be no text."""
-_DECODED: dict[int, type[McapRecord]] = {Opcode.SCHEMA: Schema, Opcode.CHANNEL: Channel, Opcode.MESSAGE: Message}
 
 
 class BagMessage(NamedTuple):
@@ -89,9 +88,10 @@ def bag_files(path: Path) -> tuple[list[Path], list[str]]:
             raise ConfigError(f"{path}: no such file")
         return [path], []
     listed = [path / Path(name).name for name in _listed_files(path)]
-    there = [file for file in listed if file.is_file()]
+    present = [file for file in path.iterdir() if file.is_file()]
+    there = [file for file in listed if file in present]
     if not there:
-        found = [file for file in path.iterdir() if file.is_file() and file.name.lower().endswith(SUFFIXES)]
+        found = [file for file in present if file.name.lower().endswith(SUFFIXES)]
         there = sorted(found, key=lambda file: (len(file.name), file.name))
     if not there:
         raise ConfigError(f"{path}: no bag in this folder; expected {METADATA} or files {', '.join(SUFFIXES)}")
@@ -266,11 +266,14 @@ class BagReader:
 def _records(opcode: int, body: memoryview) -> list[McapRecord]:
     """Return the schemas, channels and messages in a record of the data section; others give none."""
     stream = ReadDataStream(BytesIO(body))
+    if opcode == Opcode.SCHEMA:
+        return [Schema.read(stream)]
+    if opcode == Opcode.CHANNEL:
+        return [Channel.read(stream)]
+    if opcode == Opcode.MESSAGE:
+        return [Message.read(stream, len(body))]
     if opcode != Opcode.CHUNK:
-        kind = _DECODED.get(opcode)
-        if kind is None:
-            return []
-        return [Message.read(stream, len(body)) if kind is Message else kind.read(stream)]  # type: ignore[attr-defined]
+        return []
     chunk = Chunk.read(stream)
     if chunk.uncompressed_size > _LARGEST:
         raise ValueError(f"{chunk.uncompressed_size} bytes uncompressed")
@@ -316,7 +319,7 @@ def _listed_counts(path: Path) -> Counter[str]:
     counts: Counter[str] = Counter()
     listed = _metadata(path).get("topics_with_message_count") if path.is_dir() else None
     for entry in listed if isinstance(listed, list) else []:
-        with suppress(KeyError, TypeError, ValueError):
+        with suppress(KeyError, TypeError, ValueError, OverflowError):
             counts[str(entry["topic_metadata"]["name"])] += int(entry["message_count"])
     return counts
 
@@ -325,7 +328,7 @@ def _metadata(folder: Path) -> dict[str, object]:
     """Return the entries of ``metadata.yaml``; {} if there is none, or it is not readable."""
     try:
         content = yaml.safe_load((folder / METADATA).read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError):
+    except (OSError, ValueError, RecursionError, yaml.YAMLError):  # a date may be none, such as 2024-13-01
         return {}
     entries = content.get("rosbag2_bagfile_information") if isinstance(content, dict) else None
     return entries if isinstance(entries, dict) else {}

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armident.configs import DataError
+from armident.daq.interchange.time_stamps import MOST_NUMBERS
 
 HOLE = 1.5
 """Steps longer than this number of usual ones, and than usual jitter beyond it, are holes."""
@@ -14,6 +15,8 @@ _USUAL = 0.8
 """Share of the steps whose deviations from the median are usual jitter."""
 _FEWEST = 4
 """Rows that a cubic spline needs; shorter pieces between holes are left out."""
+_MOST_BETWEEN = 1000.0
+"""Most even samples between two rows that are no hole: more are no resampling."""
 _MOST_UNEVEN = 0.5
 """Share of steps that are holes above which the rows are no samples of one motion."""
 
@@ -87,6 +90,11 @@ def onto_even_times(times: Floats, raw: Mapping[str, Floats], rate_hz: float) ->
     values: dict[str, list[Floats]] = {name: [] for name in raw}
     left_out = 0
     relative = times - times[0]
+    between = (HOLE + jitter) * median * rate_hz
+    if between > _MOST_BETWEEN or not relative[-1] * rate_hz < MOST_NUMBERS:
+        raise DataError(
+            f"steps of {steps.min():.4g} to {steps.max():.4g} s are no samples of a clock of {rate_hz:g} Hz"
+        )
     for piece in np.split(np.arange(times.size), holes + 1):
         own = relative[piece]
         clock = np.arange(np.ceil(own[0] * rate_hz - 1e-6), np.floor(own[-1] * rate_hz + 1e-6) + 1, dtype=np.int64)

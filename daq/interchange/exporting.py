@@ -123,7 +123,7 @@ def _write_parquet(_: Recording, table: dict[str, NDArray[np.float64]], path: Pa
         import pyarrow.parquet
     except ImportError as error:
         raise ConfigError(install_line(f"{path}: Parquet", ["parquet"])) from error
-    pyarrow.parquet.write_table(pyarrow.table(table), path)  # type: ignore[no-untyped-call]
+    pyarrow.parquet.write_table(pyarrow.table(table), path)
 
 
 def _write_mat(_: Recording, table: dict[str, NDArray[np.float64]], path: Path) -> None:

@@ -107,6 +107,7 @@ def import_recording(
         path, robot, effort=effort, names=names, topic=topic, joints=joints, by_position=by_position
     )
     rows = in_si(rows, robot, units or {})
+    _refuse_immense(source, rows)
     side: Side = "motor" if motor_side else "joint"
     fields: dict[str, Field] = {
         name: Field(
@@ -239,6 +240,17 @@ def _resampled(path: Path, robot: RobotConfig | None, rate_hz: float | None) -> 
         raise DataError(f"{path}: {error}") from error
     facts = {**made.metadata, "source": path.name, "source_sha256": hashlib.sha256(path.read_bytes()).hexdigest()}
     return replace(made, path=None, robot=robot or recording.robot, metadata=facts)
+
+
+def _refuse_immense(source: Source, rows: Rows) -> None:
+    """Refuse values whose squares are no numbers: no measurement is so large, and least squares needs them."""
+    most = np.sqrt(np.finfo(np.float64).max)
+    for name, values in rows.values.items():
+        bad = np.argwhere(np.abs(values) > most)
+        if bad.size:
+            row, column = bad[0]
+            where = source.place(int(rows.row[row]), rows.labels[name][column])
+            raise DataError(f"{where}: {values[row, column]:.3g} is no measurement")
 
 
 def _rows_with_demand(source: Source, rows: Rows) -> slice:

@@ -31,6 +31,8 @@ int32 sec
 uint32 nanosec
 """
 _NS = 1_000_000_000
+_MOST_NS = 2**63 - 1
+"""Last time that 64 bits hold, ns."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,6 +119,9 @@ class TopicMessages:
             return
         if not (len(q) or len(tau)):
             self._refuse("has neither positions nor efforts")
+            return
+        if not -_MOST_NS <= logged_ns <= _MOST_NS:
+            self._refuse(f"has a time of {logged_ns / _NS:.3g} s")
             return
         rows = self._rows.setdefault((names, len(q) > 0, len(tau) > 0), _Rows())
         rows.times.extend((self.count, stamp, logged_ns))

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from armident.configs import DataError
 from armident.daq.interchange.text_files import listed
 
-STATE, ACTION = "observation.state", "action"
+STATE, ACTION, EPISODE = "observation.state", "action", "episode_index"
 _EFFORTS = {
     "tau": ("effort", "efforts", "torque", "torques", "joint_effort", "joint_torque"),
     "current": ("current", "currents", "joint_current", "motor_current"),
@@ -94,15 +94,18 @@ def lerobot_table(path: Path, arrays: Mapping[str, Any]) -> tuple[dict[str, NDAr
     if len({len(values) for values in table.values()}) > 1:
         raise DataError(f"{path}: its columns have unequal lengths")
     if "timestamp" in arrays:
-        table["t"] = _one_clock(_matrix(path, "timestamp", arrays["timestamp"]).ravel(), arrays, notes)
+        times = _matrix(path, "timestamp", arrays["timestamp"]).ravel()
+        episode = _matrix(path, EPISODE, arrays[EPISODE]).ravel() if EPISODE in arrays else np.zeros(times.size)
+        if episode.size != times.size or not np.isfinite(episode).all():
+            raise DataError(f"{path}: {EPISODE} has values that are no numbers, or not one for every timestamp")
+        table["t"] = _one_clock(times, episode, notes)
     return table, notes
 
 
-def _one_clock(times: NDArray[np.float64], arrays: Mapping[str, Any], notes: list[str]) -> NDArray[np.float64]:
+def _one_clock(times: NDArray[np.float64], episode: NDArray[np.float64], notes: list[str]) -> NDArray[np.float64]:
     """Return times that increase over all episodes, each of which begins at zero."""
-    if "episode_index" not in arrays or times.size < 2:
+    if times.size < 2:
         return times
-    episode = np.asarray(arrays["episode_index"]).ravel()
     begins = np.flatnonzero(np.diff(episode) != 0) + 1
     step = float(np.median(np.diff(times)))
     made = times.copy()

@@ -55,7 +55,8 @@ def _stamp(text: str) -> int | None:
 
 def _date_ns(parts: list[int], fraction: str | None) -> int | None:
     try:
-        seconds = int(datetime(*parts).timestamp())  # type: ignore[arg-type]
+        year, month, day, hour, minute, second = parts
+        seconds = int(datetime(year, month, day, hour, minute, second).timestamp())
     except (ValueError, OverflowError, OSError):
         return None
     return nanoseconds(str(seconds), fraction) if seconds >= 0 else None

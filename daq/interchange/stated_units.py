@@ -60,7 +60,7 @@ def in_si(rows: Rows, robot: RobotConfig, units: Mapping[str, str]) -> Rows:
         for name in concerned:
             if name in values:
                 values[name] = values[name] * factors
-        notes.append(f"{quantity} taken in {unit}, as --units says")
+        notes.append(f"{quantity} taken in {unit} (--units)")
     return replace(rows, values=values, notes=tuple(notes))
 
 

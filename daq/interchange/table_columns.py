@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from armident.configs import DataError, RobotConfig
 from armident.daq.interchange.column_units import SCALES, plain_unit
+from armident.daq.interchange.demand_names import of_another_quantity, without_demand
 from armident.daq.interchange.joint_names import match_joints
 from armident.daq.interchange.text_files import listed, shortened
 
@@ -18,9 +19,10 @@ NAMES: Mapping[str, tuple[str, ...]] = {
     "torque": ("tau", "torque", "torques", "effort", "efforts"),
     "current": ("current", "currents", "actual_current"),
     "voltage": ("voltage", "vir"),
-    "demand": ("qr", "qg", "target_positions", "target_q"),
+    "demand": ("qr", "qg"),
 }
-"""Accepted names of each quantity; ``q`` also stands for columns ``q1..qn`` and ``q0..q(n-1)``."""
+"""Accepted names of each quantity; ``q`` also stands for columns ``q1..qn`` and ``q0..q(n-1)``. A demand is also a
+position with a word for a demand in its name (`armident.daq.interchange.demand_names`)."""
 
 _WORDS: Mapping[str, frozenset[str]] = {
     "position": frozenset({"position", "positions", "pos", "q"}),
@@ -29,8 +31,6 @@ _WORDS: Mapping[str, frozenset[str]] = {
     "voltage": frozenset({"voltage", "voltages"}),
 }
 """Words of a column name, beside the name of a joint, that tell its quantity."""
-_DEMANDED = frozenset({"desired", "reference", "target", "setpoint", "command", "commanded", "demand", "goal"})
-"""Words of a column name that tell a demand."""
 _MEASURED = frozenset({"actual", "measured", "feedback"})
 """Words of a column name that tell a measurement, as others do without them."""
 _WORD = re.compile(r"[^\W_]+")
@@ -162,7 +162,61 @@ def find_columns(
             return found
     if name is not None:
         raise DataError(f"no array named {name!r}; found {listed(list(table))}")
+    if quantity == "demand":
+        return _demand(table, robot, by_position, joints)
     return _by_joint(table, quantity, robot, by_position, joints)
+
+
+def unused_demand(table: Table) -> str:
+    """Return a sentence on columns that name a demand, for a table in which no demand was found; empty without any.
+
+    Parameters
+    ----------
+    table
+        Columns by name.
+    """
+    named = [name for name in table if without_demand(name) is not None]
+    if not named:
+        return ""
+    return (
+        f"without a demand: {listed(named)} cannot be assigned to the joints as positions; "
+        "--map demand=NAME takes NAME1..NAMEn"
+    )
+
+
+def _demand(table: Table, robot: RobotConfig, by_position: bool, joints: Sequence[str] | None) -> Columns | None:
+    """Return the positions with a word for a demand in their names, such as ``q1_ref``, ``reference1``, ``elbow_cmd``.
+
+    Names alone decide here, so that columns which do not fit the joints are no error (`unused_demand`).
+    """
+    origin: dict[str, str] = {}
+    twice = []
+    for name in table:
+        rest = without_demand(name)
+        if rest is None or of_another_quantity(rest):
+            continue
+        if origin.setdefault(rest, name) != name:
+            twice.append(name)
+    positions = {rest: table[name] for rest, name in origin.items()}
+    found = None
+    for base in ("", *NAMES["position"]):
+        try:
+            found = found or _numbered(positions, base, robot.n)
+        except DataError:
+            continue
+    try:
+        found = found or _by_joint(positions, "position", robot, by_position, joints)
+        columns = [rest for rest, values in positions.items() if values.ndim == 1]
+        if found is None and columns:
+            match = match_joints(columns, robot.joints, joints=joints)
+            found = Columns(np.stack([positions[one] for one in match.names], axis=1), match.names, match.remarks)
+    except (DataError, ValueError):
+        return None
+    if found is None:
+        return None
+    labels = tuple(origin.get(label, label) for label in found.labels)
+    notes = [*found.notes] + ([f"demand taken from {listed(labels)}, not from {listed(twice)}"] if twice else [])
+    return Columns(found.values, labels, tuple(notes))
 
 
 def _numbered(table: Table, base: str, n: int) -> Columns | None:
@@ -192,7 +246,7 @@ def _numbered(table: Table, base: str, n: int) -> Columns | None:
     if any(table[label].ndim != 1 for label in labels):
         raise DataError(f"{labels[0]} has {table[labels[0]].ndim} dimensions, expected a column")
     note = (f"columns are counted from 0: {labels[0]} is {_FIRST}",) if first == 0 else ()
-    return Columns(np.stack([table[label] for label in labels], axis=1), tuple(labels), note)
+    return Columns(_side_by_side(table, labels), tuple(labels), note)
 
 
 _FIRST = "the first joint"
@@ -216,19 +270,26 @@ def _by_joint(
                   for rest, name in of_joint.items()}  # fmt: skip
     match = match_joints(list(chosen), robot.joints, by_position=by_position, joints=joints)
     labels = tuple(chosen[each] for each in match.names)
-    return Columns(np.stack([table[label] for label in labels], axis=1), labels, match.remarks, match.names)
+    return Columns(_side_by_side(table, labels), labels, match.remarks, match.names)
 
 
 def _joint_of(name: str, quantity: str) -> str | None:
-    """Return the part of a column's name that tells its joint, if the column is of a quantity."""
+    """Return the part of a column's name that tells its joint, if the column is of a quantity and no demand."""
     words = [(found[0].lower(), found.start(), found.end()) for found in _WORD.finditer(name)]
-    demanded = any(word in _DEMANDED for word, _, _ in words)
-    wanted = "position" if quantity == "demand" else quantity
-    if len(words) < 2 or wanted not in _WORDS or demanded != (quantity == "demand"):
+    if len(words) < 2 or quantity not in _WORDS or without_demand(name) is not None:
         return None
-    if words[-1][0] in _WORDS[wanted]:
-        end = words[-2][1] if words[-2][0] in _DEMANDED | _MEASURED and len(words) > 2 else words[-1][1]
+    if words[-1][0] in _WORDS[quantity]:
+        end = words[-2][1] if words[-2][0] in _MEASURED and len(words) > 2 else words[-1][1]
         return name[:end].strip(" ./_-:[]")
-    if words[0][0] in _WORDS[wanted]:
+    if words[0][0] in _WORDS[quantity]:
         return name[words[0][2] :].strip(" ./_-:[]")
     return None
+
+
+def _side_by_side(table: Table, labels: Sequence[str]) -> NDArray[np.float64]:
+    """Return columns as one array (N, n); refuse columns of different lengths."""
+    first = labels[0]
+    for label in labels:
+        if table[label].shape != table[first].shape:
+            raise DataError(f"{label} has {table[label].size} values, {first} has {table[first].size}")
+    return np.stack([table[label] for label in labels], axis=1)

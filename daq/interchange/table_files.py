@@ -196,7 +196,7 @@ def _parquet(path: Path) -> dict[str, Any]:
     except ImportError as error:
         raise ConfigError(install_line(f"{path}: Parquet", ["parquet"])) from error
     try:
-        table = pyarrow.parquet.read_table(path)  # type: ignore[no-untyped-call]
+        table = pyarrow.parquet.read_table(path)
         return {name: table.column(name).to_numpy() for name in table.column_names}
     except Exception as error:  # pyarrow raises various errors for damaged files
         raise DataError(f"{path}: not a readable Parquet file: damaged, or cut off") from error

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from armident.configs import DataError, RobotConfig
 from armident.daq.interchange.column_units import check_unit, time_unit
 from armident.daq.interchange.si_checks import OMITTED
-from armident.daq.interchange.table_columns import Columns, find_columns, find_time
+from armident.daq.interchange.table_columns import Columns, find_columns, find_time, unused_demand
 from armident.daq.interchange.table_files import Source
 from armident.daq.interchange.text_files import listed
 from armident.daq.recording.model import Quantity
@@ -116,6 +116,8 @@ def complete_rows(
     if len(lengths) > 1:
         raise DataError(f"{source.path}: its arrays have {' and '.join(map(str, sorted(lengths)))} rows")
     notes = [note for columns in found.values() for note in columns.notes]
+    if "demand" not in found and names.get("demand") != OMITTED and (unused := unused_demand(source.table)):
+        notes.append(unused)
     rows = Rows(
         {quantity: np.array(columns.values, np.float64) for quantity, columns in found.items()},
         {quantity: columns.labels for quantity, columns in found.items()},
@@ -266,8 +268,8 @@ def _empty(rows: Rows) -> list[str]:
         label
         for name, values in rows.values.items()
         if name != "demand"
-        for label, number in zip(rows.labels[name], np.isfinite(values).T, strict=True)
-        if not number.any()
+        for label, column in zip(rows.labels[name], values.T, strict=True)
+        if not np.isfinite(column).any()
     ]
 
 

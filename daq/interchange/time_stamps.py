@@ -24,6 +24,8 @@ RATE_TOLERANCE = 0.01
 """Largest relative difference of a stated rate from that of the times."""
 _MOST_MISSING = 0.5
 """Share of missing samples above which the usual step is not the period."""
+MOST_NUMBERS = 2.0**53
+"""Largest sample number that a floating-point number holds exactly."""
 _JITTER = 3.0
 """Longest step of even samples whose times jitter, periods; longer ones are holes of an unknown length."""
 _REPEATED = 0.01
@@ -180,6 +182,11 @@ def clock_of(times: Floats, rate_hz: float | None, repeated: float = 0.0) -> Clo
         return _jittering(times, rate_hz, repeated, f"{uneven.size} of {steps.size} steps")
     single = steps[advance == 1]
     measured = float(single.size / single.sum())
+    if advance.sum() > MOST_NUMBERS:
+        raise DataError(
+            f"{float(times[-1] - times[0]):.6g} s in steps of {median:.6g} s are no recording of {times.size} samples; "
+            "give the column of times with --map time=NAME"
+        )
     missing = int(advance.sum()) - steps.size
     if missing > _MOST_MISSING * advance.sum() and np.any(advance > 1) and (advance > 1).mean() > EVEN:
         raise DataError(f"{missing} of {int(advance.sum()) + 1} samples are missing at {measured:.6g} Hz")

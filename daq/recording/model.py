@@ -158,6 +158,11 @@ def mark_from(entries: object) -> Mark:
     return mark
 
 
+def _bytes(values: NDArray[Any]) -> memoryview:
+    """Return the bytes of an array, without a copy where it is contiguous."""
+    return np.ascontiguousarray(values).reshape(-1).view(np.uint8).data
+
+
 _NO_SYNC = 2**63
 """Upper bound of SYNC numbers: they are int64."""
 _GAP_ENTRIES = {entry.name for entry in fields(Gap)}
@@ -251,10 +256,10 @@ class Recording:
         for name in sorted(self.streams):
             stream = self.streams[name]
             digest.update(name.encode())
-            digest.update(np.ascontiguousarray(stream.sync).tobytes())
+            digest.update(_bytes(stream.sync))
             for key in sorted(stream.raw):
                 digest.update(key.encode())
-                digest.update(np.ascontiguousarray(stream.raw[key]).tobytes())
+                digest.update(_bytes(stream.raw[key]))
         return digest.hexdigest()
 
     def experiments(self) -> list[tuple[int, int]]:

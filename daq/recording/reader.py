@@ -13,6 +13,7 @@ from mcap.reader import make_reader
 from pydantic import ValidationError
 
 from armident.configs import ConfigError, DataError, RobotConfig, SessionConfig
+from armident.configs.yaml_loader import is_file
 from armident.daq.recording import mcap_records as mcap
 from armident.daq.recording.layout import StreamLayout
 from armident.daq.recording.model import Gap, Mark, Recording, Stream, gap_from, mark_from
@@ -80,6 +81,9 @@ def is_recording(path: Path) -> bool:
     path
         The file.
     """
+    if not is_file(path):
+        # A named pipe would be waited for.
+        return False
     try:
         with path.open("rb") as file:
             head = file.read(_HEAD)
@@ -93,8 +97,8 @@ def _is_listed(file: BinaryIO) -> bool:
     file.seek(0)
     try:
         summary = make_reader(file).get_summary()
-    except (McapError, ValueError, struct.error, EOFError, MemoryError):
-        # A damaged length asks for any amount of memory.
+    except (McapError, ValueError, struct.error, EOFError, MemoryError, OverflowError):
+        # A damaged length asks for any amount of memory, or for more than there can be.
         return False
     return summary is not None and any(index.name == RECORDING for index in summary.metadata_indexes)
 

@@ -7,6 +7,7 @@ import re
 import shutil
 import threading
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 
 _NAME = re.compile(r"-(\d{8}T\d{6})-(\d{3})Z(?:\.\d+)?\.mcap(?:\.damaged)?$")
@@ -98,8 +99,10 @@ def recordings_of(directory: Path, robot: str) -> Iterator[tuple[Path, datetime.
     for path in directory.glob(f"{robot}-*.mcap*"):
         match = _NAME.search(path.name)
         if match is not None and path.name[: match.start()] == robot and path.is_file():
-            made = datetime.datetime.strptime(f"{match[1]}.{match[2]}+0000", "%Y%m%dT%H%M%S.%f%z")
-            found.append((path, made))
+            # A name that only looks like a time is none of a capture.
+            with suppress(ValueError):
+                made = datetime.datetime.strptime(f"{match[1]}.{match[2]}+0000", "%Y%m%dT%H%M%S.%f%z")
+                found.append((path, made))
     yield from sorted(found, key=lambda entry: entry[0].name)
 
 
@@ -156,7 +159,12 @@ class RetentionThread:
                 last = None
             except OSError as error:
                 if str(error) != last:
-                    log.warning("retention: %s", error)
+                    log.warning(
+                        "retention: %s: %s; old recordings stay, tried again every %g s",
+                        error.filename or "the folder",
+                        error.strerror,
+                        self._every_s,
+                    )
                 last = str(error)
             if self._over.wait(self._every_s):
                 return

@@ -9,6 +9,7 @@ import ctypes
 import fcntl
 import os
 import platform
+import re
 import shlex
 import shutil
 import signal
@@ -35,6 +36,11 @@ MALLOC_TUNABLES = "glibc.malloc.mmap_threshold=1073741824:glibc.malloc.trim_thre
 CACHES = {"NUMBA_CACHE_DIR": "numba", "MPLCONFIGDIR": "matplotlib", "XDG_CACHE_HOME": "guest"}
 """Environment variables of cache folders, and their default folders in the cache of armident. The user's own caches are
 read-only in the guest, which Matplotlib and Fontconfig report on stderr."""
+MAPPINGS = Path("/proc/sys/vm/max_map_count")
+"""Most mappings of a process (documentation of the Linux kernel, sysctl/vm). In a guest, each page of a process that
+is not beside its neighbour in the memory of the guest is one mapping of the host."""
+MEMORY_UNITS = {"K": 1 << 10, "M": 1 << 20, "G": 1 << 30}
+"""Units of the kernel's ``mem=``."""
 PR_SET_PDEATHSIG = 1
 """Option of ``prctl`` (linux/prctl.h)."""
 
@@ -76,12 +82,16 @@ def run(command: Sequence[str], buses: int = 1, memory: str = "4096M", writable:
     Raises
     ------
     ArmidentError
-        If the guest cannot be set up or ends without a status; contains the end of its kernel log.
+        If the memory is no size, or the guest cannot be set up or ends without a status; contains the end of its
+        kernel log.
     """
+    if not re.fullmatch(r"\d+[KMG]?", memory):
+        raise ArmidentError(f"{memory!r}: expected the memory of a guest as a number with K, M or G, such as 4096M")
     reason = launcher_obstacle()
     if reason is not None:
         raise ArmidentError(f"no vcan: {reason}")
     root = packages.provide()
+    _allow_mappings(memory)
     environment = dict(os.environ)
     caches = [
         Path(environment.setdefault(name, str(packages.cache_folder().parent / folder))).absolute()
@@ -103,6 +113,28 @@ def run(command: Sequence[str], buses: int = 1, memory: str = "4096M", writable:
         except (OSError, ValueError):
             log = (folder / "log").read_text(errors="replace").splitlines()
             raise ArmidentError("the vcan guest ended without a status: " + " | ".join(log[-6:])) from None
+
+
+def _allow_mappings(memory: str) -> None:
+    """Allow a process of the guest to use all of its memory, until the next boot; say so where that is not permitted.
+
+    Beyond the limit a process of the guest hangs in a page fault, or ends by SIGSEGV.
+    """
+    number, unit = (memory[:-1], memory[-1]) if memory[-1:] in MEMORY_UNITS else (memory, "")
+    needed = int(number) * MEMORY_UNITS.get(unit, 1) // os.sysconf("SC_PAGE_SIZE")
+    with suppress(OSError, ValueError):
+        present = int(MAPPINGS.read_text())
+        if present >= needed:
+            return
+        try:
+            MAPPINGS.write_text(str(needed))
+        except OSError:
+            usable = present * os.sysconf("SC_PAGE_SIZE") >> 20
+            print(
+                f"armident.drivers.vcan: a process with more than {usable} MB may hang in the guest: "
+                f"sudo sysctl -w vm.max_map_count={needed}",
+                file=sys.stderr,
+            )
 
 
 def _write_scripts(

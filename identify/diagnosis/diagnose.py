@@ -141,7 +141,7 @@ def diagnose(
     """
     deadline = float("inf") if time_limit_s is None else time.monotonic() + time_limit_s
     # Threads gain little on tall and narrow matrices, and round otherwise.
-    with threadpool_limits(1):  # type: ignore[no-untyped-call]
+    with threadpool_limits(1):
         return _diagnose(
             training, validation, robot, recordings, baseline, notes, _Steps(progress), criteria or Criteria(), deadline
         )

@@ -11,9 +11,9 @@ from armident.configs import DataError
 from armident.identify.diagnosis.equations import Equations
 from armident.identify.diagnosis.study import Study
 from armident.identify.regression.ar_noise import WHITE, ArModel, ar_models
-from armident.identify.regression.equations import joint_variances, residuals, stacked
+from armident.identify.regression.equations import joint_variances, residuals, stacked_parts
 from armident.identify.regression.iv_regression import IvRegression
-from armident.identify.regression.least_squares import least_squares, require_excitation
+from armident.identify.regression.least_squares import Triangle, require_excitation
 from armident.identify.regression.whitening import whitened
 
 Array = NDArray[np.float64]
@@ -155,9 +155,9 @@ def fit(study: Study, theta0: Array | None = None, noise: Sequence[ArModel] | No
     """
     equations = Equations(study, theta0)
     if noise is None:
-        x, y = stacked(equations.train, [WHITE] * study.robot.n)
-        require_excitation(x, study.model.base.names)
-        noise = joint_variances(equations.train, least_squares(x, y))
+        rows = Triangle.of(stacked_parts(equations.train, [WHITE] * study.robot.n))
+        require_excitation(rows, study.model.base.names)
+        noise = joint_variances(equations.train, rows.theta)
         passes = PASSES
     else:
         passes = 1

@@ -19,7 +19,7 @@ from armident.identify.robot.simulation import Simulation
 from armident.identify.signals.bandpass import butterworth
 from armident.identify.signals.decimate import Decimation
 from armident.identify.signals.differentiate import Derivatives
-from armident.identify.streamed import kept, mapped
+from armident.identify.streamed import chosen, kept, mapped
 
 HALVINGS = 8
 """Step halvings towards the last estimate that could be simulated."""
@@ -172,10 +172,10 @@ class AuxiliaryModel:
         """
         return replace(
             self,
-            references=[self.references[k] for k in numbers],
+            references=chosen(self.references, numbers),
             initial=[self.initial[k] for k in numbers],
             starts=[self._start(k) for k in numbers],
-            first_motions=None if self.first_motions is None else [self.first_motions[k] for k in numbers],
+            first_motions=None if self.first_motions is None else chosen(self.first_motions, numbers),
         )
 
     def simulate(
@@ -248,7 +248,10 @@ class AuxiliaryModel:
         DataError
             As `instruments`.
         """
-        _, runs = self._nearest(theta)
+        return self.motions_of(self._nearest(theta)[1])
+
+    def motions_of(self, runs: Sequence[Simulation]) -> Sequence[Derivatives]:
+        """Signals of simulations of every experiment."""
         starts = [self._start(k) for k in range(len(runs))]
         return mapped(lambda run, start: Derivatives(run.q, run.qd, run.qdd, None, self.dt, start), runs, starts)
 

@@ -13,11 +13,12 @@ from armident.identify.regression.equations import (
     joint_variances,
     residual_norm,
     stacked,
+    stacked_parts,
     whitened_residuals,
 )
 from armident.identify.regression.iterations import ITERATIONS, Iterations, iterate
 from armident.identify.regression.iv import factored
-from armident.identify.regression.least_squares import inverse_gram, least_squares
+from armident.identify.regression.least_squares import Triangle
 
 
 def didim(
@@ -57,11 +58,11 @@ def didim(
     auxiliary = auxiliary.fresh()
     (theta, done, converged, reason), simulated = solve_didim(blocks, auxiliary, start, iterations)
     noise = joint_variances(simulated, theta)
-    z, y = stacked(simulated, noise)
     if true_sensitivities:
+        z, y = stacked(simulated, noise)
         covariance = factored(z, torque_sensitivities(auxiliary, theta, blocks, noise), y).covariance
     else:
-        covariance = inverse_gram(z)  # 2.37
+        covariance = Triangle.of(stacked_parts(simulated, noise)).inverse_gram  # 2.37
     residuals = whitened_residuals(simulated, theta, noise)
     return Estimate(theta, covariance, tuple(noise), residuals, done, converged, reason, auxiliary.warnings)
 
@@ -99,7 +100,7 @@ def solve_didim(
     def step(previous: NDArray[np.float64], _: int) -> tuple[NDArray[np.float64], float]:
         nonlocal noise
         simulated = auxiliary.equations(blocks, previous)
-        estimate = least_squares(*stacked(simulated, noise))  # 2.36
+        estimate = Triangle.of(stacked_parts(simulated, noise)).theta  # 2.36
         noise = joint_variances(simulated, estimate)
         return estimate, residual_norm(simulated, estimate, scale)
 

@@ -10,14 +10,14 @@ from armident.identify.regression.equations import (
     COVARIANCE_PASSES,
     Estimate,
     ExperimentEquations,
+    instrumented,
     joint_variances,
     noise_models,
     residual_norm,
-    stacked,
     whitened_residuals,
 )
 from armident.identify.regression.iterations import ITERATIONS, iterate
-from armident.identify.regression.iv import factored, serial_covariance
+from armident.identify.regression.iv import IvProducts, factored_parts, instrumented_parts, serial_covariance
 from armident.identify.streamed import mapped
 
 
@@ -53,17 +53,20 @@ def idim_iv(
     auxiliary = auxiliary.fresh()
     scale = noise = joint_variances(blocks, start)
 
+    def products(simulated: Sequence[ExperimentEquations]) -> IvProducts:
+        rows = instrumented(blocks, mapped(lambda b: b.x, simulated))
+        return factored_parts(instrumented_parts(rows, noise), start.size)
+
     def step(previous: NDArray[np.float64], _: int) -> tuple[NDArray[np.float64], float]:
         nonlocal noise
-        z, _y = stacked(auxiliary.equations(blocks, previous), noise)
-        estimate = factored(z, *stacked(blocks, noise)).theta  # 2.33
+        estimate = products(auxiliary.equations(blocks, previous)).theta  # 2.33
         noise = joint_variances(blocks, estimate)
         return estimate, residual_norm(blocks, estimate, scale)
 
     theta, done, converged, reason = iterate(step, start, iterations)
     noise = joint_variances(blocks, theta)
     simulated = auxiliary.equations(blocks, theta)
-    covariance = factored(stacked(simulated, noise)[0], *stacked(blocks, noise)).covariance
+    covariance = products(simulated).covariance
     if serial_order:
         weights, keep = noise, [b.keep for b in blocks]
         zeta, x = mapped(lambda b: b.x, simulated), mapped(lambda b: b.x, blocks)

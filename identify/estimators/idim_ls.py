@@ -9,11 +9,11 @@ from armident.identify.regression.equations import (
     ExperimentEquations,
     joint_variances,
     noise_models,
-    stacked,
+    stacked_parts,
     whitened_residuals,
 )
 from armident.identify.regression.iv import serial_covariance
-from armident.identify.regression.least_squares import inverse_gram, least_squares, require_excitation
+from armident.identify.regression.least_squares import Triangle, require_excitation
 from armident.identify.streamed import mapped
 
 
@@ -41,14 +41,14 @@ def idim_ls(
         If the motion leaves parameters undetermined.
     """
     plain = [WHITE] * blocks[0].y.shape[1]
-    x, y = stacked(blocks, plain)
-    require_excitation(x, names)
-    theta = least_squares(x, y)  # 2.22
+    rows = Triangle.of(stacked_parts(blocks, plain))
+    require_excitation(rows, names)
+    theta = rows.theta  # 2.22
     noise = joint_variances(blocks, theta)  # 2.24 to 2.26
     if weighted:
-        x, y = stacked(blocks, noise)
-        theta = least_squares(x, y)  # 2.23
-        covariance = inverse_gram(x)  # 2.27
+        rows = Triangle.of(stacked_parts(blocks, noise))
+        theta = rows.theta  # 2.23
+        covariance = rows.inverse_gram  # 2.27
     else:
         regressors = mapped(lambda b: b.x, blocks)
         covariance = serial_covariance(regressors, regressors, [b.keep for b in blocks], plain, noise)

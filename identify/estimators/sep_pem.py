@@ -14,11 +14,11 @@ from armident.identify.regression.equations import (
     ExperimentEquations,
     joint_variances,
     noise_models,
-    stacked,
+    stacked_parts,
     whitened_residuals,
 )
 from armident.identify.regression.iterations import ITERATIONS
-from armident.identify.regression.least_squares import inverse_gram
+from armident.identify.regression.least_squares import Triangle
 
 
 def sep_pem(
@@ -56,9 +56,9 @@ def sep_pem(
     auxiliary = auxiliary.fresh()
     (theta, done, converged, reason), simulated = solve_didim(blocks, auxiliary, start, iterations)  # step 1
     noise = joint_variances(simulated, theta)
-    covariance = inverse_gram(stacked(simulated, noise)[0])
+    covariance = Triangle.of(stacked_parts(simulated, noise)).inverse_gram
     for _ in range(COVARIANCE_PASSES):
         noise = noise_models(simulated, theta, covariance, max_order)  # step 2, 6.27
-        covariance = inverse_gram(stacked(simulated, noise)[0])  # step 3, 6.29
+        covariance = Triangle.of(stacked_parts(simulated, noise)).inverse_gram  # step 3, 6.29
     residuals = whitened_residuals(simulated, theta, noise)
     return Estimate(theta, covariance, tuple(noise), residuals, done, converged, reason, auxiliary.warnings)

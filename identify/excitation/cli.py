@@ -58,6 +58,8 @@ class TrajectoryOptions:
         File of the plot; ``None``: named after ``out`` or ``look_at``.
     look_at
         Existing trajectory to check instead of a design.
+    masses
+        Standard parameters that predict torques, without an identification.
     """
 
     config: Path
@@ -73,6 +75,7 @@ class TrajectoryOptions:
     harmonics: int | None = None
     picture: Path | None = None
     look_at: Path | None = None
+    masses: Path | None = None
 
 
 def trajectory_command(options: TrajectoryOptions) -> CheckedTrajectory:
@@ -102,10 +105,12 @@ def trajectory_command(options: TrajectoryOptions) -> CheckedTrajectory:
         picture = out.with_suffix(".png") if out is not None else Path(f"{Path(look_at or '').stem}.png")
     check_name(picture)
     prior = None
+    if options.known is not None and options.masses is not None:
+        raise ConfigError("--known has identified masses: leave --masses out")
     if options.known is not None:
         document = load_document(options.known, IdentificationDocument)
         prior = physical_estimate(document, robot, str(options.known))
-    safety = safety_model(robot, options.config, prior, str(options.known))
+    safety = safety_model(robot, options.config, prior, str(options.known), options.masses)
     aim = with_objective(robot, options.wanted, options.joint, options.against, safety.theta)
     if look_at is not None:
         design = _looked_at(robot, look_at, prior, aim, safety)

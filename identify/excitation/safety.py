@@ -1,6 +1,7 @@
 """Limits of a trajectory beyond those of motion: torques by known masses, and distances between bodies."""
 
-from collections.abc import Iterable
+import re
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import numpy as np
 from armident.configs import ConfigError, RobotConfig
 from armident.configs.loading import load_inertials, load_shapes
 from armident.configs.urdf_inertials import UrdfInertials
+from armident.identify.document import read_json
 from armident.identify.effects.terms import arm_model
 from armident.identify.excitation.collision import CollisionModel
 from armident.identify.excitation.design import ASSUMED_NOISE, PERIOD, Design, excesses, predict_precision
@@ -57,9 +59,13 @@ class SafetyChecks:
 
 
 def safety_model(
-    robot: RobotConfig, source: str | Path | None, prior: PreviousEstimate | None, prior_name: str = "--known"
+    robot: RobotConfig,
+    source: str | Path | None,
+    prior: PreviousEstimate | None,
+    prior_name: str = "--known",
+    masses: Path | None = None,
 ) -> SafetyModel:
-    """Collect masses and bodies of an arm: of an earlier estimate, of its configuration, of its URDF.
+    """Collect masses and bodies of an arm: of an earlier estimate, of a file, of its configuration, of its URDF.
 
     Parameters
     ----------
@@ -69,6 +75,8 @@ def safety_model(
         Path or shipped name from which it was loaded: its URDF is read; ``None``: there is none.
     prior, prior_name
         Earlier estimate, and its name in messages.
+    masses
+        JSON file of standard parameters, as ``armident robot --truth`` writes it; replaces the masses of the URDF.
 
     Raises
     ------
@@ -85,6 +93,10 @@ def safety_model(
     )
     if prior is not None:
         return SafetyModel(collision, prior.theta, prior_name, tuple(remarks))
+    if masses is not None:
+        given, lacking = _theta_of_file(robot, masses)
+        remarks += [f"torques of parameters that {masses} lacks: {_listed(lacking)}"] if lacking else []
+        return SafetyModel(collision, given, f"the parameters of {masses}", tuple(remarks))
     found = None if source is None else load_inertials(source)
     theta = None if found is None else _theta_of_urdf(robot, found)
     if found is not None and theta is not None:
@@ -104,6 +116,32 @@ def _theta_of_urdf(robot: RobotConfig, found: UrdfInertials) -> Floats | None:
     return np.array([values.get(name, 0.0) for name in arm_model(robot).names])
 
 
+def _theta_of_file(robot: RobotConfig, file: Path) -> tuple[Floats, list[str]]:
+    """Return the standard parameters (p,) of a JSON file, and the names of those that it lacks, which are zero."""
+    values = read_json(file)
+    names = arm_model(robot).names
+    given = {name: values[name] for name in names if name in values}
+    wrong = next((n for n, v in given.items() if isinstance(v, bool) or not isinstance(v, int | float)), None)
+    if wrong is not None or not np.isfinite([float(v) for v in given.values()]).all():
+        raise ConfigError(f"{file}: {wrong or 'a parameter'}: expected a finite number, SI")
+    if not any(name in given for name in _not_negative(names, "m")):
+        raise ConfigError(
+            f"{file}: has no masses of links (m1 to m{robot.n}); expected standard parameters in SI by name, as "
+            "`armident robot --truth FILE` writes them"
+        )
+    negative = next((n for n in _not_negative(names, "m", "ia", "fv", "fc") if given.get(n, 0.0) < 0.0), None)
+    if negative is not None:
+        raise ConfigError(f"{file}: {negative}: {given[negative]:g} is negative, which no arm has")
+    important = _not_negative(names, "m", "ia", "fv", "fc")
+    lacking = sorted((name for name in names if name not in given), key=lambda name: name not in important)
+    return np.array([float(given.get(name, 0.0)) for name in names]), lacking
+
+
+def _not_negative(names: Sequence[str], *kinds: str) -> list[str]:
+    """Return the names of parameters of some kinds: kind and number of a link, joint or coupling."""
+    return [name for name in names if re.fullmatch(rf"({'|'.join(kinds)})m?\d+", name)]
+
+
 def check_safety(robot: RobotConfig, design: Design, safety: SafetyModel) -> SafetyChecks:
     """Return what was checked of a trajectory, with the results, and what was not.
 
@@ -119,7 +157,7 @@ def check_safety(robot: RobotConfig, design: Design, safety: SafetyModel) -> Saf
     done = ["position, velocity and acceleration keep their limits"]
     left = list(safety.remarks)
     if design.torque is None:
-        left.append("torques: no --known identification, and no masses in a URDF")
+        left.append("torques: no --known identification, no --masses, and no masses in a URDF")
     else:
         used = np.abs(design.torque).max(axis=0) / [joint.limits.torque for joint in robot.joints]
         worst = int(np.argmax(used))

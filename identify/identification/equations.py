@@ -15,7 +15,7 @@ from armident.identify.signals.bandpass import butterworth, central_difference
 from armident.identify.signals.decimate import Decimation, design
 from armident.identify.signals.differentiate import Derivatives
 from armident.identify.signals.published_filters import chebyshev_decimate, kept_samples
-from armident.identify.streamed import Streamed, kept
+from armident.identify.streamed import Streamed, chosen, kept
 
 LS_CUTOFF = 2.0
 """Cut-off of the least-squares decimation in closed-loop bandwidths (thesis 2.3.1: ``w_Fp >= 2 w_dyn``)."""
@@ -166,7 +166,7 @@ class Prepared:
         numbers
             Their numbers, from 0.
         """
-        return Prepared(self.model, [self.experiments[k] for k in numbers], [self.signals[k] for k in numbers])
+        return Prepared(self.model, chosen(self.experiments, numbers), chosen(self.signals, numbers))
 
 
 def tested(blocks: Sequence[ExperimentEquations]) -> list[int]:

@@ -1,6 +1,6 @@
 """Excitation: base parameters that a motion supports, and inertia and gravity of each joint that it determines."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,8 +16,8 @@ from armident.identify.identification.result import units
 from armident.identify.identification.verdict import Level, Reason, listed
 from armident.identify.regression.ar_noise import ArModel
 from armident.identify.regression.equations import ExperimentEquations, filtered_regressor
-from armident.identify.regression.least_squares import RANK_TOLERANCE, column_norms, least_squares
-from armident.identify.regression.qr import triangularize
+from armident.identify.regression.least_squares import RANK_TOLERANCE, Triangle
+from armident.identify.regression.qr import triangularize_parts
 from armident.identify.robot.arm import ArmModel
 from armident.identify.signals.decimate import Decimation
 from armident.identify.signals.differentiate import Derivatives
@@ -28,6 +28,10 @@ POSTURES = 100
 
 NEGLIGIBLE = 1e-6
 """Torque per SI unit of a parameter, relative to the greatest of all, below which a motion does not show it."""
+
+TIE = 1e-6
+"""Relative advantage, in the order of pivoted QR, of the parameter with most torque per SI unit: among those that the
+motion cannot separate at all, rounding would decide."""
 
 NON_NEGATIVE = ("fv", "fc", "ia")
 """First letters of the parameters that cannot be negative: viscous and Coulomb friction, rotor inertia."""
@@ -125,15 +129,22 @@ def examine_support(
         Residual variances of least squares, which weigh the equations; ``None``: the variances of the torques.
     """
     model = prepared.model
-    x, y, joint = _moving_rows(prepared, blocks, decimation, moving, noise)
-    scale = column_norms(x)
+    b, rows = model.base.b, 0
+    powers = np.zeros((model.n, b + 1))
+
+    def joint_by_joint() -> Iterator[tuple[Array]]:
+        nonlocal rows
+        for j, own in _moving_rows(prepared, blocks, decimation, moving, noise):
+            powers[j] += np.einsum("ij,ij->j", own, own)
+            rows += own.shape[0]
+            yield (own,)
+
+    top, norms = triangularize_parts(joint_by_joint(), columns=b + 1)
     # Rounding errors, such as that of cos(pi / 2), give columns that no real parameter fills.
-    scale = np.where(scale > NEGLIGIBLE * scale.max(), scale, np.inf)
-    top = triangularize(x, columns=x.shape[1], scales=(scale,))
-    factor, order = linalg.qr(top, mode="r", pivoting=True)
-    torque = np.array([np.linalg.norm(y[joint == j]) for j in range(model.n)])
-    share = np.stack([np.sum((x[joint == j] / scale) ** 2, axis=0) for j in range(model.n)])
-    limit = criteria.max_relative_std * np.sqrt(torque**2 @ share)[order]
+    scale = np.where(norms[:b] > NEGLIGIBLE * norms[:b].max(), norms[:b], np.inf)
+    preferred = 1.0 + TIE * norms[:b] / norms[:b].max()
+    factor, order = linalg.qr(top[:, :b] * (preferred / scale), mode="r", pivoting=True)
+    limit = criteria.max_relative_std * np.sqrt(powers[:, b] @ (powers[:, :b] / scale**2))[order]
     pivots = np.abs(np.diag(factor))
     count = int(np.sum(pivots > RANK_TOLERANCE * max(float(pivots[0]), 1e-300)))
     while count:
@@ -141,17 +152,17 @@ def examine_support(
         if np.all(np.linalg.norm(inverse, axis=1) <= limit[:count]):
             break
         count -= 1
-    supported = np.zeros(x.shape[1], dtype=np.bool_)
+    supported = np.zeros(b, dtype=np.bool_)
     supported[order[:count]] = True
-    theta, std = np.full((2, x.shape[1]), np.nan)
+    theta, std = np.full((2, b), np.nan)
     if count:
-        chosen = x[:, supported]
-        theta[supported] = least_squares(chosen, y)
-        rest = y - chosen @ theta[supported]
-        variance = float(rest @ rest) / max(y.size - count, 1)
-        norms = column_norms(chosen)
-        inverse = linalg.solve_triangular(triangularize(chosen, columns=count, scales=(norms,)), np.eye(count))
-        std[supported] = np.sqrt(variance) * np.linalg.norm(inverse, axis=1) / norms
+        # An orthogonal transformation of all rows: the least squares of a part of the columns are the same.
+        chosen, y = top[:, :b][:, supported], top[:, b]
+        solved = Triangle.of([(chosen, y)])
+        theta[supported] = solved.theta
+        rest = y - chosen @ solved.theta
+        variance = float(rest @ rest) / max(rows - count, 1)
+        std[supported] = np.sqrt(variance * np.diag(solved.inverse_gram))
     return Support(moving, supported, theta, std)
 
 
@@ -280,23 +291,26 @@ def _moving_rows(
     decimation: Decimation,
     moving: Mask,
     noise: Sequence[ArModel] | None,
-) -> tuple[Array, Array, NDArray[np.int64]]:
-    """Regressor (R, b), torques (R,) in residual standard deviations, and joint (R,), of the joints that move."""
+) -> Iterator[tuple[int, Array]]:
+    """Yield the joints that move, experiment by experiment, with regressor and torques side by side (R, b + 1).
+
+    The rows are in residual standard deviations.
+    """
     regressors = mapped(lambda b: b.x, blocks)
     if not moving.all():
         blocks = prepared.equations(decimation)
         still = (_held(s, moving) for s in prepared.signals)
         regressors = kept((filtered_regressor(prepared.model, s, decimation) for s in still), like=blocks)
-    x, y, joints = [], [], []
-    for j in np.flatnonzero(moving).tolist():
-        power = np.concatenate([b.y[b.keep[:, j], j] for b in blocks]).var() if noise is None else noise[j].variance
-        std = max(float(np.sqrt(power)), 1e-150)
-        for block, regressor in zip(blocks, regressors, strict=True):
-            rows = block.keep[:, j]
-            x.append(regressor[rows, j] / std)
-            y.append(block.y[rows, j] / std)
-            joints.append(np.full(int(rows.sum()), j))
-    return np.concatenate(x), np.concatenate(y), np.concatenate(joints)
+    if noise is None:
+        torques = [(b.y, b.keep) for b in blocks]
+        variances = [np.concatenate([y[used[:, j], j] for y, used in torques]).var() for j in range(moving.size)]
+    else:
+        variances = [ar.variance for ar in noise]
+    stds = np.maximum(np.sqrt(variances), 1e-150)
+    for block, regressor in zip(blocks, regressors, strict=True):
+        for j in np.flatnonzero(moving).tolist():
+            used = block.keep[:, j]
+            yield j, np.column_stack([regressor[used, j], block.y[used, j]]) / stds[j]
 
 
 def _held(signals: Derivatives, moving: Mask) -> Derivatives:

@@ -23,6 +23,8 @@ RATE_TOLERANCE = 0.01
 """Relative difference between the nominal rate and the receive times above which a note is added."""
 NO_REFERENCE = "no reference trajectory was recorded: identified without one"
 """Note on a recording without demands."""
+PIECE = 1_000_000
+"""Number of samples whose references are looked up at a time."""
 EFFORTS: tuple[Literal["torque", "current", "voltage"], ...] = ("torque", "current", "voltage")
 
 Array = NDArray[np.float64]
@@ -99,7 +101,7 @@ def _converted(
     samples = recording.samples
     dt = 1.0 / recording.sample_rate_hz
     demand = _demand_stream(recording)
-    has_ref = np.ones(samples.sync.size, dtype=bool) if demand is None else _between_knots(demand, samples.sync)[0]
+    has_ref = np.ones(samples.sync.size, dtype=bool) if demand is None else _has_reference(demand, samples.sync)
     if demand is None:
         notes.append(NO_REFERENCE)
     long = samples.sync.size * robot.n > stretches.beyond
@@ -309,6 +311,13 @@ def _reference(stream: Stream, samples: Stream, robot: RobotConfig) -> Array:
     _, low, share = _between_knots(stream, samples.sync)
     q_ref: Array = knots[low] + share[:, None] * (knots[low + 1] - knots[low])
     return q_ref
+
+
+def _has_reference(stream: Stream, sync: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Mask (N,) of samples with a reference, found piece by piece: the numbers of all knots would fill the memory."""
+    if stream.sync is sync:
+        return np.ones(sync.size, dtype=bool)
+    return np.concatenate([_between_knots(stream, part)[0] for part in np.array_split(sync, 1 + sync.size // PIECE)])
 
 
 def _between_knots(stream: Stream, sync: NDArray[np.int64]) -> tuple[NDArray[np.bool_], NDArray[np.int64], Array]:

@@ -4,8 +4,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from armident.identify.estimators.diagnostics import ljung_box
 from armident.identify.estimators.idim_ls import idim_ls
+from armident.identify.estimators.residual_tests import ljung_box
 from armident.identify.identification.equations import Prepared
 from armident.identify.identification.options import Options
 from armident.identify.identification.result import Array, LeastSquares

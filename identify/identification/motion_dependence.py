@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armident.identify.identification.equations import Prepared
-from armident.identify.regression.equations import ExperimentEquations, residuals
+from armident.identify.regression.equations import ExperimentEquations, instants, residuals
 
 POSITION_BINS, VELOCITY_BINS = 100, 40
 """Largest number of bins of position, for each direction of motion, and of velocity."""
@@ -65,12 +65,13 @@ def motion_dependence(prepared: Prepared, blocks: Sequence[ExperimentEquations],
     """
     dt = prepared.experiments[0].dt
     errors = residuals(blocks, theta)
-    at = [np.rint(block.t / dt).astype(np.int64) for block in blocks]
+    pairs = [(s.q[at], s.qd[at]) for s, at in zip(prepared.signals, instants(blocks, dt), strict=True)]
+    motion = [np.concatenate(each) for each in zip(*pairs, strict=True)]
+    keep = [block.keep for block in blocks]
     found = []
     for j in range(errors[0].shape[1]):
-        kept = [np.where(block.keep[:, j], e[:, j], 0.0) for e, block in zip(errors, blocks, strict=True)]
-        q = np.concatenate([s.q[k, j] for s, k in zip(prepared.signals, at, strict=True)])
-        qd = np.concatenate([s.qd[k, j] for s, k in zip(prepared.signals, at, strict=True)])
+        kept = [np.where(used[:, j], e[:, j], 0.0) for e, used in zip(errors, keep, strict=True)]
+        q, qd = (signal[:, j] for signal in motion)
         for variable, bins in (("position", _position_bins(q, qd)), ("velocity", _velocity_bins(qd))):
             found.append(Dependence(j, variable, *_explained(kept, bins)))
     return found

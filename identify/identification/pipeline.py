@@ -103,7 +103,7 @@ def identify_experiment(
     clock = _Clock(progress or (lambda stage, share: None))
     try:
         # The matrices are tall and narrow: threads gain little, delay each other on a busy machine, round differently.
-        with threadpool_limits(1):  # type: ignore[no-untyped-call]
+        with threadpool_limits(1):
             return _identify(experiments, robot, options or Options(), clock, setup)
     except DataError as error:
         known = judge([], setup).reasons

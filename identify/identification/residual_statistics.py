@@ -14,7 +14,14 @@ from numpy.typing import NDArray
 
 from armident.identify.identification.equations import Prepared
 from armident.identify.regression.ar_noise import ArModel
-from armident.identify.regression.equations import MAX_AR_ORDER, Estimate, ExperimentEquations, noise_models, residuals
+from armident.identify.regression.equations import (
+    MAX_AR_ORDER,
+    Estimate,
+    ExperimentEquations,
+    instants,
+    noise_models,
+    residuals,
+)
 from armident.identify.regression.whitening import whitened
 
 Array = NDArray[np.float64]
@@ -91,7 +98,7 @@ def residual_statistics(
     if not any(ar.order for ar in noise):
         noise = noise_models(blocks, estimate.theta, estimate.covariance, MAX_AR_ORDER)
     dt = prepared.experiments[0].dt
-    at = [np.rint(block.t / dt).astype(np.int64) for block in blocks]
+    motion = [(s.q[at], s.qd[at]) for s, at in zip(prepared.signals, instants(blocks, dt), strict=True)]
     keep = [block.keep for block in blocks]
     errors = residuals(blocks, estimate.theta)
     x, e = whitened([block.x for block in blocks], noise, keep), whitened(errors, noise, keep)
@@ -101,8 +108,7 @@ def residual_statistics(
     whole = (x / scale) @ (vectors[:, regular] / np.sqrt(values[regular]))
     found, first = [], 0
     for j, joint in enumerate(prepared.model.robot.joints):
-        q = [s.q[k, j] for s, k in zip(prepared.signals, at, strict=True)]
-        qd = [s.qd[k, j] for s, k in zip(prepared.signals, at, strict=True)]
+        q, qd = [q[:, j] for q, _ in motion], [qd[:, j] for _, qd in motion]
         limits = min(float(v.min()) for v in q), max(float(v.max()) for v in q)
         fastest = float(np.quantile(np.abs(np.concatenate(qd)), SPEED_QUANTILE))
         functions = [motion_functions(a, b, limits, fastest) for a, b in zip(q, qd, strict=True)]

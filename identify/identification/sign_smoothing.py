@@ -14,6 +14,7 @@ from armident.configs import RobotConfig
 from armident.identify.experiment import Experiment
 from armident.identify.signals.bandpass import butterworth, central_difference
 from armident.identify.signals.bandwidth import position_noise
+from armident.identify.streamed import Streamed
 
 SATURATION = 450.0
 """``g`` times the top speed of the joint.
@@ -33,6 +34,10 @@ SATURATED = 0.98
 The missing part of Coulomb friction, ``2 / (pi g qd)``, varies with the velocity, and viscous friction absorbs it: a
 lift at 150 s/m and 0.1 m/s rms misses 4 %, and its viscous friction comes out at 45 instead of 60 N s/m.
 """
+
+SPEEDS_PER_PERIOD = 8
+"""Velocities per period of the low-pass from which the top speed of a long recording is taken: all of them would take
+as much memory as the recording."""
 
 LARGEST_CUTOFF = 0.45
 """Highest cut-off of the velocity filter, over the sampling rate."""
@@ -69,17 +74,18 @@ def recorded_speeds(experiments: Sequence[Experiment], bandwidth_hz: float) -> S
     bandwidth_hz
         Closed-loop bandwidth, Hz.
     """
-    speeds, noise = [], []
+    speeds, noise, power, samples = [], [], np.zeros(experiments[0].q.shape[1]), 0
     for e in experiments:
         cutoff = min(bandwidth_hz, LARGEST_CUTOFF / e.dt)
-        speeds.append(np.abs(central_difference(butterworth(e.q, e.dt, cutoff), e.dt)))
+        speed = np.abs(central_difference(butterworth(e.q, e.dt, cutoff), e.dt))
+        power += np.sum(speed**2, axis=0)
+        samples += speed.shape[0]
+        every = max(1, int(1 / (SPEEDS_PER_PERIOD * cutoff * e.dt))) if isinstance(experiments, Streamed) else 1
+        speeds.append(speed[::every].copy())
         # White noise has the density 2 var dt per Hz; differentiated up to the cut-off, its variance is this integral.
         noise.append(position_noise(e.q, e.dt) * np.sqrt(8 / 3 * e.dt * np.pi**2 * cutoff**3))
-    samples = sum(s.shape[0] for s in speeds)
-    # One joint after the other: of a long recording the speeds of all take as much memory as the recording.
     top = [np.quantile(np.concatenate([s[:, j] for s in speeds]), TOP_QUANTILE) for j in range(speeds[0].shape[1])]
-    rms = np.sqrt(sum(np.sum(s**2, axis=0) for s in speeds) / samples)
-    return Speeds(np.array(top), rms, np.max(noise, axis=0))
+    return Speeds(np.array(top), np.sqrt(power / samples), np.max(noise, axis=0))
 
 
 def with_sign_smoothing(robot: RobotConfig, experiments: Sequence[Experiment], bandwidth_hz: float) -> RobotConfig:

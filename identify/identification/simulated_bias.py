@@ -24,11 +24,11 @@ from armident.identify.regression.equations import (
     filtered_regressor,
     instrumented,
     joint_variances,
-    stacked,
+    stacked_parts,
     whitened_residuals,
 )
 from armident.identify.regression.iv import iv_products
-from armident.identify.regression.least_squares import least_squares
+from armident.identify.regression.least_squares import Triangle
 from armident.identify.robot.controller import DiscreteController
 from armident.identify.robot.simulation import Simulation
 from armident.identify.signals.bandpass import central_difference
@@ -72,11 +72,14 @@ class SimulatedBias:
         Standard deviations of these estimates, SI, (b,).
     runs
         Number of simulated recordings.
+    share
+        Share of the experiments that were simulated, 0 to 1: estimates from all scatter by its square root of that.
     """
 
     bias: Array
     scatter: Array
     runs: int
+    share: float = 1.0
 
     def largest(self, estimate: Estimate) -> tuple[int, float]:
         """Parameter with the largest bias, and the bias in its standard deviations.
@@ -100,6 +103,7 @@ def simulated_bias(
     derivatives: DerivativesName,
     *,
     runs: int | None = None,
+    share: float = 1.0,
 ) -> SimulatedBias | None:
     """Return the bias of an instrumental-variable estimate.
 
@@ -119,6 +123,8 @@ def simulated_bias(
         Smoother of the positions.
     runs
         Number of simulated recordings; ``None``: few where the bias is irrelevant, else many.
+    share
+        Share of the experiments of the estimate that are simulated, 0 to 1.
 
     Returns
     -------
@@ -148,7 +154,7 @@ def simulated_bias(
         errors.append(found - theta)
         if runs is None and len(errors) == FEW and not _relevant(errors, estimate):
             break
-    return SimulatedBias(np.mean(errors, axis=0), np.std(errors, axis=0, ddof=1), len(errors))
+    return SimulatedBias(np.mean(errors, axis=0), np.std(errors, axis=0, ddof=1), len(errors), share)
 
 
 def corrected(estimate: Estimate, found: SimulatedBias, blocks: Sequence[ExperimentEquations]) -> Estimate:
@@ -168,7 +174,7 @@ def corrected(estimate: Estimate, found: SimulatedBias, blocks: Sequence[Experim
         Equations of the estimate.
     """
     theta = estimate.theta - found.bias
-    ratio = found.scatter / estimate.std
+    ratio = np.sqrt(found.share) * found.scatter / estimate.std
     least = np.sqrt(stats.chi2.ppf(1.0 - SIGNIFICANCE, found.runs - 1) / (found.runs - 1))
     wider = np.where(ratio > least, ratio, 1.0)
     covariance = estimate.covariance * np.outer(wider, wider) + np.diag(
@@ -294,6 +300,6 @@ def least_squares_bias(
             return replace(blocks[k], y=truths[k], x=x)
 
         pairs = enumerate(zip(prepared.experiments, prepared.signals, strict=True))
-        x, y = stacked(kept((of(k, *pair) for k, pair in pairs), like=prepared.experiments), weights)
-        errors.append(least_squares(x, y) - theta)
+        rows = (of(k, *pair) for k, pair in pairs)
+        errors.append(Triangle.of(stacked_parts(rows, weights)).theta - theta)
     return SimulatedBias(np.mean(errors, axis=0), np.std(errors, axis=0, ddof=1), FEW)

@@ -46,6 +46,7 @@ from armident.identify.regression.iv import serial_covariance
 from armident.identify.robot.simulation import Simulation
 from armident.identify.signals.decimate import Decimation, design
 from armident.identify.signals.differentiate import Derivatives
+from armident.identify.streamed import chosen
 
 CONTRADICTION = 5.0
 """Standard deviations by which IDIM-PIV may differ from IDIM-IV in any parameter before IDIM-IV replaces it."""
@@ -206,18 +207,21 @@ class Solution:
         DataError
             If neither the estimate nor any point between it and the last good one can be simulated.
         """
-        return self.problem.auxiliary.fresh().motions(self.estimate.theta)
+        auxiliary = self.problem.auxiliary.fresh()
+        return auxiliary.motions(self.estimate.theta) if self.runs is None else auxiliary.motions_of(self.runs)
 
     @cached_property
     def instruments(self) -> Sequence[Array]:
-        """Regressors at these motions, decimated to the band of the instruments, one (M, n, b) per experiment."""
-        return self.problem.in_band.auxiliary.regressors(self.motions)
+        """Regressors at these motions, decimated to the band of the instruments, (M, n, b) per `tested` experiment."""
+        problem = self.problem.in_band
+        numbers = tested(problem.blocks)
+        return list(problem.auxiliary.of_experiments(numbers).regressors(chosen(self.motions, numbers)))
 
     def diagnostics(self, essential: NDArray[np.bool_]) -> Diagnostics:
         """Tests of the estimate on its equations, decimated to the band of its instruments; see `tested`."""
         problem = self.problem.in_band
         numbers = tested(problem.blocks)
-        estimate, instruments = residuals_of(self.estimate, numbers), [self.instruments[k] for k in numbers]
+        estimate, instruments = residuals_of(self.estimate, numbers), self.instruments
         blocks, method = [problem.blocks[k] for k in numbers], problem.options.method
         if method not in MEASURED:
             blocks = [replace(b, x=z) for b, z in zip(blocks, instruments, strict=True)]
@@ -242,9 +246,10 @@ class Solution:
         blocks = prepared.equations(problem.plain)
         numbers = tested(blocks)
         x = [blocks[k].x for k in numbers]
-        motions = [self.motions[k] for k in numbers]
+        motions = chosen(self.motions, numbers)
         thinned = problem.in_band.auxiliary.decimation == problem.plain
-        z = [self.instruments[k] for k in numbers] if thinned else problem.plain_problem.auxiliary.regressors(motions)
+        loop = problem.plain_problem.auxiliary.of_experiments(numbers)
+        z = self.instruments if thinned else loop.regressors(motions)
         part = prepared.part(numbers)
         try:
             found = torque_delay(part.model, part.experiments, part.signals, problem.plain, motions, (x, z))
@@ -331,16 +336,21 @@ def _idim_iv(problem: Problem) -> Solution:
 
 
 def _bias(problem: Problem, estimate: Estimate, *, prefiltered: bool, runs: int | None = None) -> SimulatedBias | None:
-    """Bias of IDIM-IV or IDIM-PIV on recordings simulated with the estimate; ``None`` if that is impossible."""
+    """Bias of IDIM-IV or IDIM-PIV on recordings simulated with the estimate; ``None`` if that is impossible.
+
+    Of a long recording the `tested` stretches are simulated: more of them take as much time as all iterations.
+    """
     weights = estimate.noise if prefiltered else joint_variances(problem.blocks, estimate.theta)
+    numbers = tested(problem.blocks)
     return simulated_bias(
-        problem.prepared,
-        problem.auxiliary,
-        problem.blocks,
+        problem.prepared.part(numbers),
+        problem.auxiliary.of_experiments(numbers),
+        chosen(problem.blocks, numbers),
         estimate,
         weights,
         problem.options.derivatives or "irwsm",
         runs=runs,
+        share=len(numbers) / len(problem.blocks),
     )
 
 

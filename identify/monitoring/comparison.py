@@ -1,4 +1,4 @@
-"""Comparison of two identifications, joint by joint: document, table and report of the change test."""
+"""Comparison of two identifications, joint by joint: document and table of the change test."""
 
 import re
 from collections.abc import Sequence
@@ -10,17 +10,10 @@ import numpy as np
 from armident.configs import DataError
 from armident.identify.document import IdentificationDocument, Parameter
 from armident.identify.effects.terms import terms_of
-from armident.identify.model_documents import ComparedModel, ComparedParameter, ComparisonDocument
+from armident.identify.model_documents import LEVEL_95, ComparedModel, ComparedParameter, ComparisonDocument
 from armident.identify.monitoring.change_test import FALSE_ALARMS, ParameterChangeTest, compare
-from armident.identify.report.glossary import identification_entries
-from armident.identify.report.page import BAND, MODEL, MUTED, RESIDUAL, figure, render
+from armident.identify.monitoring.model_differences import model_differences
 from armident.identify.saved_model import configuration_of
-
-LEVEL_95 = 1.959964
-"""Half width of a 95 % interval of a normal distribution, standard deviations."""
-
-SHOWN_PER_ROW = 18
-"""Most parameters in one row of the plot: their names stay readable."""
 
 
 def compare_models(
@@ -121,7 +114,13 @@ def _warnings(
 ) -> list[str]:
     lines = []
     if left_out:
-        lines.append(f"compared on {len(result.parameters)} parameters that both have, without {', '.join(left_out)}")
+        lines.append(
+            f"compared on {len(result.parameters)} parameters that both have, without {', '.join(left_out)}: the "
+            "others may take over what these explain, and differ although the arm has not changed"
+        )
+    lines += model_differences(
+        baseline, now, {p.name: float(s) for p, s in zip(result.parameters, result.std, strict=True)}
+    )
     if baseline.recording.sha256 == now.recording.sha256:
         lines.append(
             "both were identified from the same recording: their errors are not independent, as the test needs"
@@ -186,25 +185,6 @@ def _places(document: IdentificationDocument) -> tuple[list[str], list[str]]:
     return list(document.relative_error_pct_by_joint), [each["name"] for each in configuration.get("couplings", [])]
 
 
-def comparison_report(document: ComparisonDocument, glossary_of: IdentificationDocument) -> str:
-    """Return the HTML page of a comparison, complete in one file.
-
-    Parameters
-    ----------
-    document
-        The comparison.
-    glossary_of
-        The later identification, whose parameters the glossary explains.
-    """
-    return render(
-        "comparison.html",
-        document=document,
-        picture=_picture(document),
-        level=LEVEL_95,
-        glossary=identification_entries(glossary_of),
-    )
-
-
 def comparison_table(document: ComparisonDocument) -> None:
     """Print the verdict of a comparison, and the essential and the changed parameters with 95 % intervals by joint."""
     from rich.console import Console
@@ -239,30 +219,3 @@ def _row(p: ComparedParameter) -> tuple[str, str, str, str, str]:
     values = ((p.before, p.before_std), (p.now, p.now_std), (p.now - p.before, p.std_of_difference))
     before, now, difference = (f"{value:.4g} ± {LEVEL_95 * std:.2g}" for value, std in values)
     return p.name, before, now, difference, p.unit
-
-
-def _picture(document: ComparisonDocument) -> str:
-    """Draw both values of every parameter with 95 % intervals, in standard deviations of their difference."""
-    rows = [
-        (joint, parameters[k : k + SHOWN_PER_ROW])
-        for joint, parameters in document.by_joint.items()
-        for k in range(0, len(parameters), SHOWN_PER_ROW)
-    ]
-    with figure(len(rows), 1, 1.7) as (_, axes, picture):
-        for axis, (joint, parameters) in zip(axes[:, 0], rows, strict=True):
-            x = np.arange(len(parameters))
-            scale = np.array([p.std_of_difference for p in parameters])
-            shift = np.array([p.now - p.before for p in parameters]) / scale
-            before, now = (
-                np.array([getattr(p, f"{end}_std") for p in parameters]) / scale for end in ("before", "now")
-            )
-            colours = [MODEL if p.changed else RESIDUAL for p in parameters]
-            axis.axhspan(-LEVEL_95, LEVEL_95, color=BAND)
-            axis.errorbar(x - 0.12, 0 * x, LEVEL_95 * before, fmt="o", color=MUTED, markersize=3, capsize=2)
-            axis.vlines(x + 0.12, shift - LEVEL_95 * now, shift + LEVEL_95 * now, color=colours, linewidth=1.4)
-            axis.scatter(x + 0.12, shift, color=colours, s=12, zorder=3)
-            axis.set_xticks(x, [p.name for p in parameters], rotation=45, ha="right", fontsize=7.5)
-            axis.set_xlim(-0.7, max(len(parameters), 6) - 0.3)
-            axis.set_title(joint)
-            axis.set_ylabel("std")
-    return picture[0]

@@ -13,11 +13,22 @@ from typing import Any
 import sqlalchemy as sa
 
 from armident.configs import ConfigError
+from armident.identify.monitoring.sqlite_reason import sqlite_reason
 
 BUSY_S = 15.0
 """Longest wait for another process that writes to the database, s."""
 _LOCK = 0x61726D69
 """Number of the advisory lock of an upgrade in PostgreSQL."""
+
+_STATES = {
+    "55P03": "locked by another process for more than {busy:g} s; try again when that has ended",
+    "40P01": "locked by another process (deadlock); try again",
+    "57P01": "the server has ended the connection; try again when it runs",
+    "25006": "it may not be written (read-only)",
+    "42501": "{text}; the user of the URL needs the rights to create, read and write tables",
+    "53100": "the disk of the server is full; free space and try again",
+}
+"""Reasons by the SQLSTATE of PostgreSQL (its manual, appendix A)."""
 
 tables = sa.MetaData()
 runs = sa.Table(
@@ -104,12 +115,31 @@ def engine_for(url: str) -> sa.Engine:
         SQLAlchemy URL.
     """
     if not url.startswith("sqlite"):
-        return sa.create_engine(url)
+        try:
+            return _server_engine(sa.make_url(url))
+        except ValueError as error:
+            raise ConfigError("the port in the URL is no number") from error
     engine = sa.create_engine(url, connect_args={"timeout": BUSY_S})
     # The driver begins transactions late, and none for changes of tables: they are begun here.
     sa.event.listen(engine, "connect", _without_own_transactions)
     sa.event.listen(engine, "begin", _begin)
     return engine
+
+
+def _server_engine(url: sa.URL) -> sa.Engine:
+    """Return the engine of a database server; on PostgreSQL nothing is waited for longer than `BUSY_S`."""
+    if url.get_backend_name() != "postgresql":
+        return sa.create_engine(url, pool_pre_ping=True)
+    waits = {"connect_timeout": round(BUSY_S) or 1, "tcp_user_timeout": round(1000 * BUSY_S)}
+    own = {key: value for key, value in waits.items() if key not in url.query and url.get_driver_name() == "psycopg"}
+    # A connection that the server has closed since is replaced.
+    engine = sa.create_engine(url, connect_args=own, pool_pre_ping=True)
+    sa.event.listen(engine, "begin", _limit_waits)
+    return engine
+
+
+def _limit_waits(connection: sa.Connection) -> None:
+    connection.exec_driver_sql(f"SET LOCAL lock_timeout = {round(1000 * BUSY_S)}")
 
 
 def _without_own_transactions(connection: sqlite3.Connection, _record: Any) -> None:
@@ -167,7 +197,10 @@ def _version(connection: sa.Connection) -> int:
         return int(connection.exec_driver_sql("PRAGMA user_version").scalar_one())
     if not sa.inspect(connection).has_table("armident_history_version"):
         return 0
-    return int(connection.execute(sa.text("SELECT version FROM armident_history_version")).scalar_one())
+    version = connection.execute(sa.text("SELECT version FROM armident_history_version")).scalar()
+    if version is None:
+        raise ConfigError("damaged (armident_history_version has no row); restore a copy")
+    return int(version)
 
 
 def _set_version(connection: sa.Connection, version: int) -> None:
@@ -188,16 +221,20 @@ def reason(error: Exception) -> str:
         Error of SQLAlchemy or of the file system.
     """
     cause = getattr(error, "orig", None) or error
-    text = " ".join(str(cause).split())[:200]
-    if isinstance(cause, sqlite3.DatabaseError):
-        if "locked" in text:
-            return f"locked by another process for more than {BUSY_S:g} s; try again when that has ended"
-        if "malformed" in text or "not a database" in text:
-            return f"damaged ({text}); restore a copy, or begin a new history and add the results to it"
-        if "readonly" in text:
-            return "it may not be written (read-only)"
-        if "unable to open" in text:
-            return "the file cannot be opened; check the folder and its permissions"
+    if isinstance(cause, ImportError):
+        return f"the Python package {cause.name} is not installed"
+    # libpq adds a question after the reason.
+    text = " ".join(str(cause).partition("\n\tIs the server")[0].split())[:200]
+    state = getattr(cause, "sqlstate", None)
+    if state in _STATES:
+        return _STATES[state].format(busy=BUSY_S, text=text)
+    if isinstance(error, sa.exc.OperationalError) and not isinstance(cause, sqlite3.Error):
+        text = text.removeprefix("connection failed: ")
+        return f"no connection to the server ({text}); check that it runs, and host, port, user and database of the URL"
+    if isinstance(cause, sqlite3.Error):
+        text = sqlite_reason(cause, BUSY_S)
+        damaged = "; restore a copy, or begin a new history and add the results to it"
+        return text + damaged if text.startswith("damaged") else text
     return text
 
 

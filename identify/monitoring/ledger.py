@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Literal
 
 from armident.configs import ArmidentError
+from armident.identify.monitoring.sqlite_reason import sqlite_reason
 
 FILE = "worker.sqlite"
 """Name of the ledger in the folder of the results."""
@@ -61,6 +62,10 @@ class LedgerError(ArmidentError):
     """The ledger cannot be read or written at present: locked, or the disk is full. Try again."""
 
 
+class LedgerUnusable(ArmidentError):
+    """The ledger is damaged, or of a newer version."""
+
+
 @dataclass(frozen=True)
 class Entry:
     """Recording in the ledger.
@@ -96,6 +101,8 @@ class Entry:
 
 
 _COLUMNS = "sha256, name, paths, state, attempts, result, message, announced"
+_LATER = "max(:time, coalesce((SELECT max(finished) FROM experiments), 0) + 0.001)"
+"""Time of a result: later than all others, also after a step of the clock back."""
 _FREE = "(owner IS NULL OR boot IS NOT :boot OR lease_until < :now OR owner = :owner)"
 
 
@@ -117,7 +124,7 @@ class Ledger:
     ------
     LedgerError
         If the file is locked or the disk is full.
-    ArmidentError
+    LedgerUnusable
         If the file is damaged or of a newer version.
     """
 
@@ -132,7 +139,10 @@ class Ledger:
         with self._transaction() as db:
             version = int(db.execute("PRAGMA user_version").fetchone()[0])
             if version > len(_MIGRATIONS):
-                raise ArmidentError(f"{path}: ledger of version {version}, this program knows {len(_MIGRATIONS)}")
+                raise LedgerUnusable(
+                    f"{path}: ledger of version {version}, this program knows {len(_MIGRATIONS)}; "
+                    "use the newer armident"
+                )
             for number, script in enumerate(_MIGRATIONS[version:], start=version + 1):
                 for statement in script.split(";"):
                     db.execute(statement)
@@ -178,8 +188,10 @@ class Ledger:
         with self._transaction() as db:
             done = db.execute(
                 "INSERT INTO experiments (sha256, name, paths, added, state, result, message, finished, announced) "
-                "VALUES (?, ?, ?, ?, 'done', ?, ?, ?, 1) ON CONFLICT DO NOTHING",
-                (sha256, name, _texts(paths), time.time(), str(result), message, time.time()),
+                f"VALUES (:sha256, :name, :paths, :time, 'done', :result, :message, {_LATER}, 1) "
+                "ON CONFLICT DO NOTHING",
+                {"sha256": sha256, "name": name, "paths": _texts(paths), "time": time.time()}
+                | {"result": str(result), "message": message},
             )
             return bool(done.rowcount)
 
@@ -243,7 +255,7 @@ class Ledger:
         values = {"sha256": sha256, "state": state, "result": None if result is None else str(result)}
         with self._transaction() as db:
             done = db.execute(
-                "UPDATE experiments SET state = :state, result = :result, message = :message, finished = :time "
+                f"UPDATE experiments SET state = :state, result = :result, message = :message, finished = {_LATER} "
                 "WHERE sha256 = :sha256 AND owner = :owner AND state = 'waiting'",
                 values | {"message": message, "time": time.time()} | self._me(),
             )
@@ -343,7 +355,7 @@ class Ledger:
         except (sqlite3.OperationalError, OSError) as error:
             raise LedgerError(f"{self.path}: {_reason(error)}") from error
         except sqlite3.DatabaseError as error:
-            raise ArmidentError(
+            raise LedgerUnusable(
                 f"{self.path}: the ledger is damaged ({error}); move it away and start again, results are found"
             ) from error
 
@@ -368,8 +380,10 @@ def _use_write_ahead_log(db: sqlite3.Connection) -> None:
             time.sleep(0.02)
 
 
-def _reason(error: Exception) -> str:
-    return (error.strerror or str(error)) if isinstance(error, OSError) else str(error)
+def _reason(error: OSError | sqlite3.Error) -> str:
+    if isinstance(error, OSError):
+        return error.strerror or str(error)
+    return sqlite_reason(error, BUSY_S)
 
 
 def _entry(row: tuple[str, str, str, State, int, str | None, str | None, int]) -> Entry:

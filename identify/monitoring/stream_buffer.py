@@ -24,8 +24,12 @@ MOST_EARLY_BYTES = 64 << 20
 """Largest size of the blocks in memory whose capture was not announced yet, bytes: a minute of six axes at 5 kHz."""
 MOST_CAPTURES = 8
 """Largest number of captures in memory: one per cell is usual."""
+MOST_STREAMS = 8
+"""Largest number of streams without a file that wait in memory, together of `MOST_BYTES`."""
 MOST_NAMES = 1000
 """Number of names of finished captures that are remembered: late copies of their events are passed over."""
+BLOCK_BYTES = 1024
+"""Memory of a block besides its message, bytes: also blocks without rows fill it."""
 LARGEST_BLOCK = 16 << 20
 """Largest block that is decoded, bytes; a block of six axes at 5 kHz over 0.2 s has 40 kB."""
 LARGEST_EVENT = 16 << 20
@@ -45,7 +49,7 @@ class Assembly:
     blocks
         Blocks by number.
     nbytes
-        Memory of the blocks.
+        Memory of the blocks, bytes.
     touched
         Time of the last event or block, s.
     too_long
@@ -176,12 +180,13 @@ class StreamBuffer:
         assembly = self._assembly(block.capture)
         if assembly.too_long or block.sequence in assembly.blocks:
             return
-        early = sum(each.nbytes for each in self._captures.values() if each.start is None) + block.nbytes
+        kept = len(data) + BLOCK_BYTES
+        early = sum(each.nbytes for each in self._captures.values() if each.start is None) + kept
         if assembly.start is None and early > MOST_EARLY_BYTES:
             self.refuse("unknown", f"samples of capture {block.capture}, which nobody announced, fill the memory")
             return
         assembly.blocks[block.sequence] = block
-        assembly.nbytes += block.nbytes
+        assembly.nbytes += kept
         if self.nbytes > self._most_bytes:
             self._give_up(max(self._captures.values(), key=lambda each: each.nbytes))
 
@@ -231,9 +236,12 @@ class StreamBuffer:
     def _assembly(self, capture: str) -> Assembly:
         if capture not in self._captures:
             if len(self._captures) >= MOST_CAPTURES:
-                stalest = min(self._captures.values(), key=lambda each: each.touched)
-                self.refuse("captures", f"more than {MOST_CAPTURES} captures at once; {stalest.capture} is given up")
-                del self._captures[stalest.capture]
+                # A capture under way has samples; names that somebody only makes up have few or none.
+                least = min(
+                    self._captures.values(), key=lambda each: (each.start is not None, each.nbytes, each.touched)
+                )
+                self.refuse("captures", f"more than {MOST_CAPTURES} captures at once; {least.capture} is given up")
+                del self._captures[least.capture]
             self._captures[capture] = Assembly(capture)
         assembly = self._captures[capture]
         assembly.touched = self._clock()
@@ -249,3 +257,25 @@ class StreamBuffer:
         self._finished[capture] = None
         while len(self._finished) > MOST_NAMES:
             self._finished.popitem(last=False)
+
+
+def drop_oldest(streams: dict[str, Recording]) -> None:
+    """Remove the oldest streams while there are more than `MOST_STREAMS`, or several with more than `MOST_BYTES`.
+
+    Parameters
+    ----------
+    streams
+        Captures without a file that wait for a worker, in the order in which they came.
+    """
+    sizes = {digest: _samples_nbytes(recording) for digest, recording in streams.items()}
+    while len(sizes) > MOST_STREAMS or (len(sizes) > 1 and sum(sizes.values()) > MOST_BYTES):
+        oldest = next(iter(sizes))
+        del sizes[oldest], streams[oldest]
+        log.warning("captures without a file fill the memory; the oldest one that waits is given up")
+
+
+def _samples_nbytes(recording: Recording) -> int:
+    return sum(
+        stream.sync.nbytes + stream.t_ns.nbytes + sum(values.nbytes for values in stream.raw.values())
+        for stream in recording.streams.values()
+    )

@@ -24,7 +24,7 @@ from armident.identify.monitoring.recorded import (
     is_of,
     result_of,
 )
-from armident.identify.monitoring.stream_buffer import LARGEST_BLOCK, LARGEST_EVENT, Assembly, StreamBuffer
+from armident.identify.monitoring.stream_buffer import LARGEST_BLOCK, LARGEST_EVENT, Assembly, StreamBuffer, drop_oldest
 from armident.identify.monitoring.worker_link import LinkDown, WorkerLink
 from armident.identify.report.files import write_identification
 from armident.systemd import Notifier
@@ -37,8 +37,6 @@ SCAN_S = 5.0
 """Interval at which folders are searched for recordings whose capture announced no end, s."""
 RETRY_S, LONGEST_RETRY_S = 1.0, 30.0
 """First and longest wait before a write is tried again, s."""
-MOST_STREAMS = 8
-"""Largest number of streams without a file that wait in memory."""
 LONGEST_STAGE_S = 7200.0
 """Time after which an identification that reports no further stage counts as hung, s."""
 
@@ -211,6 +209,10 @@ class Worker:
             streamed = None
             if not found or (assembly.complete and not assembly.too_long and not assembly.triggered):
                 streamed = assembly.recording()
+                if not found and not is_of(streamed, None, self._robot.name):
+                    raise DataError(
+                        f"capture {assembly.capture}: of robot {streamed.robot.name}, not {self._robot.name}"
+                    )
         except DataError as error:
             if not found:
                 self._refuse_stream(assembly, error)
@@ -221,10 +223,7 @@ class Worker:
         elif streamed is not None:
             digest = streamed.sha256
             self._streams[digest] = streamed
-            while len(self._streams) > MOST_STREAMS:
-                lost = next(iter(self._streams))
-                del self._streams[lost]
-                log.warning("more than %d captures without a file wait; one is given up", MOST_STREAMS)
+            drop_oldest(self._streams)
             name = assembly.capture if streamed.path is None else streamed.path.name.removesuffix(".mcap")
             ledger.add(digest, name, ())
 
@@ -255,7 +254,13 @@ class Worker:
             known = ledger.file_hash(first, stamp)
             if announced and known == (None,):
                 known = None
-            digest = known[0] if known else self._read_and_enter(ledger, captured, announced)
+            try:
+                digest = known[0] if known else self._read_and_enter(ledger, captured, announced)
+            except OSError as error:
+                # Other recordings are not held up; this one is tried again.
+                with self._lock:
+                    self._buffer.refuse("files", f"{first}: cannot be read: {_reason(error)}; trying again")
+                continue
             self._known[first] = stamp
             if known is None:
                 ledger.enter_file(first, stamp, digest)
@@ -270,6 +275,12 @@ class Worker:
                 return None
         except ArmidentError as error:
             log.warning("%s", error)
+            return None
+        except OSError:
+            raise
+        except Exception as error:
+            log.warning("%s: internal error (%s); it is not identified", captured.paths[0], type(error).__name__)
+            log.debug("internal error", exc_info=True)
             return None
         digest = recording.sha256
         found = result_of(digest, self._folder(captured.name))

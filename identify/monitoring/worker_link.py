@@ -81,7 +81,10 @@ class WorkerLink:
                 return
             try:
                 self._use(open_session(self._config, "worker", any_port=True), beside=True)
-                log.info("another worker of cell %s runs; both share the recordings", self._config.cell)
+                log.info(
+                    "the worker port of cell %s is taken, as by another worker; workers share the recordings",
+                    self._config.cell,
+                )
             except (ConfigError, zenoh.ZError):
                 if str(error) != self._problem:
                     log.warning("%s; recordings are identified from their files, trying again", error)

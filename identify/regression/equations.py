@@ -1,7 +1,7 @@
 """The equations ``y = X theta + e`` of all joints and experiments, their residuals and noise models (thesis 2.3)."""
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
@@ -190,6 +190,22 @@ def stacked(
     return whitened(mapped(lambda b: b.x, blocks), noise, keep), whitened([b.y for b in blocks], noise, keep)
 
 
+def stacked_parts(
+    blocks: Iterable[ExperimentEquations], noise: Sequence[ArModel]
+) -> Iterator[tuple[NDArray[np.float64], NDArray[np.float64]]]:
+    """Yield `stacked` of one experiment after the other: rows of a long recording are in memory one at a time.
+
+    Parameters
+    ----------
+    blocks
+        Equations of every experiment.
+    noise
+        Noise model of each joint.
+    """
+    for block in blocks:
+        yield stacked([block], noise)
+
+
 def instrumented(
     blocks: Sequence[ExperimentEquations], instruments: Sequence[NDArray[np.float64]]
 ) -> Sequence[InstrumentedEquations]:
@@ -217,6 +233,19 @@ def applied(columns: NDArray[np.float64], values: NDArray[np.float64]) -> NDArra
     """
     product: NDArray[np.float64] = (columns.reshape(-1, columns.shape[2]) @ values).reshape(columns.shape[:2])
     return product
+
+
+def instants(blocks: Sequence[ExperimentEquations], dt: float) -> list[NDArray[np.int64]]:
+    """Numbers of the samples of the equations, (M,) per experiment.
+
+    Parameters
+    ----------
+    blocks
+        Equations of every experiment.
+    dt
+        Sampling period, s.
+    """
+    return [np.rint(block.t / dt).astype(np.int64) for block in blocks]
 
 
 def residuals(blocks: Sequence[ExperimentEquations], theta: NDArray[np.float64]) -> list[NDArray[np.float64]]:
@@ -300,12 +329,12 @@ def noise_models(
     samples = [e.shape[0] for e in errors]
     longest = min(max_order, min(samples) - 1)
 
-    def absorbed(j: int) -> NDArray[np.float64]:
-        return sum((absorbed_sums(b.x[:, j], factor, longest) for b in blocks), np.zeros(longest + 1))
-
+    lost = np.zeros((errors[0].shape[1], longest + 1))
     with ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
-        lost = list(pool.map(absorbed, range(errors[0].shape[1])))
-    return [ar.widened(sum(samples)) for ar in ar_models(errors, longest, absorbed=lost)]
+        for block in blocks:
+            joints = (block.x[:, j] for j in range(lost.shape[0]))
+            lost += np.array(list(pool.map(lambda x: absorbed_sums(x, factor, longest), joints)))
+    return [ar.widened(sum(samples)) for ar in ar_models(errors, longest, absorbed=list(lost))]
 
 
 def absorbed_sums(x: NDArray[np.float64], factor: NDArray[np.float64], max_lag: int) -> NDArray[np.float64]:

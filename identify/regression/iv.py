@@ -10,7 +10,7 @@ import os
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +20,7 @@ from armident.identify.regression.ar_noise import ArModel
 from armident.identify.regression.equations import InstrumentedEquations
 from armident.identify.regression.fir import filter_columns
 from armident.identify.regression.least_squares import column_norms
-from armident.identify.regression.qr import triangularize
+from armident.identify.regression.qr import triangularize, triangularize_parts
 from armident.identify.regression.whitening import columns_of, whitened
 from armident.identify.robot.compiled import compiled
 from armident.identify.signals.decimate import Decimation
@@ -129,9 +129,39 @@ def factored(z: Array, x: Array, y: Array) -> IvProducts:
     y
         Torques, shape (rows,).
     """
-    b, scale = x.shape[1], column_norms(x)
-    top = triangularize(z, x, y, columns=b, scales=(column_norms(z), scale))
-    return IvProducts(np.eye(b), top[:, b : 2 * b], top[:, 2 * b], scale)
+    return factored_parts([(z, x, y)], x.shape[1])
+
+
+def factored_parts(parts: Iterable[tuple[Array, Array, Array]], b: int) -> IvProducts:
+    """`factored` of rows that come in parts, of which one is in memory.
+
+    Parameters
+    ----------
+    parts
+        Whitened instruments and regressor (rows, b) and torques (rows,) of each part.
+    b
+        Number of parameters.
+    """
+    top, norms = triangularize_parts(parts, columns=b)
+    scale = norms[b : 2 * b]
+    return IvProducts(np.eye(b), top[:, b : 2 * b] / scale, top[:, 2 * b], scale)
+
+
+def instrumented_parts(
+    blocks: Iterable[InstrumentedEquations], noise: Sequence[ArModel]
+) -> Iterator[tuple[Array, Array, Array]]:
+    """Yield whitened instruments, regressor (rows, b) and torques (rows,) of one experiment after the other.
+
+    Parameters
+    ----------
+    blocks
+        Equations of every experiment.
+    noise
+        Noise model of each joint.
+    """
+    for block in blocks:
+        z, x, y = (whitened([values], noise, [block.keep]) for values in (block.z, block.x, block.y))
+        yield z, x, y
 
 
 def serial_covariance(
@@ -157,16 +187,19 @@ def serial_covariance(
     noise
         Noise model of the residuals of each joint.
     """
-    z = whitened(zeta, weights, keep)
-    zs = column_norms(z)
-    cross = (z / zs).T @ whitened(x, weights, keep)
-    meat = np.zeros((zs.size, zs.size))
-    for j, (weight, ar) in enumerate(zip(weights, noise, strict=True)):
-        for value, kept in zip(zeta, keep, strict=True):
-            rows = value[:, j] * kept[:, j, None] / (weight.variance * zs)
-            coloured = signal.lfilter([np.sqrt(ar.variance)], np.append(1.0, ar.coefficients), rows[::-1], axis=0)
-            meat += coloured.T @ coloured
-    return IvProducts(meat, cross / zs, np.zeros(zs.size), zs).covariance
+    b = zeta[0].shape[2]
+    squares, cross, meat = np.zeros(b), np.zeros((b, b)), np.zeros((b, b))
+    for z, regressor, used in zip(zeta, x, keep, strict=True):
+        rows = whitened([z], weights, [used])
+        squares += np.einsum("ij,ij->j", rows, rows)
+        cross += rows.T @ whitened([regressor], weights, [used])
+        for j, (weight, ar) in enumerate(zip(weights, noise, strict=True)):
+            acting = columns_of(z[:, j])
+            own = z[:, j, acting] * used[:, j, None] / weight.variance
+            coloured = signal.lfilter([np.sqrt(ar.variance)], np.append(1.0, ar.coefficients), own[::-1], axis=0)
+            meat[np.ix_(acting, acting)] += coloured.T @ coloured
+    zs = np.sqrt(np.where(squares > 0.0, squares, 1.0))
+    return IvProducts(meat / np.outer(zs, zs), cross / np.outer(zs, zs), np.zeros(b), zs).covariance
 
 
 @dataclass(frozen=True, eq=False)
@@ -312,15 +345,14 @@ def iv_products(blocks: Sequence[InstrumentedEquations], noise: Sequence[ArModel
     """
     combine, scale = _combinations(blocks, noise)
 
-    def of_series(joint_and_block: tuple[int, int]) -> tuple[JointEquations, Array]:
-        j, k = joint_and_block
-        joint = JointEquations.of([blocks[k]], j, copied=False)
+    def of_joint(block: InstrumentedEquations, j: int) -> tuple[JointEquations, Array]:
+        joint = JointEquations.of([block], j, copied=False)
         return joint, joint.products(joint.whitened(noise[j]), combine)
 
-    series = [(j, k) for j in range(len(noise)) for k in range(len(blocks))]
     with ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
-        # Summed in the order of the joints, so that the same data give the same bits.
-        return together(pool.map(of_series, series), scale.size, combined=combine is not None, scale=scale)
+        # Summed in the order of experiments and joints, so that the same data give the same bits.
+        sums = (pair for block in blocks for pair in pool.map(partial(of_joint, block), range(len(noise))))
+        return together(sums, scale.size, combined=combine is not None, scale=scale)
 
 
 def _combinations(blocks: Sequence[InstrumentedEquations], noise: Sequence[ArModel]) -> tuple[Array | None, Array]:
@@ -332,9 +364,9 @@ def _combinations(blocks: Sequence[InstrumentedEquations], noise: Sequence[ArMod
     total = sum(int(block.keep.sum()) for block in blocks)
     every = max(1, total // (SAMPLE * b))
     parts = []
-    for j, ar in enumerate(noise):
-        thinned = Decimation(every, ar.whitening[::-1])
-        for block in blocks:
+    for block in blocks:
+        for j, ar in enumerate(noise):
+            thinned = Decimation(every, ar.whitening[::-1])
             parts.append(thinned(block.z[:, j])[block.keep[ar.order :: every, j]])
     rows = np.concatenate(parts)
     norms = column_norms(rows)

@@ -1,19 +1,70 @@
 """Least squares of tall, narrow systems, and the excitation that it needs (thesis 2.3.1)."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
 from armident.configs import DataError
-from armident.identify.regression.qr import triangularize
+from armident.identify.regression.qr import triangularize_parts
+
+Array = NDArray[np.float64]
 
 RANK_TOLERANCE = 1e-10
 """Smallest singular value of the column-normalised regressor, relative to the greatest, that counts as excited."""
 
 
-def least_squares(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
+@dataclass(frozen=True, eq=False)
+class Triangle:
+    """QR factors of a column-normalised regressor with torques.
+
+    Parameters
+    ----------
+    factor
+        Triangular factor of the regressor, (b, b).
+    projected
+        Projections of the torques, (b,); of no use where the rows had no torques.
+    scale
+        Norms of the regressor's columns, 1 where a column is zero, (b,).
+    """
+
+    factor: Array
+    projected: Array
+    scale: Array
+
+    @classmethod
+    def of(cls, parts: Iterable[tuple[Array, Array]]) -> "Triangle":
+        """Factors of rows that come in parts.
+
+        Parameters
+        ----------
+        parts
+            Regressor (rows, b) and torques (rows,) of each part, of which there is at least one.
+        """
+        rows = iter(parts)
+        first = next(rows)
+        b = first[0].shape[1]
+        top, norms = triangularize_parts(chain([first], rows), columns=b)
+        return cls(top[:, :b] / norms[:b], top[:, b], norms[:b])
+
+    @property
+    def theta(self) -> Array:
+        """Solution (b,) of ``min |y - x theta|`` (2.22)."""
+        solved: Array = linalg.solve_triangular(self.factor, self.projected) / self.scale
+        return solved
+
+    @property
+    def inverse_gram(self) -> Array:
+        """``(x' x)^-1``, (b, b)."""
+        inverse = linalg.solve_triangular(self.factor, np.eye(self.scale.size)) / self.scale[:, None]
+        gram: Array = inverse @ inverse.T
+        return gram
+
+
+def least_squares(x: Array, y: Array) -> Array:
     """Solution (b,) of ``min |y - x theta|`` by QR of the column-normalised regressor (2.22).
 
     Parameters
@@ -23,35 +74,27 @@ def least_squares(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.
     y
         Torques, shape (rows,).
     """
-    b = x.shape[1]
-    scale = column_norms(x)
-    top = triangularize(x, y, columns=b, scales=(scale,))
-    theta: NDArray[np.float64] = linalg.solve_triangular(top[:, :b], top[:, b]) / scale
-    return theta
+    return Triangle.of([(x, y)]).theta
 
 
-def inverse_gram(x: NDArray[np.float64]) -> NDArray[np.float64]:
+def inverse_gram(x: Array) -> Array:
     """``(x' x)^-1`` from the triangular factor of ``x``."""
-    scale = column_norms(x)
-    factor = triangularize(x, columns=x.shape[1], scales=(scale,))
-    inverse = linalg.solve_triangular(factor, np.eye(x.shape[1])) / scale[:, None]
-    gram: NDArray[np.float64] = inverse @ inverse.T
-    return gram
+    return Triangle.of([(x, np.zeros(x.shape[0]))]).inverse_gram
 
 
-def column_norms(x: NDArray[np.float64]) -> NDArray[np.float64]:
+def column_norms(x: Array) -> Array:
     """Norm of each column, 1 where a column is zero."""
     norms = np.sqrt(np.einsum("ij,ij->j", x, x))
     return np.where(norms > 0.0, norms, 1.0)
 
 
-def require_excitation(x: NDArray[np.float64], names: Sequence[str]) -> int:
+def require_excitation(rows: Triangle, names: Sequence[str]) -> int:
     """Rank of the stacked regressor; a motion that leaves parameters undetermined is an error.
 
     Parameters
     ----------
-    x
-        Regressor, shape (rows, b).
+    rows
+        Factors of the regressor.
     names
         Base parameters, shape (b,), for the message.
 
@@ -60,9 +103,9 @@ def require_excitation(x: NDArray[np.float64], names: Sequence[str]) -> int:
     DataError
         Naming the parameters that the motion did not excite.
     """
-    dead = [name for name, used in zip(names, np.any(x, axis=0).tolist(), strict=True) if not used]
+    dead = [name for name, used in zip(names, np.any(rows.factor, axis=0).tolist(), strict=True) if not used]
     if not dead:
-        _, s, vt = np.linalg.svd(triangularize(x / column_norms(x), columns=x.shape[1]))
+        _, s, vt = np.linalg.svd(rows.factor)
         rank = int(np.sum(s > RANK_TOLERANCE * s[0]))
         if rank == len(names):
             return rank

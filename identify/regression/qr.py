@@ -6,7 +6,7 @@ rows, 20 to 53 columns). It rounds differently, which the finite differences of 
 change to it has to come with new reference results.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,6 +45,36 @@ def triangularize(
     top = np.zeros((columns, work.shape[1]))
     _reflect(work, top)
     return top
+
+
+def triangularize_parts(
+    parts: Iterable[Sequence[NDArray[np.float64]]], columns: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Reflect rows that come in parts, of which one is in memory, as `triangularize` does with all together.
+
+    Parameters
+    ----------
+    parts
+        Arrays (m, p_i) or (m,), side by side, of each part; the numbers of their columns are the same in all.
+    columns
+        Number b of the leading columns to make triangular.
+
+    Returns
+    -------
+    top : ndarray
+        Triangular factor and projections, as `triangularize` returns them, (b, p).
+    norms : ndarray
+        Norm of every column over all rows, 1 where it is zero, (p,).
+    """
+    top, squares = np.empty((0, 0)), np.zeros(0)
+    for part in parts:
+        work = np.column_stack(part)
+        if not top.size:
+            top, squares = np.zeros((columns, work.shape[1])), np.zeros(work.shape[1])
+        squares += np.einsum("ij,ij->j", work, work)
+        _reflect(work, top)
+    norms = np.sqrt(squares)
+    return top, np.where(norms > 0.0, norms, 1.0)
 
 
 @compiled

@@ -30,12 +30,15 @@ class Series:
         Values (M,); NaN breaks the curve.
     colour, width
         CSS colour, and width of the line, pixels.
+    half
+        Half widths (M,) of the intervals around the values: points with bars are drawn instead of a curve.
     """
 
     name: str
     y: Array
     colour: str
     width: float = 1.2
+    half: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,6 +57,10 @@ class Plot:
         Horizontal lines: name and value.
     x_unit
         Unit of the axis.
+    names
+        Names of the points, M of them, at integer ``x`` from 0; empty: the axis has numbers.
+    readings
+        Text that is read at each point, M of them; empty: the values of the curves.
     """
 
     title: str
@@ -62,6 +69,8 @@ class Plot:
     series: tuple[Series, ...]
     limits: tuple[tuple[str, float], ...] = ()
     x_unit: str = "s"
+    names: tuple[str, ...] = ()
+    readings: tuple[str, ...] = ()
 
 
 def plots_html(plots: Sequence[Plot]) -> Markup:
@@ -102,18 +111,23 @@ def kept_points(curves: Sequence[Array], most: int = MOST_POINTS) -> NDArray[np.
 
 
 def _data(plot: Plot) -> dict[str, object]:
-    kept = kept_points([series.y for series in plot.series])
+    kept = np.arange(len(plot.names)) if plot.names else kept_points([series.y for series in plot.series])
     return {
         "title": plot.title,
         "unit": plot.unit,
         "x_unit": plot.x_unit,
         "x": [round(float(value), 6) for value in plot.x[kept]],
-        "series": [
-            {"name": s.name, "colour": s.colour, "width": s.width, "y": [_number(v) for v in s.y[kept]]}
-            for s in plot.series
-        ],
+        "series": [_curve(series, kept) for series in plot.series],
         "limits": [{"name": name, "y": _number(value)} for name, value in plot.limits if np.isfinite(value)],
+        "names": list(plot.names),
+        "readings": list(plot.readings),
     }
+
+
+def _curve(series: Series, kept: NDArray[np.intp]) -> dict[str, object]:
+    half = None if series.half is None else [_number(value) for value in series.half[kept]]
+    y = [_number(value) for value in series.y[kept]]
+    return {"name": series.name, "colour": series.colour, "width": series.width, "y": y, "half": half}
 
 
 def _number(value: float) -> float | None:

@@ -64,7 +64,7 @@ def check_setup(experiments: Sequence[Experiment], robot: RobotConfig) -> SetupC
     """
     _validate(experiments, robot)
     # The matrices are small: threads delay each other.
-    with threadpool_limits(1):  # type: ignore[no-untyped-call]
+    with threadpool_limits(1):
         try:
             return _check(put_right(experiments, robot), robot)
         except np.linalg.LinAlgError as error:

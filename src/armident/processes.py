@@ -1,5 +1,6 @@
 """Child processes: start an ``armident`` command, wait for its output, stop it."""
 
+import ctypes
 import os
 import signal
 import subprocess
@@ -24,6 +25,10 @@ POLL_S = 0.02
 """Time between two looks at the output of a process, s."""
 TAIL_LINES = 8
 """Lines of output in an error message."""
+PARENT_VARIABLE = "ARMIDENT_PARENT"
+"""Environment variable with the number of the process that a command ends with."""
+_PR_SET_PDEATHSIG = 1
+"""Option of prctl(2): signal that the kernel sends when the parent ends."""
 
 
 class Process(Protocol):
@@ -58,6 +63,7 @@ def start_command(
     module: str = COMMAND_LINE,
     niceness: int = 0,
     own_session: bool = False,
+    with_parent: bool = False,
     stdin: bool = False,
     environment: Mapping[str, str] | None = None,
 ) -> "subprocess.Popen[bytes]":
@@ -75,6 +81,8 @@ def start_command(
         Nice value added to that of this process.
     own_session
         Start a new session: signals of the terminal (Ctrl-C) then do not reach the process.
+    with_parent
+        Send SIGTERM to the process when the thread that started it ends, also by SIGKILL (Linux).
     stdin
         Connect standard input to a pipe instead of the null device.
     environment
@@ -86,15 +94,27 @@ def start_command(
         The started process.
     """
     nice = ["nice", "-n", str(niceness)] if niceness else []
+    parent = {PARENT_VARIABLE: str(os.getpid())} if with_parent else {}
     return subprocess.Popen(
         [*nice, sys.executable, "-m", module, *words],
         stdin=subprocess.PIPE if stdin else subprocess.DEVNULL,
         stdout=out,
         stderr=err,
-        env={**os.environ, **(environment or {})},
+        env={**os.environ, **parent, **(environment or {})},
         start_new_session=own_session,
         bufsize=0,
     )
+
+
+def end_with_parent() -> None:
+    """Ask the kernel for SIGTERM when the parent ends, if it started this process by ``with_parent``; see prctl(2)."""
+    parent = os.environ.pop(PARENT_VARIABLE, None)
+    if parent is None:
+        return
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+    if str(os.getppid()) != parent:
+        # It ended before the kernel was asked.
+        os.kill(os.getpid(), signal.SIGTERM)
 
 
 class ProcessEnded(ArmidentError):

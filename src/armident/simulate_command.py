@@ -41,6 +41,7 @@ def simulate(
             "--rate", min=1.0, help="Samples per second. [default: those of the drives, or of the model's recording]"
         ),
     ] = None,
+    json: Annotated[bool, typer.Option("--json", help="Print the result document on stdout.")] = False,
 ) -> None:
     """Simulate the closed loop along a trajectory, and write a recording or arrays.
 
@@ -67,7 +68,8 @@ def simulate(
     if config is None and model is None:
         raise ConfigError("--config: give the robot whose virtual arm moves, or --model")
     reference = load_trajectory(trajectory)
-    if physics == "identified" or (physics is None and model is not None):
+    identified = physics == "identified" or (physics is None and model is not None)
+    if identified:
         from armident.identify.saved_model import load_model
         from armident.identify.simulated_recording import simulate_model
 
@@ -83,21 +85,39 @@ def simulate(
         hidden = None if scenario is None else load_scenario(scenario)
         if hidden is not None and hidden.drives:
             raise ConfigError(f"{scenario}: drives: a simulation has no bus, on which drives could be odd")
-        document = None if model is None else model / "identification.json" if model.is_dir() else model
+        result = None if model is None else model / "identification.json" if model.is_dir() else model
         recording = simulate_recording(
-            config or _robot_of(document),
+            config or _robot_of(result),
             reference,
             scenario=hidden,
             seed=seed or 0,
             noise=1.0 if noise is None else noise,
             period=None if rate is None else 1.0 / rate,
-            model=document,
+            model=result,
         )
     if out.suffix.lower() == ".mcap":
         write_recording(recording, out)
     else:
         export_recording(recording, out)
-    print(out)
+    if not json:
+        print(out)
+        return
+    from armident.identify.document import reference as reference_to
+    from armident.identify.document import to_json
+    from armident.identify.model_documents import SimulationDocument
+
+    document = SimulationDocument(
+        robot=recording.robot.name,
+        physics="identified" if identified else "virtual",
+        trajectory=str(trajectory),
+        model=None if model is None else str(model),
+        scenario=None if scenario is None else str(scenario),
+        seed=None if identified else seed or 0,
+        noise=None if identified else 1.0 if noise is None else noise,
+        recording=reference_to(recording).model_copy(update={"path": str(out)}),
+        duration_s=float(recording.samples.sync[-1] - recording.samples.sync[0]) / recording.sample_rate_hz,
+    )
+    print(to_json(document), end="")
 
 
 def _robot_of(document: Path | None) -> "RobotConfig":

@@ -17,12 +17,12 @@ def run() -> list[Row]:
     rng = np.random.default_rng(0)
     y = np.sin(2 * np.pi * np.arange(SAMPLES) / 5000) + 1e-4 * rng.standard_normal(SAMPLES)
 
-    kf = KalmanFilter(dim_x=2, dim_z=1)  # type: ignore[no-untyped-call]
+    kf = KalmanFilter(dim_x=2, dim_z=1)
     kf.F, kf.H = np.array([[1.0, 1.0], [0.0, 1.0]]), np.array([[1.0, 0.0]])
     kf.Q, kf.R, kf.x, kf.P = np.diag([0.0, NVR]), np.eye(1), np.zeros((2, 1)), 1e7 * np.eye(2)
     start = time.perf_counter()
-    means, covariances, _, _ = kf.batch_filter(y)  # type: ignore[no-untyped-call]
-    states, _, _, _ = kf.rts_smoother(means, covariances)  # type: ignore[no-untyped-call]
+    means, covariances, _, _ = kf.batch_filter(y)
+    states, _, _, _ = kf.rts_smoother(means, covariances)
     theirs = time.perf_counter() - start
 
     smooth = irwsm(y, 2, NVR)

@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -236,7 +237,7 @@ def _remap(setup: RoundSetup, j: int, entries: list[int], nmt: bool) -> None:
         sent = [before, *sent, after]
     begin = setup.at(1.2)
     for i, one in enumerate(sent):
-        setup.actions.append((begin + i * SDO_STEP_S, lambda one=one: setup.farm.inject(bus, one)))  # type: ignore[misc]
+        setup.actions.append((begin + i * SDO_STEP_S, partial(setup.farm.inject, bus, one)))
 
 
 def _download(index: int, sub: int, value: int, size: int) -> bytes:

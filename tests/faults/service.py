@@ -40,7 +40,7 @@ from armident.identify.document import IdentificationDocument, load_document
 from armident.identify.identification.options import Options
 from armident.identify.monitoring.history import History, recorded_at
 from armident.identify.monitoring.ledger import FILE, Ledger
-from armident.identify.monitoring.recorded import captured_in
+from armident.identify.monitoring.recorded import Captured, captured_in
 from armident.identify.monitoring.reidentify.identify_once import identify_once
 from armident.identify.monitoring.reidentify.keep import HistoryEntry
 from armident.identify.monitoring.reidentify.publish import StatusPublisher
@@ -114,7 +114,7 @@ def job(folder: Path, path: Path) -> None:
     recording, robot = read_recording(path), load_robot(session.robot)
     options = Options(**session.identification.model_dump())
     with StatusPublisher(session, robot) as publisher:
-        done = identify_once(recording, robot, options, folder, publisher.result, lambda _: None)
+        done = identify_once(recording, robot, options, folder, publisher, lambda _: None)
     HistoryEntry(store_of(folder), recording, done.document, done.path).write()
 
 
@@ -222,29 +222,39 @@ class Service:
             self.kill("worker", worker)
         last = self.start(work)
         try:
-            until = time.monotonic() + LONGEST_S
-            ledger = Ledger(self.folder / FILE, "witness")
-            while time.monotonic() < until:
-                time.sleep(2.0)
-                known = {path for entry in ledger.entries() for path in entry.paths}
-                files = {each.paths[0] for each in captured_in((self.folder,), "emps") if _has_samples(each.paths[0])}
-                if files <= known and all(entry.announced for entry in ledger.entries()):
-                    break
-            time.sleep(1.0)
+            wait_for_results(self.folder)
         finally:
             self.kill("last worker", last)
         add_results(self.folder)
 
 
-def _has_samples(path: Path) -> bool:
-    with suppress(DataError):
-        return read_recording(path).samples.sync.size > 0
-    return False
+def wait_for_results(folder: Path, seconds: float = LONGEST_S) -> None:
+    """Wait until the results of all recordings in a folder were announced, at most for a time in s."""
+    until = time.monotonic() + seconds
+    ledger = Ledger(folder / FILE, "witness")
+    while time.monotonic() < until:
+        time.sleep(2.0)
+        entries = ledger.entries()
+        known = {path for entry in entries for path in entry.paths}
+        if {each.paths[0] for each in recorded(folder)} <= known and all(entry.announced for entry in entries):
+            break
+    time.sleep(1.0)
+
+
+def recorded(folder: Path) -> dict[Captured, str]:
+    """Return the captures in a folder that have samples, with the hashes of their recordings."""
+    found = {}
+    for captured in captured_in((folder,), "emps"):
+        with suppress(DataError):
+            recording = captured.read()
+            if recording.samples.sync.size > 0:
+                found[captured] = recording.sha256
+    return found
 
 
 def violations(folder: Path, audience: Audience) -> tuple[list[str], int, int]:
     """Return what is wrong, the number of recordings with samples, and the number of their results."""
-    digests = [read_recording(path).sha256 for path in sorted(folder.glob("emps-*.mcap")) if _has_samples(path)]
+    digests = list(recorded(folder).values())
     entries = {entry.sha256: entry for entry in Ledger(folder / FILE, "witness").entries()}
     results: Counter[str] = Counter()
     for path in folder.glob("*.identification/identification.json"):

@@ -223,7 +223,7 @@ def forge_parquet(rng: random.Random, seeds: Sequence[bytes]) -> bytes:
     import pyarrow.parquet
 
     try:
-        table = pyarrow.parquet.read_table(io.BytesIO(rng.choice(seeds)))  # type: ignore[no-untyped-call]
+        table = pyarrow.parquet.read_table(io.BytesIO(rng.choice(seeds)))
     except (pyarrow.ArrowException, OSError, ValueError):
         return spoil_bytes(rng, seeds)
     columns = {name: table.column(name).to_pylist() for name in table.column_names}
@@ -240,7 +240,7 @@ def forge_parquet(rng: random.Random, seeds: Sequence[bytes]) -> bytes:
                 _spoil_cell(rng, columns[name])
     made = io.BytesIO()
     try:
-        pyarrow.parquet.write_table(pyarrow.table(columns), made)  # type: ignore[no-untyped-call]
+        pyarrow.parquet.write_table(pyarrow.table(columns), made)
     except (pyarrow.ArrowException, ValueError, OverflowError, TypeError):
         return spoil_bytes(rng, seeds)
     return made.getvalue()

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.faults import service_vcan
 from tests.faults.service import run_rounds
 
 
@@ -19,3 +20,19 @@ def test_every_recording_has_one_result_that_was_announced_once(tmp_path: Path, 
     folder = tmp_path / f"service_{rounds}"
     folder.mkdir()
     assert run_rounds(rounds, 3, folder) == []
+
+
+@pytest.mark.slow
+@pytest.mark.vcan
+@pytest.mark.parametrize(
+    "rounds",
+    [
+        pytest.param(3, marks=pytest.mark.timeout(600)),
+        pytest.param(200, marks=[pytest.mark.proof, pytest.mark.timeout(14400)]),
+    ],
+)
+def test_every_recording_of_an_arm_has_one_result_that_was_announced_once(
+    vcan_bus: str, tmp_path: Path, rounds: int
+) -> None:
+    """The commands themselves, on a bus, with torn recordings and rotated files."""
+    assert service_vcan.run_rounds(rounds, 11, tmp_path, vcan_bus) == []

@@ -15,7 +15,7 @@ import pytest
 from armident.configs import ConfigError, DataError, SessionConfig, load_session
 from armident.daq.capture.publisher import Publisher
 from armident.daq.recording import Recording, write_recording
-from armident.daq.streaming import Keys, open_session
+from armident.daq.streaming import Keys, encode_block, open_session
 from armident.identify.document import IdentificationDocument, to_json
 from armident.identify.monitoring.recursive.block_order import LONGEST_HOLD_S, BlockOrder
 from armident.identify.monitoring.recursive.estimator import RecursiveEstimator
@@ -28,6 +28,7 @@ from armident.identify.monitoring.recursive.watch import (
     watch_cell,
     watch_recordings,
 )
+from armident.identify.monitoring.stream_buffer import LARGEST_BLOCK
 from tests.fixtures import arms
 from tests.integration.test_worker import blocks_of as published_blocks
 
@@ -77,7 +78,7 @@ def seen_by(publisher: Publisher, token: str) -> bool:
 def test_the_live_stream_and_the_replay_give_the_same_bits(session: SessionConfig) -> None:
     recording = recorded()
     live = live_estimator(session, recording.robot, reference())
-    blocks = sorted(published_blocks(recording), key=lambda block: int(block.sync[-1]))
+    published = sorted(published_blocks(recording), key=lambda block: int(block.sync[-1]))
     last = int(recording.samples.sync[-1])
     with watching(session, live) as watch, open_session(session, "worker") as observer:
         keys = Keys(session.cell, recording.robot.name)
@@ -85,7 +86,7 @@ def test_the_live_stream_and_the_replay_give_the_same_bits(session: SessionConfi
         # A capture configures its drives before its first block: by then the sessions have found each other.
         until(lambda: seen_by(publisher, keys.alive("watch")))
         time.sleep(1.0)
-        for k, block in enumerate(blocks):
+        for k, block in enumerate(published):
             publisher.offer(replace(block, sequence=k))
             time.sleep(0.005)
         until(lambda: live.matcher.last_sync == last)
@@ -136,13 +137,13 @@ def test_first_blocks_of_a_capture_that_was_found_late_are_counted() -> None:
 def test_a_watch_reports_the_number_of_lost_blocks(session: SessionConfig, caplog: pytest.LogCaptureFixture) -> None:
     recording = recorded()
     estimator = live_estimator(session, recording.robot, reference())
-    blocks = sorted(published_blocks(recording), key=lambda block: int(block.sync[-1]))[:20]
+    published = sorted(published_blocks(recording), key=lambda block: int(block.sync[-1]))[:20]
     with watching(session, estimator) as watch:
         keys = Keys(session.cell, recording.robot.name)
         publisher = Publisher(session, keys)
         until(lambda: seen_by(publisher, keys.alive("watch")))
         time.sleep(1.0)
-        for k, block in enumerate(blocks):
+        for k, block in enumerate(published):
             if k not in (8, 9, 10):
                 publisher.offer(replace(block, sequence=k))
                 time.sleep(0.02)
@@ -157,12 +158,17 @@ def test_blocks_of_strangers_end_no_watch(session: SessionConfig) -> None:
     estimator = live_estimator(session, recording.robot, reference())
     with watching(session, estimator) as watch, open_session(session, "worker") as stranger:
         key = Keys(session.cell, recording.robot.name).samples
-        end = time.monotonic() + 20.0
-        while watch.refused < 3 and time.monotonic() < end:
-            stranger.put(key, b"no block")
-            time.sleep(0.05)
-    assert watch.refused >= 3
+        (block, *_) = published_blocks(recording)
+        others = replace(block.layout, joints=tuple(f"other_{joint}" for joint in block.layout.joints))
+        for message in (b"no block", encode_block(replace(block, layout=others)), bytes(LARGEST_BLOCK + 1)):
+            before, end = watch.refused, time.monotonic() + 60.0
+            while watch.refused == before and time.monotonic() < end:
+                stranger.put(key, message)
+                time.sleep(0.2)
+            assert watch.refused > before
     assert estimator.result().sync == -1
+    # Blocks of another robot are not waited for.
+    assert watch.lost == 0
 
 
 def in_files(folder: Path, *recordings: Recording) -> tuple[list[Path], Path]:

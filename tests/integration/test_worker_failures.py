@@ -3,6 +3,7 @@
 import errno
 import json
 import os
+import shutil
 import threading
 import time
 from dataclasses import replace
@@ -21,7 +22,14 @@ from armident.identify.document import IdentificationDocument, load_document
 from armident.identify.identification.api import identify_recording
 from armident.identify.monitoring import worker as module
 from armident.identify.monitoring.ledger import FILE, Ledger
-from armident.identify.monitoring.stream_buffer import LARGEST_BLOCK, MOST_CAPTURES, StreamBuffer
+from armident.identify.monitoring.recorded import Captured
+from armident.identify.monitoring.stream_buffer import (
+    LARGEST_BLOCK,
+    MOST_CAPTURES,
+    MOST_STREAMS,
+    StreamBuffer,
+    drop_oldest,
+)
 from armident.identify.monitoring.worker import Worker
 from armident.identify.report.files import write_identification
 from tests.fixtures import arms
@@ -68,6 +76,28 @@ def test_recordings_of_the_time_without_a_worker_are_identified_once(session: Se
     with Worker(session, first.robot, tmp_path) as worker:
         assert worker.result(8.0) is None
     assert states(tmp_path) == {"emps-a": ("done", True), "emps-b": ("done", True)}
+
+
+def test_files_that_cannot_be_read_do_not_hold_up_others(
+    session: SessionConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    made = recorded(session, "c")
+    for name in ("a", "b"):
+        shutil.copy(tmp_path / "emps-c.mcap", tmp_path / f"emps-{name}.mcap")
+    read = Captured.read
+    errors = {"emps-a": OSError(errno.EIO, os.strerror(errno.EIO)), "emps-b": RuntimeError("unforeseen")}
+
+    def refused(captured: Captured) -> Recording:
+        if captured.name in errors:
+            raise errors[captured.name]
+        return read(captured)
+
+    monkeypatch.setattr(Captured, "read", refused)
+    with Worker(session, made.robot, tmp_path) as worker:
+        assert worker.result(LONGEST_S) == 0
+    assert states(tmp_path) == {"emps-c": ("done", True)}
+    assert "emps-a.mcap: cannot be read: Input/output error; trying again" in caplog.text
+    assert "emps-b.mcap: internal error (RuntimeError); it is not identified" in caplog.text
 
 
 def test_two_workers_share_the_recordings(session: SessionConfig, tmp_path: Path) -> None:
@@ -198,6 +228,43 @@ class TestStreamBuffer:
         assert f"more than {MOST_CAPTURES} captures at once" in caplog.text
         buffer.take_block(None, LARGEST_BLOCK + 1)
         assert f"a block of {LARGEST_BLOCK + 1} bytes, more than {LARGEST_BLOCK}" in caplog.text
+
+    def test_blocks_without_rows_fill_the_memory_too(
+        self, session: SessionConfig, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr("armident.identify.monitoring.stream_buffer.MOST_EARLY_BYTES", 100_000)
+        buffer = StreamBuffer()
+        block = next(iter(blocks(1)))
+        none = np.empty(0, np.int64)
+        raw = {name: values[:0] for name, values in block.raw.items()}
+        for k in range(200):
+            buffer.take_block(encode_block(replace(block, sequence=k, sync=none, t_ns=none, raw=raw)), 1)
+        assert 50_000 < buffer.nbytes <= 100_000
+        assert "which nobody announced, fill the memory" in caplog.text
+
+    def test_made_up_names_do_not_displace_a_capture_under_way(self, session: SessionConfig) -> None:
+        buffer = StreamBuffer()
+        start, end = (json.loads(json.dumps(event)) for event in events(session, 4))
+        sent = list(blocks(2))
+        buffer.take_event(json.dumps(start).encode(), 1)
+        buffer.take_block(encode_block(sent[0]), 1)
+        for k in range(5 * MOST_CAPTURES):
+            buffer.take_event(json.dumps(start | {"capture": f"made_up_{k}"}).encode(), 1)
+        for block in sent[1:]:
+            buffer.take_block(encode_block(block), 1)
+        buffer.take_event(json.dumps(end).encode(), 1)
+        (ended,) = buffer.take_ended()
+        assert ended.capture == start["capture"]
+        assert ended.complete
+
+    def test_streams_that_wait_are_bounded_in_number_and_memory(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        made = arms.recording("emps", "emps_excitation", 1)
+        waiting = {f"{k}": made for k in range(MOST_STREAMS + 3)}
+        drop_oldest(waiting)
+        assert list(waiting) == [f"{k}" for k in range(3, MOST_STREAMS + 3)]
+        monkeypatch.setattr("armident.identify.monitoring.stream_buffer.MOST_BYTES", 1)
+        drop_oldest(waiting)
+        assert list(waiting) == [f"{MOST_STREAMS + 2}"]
 
     def test_blocks_belong_to_a_capture_by_name_not_by_time(self, session: SessionConfig) -> None:
         """The second capture is before the first by the clock."""

@@ -216,7 +216,7 @@ def main() -> None:
     parser.add_argument("--hours", type=float, default=50.0)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--period", type=float, default=PERIOD_S, help="SYNC period with --changes, s")
-    parser.add_argument("--changes", action="store_true", help="time to see 10 %% more friction, all joints and motions")
+    parser.add_argument("--changes", action="store_true", help="time to see 10 %% more friction, every joint")
     parser.add_argument("--simulate", action="store_true", help="simulate and filter every second of a life")
     parser.add_argument("--cost", action="store_true", help="CPU time of a replay at 5 kHz against real time")
     asked = parser.parse_args()

@@ -6,7 +6,7 @@ import time
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from subprocess import Popen
+from subprocess import PIPE, Popen
 from typing import IO, Any
 
 import pytest
@@ -106,3 +106,21 @@ def test_the_memory_of_a_process_is_known_until_its_end() -> None:
     assert resident_bytes(pid) > 0
     process.stop()
     assert resident_bytes(pid) == 0
+
+
+def test_a_process_ends_when_the_process_that_started_it_is_killed() -> None:
+    sleeper = "from armident.processes import end_with_parent; end_with_parent(); print('on', flush=True); "
+    parent = (
+        "import os, subprocess, sys, time\n"
+        "words = [sys.executable, '-c', sys.argv[1] + 'import time; time.sleep(60)']\n"
+        "subprocess.Popen(words, env=dict(os.environ, ARMIDENT_PARENT=str(os.getpid())))\n"
+        "time.sleep(60)"
+    )
+    with Popen([sys.executable, "-c", parent, sleeper], stdout=PIPE) as started:
+        assert started.stdout is not None
+        assert started.stdout.readline() == b"on\n"
+        started.kill()
+        begin = time.monotonic()
+        # The pipe ends when nobody has it.
+        assert started.stdout.read() == b""
+    assert time.monotonic() - begin < 20.0

@@ -5,7 +5,7 @@ import json
 import os
 import tempfile
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 from zipfile import BadZipFile
 
 import numpy as np
@@ -17,34 +17,44 @@ SCHEMA = "armident/recursive-state/1"
 """Version of the saved state: any change of the arithmetic or of the arrays changes it."""
 
 
-def state_of(owner: object, prefix: str = "") -> dict[str, NDArray[Any]]:
+@runtime_checkable
+class HasState(Protocol):
+    """Object whose attribute ``_saved`` names the attributes that are its whole state.
+
+    They are arrays, integers, floats, or other such objects.
+    """
+
+    @property
+    def _saved(self) -> tuple[str, ...]: ...
+
+
+def state_of(owner: HasState, prefix: str = "") -> dict[str, NDArray[Any]]:
     """Return copies of the state of an object by name.
 
     Parameters
     ----------
     owner
-        Object whose attribute ``_saved`` names the attributes that are its whole state: arrays, integers, floats, or
-        other such objects.
+        The object.
     prefix
         Beginning of every name.
     """
     found: dict[str, NDArray[Any]] = {}
-    for name in owner._saved:  # type: ignore[attr-defined]
+    for name in owner._saved:
         value = getattr(owner, name)
-        if hasattr(value, "_saved"):
+        if isinstance(value, HasState):
             found |= state_of(value, f"{prefix}{name}.")
         else:
             found[prefix + name] = np.array(value)
     return found
 
 
-def restore_state(owner: object, arrays: dict[str, NDArray[Any]], prefix: str = "") -> None:
+def restore_state(owner: HasState, arrays: dict[str, NDArray[Any]], prefix: str = "") -> None:
     """Give an object a state.
 
     Parameters
     ----------
     owner
-        Object as in `state_of`.
+        The object.
     arrays
         Arrays of `state_of`.
     prefix
@@ -55,9 +65,9 @@ def restore_state(owner: object, arrays: dict[str, NDArray[Any]], prefix: str = 
     DataError
         If an array is missing or has another number of dimensions.
     """
-    for name in owner._saved:  # type: ignore[attr-defined]
+    for name in owner._saved:
         value = getattr(owner, name)
-        if hasattr(value, "_saved"):
+        if isinstance(value, HasState):
             restore_state(value, arrays, f"{prefix}{name}.")
             continue
         found = arrays.get(prefix + name)

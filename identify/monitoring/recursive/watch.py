@@ -21,13 +21,14 @@ from rich.live import Live
 
 from armident.configs import ConfigError, DataError, RobotConfig, SessionConfig, load_robot, load_session
 from armident.daq.recording import read_recording
-from armident.daq.streaming import Keys, decode_block, open_session
+from armident.daq.streaming import Block, Keys, decode_block, open_session
 from armident.identify.document import IdentificationDocument, load_document
 from armident.identify.monitoring.recursive.block_order import BlockOrder
 from armident.identify.monitoring.recursive.estimator import RecursiveEstimator, RecursiveResult
 from armident.identify.monitoring.recursive.replay import blocks_of, has_reference
 from armident.identify.monitoring.recursive.report import document, friction_table, joint_states
 from armident.identify.monitoring.recursive.rows import SampleBlock
+from armident.identify.monitoring.stream_buffer import LARGEST_BLOCK
 
 log = logging.getLogger(__name__)
 
@@ -43,6 +44,8 @@ HISTORY_BLOCKS = 2000
 """Blocks that a watch requests from the capture's cache when it starts."""
 WAITING_BLOCKS = 4000
 """Blocks that wait while the estimator is busy; further ones are dropped and counted."""
+WAITING_BYTES = 256 << 20
+"""Largest size of the waiting blocks, bytes: minutes of six axes at 5 kHz."""
 
 
 @dataclass(frozen=True)
@@ -225,6 +228,8 @@ class LiveWatch:
         self._waiting: queue.Queue[bytes] = queue.Queue(WAITING_BLOCKS)
         self._last: bytes | None = None
         self.dropped = self.refused = self.lost = 0
+        # Bytes; each is changed by one thread only.
+        self._received = self._taken = 0
         self.estimator = estimator
         self._rate = 1.0 / session.sync_period
         self._session = open_session(session, "observer")
@@ -271,14 +276,17 @@ class LiveWatch:
 
         def publish(result: RecursiveResult) -> None:
             self._last = json.dumps(document(result, self._robot)).encode()
-            self._session.put(self._keys.recursive, self._last)
+            try:
+                self._session.put(self._keys.recursive, self._last)
+            except zenoh.ZError:
+                log.debug("result not published")
             show(result)
 
         watch, order = Watch(self.estimator, self._rate, publish), BlockOrder()
         began = saved = time.monotonic()
         while not stop.is_set() and (duration is None or time.monotonic() - began < duration):
             try:
-                ready = order.add(decode_block(self._waiting.get(timeout=0.2)), time.monotonic())
+                ready = order.add(self._decoded(self._waiting.get(timeout=0.2)), time.monotonic())
             except queue.Empty:
                 ready = order.overdue(time.monotonic())
             except DataError as error:
@@ -294,11 +302,26 @@ class LiveWatch:
                 saved = time.monotonic()
                 save()
 
+    def _decoded(self, data: bytes) -> Block:
+        """Return the block of this robot in a message; others must not disturb the order of its blocks."""
+        self._taken += len(data)
+        block = decode_block(data)
+        if block.layout.joints != tuple(joint.name for joint in self._robot.joints):
+            raise DataError(f"a block of capture {block.capture}: of other joints than those of {self._robot.name}")
+        return block
+
     def _on_block(self, sample: zenoh.Sample) -> None:
+        # A message that is too large for a block is refused as an empty one, without its memory.
+        data = bytes(sample.payload) if len(sample.payload) <= LARGEST_BLOCK else b""
+        if self._received - self._taken + len(data) > WAITING_BYTES:
+            self.dropped += 1
+            return
         try:
-            self._waiting.put_nowait(bytes(sample.payload))
+            self._waiting.put_nowait(data)
         except queue.Full:
             self.dropped += 1
+        else:
+            self._received += len(data)
 
     def _on_query(self, query: zenoh.Query) -> None:
         if self._last is None:
@@ -370,8 +393,12 @@ def watch_cell(config: Path | None, options: WatchOptions) -> int:
         signal.signal(number, stop)
 
     def save() -> None:
-        if options.state is not None:
+        if options.state is None:
+            return
+        try:
             estimator.save(options.state)
+        except OSError as error:
+            log.warning("--state %s: not saved: %s; tried again every %g s", options.state, error.strerror, SAVED_S)
 
     with LiveWatch(session, robot, estimator) as live, Screen(robot, options.as_json) as screen:
         print("watch: ready", file=sys.stderr, flush=True)

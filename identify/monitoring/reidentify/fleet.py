@@ -168,8 +168,10 @@ def identify_one(path: str, robot: RobotConfig | None, out: str) -> Identified:
         file, _ = write_identification(done, Path(out))
     except ArmidentError:
         raise
+    except OSError as error:
+        raise ArmidentError(f"{error.filename or out}: {error.strerror or 'cannot be used'}") from error
     except Exception as error:
-        raise ArmidentError(f"{type(error).__name__}: {error}") from error
+        raise ArmidentError(f"internal error ({type(error).__name__})") from error
     return Identified(to_json(done.document), str(file), done.robot, History.facts(recording))
 
 

@@ -1,8 +1,9 @@
 """Identification of a recording that a worker of the cell may identify, too: one of them does it and announces it."""
 
+import math
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,13 +13,16 @@ from armident.daq.recording import Recording
 from armident.identify.document import IdentificationDocument, load_document, to_json
 from armident.identify.identification.api import identify_recording
 from armident.identify.identification.options import Options
-from armident.identify.monitoring.ledger import FILE, Ledger, unique_owner
+from armident.identify.monitoring.ledger import FILE, Ledger, LedgerError, LedgerUnusable, unique_owner
 from armident.identify.monitoring.recorded import captured_in, result_of
+from armident.identify.monitoring.reidentify.publish import StatusPublisher
 from armident.identify.monitoring.reidentify.record_run import Say
 from armident.identify.report.files import write_identification
 
 RENEW_S = 1.0
 """Interval at which the lease is renewed, s."""
+RETRY_S = 60.0
+"""Time for which a ledger that is locked or cannot be written is tried again, s."""
 POLL_S = 0.5
 """Interval at which the result of a worker is waited for, s."""
 
@@ -32,15 +36,56 @@ class OnceIdentified:
     ours: bool
 
 
+class _NotPublished(Exception):
+    """Zenoh took no announcement: its entry in the ledger must not count."""
+
+
+@dataclass
+class _Recorded:
+    """Recording that is to be identified and announced once.
+
+    Parameters
+    ----------
+    digest, name
+        Hash of the recording and its name, without suffix.
+    identify
+        Returns its identification, from the file if there is one.
+    publisher
+        Publishes results and failures.
+    published
+        True if the result or the failure was published by this process.
+    """
+
+    digest: str
+    name: str
+    identify: Callable[[], OnceIdentified]
+    publisher: StatusPublisher
+    published: bool = False
+
+    def publish(self, done: OnceIdentified) -> None:
+        """Publish a result once."""
+        if not self.published and not self.publisher.result(to_json(done.document)):
+            raise _NotPublished
+        self.published = True
+
+    def publish_failure(self, message: str) -> None:
+        """Publish the reason of a failure once, as a worker does."""
+        if not self.published:
+            self.publisher.status("failed", message=message, capture=self.name, sha256=self.digest)
+        self.published = True
+
+
 def identify_once(
     recording: Recording,
     robot: RobotConfig,
     options: Options,
     out: Path,
-    publish: Callable[[str], None],
+    publisher: StatusPublisher,
     say: Say,
 ) -> OnceIdentified:
     """Identify a recording and announce the result, unless a worker does it; then wait for its result.
+
+    Without a ledger that can be written the result is announced all the same.
 
     Parameters
     ----------
@@ -52,8 +97,8 @@ def identify_once(
         Options of the identification.
     out
         Folder of the results, with the ledger that the workers use.
-    publish
-        Announces the text of a document.
+    publisher
+        Publishes the result, or the reason why there is none.
     say
         Takes lines of progress.
 
@@ -61,53 +106,76 @@ def identify_once(
     ------
     DataError
         If the recording cannot be identified.
+    ArmidentError
+        If the result cannot be written.
     """
     path = recording.path
     beside = [] if path is None else captured_in((path.parent,), robot.name)
     files = [each for each in beside if path is not None and path.resolve() in each.paths]
     name = files[0].name if files else "recording" if path is None else path.name.removesuffix(".mcap")
     folder = out / f"{name}.identification"
-    digest = recording.sha256
-    try:
-        ledger = Ledger(out / FILE, unique_owner())
-        ledger.add(digest, name, files[0].paths if files else ())
-    except ArmidentError as error:
-        say(f"warning: {error}; workers of this cell may identify the recording, too")
-        done = _identified(recording, robot, options, folder)
-        publish(to_json(done.document))
-        return done
+    recorded = _Recorded(recording.sha256, name, lambda: _identified(recording, robot, options, folder), publisher)
+    paths = files[0].paths if files else ()
+    problem: ArmidentError | None = None
+    until = math.inf
+    while problem is None or time.monotonic() < until:
+        try:
+            return _shared(out / FILE, recorded, paths, say)
+        except LedgerUnusable as error:
+            problem, until = error, 0.0
+        except LedgerError as error:
+            if problem is None:
+                until = time.monotonic() + RETRY_S
+                say(f"warning: {error}; trying again for {RETRY_S:g} s")
+            problem = error
+            time.sleep(POLL_S)
+    say(f"warning: {problem}; workers of this cell may identify and announce the recording, too")
+    return _alone(recorded)
+
+
+def _shared(file: Path, recorded: _Recorded, paths: Sequence[Path], say: Say) -> OnceIdentified:
+    """Identify and publish, or wait for a worker that does, by the ledger in a file."""
+    ledger = Ledger(file, unique_owner())
     with _renewed(ledger):
-        return _claimed(ledger, digest, lambda: _identified(recording, robot, options, folder), publish, say)
+        ledger.add(recorded.digest, recorded.name, paths)
+        return _claimed(ledger, recorded, say)
 
 
-def _claimed(
-    ledger: Ledger,
-    digest: str,
-    identify: Callable[[], OnceIdentified],
-    publish: Callable[[str], None],
-    say: Say,
-) -> OnceIdentified:
+def _alone(recorded: _Recorded) -> OnceIdentified:
+    """Identify and publish without a ledger."""
+    try:
+        done = recorded.identify()
+    except DataError as error:
+        recorded.publish_failure(str(error))
+        raise
+    with suppress(_NotPublished):
+        recorded.publish(done)
+    return done
+
+
+def _claimed(ledger: Ledger, recorded: _Recorded, say: Say) -> OnceIdentified:
     """Return the result of the process that has the claim: this one, or a worker."""
-    waiting = False
+    digest, waiting = recorded.digest, False
     while True:
         mine = ledger.claim(digest, held=(digest,))
         entry = mine or ledger.entry(digest)
         assert entry is not None
         done = None
         if mine is not None and mine.state == "waiting":
-            done = _entered(ledger, digest, identify)
+            done = _entered(ledger, recorded)
             if done is None:
                 continue
         elif entry.state == "done" and entry.result is not None:
             done = OnceIdentified(load_document(entry.result, IdentificationDocument), entry.result, ours=False)
         elif entry.state == "failed":
-            with ledger.announcement(digest):
-                pass
-            raise DataError(entry.message or "the recording cannot be identified")
+            message = entry.message or "the recording cannot be identified"
+            _announce_failure(ledger, recorded, message)
+            raise DataError(message)
         if done is not None:
-            with ledger.announcement(digest) as announced_here:
+            # A worker announces what Zenoh has not taken here.
+            with suppress(_NotPublished), ledger.announcement(digest) as announced_here:
                 if announced_here:
-                    publish(to_json(done.document))
+                    recorded.publish(done)
             return done
         if not waiting:
             say("a worker of this cell identifies the recording; waiting for its result")
@@ -115,16 +183,22 @@ def _claimed(
         time.sleep(POLL_S)
 
 
-def _entered(ledger: Ledger, digest: str, identify: Callable[[], OnceIdentified]) -> OnceIdentified | None:
+def _entered(ledger: Ledger, recorded: _Recorded) -> OnceIdentified | None:
     """Identify, and enter the result; ``None`` if the claim was lost meanwhile."""
     try:
-        done = identify()
+        done = recorded.identify()
     except DataError as error:
-        ledger.finish(digest, "failed", None, str(error))
-        with ledger.announcement(digest):
-            pass
+        if not ledger.finish(recorded.digest, "failed", None, str(error)):
+            return None
+        _announce_failure(ledger, recorded, str(error))
         raise
-    return done if ledger.finish(digest, "done", done.path, done.document.verdict or "") else None
+    return done if ledger.finish(recorded.digest, "done", done.path, done.document.verdict or "") else None
+
+
+def _announce_failure(ledger: Ledger, recorded: _Recorded, message: str) -> None:
+    with ledger.announcement(recorded.digest) as announced_here:
+        if announced_here:
+            recorded.publish_failure(message)
 
 
 def _identified(recording: Recording, robot: RobotConfig, options: Options, folder: Path) -> OnceIdentified:
@@ -132,7 +206,13 @@ def _identified(recording: Recording, robot: RobotConfig, options: Options, fold
     if found is not None:
         return OnceIdentified(found[1], found[0], ours=True)
     outcome = identify_recording(recording, robot, options)
-    path, _ = write_identification(outcome, folder)
+    try:
+        path, _ = write_identification(outcome, folder)
+    except OSError as error:
+        raise ArmidentError(
+            f"{error.filename or folder}: the result cannot be written: {error.strerror}; mend that, "
+            f"then a worker of the cell identifies the recording, or: armident identify {recording.path}"
+        ) from error
     return OnceIdentified(outcome.document, path, ours=True)
 
 

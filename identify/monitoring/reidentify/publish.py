@@ -51,21 +51,24 @@ class StatusPublisher:
         content = {"component": "reidentify", "state": state, **more}
         self._put(self._keys.status, json.dumps(content).encode())
 
-    def result(self, text: str) -> None:
-        """Publish an identification document and answer queries with it."""
+    def result(self, text: str) -> bool:
+        """Publish an identification document and answer queries with it; return False if Zenoh did not take it."""
         self._last = text.encode()
-        self._put(self._keys.identification, self._last)
+        return self._put(self._keys.identification, self._last)
 
     def diagnosis(self, text: str) -> None:
         """Publish a diagnosis document."""
         self._put(self._keys.diagnosis, text.encode())
 
-    def _put(self, key: str, data: bytes) -> None:
+    def _put(self, key: str, data: bytes) -> bool:
         """Publish a message; the job does not depend on it, because the result is in its file."""
         try:
-            self._session.put(key, data, express=True)
+            # As the worker's announcements: dropped by no full queue.
+            self._session.put(key, data, express=True, congestion_control=zenoh.CongestionControl.BLOCK)
         except zenoh.ZError:
             log.warning("zenoh: the session failed; %s was not published", key)
+            return False
+        return True
 
     def __enter__(self) -> Self:
         """Return the publisher."""

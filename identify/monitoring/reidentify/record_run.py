@@ -28,7 +28,7 @@ Say = Callable[[str], None]
 
 
 def start_process(words: Sequence[str], out: IO[bytes], err: IO[bytes]) -> Process:
-    """Start an armident command in a session of its own.
+    """Start an armident command in a session of its own; it stops the arm and ends if this process is killed.
 
     Signals of the terminal then reach this process only, which signals the guard before the capture.
 
@@ -39,7 +39,7 @@ def start_process(words: Sequence[str], out: IO[bytes], err: IO[bytes]) -> Proce
     out, err
         Files of standard output and standard error.
     """
-    return start_command(words, out, err, own_session=True)
+    return start_command(words, out, err, own_session=True, with_parent=True)
 
 
 class Interrupted(ArmidentError):

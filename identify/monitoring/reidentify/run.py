@@ -230,7 +230,7 @@ def carry_out(job: Job, announcer: StatusPublisher, say: Say, start: Start = sta
     say(f"recorded {recording.path}")
     announcer.status("identifying", recording=str(recording.path))
     options = Options(**job.session.identification.model_dump())
-    done = identify_once(recording, job.robot, options, job.out, announcer.result, say)
+    done = identify_once(recording, job.robot, options, job.out, announcer, say)
     document, path = done.document, done.path
     for reason in document.reasons:
         say(f"{reason.level}: {reason.message}. Next: {reason.next_step}")

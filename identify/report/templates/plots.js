@@ -55,7 +55,13 @@ function extent(plot, shown, first, last) {
     high = Math.max(high, value);
   };
   plot.series.forEach((series, s) => {
-    if (shown[s]) for (let k = first; k <= last; k++) take(series.y[k]);
+    if (!shown[s]) return;
+    for (let k = first; k <= last; k++) {
+      if (series.y[k] === null) continue;
+      const half = series.half ? series.half[k] : 0;
+      take(series.y[k] - half);
+      take(series.y[k] + half);
+    }
   });
   plot.limits.forEach((limit) => take(limit.y));
   if (low > high) return [-1, 1];
@@ -67,9 +73,10 @@ function extent(plot, shown, first, last) {
 class Group {
   constructor(root, data) {
     this.root = root;
+    const room = data.some((plot) => plot.names.length) ? 0.6 : 0;
     this.whole = [
-      Math.min(...data.map((plot) => plot.x[0])),
-      Math.max(...data.map((plot) => plot.x[plot.x.length - 1])),
+      Math.min(...data.map((plot) => plot.x[0])) - room,
+      Math.max(...data.map((plot) => plot.x[plot.x.length - 1])) + room,
     ];
     this.range = this.whole;
     this.at = null;
@@ -182,7 +189,7 @@ class Plot {
     pen.clip();
     this.data.limits.forEach((limit) => this.line(pen, limit.y, toY));
     this.data.series.forEach((series, s) => {
-      if (this.shown[s]) this.curve(pen, series, first, last, toY);
+      if (this.shown[s]) this[series.half ? "points" : "curve"](pen, series, first, last, toY);
     });
     this.pointer(pen);
     pen.restore();
@@ -202,11 +209,23 @@ class Plot {
     });
     pen.textAlign = "center";
     pen.textBaseline = "top";
-    ticks(...this.group.range, Math.max(2, Math.floor(this.width / 90))).forEach((value) => {
+    this.marks().forEach(([value, label]) => {
       const pixel = this.toPixel(value);
       this.stroke(pen, pixel, MARGIN.top, pixel, HEIGHT - MARGIN.bottom);
-      pen.fillText(`${text(value)} ${this.data.x_unit}`, pixel, HEIGHT - MARGIN.bottom + 5);
+      pen.fillText(label, pixel, HEIGHT - MARGIN.bottom + 5);
     });
+  }
+
+  /** Positions and labels of the axis: round numbers, or as many names as there is room for. */
+  marks() {
+    const { names, x_unit } = this.data;
+    const [low, high] = this.group.range;
+    if (!names.length) {
+      return ticks(low, high, Math.max(2, Math.floor(this.width / 90))).map((x) => [x, `${text(x)} ${x_unit}`]);
+    }
+    const room = 7 * Math.max(...names.map((name) => name.length)) + 10;
+    const every = Math.max(1, Math.ceil((room * (high - low)) / this.width));
+    return names.map((name, k) => [k, name]).filter(([k]) => k >= low && k <= high && k % every === 0);
   }
 
   stroke(pen, x0, y0, x1, y1) {
@@ -241,6 +260,20 @@ class Plot {
     pen.stroke();
   }
 
+  /** Values with intervals; those of one place stand side by side. */
+  points(pen, series, first, last, toY) {
+    const aside = 7 * (this.data.series.indexOf(series) - (this.data.series.length - 1) / 2);
+    pen.strokeStyle = series.colour;
+    pen.fillStyle = series.colour;
+    pen.lineWidth = series.width;
+    for (let k = first; k <= last; k++) {
+      if (series.y[k] === null) continue;
+      const x = this.toPixel(this.data.x[k]) + aside;
+      this.stroke(pen, x, toY(series.y[k] - series.half[k]), x, toY(series.y[k] + series.half[k]));
+      pen.fillRect(x - 2.5, toY(series.y[k]) - 2.5, 5, 5);
+    }
+  }
+
   pointer(pen) {
     if (this.group.at === null) return;
     const now = this.toPixel(this.group.at);
@@ -255,13 +288,17 @@ class Plot {
   }
 
   read() {
-    const { x, x_unit, unit, series, limits } = this.data;
+    const { x, x_unit, unit, series, limits, readings } = this.data;
     if (this.group.at === null) {
       const names = limits.map((limit) => `${limit.name} ${text(limit.y)} ${unit}`);
       this.readout.textContent = names.length ? names.join(" · ") : "\u00a0";
       return;
     }
     const k = nearest(x, this.group.at);
+    if (readings.length) {
+      this.readout.textContent = readings[k];
+      return;
+    }
     const values = series.map((one) => `${one.name} ${text(one.y[k])} ${unit}`);
     this.readout.textContent = [`${text(x[k])} ${x_unit}`, ...values].join(" · ");
   }

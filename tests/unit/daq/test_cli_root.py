@@ -1,5 +1,6 @@
 """Root of the command line: finds commands, imports only the one called, one line for every error."""
 
+import errno
 import importlib.metadata
 import os
 import signal
@@ -30,6 +31,8 @@ def refuse(kind: str) -> None:
         "config": ConfigError("cell.yaml: sync.rate_hz:\n expected a number"),
         "data": DataError("too short"),
         "other": ArmidentError("bus is down"),
+        "full": OSError(errno.ENOSPC, "No space left on device", "a.json"),
+        "device": OSError(errno.EIO, "Input/output error"),
         "bug": ValueError("unforeseen"),
         "interrupt": KeyboardInterrupt(),
         "changed": typer.Exit(4),
@@ -72,6 +75,8 @@ def call(*words: str) -> tuple[int, str, str]:
         ("config", 2, "armident: cell.yaml: sync.rate_hz: expected a number"),
         ("data", 3, "armident: too short"),
         ("other", 1, "armident: bus is down"),
+        ("full", 1, "armident: a.json: No space left on device; free space on the disk, or choose another folder"),
+        ("device", 1, "armident: Input/output error"),
     ],
 )
 def test_an_expected_error_is_one_line_on_stderr_and_its_own_exit_code(kind: str, code: int, line: str) -> None:

@@ -1,6 +1,7 @@
 """Import and export: numbers survive the round trip, and every error has one clear line."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -233,3 +234,27 @@ def test_a_recording_without_samples_is_not_exported(tmp_path: Path) -> None:
     )
     with pytest.raises(DataError, match="no samples"):
         columns(Recording(None, TX40, None, 1000.0, {"samples": empty}))
+
+
+def test_columns_of_different_lengths_are_refused_by_name(tmp_path: Path) -> None:
+    path = tmp_path / "a.npz"
+    columns: dict[str, Any] = {f"{name}{j}": np.zeros(60) for name in ("q", "tau") for j in range(1, 7)}
+    np.savez(path, **{"t": np.arange(60) / 100, **columns, "q6": np.zeros(64)})
+    with pytest.raises(DataError, match="q6 has 64 values, q1 has 60"):
+        import_recording(path, load_robot("tx40"))
+
+
+def test_times_that_no_clock_can_have_are_refused(tmp_path: Path) -> None:
+    values = table()
+    values[-1, 0] = 1e300
+    path = write_csv(tmp_path / "a.csv", values, HEADER)
+    with pytest.raises(DataError, match=r"1e\+300 s in steps of 0\.\d+ s are no recording of 50 samples"):
+        import_recording(path, TX40)
+
+
+def test_values_whose_squares_are_no_numbers_are_refused(tmp_path: Path) -> None:
+    values = table()
+    values[7, 9] = -1e308
+    path = write_csv(tmp_path / "a.csv", values, HEADER)
+    with pytest.raises(DataError, match=r"a\.csv: line 9, column tau3: -1e\+308 is no measurement"):
+        import_recording(path, TX40, resample_hz=1000.0)

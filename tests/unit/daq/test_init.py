@@ -84,7 +84,7 @@ def test_urdf_and_csv_become_a_model_without_an_edit(tmp_path: Path, arm: Path) 
     made = run("init", str(arm), "--recording", str(tmp_path / "data.csv"), "--out", str(tmp_path / "cell"))
     assert made.exit_code == 0, made.output
     assert "1000 Hz, 8.1" in made.output
-    assert " s, torques, with reference" in made.output
+    assert " s, torques, with demand" in made.output
     lines = [line.strip() for line in made.output.splitlines()]
     commands = [line.split()[1:] for line in lines[lines.index("next:") + 1 :]]
     assert [words[0] for words in commands] == ["import", "check", "identify"]
@@ -122,18 +122,18 @@ def test_other_limits_are_blank_with_what_was_reached_beside_them(tmp_path: Path
 
 
 @pytest.mark.parametrize(
-    ("changes", "options"),
+    ("unit", "time", "options"),
     [
-        ({}, ""),
-        ({"unit": np.pi / 180}, " --units position=deg"),
-        ({"time": 1e-3}, " --time-unit ms"),
-        ({"time": 1e-6, "unit": np.pi / 180}, " --units position=deg --time-unit us"),
+        (1.0, 1.0, ""),
+        (np.pi / 180, 1.0, " --units position=deg"),
+        (1.0, 1e-3, " --time-unit ms"),
+        (np.pi / 180, 1e-6, " --units position=deg --time-unit us"),
     ],
 )
 def test_units_are_found_by_magnitude_and_the_import_gets_them(
-    tmp_path: Path, arm: Path, changes: dict[str, float], options: str
+    tmp_path: Path, arm: Path, unit: float, time: float, options: str
 ) -> None:
-    path = table(tmp_path / "d.csv", **changes)  # type: ignore[arg-type]
+    path = table(tmp_path / "d.csv", unit=unit, time=time)
     made = run("init", str(arm), "--recording", str(path), "--out", str(tmp_path))
     assert made.exit_code == 0, made.output
     command = next(line.split()[1:] for line in made.output.splitlines() if line.startswith("  armident import"))

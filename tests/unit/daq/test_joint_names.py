@@ -1,5 +1,6 @@
 """Joint names of a file: matched as names, with a remark where they are not equal, and never by their order."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -42,7 +43,7 @@ def test_equal_names_are_found_in_any_order(names: list[str]) -> None:
         (lambda name: name.removeprefix("joint_"), "without the prefix 'joint'"),
     ],
 )
-def test_case_and_a_common_prefix_are_matched_and_said(spell, remark: str) -> None:  # type: ignore[no-untyped-def]
+def test_case_and_a_common_prefix_are_matched_and_said(spell: Callable[[str], str], remark: str) -> None:
     names = [spell(NAMES[k]) for k in EXCHANGED]
     match = match_joints(names, TX40)
     assert [names[k] for k in match.index] == [spell(name) for name in NAMES]

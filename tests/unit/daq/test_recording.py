@@ -7,6 +7,7 @@ import struct
 import tracemalloc
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -313,11 +314,16 @@ def with_chunks(data: bytes, change: Callable[[bytearray], None]) -> bytes:
     return bytes(out) + mcap.MAGIC
 
 
+def _with_size(size: int, content: bytearray) -> None:
+    """State another uncompressed size in a chunk."""
+    struct.pack_into("<Q", content, 16, size)
+
+
 def test_memory_is_not_reserved_by_sizes_stated_in_a_file(tmp_path: Path) -> None:
     write_chunked(make_recording(2000), tmp_path / "r.mcap").close({})
     data = (tmp_path / "r.mcap").read_bytes()
     for size in (2**28, 2**31, 2**40, 2**63, 2**64 - 1):
-        forged = with_chunks(data, lambda content, size=size: struct.pack_into("<Q", content, 16, size))  # type: ignore[misc]
+        forged = with_chunks(data, partial(_with_size, size))
         (tmp_path / "f.mcap").write_bytes(forged)
         tracemalloc.start()
         read = read_recording(tmp_path / "f.mcap")

@@ -221,6 +221,13 @@ def test_finished_recordings_of_a_clock_far_ahead_delete_nothing_until_they_are_
     assert third.exists()
 
 
+def test_a_name_that_only_looks_like_a_time_is_of_no_capture(tmp_path: Path) -> None:
+    odd = made(tmp_path, "20261399T000000")
+    assert next_time(tmp_path, "tx40", NOW) == NOW
+    assert prune(tmp_path, "tx40", NOW, 1.0, None) == []
+    assert odd.exists()
+
+
 def test_after_a_step_of_the_clock_back_a_recording_is_named_after_the_newest_one(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -262,5 +269,5 @@ def test_deleted_files_are_logged_and_an_error_once(caplog: pytest.LogCaptureFix
     assert thread.deleted == 1
     assert [(record.levelname, record.message) for record in caplog.records] == [
         ("INFO", "deleted a.mcap (retention)"),
-        ("WARNING", "retention: [Errno 5] Input/output error"),
+        ("WARNING", "retention: the folder: Input/output error; old recordings stay, tried again every 0.001 s"),
     ]

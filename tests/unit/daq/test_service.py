@@ -1,4 +1,4 @@
-"""``armident service install``: user, folders, permissions and units of a cell in a system image."""
+"""``armident service``: user, folders, permissions and units of a cell in a system image, and their removal."""
 
 import os
 import stat
@@ -8,11 +8,14 @@ from configparser import ConfigParser
 from pathlib import Path
 
 import pytest
+from typer.testing import CliRunner
 
 from armident.configs import ArmidentError, ConfigError
 from armident.configs.loading import HERE
 from armident.daq import service
-from armident.daq.service import ACCOUNT, HEADER, STATE, UNITS, System, install, steps
+from armident.daq.cli import application
+from armident.daq.service import ACCOUNT, CACHE, HEADER, SETTINGS, STATE, UNITS, System, install, steps
+from armident.daq.service_state import status, uninstall
 
 needs_root = pytest.mark.skipif(os.geteuid() != 0, reason="owners of files are set by root only")
 
@@ -182,3 +185,97 @@ def test_a_reader_without_rights_is_sent_to_sudo(image: Path, monkeypatch: pytes
     monkeypatch.setattr(Path, "is_file", lambda self: closed(self) if self.suffix == ".yaml" else session(self))
     with pytest.raises(ConfigError, match=r"line3\.yaml: only root may read it: sudo"):
         install("line3", image, dry_run=True)
+
+
+def enable(image: Path, name: str, by: str) -> Path:
+    """Enable a unit as ``systemctl enable`` does."""
+    link = image / UNITS / f"{by}.wants" / name
+    link.parent.mkdir(exist_ok=True)
+    link.symlink_to(f"/{UNITS}/{name.partition('@')[0]}@.{name.rpartition('.')[2]}")
+    return link
+
+
+def session_of(image: Path, cell: str) -> Path:
+    file = image / SETTINGS / f"{cell}.yaml"
+    file.write_text("schema: armident/session/1\n")
+    return file
+
+
+@needs_root
+def test_a_removed_cell_keeps_its_recordings_and_its_configuration(image: Path) -> None:
+    install("line3", image)
+    session = session_of(image, "line3")
+    link = enable(image, "armident-capture@line3.service", "multi-user.target")
+    recording = image / STATE / "line3" / "monday.mcap"
+    recording.write_bytes(b"1" * 2_000_000)
+    before = list(contents(image))
+    planned = uninstall("line3", image, dry_run=True)
+    assert list(contents(image)) == before
+    done = uninstall("line3", image)
+    assert [line.replace("done: ", "to do: ") for line in done] == planned
+    assert not link.is_symlink()
+    assert not list((image / UNITS).glob("armident-*"))
+    assert not (image / CACHE).exists()
+    assert recording.stat().st_size == 2_000_000
+    assert session.read_text() == "schema: armident/session/1\n"
+    assert "recordings and results: /var/lib/armident/line3 (1 files, 2.0 MB); never deleted" in done
+    assert uninstall("line3", image)[0] == "nothing to do: the service of cell line3 is not installed"
+
+
+@needs_root
+def test_units_stay_while_another_cell_uses_them(image: Path) -> None:
+    for cell in ("line3", "line4"):
+        install(cell, image)
+        session_of(image, cell)
+    (image / SETTINGS / "arm.yaml").write_text("schema: armident/robot/1\n")
+    enable(image, "armident-worker@line3.service", "multi-user.target")
+    lines = uninstall("line3", image)
+    assert lines[0] == "done: disable armident-worker@line3.service (multi-user.target.wants)"
+    assert len(list((image / UNITS).glob("armident-*"))) == len(list((HERE / "systemd").iterdir()))
+    assert any(line.startswith("kept: unit files, for line4 ") for line in lines)
+
+
+@needs_root
+def test_a_unit_of_other_origin_is_not_removed(image: Path) -> None:
+    install("line3", image)
+    unit = image / UNITS / "armident-worker@.service"
+    unit.write_text("[Service]\nExecStart=/usr/local/bin/ours\n")
+    lines = uninstall("line3", image)
+    assert [path.name for path in (image / UNITS).iterdir()] == [unit.name]
+    assert f"kept: unit /{UNITS / unit.name}, which this command did not write" in lines
+
+
+@needs_root
+def test_the_status_names_every_part_with_its_state(image: Path) -> None:
+    lines, complete = status("line3", image)
+    assert not complete
+    assert "missing or different: system group armident" in lines
+    install("line3", image)
+    session_of(image, "line3")
+    install("line3", image)
+    enable(image, "armident-reidentify@line3.timer", "timers.target")
+    lines, complete = status("line3", image)
+    assert complete
+    assert "enabled: armident-reidentify@line3.timer" in lines
+    assert "not enabled: armident-capture@line3.service" in lines
+    (image / UNITS / "armident-worker@.service").write_text("[Service]\n")
+    lines, complete = status("line3", image)
+    assert not complete
+    assert "written by another program or person: unit /etc/systemd/system/armident-worker@.service" in lines
+
+
+@pytest.mark.parametrize("action", ["status", "uninstall", "remove"])
+def test_the_command_ends_with_the_exit_code_of_the_action(action: str, image: Path) -> None:
+    words = ["service", action, "line3", "--root", str(image), "--dry-run"]
+    result = CliRunner().invoke(application(words), words)
+    assert result.exit_code == {"status": 4, "uninstall": 0, "remove": 2}[action]
+    if action == "remove":
+        assert "expected: armident service install, status or uninstall CELL" in result.stderr
+
+
+def test_only_root_removes_a_service(image: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (image / UNITS).mkdir(parents=True)
+    (image / UNITS / "armident-worker@.service").write_text(HEADER)
+    monkeypatch.setattr(os, "geteuid", lambda: 1000)
+    with pytest.raises(ConfigError, match="sudo armident service uninstall line3"):
+        uninstall("line3", image)

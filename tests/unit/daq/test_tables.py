@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from armident.configs import ConfigError, DataError
+from armident.configs import ConfigError, DataError, load_robot
 from armident.daq.cli import application
 from armident.daq.interchange.importing import import_recording
 from armident.daq.recording import Recording
@@ -52,7 +52,7 @@ BY_JOINT = [
         ["Time [s]", *(f"q_{j + 1} [rad]" for j in range(N)), *(f"tau_{j + 1} (Nm)" for j in range(N))],
         ["timestamp", *(f"joint_{j + 1}_pos" for j in range(N)), *(f"joint_{j + 1}_torque" for j in range(N))],
         ["timestamp", *(f"actual_q_{j}" for j in range(N)), *(f"effort.joint_{j + 1}" for j in range(N))],
-        ["# t", *NAMES[1:]],
+        ["# t", *NAMES[1:]], ["t", *(f"q[{j + 1}]" for j in range(N)), *(f"effort[{j}]" for j in range(N))],
     ],
 )  # fmt: skip
 @pytest.mark.parametrize("sep", [",", ";", "\t", "|"])
@@ -423,7 +423,7 @@ def lerobot(folder: Path, names: list[str] | None, extra: str = "observation.eff
         "timestamp": np.append(values[:200, 0], values[:100, 0]).astype(np.float32),
         "episode_index": np.append(np.zeros(200, int), np.ones(100, int)),
     }
-    pyarrow.parquet.write_table(pyarrow.table(columns), data)  # type: ignore[no-untyped-call]
+    pyarrow.parquet.write_table(pyarrow.table(columns), data)
     return data
 
 
@@ -479,10 +479,10 @@ def test_times_of_a_lerobot_data_set_that_are_no_numbers_are_refused(tmp_path: P
     import pyarrow.parquet
 
     data = lerobot(tmp_path, None)
-    table = pyarrow.parquet.read_table(data)  # type: ignore[no-untyped-call]
+    table = pyarrow.parquet.read_table(data)
     times = pyarrow.array([{"s": 1}] * len(table))
     table = table.set_column(table.column_names.index("timestamp"), "timestamp", times)
-    pyarrow.parquet.write_table(table, data)  # type: ignore[no-untyped-call]
+    pyarrow.parquet.write_table(table, data)
     with pytest.raises(DataError, match="timestamp has rows of unequal lengths, or values that are no numbers"):
         import_recording(data, TX40)
 
@@ -501,5 +501,60 @@ def test_values_that_overflow_are_refused_without_warnings(tmp_path: Path) -> No
     path = written(tmp_path / "a.csv", values)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        with pytest.raises(DataError, match=r"position of .* reaches"):
+        with pytest.raises(DataError, match=r"line 9, column q3: 1e\+308 is no measurement"):
             import_recording(path, TX40)
+
+
+def with_columns(path: Path, names: list[str], values: np.ndarray) -> Path:
+    """Write the motion of `motion` with further columns."""
+    return written(path, np.hstack([motion(), values]), [*NAMES, *names])
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "qr{j}", "reference{j}", "ref_{j}", "q_ref{j}", "q{j}_ref", "qref{j}", "q_des[{j}]", "setpoint_{j}",
+        "set point {j}", "target{j}", "target_q_{i}", "targetPosition{j}", "desired_position_{j} [rad]", "command{j}",
+        "commanded_pos_{j}", "posCmd{j}", "demand{j}", "joint_{j}_ref", "/arm/joint_{j}/reference/position",
+        "goal_position.joint_{j}", "JOINT {j} setpoint",
+    ],
+)  # fmt: skip
+def test_a_demand_is_found_by_the_words_of_other_tools(tmp_path: Path, name: str) -> None:
+    demand = motion()[:, 1 : N + 1] + 0.001
+    names = [name.format(j=j + 1, i=j) for j in range(N)]
+    found = import_recording(with_columns(tmp_path / "a.csv", names, demand), TX40)
+    assert np.allclose(found.samples.raw["demand"], demand, rtol=0, atol=1e-8)
+    assert same(found, motion())
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        [f"target_qd_{j}" for j in range(N)], [f"joint_{j + 1}_torque_ref" for j in range(N)],
+        [f"reference{j + 1}" for j in range(N - 1)], ["setpoint"], ["ref_velocity_joint_1"],
+    ],
+)  # fmt: skip
+def test_a_demand_of_no_joint_positions_is_named_once_and_left_out(tmp_path: Path, names: list[str]) -> None:
+    table = with_columns(tmp_path / "a.csv", names, np.ones((400, len(names))))
+    found = import_recording(table, TX40)
+    assert "demand" not in found.samples.fields
+    remarks = found.metadata["source_remarks"]
+    assert f"without a demand: {names[0]}" in remarks
+    assert "--map demand=NAME" in remarks
+    assert "source_remarks" not in import_recording(table, TX40, names={"demand": "-"}).metadata
+
+
+def test_one_of_two_demands_is_taken_and_the_other_is_named(tmp_path: Path) -> None:
+    demand = motion()[:, 1 : N + 1]
+    names = [f"{word}_q_{j}" for word in ("target", "command") for j in range(N)]
+    found = import_recording(with_columns(tmp_path / "a.csv", names, np.hstack([demand + 0.001, demand])), TX40)
+    assert np.allclose(found.samples.raw["demand"], demand + 0.001, rtol=0, atol=1e-8)
+    assert "not from command_q_0" in found.metadata["source_remarks"]
+
+
+def test_a_demand_of_a_single_joint_needs_no_number(tmp_path: Path) -> None:
+    robot = load_robot("emps.yaml")
+    t = np.arange(400) / 1000.0
+    q = 0.01 * np.sin(6 * t)
+    table = written(tmp_path / "a.csv", np.column_stack([t, q, np.cos(t), q + 1e-4]), ["t", "q", "tau", "reference"])
+    assert np.allclose(import_recording(table, robot).samples.raw["demand"][:, 0], q + 1e-4, rtol=0, atol=1e-8)

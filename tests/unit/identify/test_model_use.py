@@ -2,6 +2,7 @@
 
 import csv
 import json
+import re
 from importlib.metadata import EntryPoint
 from pathlib import Path
 
@@ -81,6 +82,35 @@ def test_another_recording_is_held_out_and_predicted_nearly_as_well(folder: Path
     assert len(rows) == found["samples"]
     assert np.sqrt(np.mean(error**2)) == pytest.approx(found["error_rms"][name], rel=1e-6)
     assert "held-out data" in (tmp_path / "report.html").read_text()
+
+
+def test_several_recordings_are_predicted_and_the_worst_is_named(folder: Path, tmp_path: Path) -> None:
+    files = [folder / f"{name}.mcap" for name in ("one", "two", "sprung")]
+    result = call("predict", *files, "--model", folder / "one", "--out", tmp_path, "--json")
+    assert result.exit_code == 0
+    found = json.loads(result.stdout)
+    assert found == json.loads((tmp_path / "predictions.json").read_text())
+    assert found["worst_recording"] == str(files[2])
+    errors = [each["relative_error_pct"] for each in found["predictions"]]
+    assert found["worst_error_pct"] == max(errors) == errors[2]
+    assert [each["held_out"] for each in found["predictions"]] == [False, True, True]
+    for each, file in zip(found["predictions"], files, strict=True):
+        assert json.loads((tmp_path / file.stem / "prediction.json").read_text()) == each
+    shown = call("predict", *files[:2], "--model", folder / "one", "--out", tmp_path)
+    assert f"Worst torque error {max(errors[:2]):.2f} %" in shown.stdout
+    twice = call("predict", files[0], files[0], "--model", folder / "one", "--out", tmp_path)
+    assert twice.exit_code == 2
+    assert twice.stderr.count("\n") == 1
+
+
+def test_one_worthless_prediction_of_several_ends_with_exit_code_4(folder: Path, tmp_path: Path) -> None:
+    document = load_document(folder / "one/identification.json", IdentificationDocument)
+    parameters = [p.model_copy(update={"value": -p.value}) for p in document.parameters]
+    (tmp_path / "wrong.json").write_text(to_json(document.model_copy(update={"parameters": parameters})))
+    files = [folder / "one.mcap", folder / "two.mcap"]
+    result = call("predict", *files, "--model", tmp_path / "wrong.json", "--out", tmp_path)
+    assert result.exit_code == 4
+    assert "explains the torques of a recording no better than none" in result.stdout
 
 
 def test_a_model_without_the_spring_is_worse_on_a_recording_with_one(folder: Path, tmp_path: Path) -> None:
@@ -186,6 +216,15 @@ def test_a_changed_parameter_is_named_with_exit_code_4(folder: Path, tmp_path: P
     page = (tmp_path / "report.html").read_text()
     assert "http" not in page.replace("http-equiv", "").replace("http://www.w3.org", "")
     assert page.index("has changed") < page.index("<table>")
+    assert page.index("armident diagnose") < page.index("<table>")
+    (plot,) = json.loads(
+        re.findall(r'<div class="plots"><script type="application/json">(.*?)</script>', page, re.DOTALL)[0]
+    )
+    assert plot["names"] == [p.name for p in document.parameters]
+    marked = [series for series in plot["series"] if series["name"] == "now, changed"]
+    assert [value is not None for value in marked[0]["y"]] == [True] + [False] * len(rest)
+    assert plot["readings"][0].startswith(f"{first.name} (")
+    assert plot["readings"][0].endswith(first.unit)
 
 
 def test_models_with_other_parameters_are_refused_or_compared_on_the_common_ones(folder: Path, tmp_path: Path) -> None:
@@ -215,6 +254,43 @@ def test_an_effect_of_another_shape_is_another_parameter(folder: Path, tmp_path:
     assert "(fst1)" in refused.stderr
     found = call("compare", tmp_path / "one", tmp_path / "two", "--common", "--json")
     assert json.loads(found.stdout)["left_out"] == ["fst1"]
+
+
+def differences(folder: Path, tmp_path: Path, **changes: object) -> list[str]:
+    """Return the warnings of differences between the first model and the second one after changes of its document."""
+    document = load_document(folder / "two/identification.json", IdentificationDocument)
+    (tmp_path / "two.json").write_text(to_json(document.model_copy(update=changes)))
+    result = call("compare", folder / "one", tmp_path / "two.json", "--json", "--out", tmp_path / "out")
+    return [line for line in json.loads(result.stdout)["warnings"] if "different" in line]
+
+
+def test_two_models_of_one_kind_carry_no_warning_of_a_difference(folder: Path, tmp_path: Path) -> None:
+    assert differences(folder, tmp_path) == []
+
+
+def test_another_smoothing_of_friction_is_a_warning_if_it_shifts_the_friction(folder: Path, tmp_path: Path) -> None:
+    own = load_document(folder / "two/identification.json", IdentificationDocument).sign_smoothing
+    assert own is not None
+    # Coulomb friction of the EMPS is known to a percent: a sign thirty times as wide is far beyond.
+    (line,) = differences(folder, tmp_path, sign_smoothing={"joint_1": own["joint_1"] / 30})
+    assert "different friction.sign_smoothing: joint_1" in line
+    assert differences(folder, tmp_path, sign_smoothing={"joint_1": 1.001 * own["joint_1"]}) == []
+
+
+def test_other_effects_and_another_structure_are_warnings(folder: Path, tmp_path: Path) -> None:
+    document = load_document(folder / "two/identification.json", IdentificationDocument)
+    assert document.configuration is not None
+    (joint,) = document.configuration["joints"]
+    changed = {
+        "gravity": [0.0, 0.0, 9.81],
+        "joints": [{**joint, "drive": {**joint["drive"], "gain": 2 * joint["drive"]["gain"]}}],
+        "effects": [{"effect": "drive_gain_error", "joint": "joint_1", "parameters": {"gain_error": 0.1}}],
+    }
+    found = differences(folder, tmp_path, configuration={**document.configuration, **changed})
+    assert len(found) == 2
+    assert "different effects: drive_gain_error of joint_1" in found[0]
+    assert "only in the later model" in found[0]
+    assert "(gravity, joints.joint_1.drive.gain)" in found[1]
 
 
 def test_models_of_one_recording_carry_a_warning(folder: Path, tmp_path: Path) -> None:
@@ -261,6 +337,20 @@ def test_the_virtual_arm_is_simulated_with_its_hidden_effect(tmp_path: Path) -> 
     assert set(healthy) >= {"t", "q1", "tau1", "qr1"}
     assert healthy["t"].shape == healthy["q1"].shape
     assert np.std(dry["tau1"]) > np.std(healthy["tau1"])
+
+
+@pytest.mark.parametrize("kind", ["mcap", "npz"])
+def test_a_simulation_prints_its_document_and_nothing_else(kind: str, tmp_path: Path) -> None:
+    out = tmp_path / f"a.{kind}"
+    words = ["simulate", "--config", "emps.yaml", "--trajectory", "emps_1.yaml", "--rate", "1000", "--json"]
+    result = call(*words, "--out", out)
+    assert result.exit_code == 0
+    found = json.loads(result.stdout)
+    assert (found["robot"], found["physics"], found["seed"], found["noise"]) == ("emps", "virtual", 0, 1.0)
+    assert found["recording"]["path"] == str(out)
+    assert found["duration_s"] == pytest.approx((found["recording"]["samples"] - 1) / 1000)
+    if kind == "mcap":
+        assert armident.read_recording(out).sha256 == found["recording"]["sha256"]
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from armident.configs import ConfigError
-from armident.identify.streamed import OnDisk, Streamed, kept, mapped
+from armident.identify.streamed import OnDisk, Streamed, chosen, kept, mapped
 
 
 def test_items_on_disk_come_back_by_number_slice_and_in_threads() -> None:
@@ -30,6 +30,10 @@ def test_what_belongs_to_streamed_items_is_streamed_and_to_a_list_is_a_list() ->
     assert isinstance(doubled, Streamed)
     assert list(doubled) == [11, 22, 33]
     assert isinstance(kept(iter(doubled), like=doubled), OnDisk)
+    part = chosen(doubled, [2, 0])
+    assert isinstance(part, Streamed)
+    assert list(part) == [33, 11]
+    assert chosen([1, 2, 3], [2, 0]) == [3, 1]
     assert mapped(lambda a: 2 * a, [1, 2]) == [2, 4]
     assert kept(iter([1, 2]), like=[0]) == [1, 2]
 

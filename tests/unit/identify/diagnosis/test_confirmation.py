@@ -5,6 +5,7 @@ import pytest
 from scipy import stats
 
 from armident.configs.schema.robot import Effect
+from armident.configs.schema.scenario import HiddenEffect
 from armident.identify.diagnosis.confirmation import Confirmation, confirmed
 from armident.identify.diagnosis.model_state import with_report_part
 from tests.fixtures.arms import hide
@@ -15,9 +16,9 @@ pytestmark = pytest.mark.slow
 TERM = Effect(effect="joint_spring", joint="joint_1")
 
 
-def compared(seed: int, *hidden: object) -> Confirmation:
+def compared(seed: int, *hidden: HiddenEffect) -> Confirmation:
     """Comparison of the models with and without a spring."""
-    _, first = selection(seed, *hidden)  # type: ignore[arg-type]
+    _, first = selection(seed, *hidden)
     return confirmed(with_report_part(with_effects(first, TERM)), with_report_part(first))
 
 

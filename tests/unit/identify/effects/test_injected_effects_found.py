@@ -108,7 +108,7 @@ def known_of(case: Case) -> RobotConfig:
 def first_step(data: Recording, whole: RobotConfig, known: RobotConfig) -> tuple[StepwiseSelection, Step]:
     """Comparison of all candidates beside a model that lacks at most one effect."""
     experiments, _ = experiments_from_recording(data, whole)
-    with threadpool_limits(1):  # type: ignore[no-untyped-call]
+    with threadpool_limits(1):
         selection = StepwiseSelection(build_study(experiments, [], known))
         return selection, selection.step(selection.start())
 

@@ -8,17 +8,10 @@ import pytest
 from numpy.typing import NDArray
 from scipy import signal, stats
 
-from armident.identify.estimators.diagnostics import (
-    WEAK_F,
-    breusch_pagan,
-    diagnose_estimate,
-    durbin_wu_hausman,
-    instrument_relevance,
-    ljung_box,
-    nested_f_test,
-    residual_tests,
-)
+from armident.identify.estimators.diagnostics import diagnose_estimate, nested_f_test
 from armident.identify.estimators.idim_ls import idim_ls
+from armident.identify.estimators.instrument_tests import WEAK_F, durbin_wu_hausman, instrument_relevance
+from armident.identify.estimators.residual_tests import breusch_pagan, ljung_box, residual_tests
 from armident.identify.regression.ar_noise import WHITE, ArModel
 from armident.identify.regression.equations import (
     Estimate,

@@ -74,7 +74,7 @@ def loop(factor: int | None, band_hz: float) -> tuple[list[ExperimentEquations],
 @cache
 def estimated(factor: int | None, band_hz: float) -> Estimate:
     blocks, auxiliary, start = loop(factor, band_hz)
-    with threadpool_limits(1):  # type: ignore[no-untyped-call]
+    with threadpool_limits(1):
         return idim_piv(blocks, auxiliary, start)
 
 

@@ -1,10 +1,13 @@
 """Designed trajectories keep links apart, avoid boxes and spare motors whose loads the URDF knows."""
 
+import json
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
 
+import armident
 from armident.configs import ConfigError, RobotConfig, load_robot, load_trajectory
 from armident.configs.schema.collision import Box, Collision, LinkCapsule
 from armident.identify.cli import trajectory as trajectory_command
@@ -37,6 +40,12 @@ URDF = """<robot name="two_links">
     <collision><origin xyz="0 0 0.42"/><geometry><mesh filename="package://arm/meshes/tool.stl"/></geometry></collision>
   </link>
 </robot>"""
+
+
+@pytest.fixture(autouse=True)
+def own_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The command writes its picture into the working directory."""
+    monkeypatch.chdir(tmp_path)
 
 
 def planar_arm(collision: Collision | None) -> RobotConfig:
@@ -119,12 +128,14 @@ def test_the_smallest_distance_of_a_motion_is_found_although_most_samples_are_sk
 
 @pytest.mark.slow
 @pytest.mark.parametrize("shape", ["moves", "fourier"])
-def test_a_design_avoids_a_box_and_itself_where_one_without_bodies_does_not(shape: str) -> None:
+def test_a_design_avoids_a_box_and_itself_where_one_without_bodies_does_not(
+    shape: Literal["moves", "fourier"],
+) -> None:
     box = Box(name="post", center=(0.8, 0.3, 0.0), size=(0.2, 0.2, 1.0))
     robot = planar_arm(bodies(box))
     model = CollisionModel(robot)
-    careless = design_trajectory(robot, 6.0, 1, evaluations=60, shape=shape)  # type: ignore[arg-type]
-    careful = design_trajectory(robot, 6.0, 1, evaluations=60, shape=shape, collision=model)  # type: ignore[arg-type]
+    careless = design_trajectory(robot, 6.0, 1, evaluations=60, shape=shape)
+    careful = design_trajectory(robot, 6.0, 1, evaluations=60, shape=shape, collision=model)
     assert model.shortfall(careless.trajectory.sample(1e-3)) > 0.0
     assert careful.closest is not None
     assert careful.closest.distance >= model.clearance
@@ -239,3 +250,39 @@ def test_a_trajectory_into_a_box_is_refused(tmp_path: Path) -> None:
     into.write_text("schema: armident/trajectory/1\nstart: [0, 0]\nmoves:\n- {to: [1.5, 0.1], duration: 3}\n")
     with pytest.raises(ConfigError, match=r"needs a distance of -0\.\d+ m between link of .* and box 'shelf'"):
         trajectory_command(config, None, look_at=into)
+
+
+def masses_file(path: Path, **values: object) -> Path:
+    path.write_text(json.dumps(values))
+    return path
+
+
+def test_torques_keep_their_limits_by_the_masses_of_a_file(tmp_path: Path) -> None:
+    robot = load_robot("emps.yaml")
+    limit, acceleration = robot.joints[0].limits.torque, robot.joints[0].limits.acceleration
+    # Half of the mass that the motor could accelerate at the limit.
+    file = masses_file(tmp_path / "m.json", m1=0.5 * limit / acceleration, kp1=3.0)
+    design = armident.design_trajectory(robot, 4.0, evaluations=10, masses=file)
+    (torque,) = [line for line in design.checks.checked if line.startswith("torque")]
+    assert f"the parameters of {file}" in torque
+    assert any("parameters that" in line and "fv1" in line for line in design.checks.unchecked)
+    heavy = masses_file(tmp_path / "h.json", m1=1e6 * limit / acceleration)
+    with pytest.raises(ConfigError, match="torque"):
+        armident.design_trajectory(robot, 4.0, evaluations=10, masses=heavy)
+
+
+@pytest.mark.parametrize(
+    ("values", "expected"),
+    [
+        ({"kp1": 1.0}, "no masses of links"),
+        ({"m1": -2.0}, "m1: -2 is negative"),
+        ({"m1": 1.0, "fv1": -1.0}, "fv1: -1 is negative"),
+        ({"m1": "heavy"}, "m1: expected a finite number"),
+        ({"m1": float("inf")}, "expected a finite number"),
+    ],
+)
+def test_masses_that_no_arm_has_are_refused_in_one_line(
+    values: dict[str, object], expected: str, tmp_path: Path
+) -> None:
+    with pytest.raises(ConfigError, match=expected):
+        armident.design_trajectory("emps", 4.0, evaluations=10, masses=masses_file(tmp_path / "m.json", **values))

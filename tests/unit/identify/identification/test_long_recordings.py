@@ -18,8 +18,9 @@ from tests.fixtures import arms
 
 EDGES = 0.2
 """Largest change by the ends of the stretches, standard deviations: each end costs half a filter."""
-MOST_BYTES = 150.0
-"""Largest memory of each further sample of one axis, bytes: 97 were measured, with the raw sample and masks of rows.
+MOST_BYTES = 65.0
+"""Largest memory of each further sample of one axis, bytes: 51 were measured, 28 of them of the raw sample, 24 of the
+signals of the controller.
 
 In one piece an identification takes about 260 bytes per value.
 """

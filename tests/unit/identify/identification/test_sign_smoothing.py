@@ -9,7 +9,7 @@ from pydantic import ValidationError
 from armident.configs import RobotConfig, load_robot
 from armident.identify.effects.terms import arm_model
 from armident.identify.experiment import Experiment
-from armident.identify.identification.options import Options
+from armident.identify.identification.options import Method, Options
 from armident.identify.identification.pipeline import identify_experiment
 from armident.identify.identification.sign_smoothing import SATURATION, with_sign_smoothing
 from armident.identify.robot.controller import DiscreteController
@@ -60,8 +60,8 @@ def recorded() -> Experiment:
 
 
 @pytest.mark.parametrize("method", ["idim-ls", "idim-iv"])
-def test_friction_of_a_slow_prismatic_joint_is_not_biased_by_the_smoothing(method: str) -> None:
-    found = identify_experiment(recorded(), lift(), Options(method=method))  # type: ignore[arg-type]
+def test_friction_of_a_slow_prismatic_joint_is_not_biased_by_the_smoothing(method: Method) -> None:
+    found = identify_experiment(recorded(), lift(), Options(method=method))
     friction = dict(zip(found.names, found.theta, strict=True))
     assert friction["fv1"] == pytest.approx(VISCOUS, rel=0.02)
     assert friction["fc1"] == pytest.approx(COULOMB, rel=0.01)

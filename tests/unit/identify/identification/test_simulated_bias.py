@@ -1,6 +1,7 @@
 """Bias by derivatives and encoder noise: subtracted from IDIM-IV and IDIM-PIV, reported by IDIM-LS."""
 
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
@@ -8,11 +9,13 @@ import pytest
 from armident.identify.identification.options import Method, Options
 from armident.identify.identification.pipeline import identify_experiment
 from armident.identify.identification.result import Identification
-from armident.identify.identification.simulated_bias import RELEVANT_BIAS
+from armident.identify.identification.simulated_bias import RELEVANT_BIAS, SIMULATION_ERROR, SimulatedBias, corrected
+from armident.identify.regression.ar_noise import ArModel
+from armident.identify.regression.equations import Estimate, ExperimentEquations
 from armident.identify.signals.differentiate import differentiate
 from tests.fixtures.arms import identified
 from tests.statistics import axis
-from tests.statistics.noise import METHODS, ROBOTS, SETTINGS, row
+from tests.statistics.noise import METHODS, ROBOTS, SETTINGS, Setting, row
 
 ENCODER = 20e-6
 """Encoder noise, m, at 1 kHz."""
@@ -84,9 +87,9 @@ def test_document_holds_the_bias_that_was_subtracted() -> None:
 def test_instruments_pass_the_bandpass_of_the_measured_positions(monkeypatch: pytest.MonkeyPatch) -> None:
     seen = []
 
-    def noted(*arguments: object, **options: object) -> object:
+    def noted(*arguments: Any, **options: Any) -> object:
         seen.append(arguments[2])
-        return differentiate(*arguments, **options)  # type: ignore[arg-type]
+        return differentiate(*arguments, **options)
 
     monkeypatch.setattr("armident.identify.identification.auxiliary_loop.differentiate", noted)
     experiment = axis.recorded(0, torque=1.0)
@@ -101,9 +104,25 @@ def test_instruments_pass_the_bandpass_of_the_measured_positions(monkeypatch: py
 @pytest.mark.proof
 @pytest.mark.parametrize("setting", SETTINGS, ids=lambda s: s.name)
 @pytest.mark.parametrize("name", list(ROBOTS))
-def test_intervals_hold_or_are_called_doubtful_under_every_noise(name: str, setting: object) -> None:
+def test_intervals_hold_or_are_called_doubtful_under_every_noise(name: str, setting: Setting) -> None:
     robot, record = ROBOTS[name]
     for method in METHODS:
-        found = row(name, robot(), record, setting, method, 20)  # type: ignore[arg-type]
+        found = row(name, robot(), record, setting, method, 20)
         # 80 correlated intervals of the axis, 560 of the TX40.
         assert found.covered >= 0.90 or found.doubtful > 0.9, found
+
+
+def test_scatter_of_a_part_of_the_stretches_is_scaled_to_all() -> None:
+    rng = np.random.default_rng(3)
+    y, x = rng.standard_normal((100, 1)), rng.standard_normal((100, 1, 2))
+    block = ExperimentEquations(y, x, np.ones((100, 1), dtype=np.bool_), np.arange(100.0))
+    noise = (ArModel(np.empty(0), 1.0, 0.0),)
+    estimate = Estimate(np.array([1.0, 2.0]), np.diag([1e-4, 1e-4]), noise, ((y[:, 0],),))
+    bias, scatter = np.array([0.01, 0.0]), np.array([0.04, 0.001])
+    whole = corrected(estimate, SimulatedBias(bias, scatter, 12), [block])
+    part = corrected(estimate, SimulatedBias(bias, scatter, 12, share=0.25), [block])
+    np.testing.assert_allclose(part.theta, [0.99, 2.0])
+    # The estimates of a quarter scatter twice as much as those of all; the mean of the simulations keeps its error.
+    of_bias = scatter**2 / 12 + (SIMULATION_ERROR * bias) ** 2
+    np.testing.assert_allclose(np.diag(whole.covariance), np.array([0.04**2, 1e-4]) + of_bias)
+    np.testing.assert_allclose(np.diag(part.covariance), np.array([0.02**2, 1e-4]) + of_bias)

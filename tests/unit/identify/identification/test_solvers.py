@@ -2,6 +2,7 @@
 
 import json
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
@@ -120,7 +121,7 @@ def test_unweighted_least_squares_is_another_estimate_of_the_same() -> None:
         ({"decimation": parse_decimation("some")}, "decimation: expected a number of samples or noise, got some"),
     ],
 )
-def test_what_is_not_offered_is_refused_by_name(wrong: dict[str, object], message: str) -> None:
+def test_what_is_not_offered_is_refused_by_name(wrong: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigError) as error:
-        Options(**wrong)  # type: ignore[arg-type]
+        Options(**wrong)
     assert message in str(error.value)

@@ -2,11 +2,12 @@
 
 import datetime
 import hashlib
+import itertools
 import json
 import multiprocessing
-import os
 import sqlite3
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,7 @@ from armident.daq.cli import application
 from armident.identify.document import IdentificationDocument, to_json
 from armident.identify.monitoring import history_schema
 from armident.identify.monitoring.history import History, recorded_at
+from tests.fixtures.postgresql import postgresql, programs
 from tests.unit.identify.monitoring.test_change_test import TRUTH, C, identified
 
 WEEK = datetime.timedelta(days=7)
@@ -47,18 +49,41 @@ def call(*arguments: str) -> tuple[int, str, str]:
     return done.exit_code, done.stdout, done.stderr
 
 
+@pytest.fixture(scope="module")
+def server() -> Iterator[str]:
+    """A PostgreSQL server of this module."""
+    folder = programs()
+    if folder is None:
+        pytest.skip("no PostgreSQL server on this machine; install the Debian package postgresql")
+    with postgresql(folder) as url:
+        yield url
+
+
 @pytest.fixture
-def url(tmp_path: Path) -> str:
-    """An empty database: SQLite, or the PostgreSQL that ARMIDENT_TEST_POSTGRES names, whose tables are dropped."""
-    given = os.environ.get("ARMIDENT_TEST_POSTGRES")
-    if given is None:
-        return f"sqlite:///{tmp_path}/h.sqlite"
-    engine = sa.create_engine(given)
-    tables = sa.MetaData()
-    tables.reflect(engine)
-    tables.drop_all(engine)
+def postgres_url(server: str) -> str:
+    """An empty database on the server."""
+    name = f"history_{next(_numbers)}"
+    engine = sa.create_engine(driven(f"{server}/postgres"), isolation_level="AUTOCOMMIT")
+    with engine.connect() as connection:
+        connection.execute(sa.text(f"CREATE DATABASE {name}"))
     engine.dispose()
-    return given
+    return f"{server}/{name}"
+
+
+@pytest.fixture(params=["sqlite", pytest.param("postgresql", marks=pytest.mark.slow)])
+def url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
+    """An empty database."""
+    if request.param == "postgresql":
+        return str(request.getfixturevalue("postgres_url"))
+    return f"sqlite:///{tmp_path}/h.sqlite"
+
+
+_numbers = itertools.count()
+
+
+def driven(url: str) -> str:
+    """The URL with the driver of our extra."""
+    return url.replace("postgresql://", "postgresql+psycopg://")
 
 
 def test_a_result_is_kept_once_and_comes_back_as_it_was(url: str, tmp_path: Path) -> None:
@@ -189,9 +214,9 @@ def test_a_name_that_only_looks_like_a_time_is_none(tmp_path: Path) -> None:
     assert found.timestamp() == pytest.approx(file.stat().st_mtime)
 
 
-def former(path: Path, documents: list[IdentificationDocument]) -> None:
+def former(url: str, documents: list[IdentificationDocument]) -> None:
     """A database as version 0.1 has left it: its tables, without a version, and a recording may be there twice."""
-    engine = sa.create_engine(f"sqlite:///{path}")
+    engine = sa.create_engine(driven(url))
     history_schema.tables.create_all(engine)
     with engine.begin() as connection:
         for k, document in enumerate(documents):
@@ -205,17 +230,34 @@ def former(path: Path, documents: list[IdentificationDocument]) -> None:
     engine.dispose()
 
 
-def test_a_database_of_the_former_version_is_upgraded_and_loses_nothing(tmp_path: Path) -> None:
-    path = tmp_path / "h.sqlite"
+def version_of(url: str) -> tuple[int, int]:
+    """Number of identifications, with those of a recording that was there before, and version of the database."""
+    query = "PRAGMA user_version" if url.startswith("sqlite") else "SELECT version FROM armident_history_version"
+    engine = sa.create_engine(driven(url))
+    with engine.connect() as connection:
+        number, version = (
+            connection.execute(sa.text(text)).scalar_one() for text in ("SELECT count(*) FROM identifications", query)
+        )
+    engine.dispose()
+    return number, version
+
+
+def test_a_database_of_the_former_version_is_upgraded_and_loses_nothing(url: str) -> None:
     first, repeated, second = result(0, TRUTH), result(0, TRUTH + 0.1), result(1, TRUTH)
-    former(path, [first, repeated, second])
-    history = History(f"sqlite:///{path}")
+    former(url, [first, repeated, second])
+    history = History(url)
     assert [run.document for run in history.runs()] == [first, second]
     assert not history.add(second, START)
-    with sqlite3.connect(path) as db:
-        assert db.execute("SELECT count(*) FROM identifications").fetchone() == (3,)
-        assert db.execute("PRAGMA user_version").fetchone() == (2,)
-    db.close()
+    assert version_of(url) == (3, len(history_schema.MIGRATIONS))
+
+
+def test_a_database_of_every_version_is_upgraded(url: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    for version in range(1, len(history_schema.MIGRATIONS) + 1):
+        with monkeypatch.context() as patched:
+            patched.setattr(history_schema, "MIGRATIONS", history_schema.MIGRATIONS[:version])
+            History(url)
+            assert version_of(url) == (0, version)
+    assert History(url).add(result(0, TRUTH), START)
 
 
 def _open_and_add(url: str, week: int) -> None:
@@ -225,18 +267,17 @@ def _open_and_add(url: str, week: int) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("old", [False, True])
-def test_eight_first_openers_at_once_add_eight_runs(tmp_path: Path, old: bool) -> None:
-    path = tmp_path / "h.sqlite"
+def test_eight_first_openers_at_once_add_eight_runs(url: str, old: bool) -> None:
     if old:
-        former(path, [])
+        former(url, [])
     context = multiprocessing.get_context("fork")
-    openers = [context.Process(target=_open_and_add, args=(f"sqlite:///{path}", k)) for k in range(8)]
+    openers = [context.Process(target=_open_and_add, args=(url, k)) for k in range(8)]
     for process in openers:
         process.start()
     for process in openers:
         process.join(60.0)
     assert [process.exitcode for process in openers] == [0] * 8
-    assert len(History(f"sqlite:///{path}").runs()) == 8
+    assert len(History(url).runs()) == 8
 
 
 def test_a_locked_damaged_or_newer_database_is_one_line_with_exit_code_2(
@@ -263,3 +304,70 @@ def test_a_locked_damaged_or_newer_database_is_one_line_with_exit_code_2(
     assert code == 2
     assert "damaged" in err
     assert len(err.strip().splitlines()) == 1
+
+
+@pytest.mark.slow
+def test_a_locked_table_on_a_server_is_one_line_and_is_not_waited_for_longer(
+    postgres_url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(history_schema, "BUSY_S", 0.2)
+    (document,) = written(tmp_path, [result(0, TRUTH)])
+    assert call(document, "--database", postgres_url)[0] == 0
+    history = History(postgres_url)
+    engine = sa.create_engine(driven(postgres_url))
+    with engine.connect() as other:
+        other.execute(sa.text("LOCK TABLE identifications"))
+        code, _, err = call(document, "--database", postgres_url)
+        assert (code, len(err.strip().splitlines())) == (2, 1)
+        assert "the history cannot be written: locked by another process for more than 0.2 s; try again" in err
+        with pytest.raises(ConfigError, match="the history cannot be read: locked by another process"):
+            history.runs()
+    engine.dispose()
+    assert history.add(result(1, TRUTH), START)
+
+
+@pytest.mark.slow
+def test_a_server_that_ends_a_connection_is_one_line_and_the_next_attempt_succeeds(postgres_url: str) -> None:
+    history = History(postgres_url)
+    engine = sa.create_engine(driven(postgres_url))
+    end = sa.text("SELECT pg_terminate_backend(pid) FROM pg_stat_activity WHERE datname = current_database() "
+                  "AND pid != pg_backend_pid()")  # fmt: skip
+
+    def halfway(*_: object) -> None:
+        with engine.connect() as other:
+            other.execute(end)
+
+    sa.event.listen(history._engine, "before_cursor_execute", halfway, once=True)
+    with pytest.raises(ConfigError, match="cannot be written: the server has ended the connection; try again when"):
+        history.add(result(0, TRUTH), START)
+    assert history.runs() == []
+    assert history.add(result(0, TRUTH), START)
+    halfway()
+    # An idle connection that has ended is replaced.
+    assert len(history.runs()) == 1
+    engine.dispose()
+
+
+@pytest.mark.slow
+def test_a_reader_without_rights_and_a_server_that_is_not_there_are_one_line(postgres_url: str, server: str) -> None:
+    History(postgres_url)
+    engine = sa.create_engine(driven(postgres_url))
+    with engine.begin() as connection:
+        connection.execute(sa.text("CREATE ROLE reader LOGIN"))
+    reader = postgres_url.replace("armident@", "reader@")
+    with pytest.raises(ConfigError, match=r"permission denied .*; the user of the URL needs the rights"):
+        History(reader)
+    with engine.begin() as connection:
+        connection.execute(sa.text("GRANT SELECT ON ALL TABLES IN SCHEMA public TO reader"))
+    assert History(reader).runs() == []
+    with pytest.raises(ConfigError, match="permission denied"):
+        History(reader).add(result(0, TRUTH), START)
+    engine.dispose()
+    for wrong, words in (
+        (f"{server}/nothing", 'database "nothing" does not exist'),
+        ("postgresql://x@127.0.0.1:1/x", "no connection to the server .*[Cc]onnection refused"),
+        ("postgresql://x@127.0.0.1:port/x", "the port in the URL is no number"),
+    ):
+        with pytest.raises(ConfigError, match=words) as caught:
+            History(wrong)
+        assert "\n" not in str(caught.value)

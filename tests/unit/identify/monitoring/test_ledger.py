@@ -83,6 +83,22 @@ def test_a_result_is_announced_once_and_again_only_if_the_announcement_failed(tw
     assert one.last_result() == Path("r.json")
 
 
+def test_the_newest_result_is_the_last_one_also_after_a_step_of_the_clock_back(
+    two: tuple[Ledger, Ledger], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one, _ = two
+    for now, digest, result in ((2000.0, A, "first.json"), (1000.0, B, "second.json")):
+        monkeypatch.setattr(time, "time", lambda now=now: now)
+        one.add(digest, digest[:1], [Path(f"{digest[:1]}.mcap")])
+        assert one.claim(digest) is not None
+        assert one.finish(digest, "done", Path(result), "trustworthy")
+        with one.announcement(digest) as mine:
+            assert mine
+    assert one.last_result() == Path("second.json")
+    assert one.adopt("c" * 64, "z", [Path("z.mcap")], Path("third.json"), "trustworthy")
+    assert one.last_result() == Path("third.json")
+
+
 def test_a_worker_that_ends_in_order_frees_its_recordings_at_once(two: tuple[Ledger, Ledger]) -> None:
     one, other = two
     one.add(A, "x", [Path("x.mcap")])
@@ -124,7 +140,7 @@ def test_a_ledger_that_is_locked_damaged_or_newer_is_one_line(tmp_path: Path, mo
     Ledger(path, "one")
     with sqlite3.connect(path) as db:
         db.execute("BEGIN IMMEDIATE")
-        with pytest.raises(LedgerError, match=r"worker\.sqlite: database is locked$"):
+        with pytest.raises(LedgerError, match=r"worker\.sqlite: locked by another process for more than"):
             Ledger(path, "two").add(A, "x", [])
     db.execute("PRAGMA user_version = 99")
     db.close()

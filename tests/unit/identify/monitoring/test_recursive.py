@@ -33,8 +33,8 @@ RATE = 1 / arms.FAST
 ROBOT = load_robot("tx40")
 
 
-def estimator(**more: object) -> RecursiveEstimator:
-    return RecursiveEstimator(ROBOT, arms.tx40_baseline(), RATE, **more)  # type: ignore[arg-type]
+def estimator(**more: Any) -> RecursiveEstimator:
+    return RecursiveEstimator(ROBOT, arms.tx40_baseline(), RATE, **more)
 
 
 def recorded() -> Recording:

@@ -7,13 +7,14 @@ from typing import Any, cast
 
 import pytest
 
-from armident.configs import config_path, load_session
+from armident.configs import ArmidentError, DataError, config_path, load_session
 from armident.daq.recording import Recording, read_recording, write_recording
 from armident.identify.identification.api import identify_recording
 from armident.identify.monitoring import history_schema
+from armident.identify.monitoring import ledger as ledger_module
 from armident.identify.monitoring.history import History
 from armident.identify.monitoring.ledger import FILE, Ledger
-from armident.identify.monitoring.reidentify import keep, run
+from armident.identify.monitoring.reidentify import identify_once, keep, run
 from armident.identify.monitoring.reidentify.baseline import Baseline
 from armident.identify.monitoring.reidentify.publish import StatusPublisher
 from armident.identify.monitoring.reidentify.run import Job, carry_out
@@ -25,15 +26,19 @@ pytestmark = pytest.mark.slow
 class Published:
     """Takes what a job publishes."""
 
-    def __init__(self) -> None:
+    def __init__(self, reachable: bool = True) -> None:
         self.results: list[str] = []
         self.states: list[str] = []
+        self.more: list[dict[str, Any]] = []
+        self.reachable = reachable
 
-    def status(self, state: str, **_: Any) -> None:
+    def status(self, state: str, **more: Any) -> None:
         self.states.append(state)
+        self.more.append(more)
 
-    def result(self, text: str) -> None:
+    def result(self, text: str) -> bool:
         self.results.append(text)
+        return self.reachable
 
 
 @pytest.fixture
@@ -83,3 +88,67 @@ def test_a_locked_history_is_reported_and_the_verdict_is_published(tmp_path: Pat
     entry = Ledger(tmp_path / FILE, "x").entry(recorded.sha256)
     assert entry is not None
     assert entry.announced
+
+
+@pytest.mark.usefixtures("quickly")
+def test_a_result_that_zenoh_has_not_taken_is_left_to_a_worker(tmp_path: Path, recorded: Recording) -> None:
+    work = job(tmp_path, arms.recording("emps", "emps_excitation", 1))
+    carry_out(work, cast(StatusPublisher, Published(reachable=False)), lambda _: None)
+    ledger = Ledger(tmp_path / FILE, "worker")
+    entry = ledger.claim(recorded.sha256)
+    assert entry is not None
+    assert (entry.state, entry.announced) == ("done", False)
+
+
+@pytest.mark.usefixtures("quickly")
+def test_a_ledger_that_locks_or_is_damaged_stops_neither_verdict_nor_announcement(
+    tmp_path: Path, recorded: Recording, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(ledger_module, "BUSY_S", 0.1)
+    monkeypatch.setattr(identify_once, "RETRY_S", 0.5)
+    work = job(tmp_path, arms.recording("emps", "emps_excitation", 1))
+    Ledger(tmp_path / FILE, "worker")
+    db = sqlite3.connect(tmp_path / FILE)
+    db.execute("BEGIN EXCLUSIVE")
+    for _ in ("locked", "damaged"):
+        heard, said = Published(), list[str]()
+        outcome = carry_out(work, cast(StatusPublisher, heard), said.append)
+        assert not outcome.changed
+        assert len(heard.results) == 1
+        assert any(FILE in line and "may identify and announce" in line for line in said)
+        db.close()
+        for name in (FILE, f"{FILE}-wal", f"{FILE}-shm"):
+            (tmp_path / name).unlink(missing_ok=True)
+        (tmp_path / FILE).write_bytes(b"no ledger" * 100)
+
+
+@pytest.mark.usefixtures("quickly")
+def test_a_failure_is_published_once_with_its_reason(
+    tmp_path: Path, recorded: Recording, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fails(*_: object) -> None:
+        raise DataError("too short")
+
+    work = job(tmp_path, arms.recording("emps", "emps_excitation", 1))
+    monkeypatch.setattr(identify_once, "identify_recording", fails)
+    heard = Published()
+    for _ in range(2):
+        with pytest.raises(DataError, match="too short"):
+            carry_out(work, cast(StatusPublisher, heard), lambda _: None)
+    assert heard.states.count("failed") == 1
+    failure = heard.more[heard.states.index("failed")]
+    assert failure == {"message": "too short", "capture": "emps-20260105T060000-000Z", "sha256": recorded.sha256}
+    entry = Ledger(tmp_path / FILE, "x").entry(recorded.sha256)
+    assert entry is not None
+    assert (entry.state, entry.announced) == ("failed", True)
+
+
+@pytest.mark.usefixtures("quickly")
+def test_a_result_that_cannot_be_written_is_one_line_and_left_to_a_worker(tmp_path: Path, recorded: Recording) -> None:
+    work = job(tmp_path, arms.recording("emps", "emps_excitation", 1))
+    (tmp_path / "emps-20260105T060000-000Z.identification").write_text("a file is where the folder belongs")
+    with pytest.raises(ArmidentError, match=r"the result cannot be written: .*; mend that, then a worker"):
+        carry_out(work, cast(StatusPublisher, Published()), lambda _: None)
+    entry = Ledger(tmp_path / FILE, "worker").claim(recorded.sha256)
+    assert entry is not None
+    assert entry.state == "waiting"

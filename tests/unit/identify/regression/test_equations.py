@@ -63,6 +63,30 @@ def test_serial_covariance_predicts_the_scatter_under_coloured_noise() -> None:
     np.testing.assert_allclose(np.std(found, axis=0), np.sqrt(np.diag(predicted)), rtol=0.12)
 
 
+def test_serial_covariance_of_experiments_is_that_of_their_products() -> None:
+    rng = np.random.default_rng(5)
+    x = [rng.standard_normal((size, 2, 3)) * SCALES for size in (50, 80)]
+    z = [value + 0.1 * rng.standard_normal(value.shape) * SCALES for value in x]
+    z[1][:, 1, 0] = 0.0
+    keep = [rng.random(value.shape[:2]) < 0.9 for value in x]
+    weights = [ArModel(np.empty(0), variance, 0.0) for variance in (1.0, 4.0)]
+    noise = [ArModel(np.array([c]), variance, 0.0) for c, variance in ((-0.5, 0.8), (0.3, 3.0))]
+    cross, meat = np.zeros((3, 3)), np.zeros((3, 3))
+    for own_z, own_x, used in zip(z, x, keep, strict=True):
+        for j in range(2):
+            weighted = own_z[used[:, j], j] / weights[j].variance
+            cross += weighted.T @ own_x[used[:, j], j]
+            lags = np.abs(np.subtract.outer(*(np.flatnonzero(used[:, j]),) * 2))
+            # An AR(1) process has the autocovariance variance (-c)^lag / (1 - c^2).
+            c = float(noise[j].coefficients[0])
+            meat += weighted.T @ ((-c) ** lags * noise[j].variance / (1 - c**2)) @ weighted
+    expected = np.linalg.solve(cross, np.linalg.solve(cross, meat).T)
+    # The filter starts at rest at one end of each experiment.
+    np.testing.assert_allclose(
+        np.sqrt(np.diag(serial_covariance(z, x, keep, weights, noise))), np.sqrt(np.diag(expected)), rtol=0.02
+    )
+
+
 def test_unexcited_parameters_are_named() -> None:
     rng = np.random.default_rng(4)
     x = rng.standard_normal((100, 1, 3))

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from armident.identify.regression.qr import triangularize
+from armident.identify.regression.qr import triangularize, triangularize_parts
 
 
 def test_factor_and_projections_are_those_of_a_qr_decomposition() -> None:
@@ -39,3 +39,15 @@ def test_columns_of_zeros_and_fewer_rows_than_columns_give_zeros_and_no_nan() ->
     assert np.isfinite(top).all()
     assert top[1, 1] == 0.0
     assert triangularize(np.ones((1, 3)), columns=3)[1:].any() == np.False_
+
+
+def test_rows_in_parts_give_the_factor_and_the_column_norms_of_all_rows() -> None:
+    rng = np.random.default_rng(4)
+    a, y = rng.standard_normal((700, 6)) * np.logspace(-4, 3, 6), rng.standard_normal(700)
+    a[:, 2] = 0.0
+    parts = ((a[first:last], y[first:last]) for first, last in ((0, 3), (3, 400), (400, 400), (400, 700)))
+    top, norms = triangularize_parts(parts, columns=6)
+    whole = triangularize(a, y, columns=6)
+    expected = np.append(np.linalg.norm(a, axis=0), np.linalg.norm(y))
+    np.testing.assert_allclose(top.T @ top, whole.T @ whole, atol=1e-12 * np.outer(expected, expected).max())
+    np.testing.assert_allclose(norms, np.where(expected > 0.0, expected, 1.0), rtol=1e-13)

@@ -12,12 +12,8 @@ from statsmodels.stats.sandwich_covariance import S_hac_simple
 from statsmodels.tsa.stattools import levinson_durbin as reference_levinson_durbin
 
 from armident.identify.diagnosis.spectral_lines import Line
-from armident.identify.estimators.diagnostics import (
-    LAGS_PER_ROOT_SAMPLE,
-    breusch_pagan,
-    instrument_relevance,
-    ljung_box,
-)
+from armident.identify.estimators.instrument_tests import LAGS_PER_ROOT_SAMPLE, instrument_relevance
+from armident.identify.estimators.residual_tests import breusch_pagan, ljung_box
 from armident.identify.regression.ar_noise import WHITE, fit_ar, levinson_durbin
 from armident.identify.regression.equations import ExperimentEquations
 from armident.identify.regression.hac import newey_west

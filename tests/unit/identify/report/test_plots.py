@@ -129,3 +129,23 @@ def test_a_gap_in_the_data_is_a_gap_in_the_curve() -> None:
     one, two = (node(code, content(plots_html([each]))) for each in (whole, broken))
     assert isinstance(one, int)
     assert two == one + 1
+
+
+@pytest.mark.skipif(NODE is None, reason="needs node")
+def test_points_with_intervals_have_names_on_the_axis_and_are_read_in_words() -> None:
+    code = """
+    const plot = p.build()[0].plots[0];
+    const named = calls.filter((call) => call[0] === "fillText").map((call) => call[1]);
+    const squares = calls.filter((call) => call[0] === "fillRect").length;
+    roots[0].children[0].children[1].listeners.pointermove({clientX: 58 + plot.width});
+    console.log(JSON.stringify({named, squares, read: plot.readout.textContent,
+                                extent: p.extent(plot.data, [true], 0, 2)}));
+    """
+    series = Series("now", np.array([1.0, np.nan, 3.0]), "#000", half=np.array([0.5, 0.5, 1.0]))
+    plot = Plot("joint_1", "std", np.arange(3.0), (series,), names=("zz1", "fv1", "fc1"), readings=("a", "b", "c"))
+    found = node(code, content(plots_html([plot])))
+    assert isinstance(found, dict)
+    assert {"zz1", "fv1", "fc1"} <= set(found["named"])
+    assert found["squares"] == 2
+    assert found["read"] == "c"
+    assert found["extent"] == pytest.approx([0.5 - 0.06 * 3.5, 4 + 0.06 * 3.5])

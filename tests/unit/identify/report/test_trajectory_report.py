@@ -16,6 +16,12 @@ pytestmark = pytest.mark.slow
 SHELF = "collision: {boxes: [{name: shelf, center: [0.5, 0, 1], size: [0.4, 1, 0.2]}]}\n"
 
 
+@pytest.fixture(autouse=True)
+def own_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The command writes its picture into the working directory."""
+    monkeypatch.chdir(tmp_path)
+
+
 def text_of(page: Path) -> str:
     return " ".join(page.read_text(encoding="utf-8").split())
 

@@ -27,7 +27,7 @@ def noisy_sine(samples: int, seed: int = 0) -> NDArray[np.float64]:
 
 
 def kalman(order: int, nvr: float) -> Any:
-    kf: Any = KalmanFilter(dim_x=order, dim_z=1)  # type: ignore[no-untyped-call]
+    kf: Any = KalmanFilter(dim_x=order, dim_z=1)
     kf.F, kf.H = TRANSITION[order], np.eye(order)[:1]
     kf.Q, kf.R = np.zeros((order, order)), np.eye(1)
     kf.Q[-1, -1] = nvr

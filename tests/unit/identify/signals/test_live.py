@@ -30,10 +30,10 @@ def measured(seed: int = 0) -> NDArray[np.float64]:
 
 def oracle(y: NDArray[np.float64], order: int, nvr: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """States (N, order) in samples and the last covariance of filterpy's filter on one joint."""
-    kf: Any = KalmanFilter(dim_x=order, dim_z=1)  # type: ignore[no-untyped-call]
+    kf: Any = KalmanFilter(dim_x=order, dim_z=1)
     model = VelocityFilter(1, DT, nvr, order)
     kf.F, kf.H, kf.R = model.F, model.H, model.R
-    kf.Q = Q_continuous_white_noise(order, dt=1.0, spectral_density=nvr)  # type: ignore[no-untyped-call]
+    kf.Q = Q_continuous_white_noise(order, dt=1.0, spectral_density=nvr)
     kf.x = np.zeros((order, 1))
     kf.x[0] = y[0]
     kf.P = np.diag([1.0] + [PRIOR] * (order - 1))
@@ -63,7 +63,7 @@ def test_states_and_covariance_are_those_of_filterpy(order: int, nvr: float) -> 
 
 @pytest.mark.parametrize("order", [2, 3])
 def test_process_noise_is_filterpys(order: int) -> None:
-    theirs = Q_continuous_white_noise(order, dt=1.0, spectral_density=0.3)  # type: ignore[no-untyped-call]
+    theirs = Q_continuous_white_noise(order, dt=1.0, spectral_density=0.3)
     np.testing.assert_allclose(VelocityFilter(1, DT, 0.3, order).Q[0], theirs)
 
 
