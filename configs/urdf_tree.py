@@ -413,7 +413,7 @@ class UrdfTree:
             value = float(text)
         except ValueError:
             value = math.nan
-        if math.isnan(value):
+        if math.isnan(value) or "_" in text:
             self.words(element, found, key, count=1)
         return value
 
@@ -496,6 +496,9 @@ def read_tree(file: Path) -> UrdfTree:
 
 
 def _is_finite(word: str) -> bool:
+    # Python also reads underscores and the digits of other scripts; readers of URDF do not.
+    if "_" in word or not word.isascii():
+        return False
     try:
         return abs(Decimal(word)) <= LARGEST
     except InvalidOperation:

@@ -165,7 +165,9 @@ def _no_values(before: Sequence[tuple[int, str, bool]]) -> str:
     """Return the first line that may be one of values, and the cell of it that is no number, for messages."""
     if not before:
         return ""
-    number, text, _ = before[min(1, len(before) - 1)]
+    if len(before) == 1:
+        return f": only line {before[0][0]}, {excerpt(before[0][1])}"
+    number, text, _ = before[1]
     odd = next((cell for cell in cells_of(text, _delimiter(text)) if cell and _number(cell) is None), text)
     dates = "; dates are read in the form 2026-03-25T10:00:00.5" if _OTHER_DATE.search(text) else ""
     return f": line {number} has {excerpt(odd)}, expected numbers{dates}"
@@ -303,6 +305,7 @@ def _slow(path: Path, encoding: str, head: _Head) -> CsvTable:
             if cells == head.header:
                 repeated += 1
                 continue
+            _refuse_other_header(path, number, cells, head)
             row, problem = _row(cells, head)
             if not problem:
                 commas += signs.add(number, cells)
@@ -335,6 +338,16 @@ def _slow(path: Path, encoding: str, head: _Head) -> CsvTable:
         notes.append(f"header repeated and passed over: {repeated} times")
     values = np.array(rows, dtype=np.float64)
     return CsvTable(head.header, head.units, values, np.array(numbers), tuple(notes))
+
+
+def _refuse_other_header(path: Path, number: int, cells: Sequence[str], head: _Head) -> None:
+    """Refuse a line with the names of the header in another order, or with some of them: its rows are others."""
+    names = set(head.header or ())
+    if len(names & set(cells)) > max(1, len(names) // 2):
+        raise DataError(
+            f"{path}: line {number} is another header than that of the file, {excerpt(','.join(cells))} after "
+            f"{excerpt(','.join(head.header or ()))}: write one file for each"
+        )
 
 
 def _row(cells: list[str], head: _Head) -> tuple[list[float], str]:

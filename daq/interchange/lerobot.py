@@ -1,6 +1,7 @@
 """Data sets of LeRobot: Parquet with ``observation.state``, ``action`` and, where recorded, effort or current."""
 
 import json
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,8 @@ _EFFORTS = {
 """Last words of the columns of observations that are an effort."""
 _BETWEEN_S = 1.0
 """Gap between two episodes, s: the time between them is not recorded."""
-_SUFFIXES = (".pos", ".position", "_pos", "_position")
+_SUFFIX = re.compile(r"[._](pos|position|goal|eff|effort|torque|tau|current)$", re.IGNORECASE)
+"""End of a name that tells the quantity, not the joint."""
 
 
 def is_lerobot(arrays: Mapping[str, Any]) -> bool:
@@ -80,7 +82,10 @@ def lerobot_table(path: Path, arrays: Mapping[str, Any]) -> tuple[dict[str, NDAr
         if source is None or source not in arrays:
             continue
         values = _matrix(path, source, arrays[source])
-        names = _names(features, source) or state_names
+        names = _names(features, source)
+        if not names and len(state_names) == values.shape[1]:
+            names = state_names
+            notes.append(f"{source} has no names of joints: taken in the order of {STATE}")
         if names and len(names) == values.shape[1]:
             word = "target position" if quantity == "demand" else quantity
             table |= {f"{name}/{word}": values[:, j] for j, name in enumerate(names)}
@@ -134,11 +139,11 @@ def _features(path: Path) -> Mapping[str, Any]:
 
 
 def _names(features: Mapping[str, Any], column: str) -> list[str]:
-    """Return the names of the joints of a column, without the word for position; empty if there are none."""
+    """Return the names of the joints of a column, without the word for the quantity; empty if there are none."""
     entry = features.get(column)
     names = entry.get("names") if isinstance(entry, dict) else None
     if isinstance(names, dict):
         names = next((each for each in names.values() if isinstance(each, list)), None)
     if not isinstance(names, list) or not all(isinstance(each, str) for each in names):
         return []
-    return [next((each.removesuffix(end) for end in _SUFFIXES if each.endswith(end)), each) for each in names]
+    return [_SUFFIX.sub("", each) for each in names]

@@ -99,9 +99,7 @@ def complete_rows(
         for quantity in quantities:
             if names.get(quantity) == OMITTED or (quantity in EFFORTS and any(e in found for e in EFFORTS)):
                 continue
-            columns = find_columns(
-                source.table, quantity, robot, names.get(quantity), by_position=by_position, joints=joints
-            )
+            columns = _found(source, quantity, robot, names.get(quantity), by_position, joints)
             if columns is not None:
                 _check_units(source, quantity, columns.labels)
                 found[quantity] = columns
@@ -130,6 +128,23 @@ def complete_rows(
         tuple(dict.fromkeys(notes)),
     )
     return _single(_without_odd_times(source, _complete(source, _joined(rows))))
+
+
+def _found(
+    source: Source,
+    quantity: Quantity,
+    robot: RobotConfig,
+    name: str | None,
+    by_position: bool,
+    joints: Sequence[str] | None,
+) -> Columns | None:
+    """Return the columns of a quantity; a demand that cannot be found can be omitted."""
+    try:
+        return find_columns(source.table, quantity, robot, name, by_position=by_position, joints=joints)
+    except DataError as error:
+        if quantity != "demand":
+            raise
+        raise DataError(f"demand: {error}; --map demand={OMITTED} omits it") from error
 
 
 def _check_same_joints(found: Mapping[Quantity, Columns]) -> None:
@@ -243,8 +258,8 @@ def _incomplete(source: Source, rows: Rows, partial: NDArray[np.bool_], whole: N
 
 def _zero(rows: Rows, name: Quantity, whole: NDArray[np.bool_]) -> list[str]:
     """Return the labels of the columns of a quantity that are 0 in all complete rows."""
-    zero = (rows.values[name][whole] == 0).all(axis=0)
-    return [label for label, is_zero in zip(rows.labels[name], zero, strict=True) if is_zero]
+    zero = rows.values[name][whole].T == 0
+    return [label for label, is_zero in zip(rows.labels[name], zero, strict=True) if is_zero.all()]
 
 
 def _empty(rows: Rows) -> list[str]:

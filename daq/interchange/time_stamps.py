@@ -228,7 +228,9 @@ def _jittering(times: Floats, rate_hz: float | None, repeated: float, how: str) 
             f"the times have too few digits: {spread}; --rate {_nice(mean):g} if the samples are even, "
             "or write the times with more digits"
         )
-    typical = _nice(1.0 / float(np.median(steps)) if np.median(steps) > 0 else mean)
+    # Missing samples lower the mean; the median of times with few digits is one of two values.
+    median = float(np.median(steps))
+    typical = _nice(1.0 / median if 0 < _JITTER * median < steps.max() else mean)
     if rate_hz is None:
         raise JitterError(f"the times jitter: {spread}; --resample {typical:g} puts the samples on an even clock")
     if abs(rate_hz / mean - 1.0) > RATE_TOLERANCE:

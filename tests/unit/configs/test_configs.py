@@ -171,6 +171,13 @@ def test_suspected_degrees_and_millimetres_are_named(tmp_path: Path, changes: di
     assert "arm.yaml: expected rad and m: " in str(caught.value)
 
 
+def test_gravity_in_millimetres_is_named(tmp_path: Path) -> None:
+    path = one_joint(tmp_path)
+    path.write_text(path.read_text() + "gravity: [0, 0, -9810]\n")
+    with pytest.raises(ConfigError, match=r"looks like mm/s\^2 \(in m/s\^2: \[0, 0, -9\.81\]\)"):
+        load_robot(path)
+
+
 @pytest.mark.parametrize(
     "changes",
     [
@@ -232,6 +239,11 @@ def session_with(tmp_path: Path, **changes: object) -> Path:
         ("streams", lambda s: s | {"more": {"tpdo": 1, "objects": ["torque"]}}, "each stream needs a tpdo of its own"),
         ("streams", lambda s: s | {"more": {"tpdo": 3, "every": 7, "objects": ["torque"]}}, "7 does not divide"),
         ("streams", {"demand": {"tpdo": 1, "objects": ["demand"]}}, "a stream named 'samples'"),
+        (
+            "streams",
+            {"samples": {"tpdo": 1, "objects": ["position"] * 2}},
+            "each object once, found position, position",
+        ),
         ("drives", lambda d: [*d[:-1], d[0] | {"joint": "joint_6"}], "node_id must be unique"),
         ("drives", lambda d: [*d[:-1], d[-1] | {"joint": "wrist"}], "'wrist' is not a joint of tx40.yaml"),
         ("drives", lambda d: [*d[:-1], d[-1] | {"eds": "no.eds"}], "drives[5].eds: no such file no.eds"),

@@ -239,6 +239,8 @@ MIMIC = LIMIT + '<mimic joint="j1"/>'
             [joint("x", "c d", rpy="${pi/2} 0 0")],
             r"joint 'x': origin rpy: .*; this is xacro, expand it first: xacro arm\.urdf > arm_expanded\.urdf",
         ),
+        ([joint("x", "c d", xyz="0 0 1_0")], r"joint 'x': origin xyz: expected 3 numbers, found '0 0 1_0'"),
+        ([joint("x", "c d", more='<limit upper="3_1"/>')], r"joint 'x': limit upper: expected a number, found '3_1'"),
         ([joint("x", "c d", more='<limit effort="strong"/>')], r"joint 'x': limit effort: expected a number"),
         ([joint("x", "c c2")], r"joint 'x': child: no link 'c2'"),
         ([joint("x", "a c")], r"link 'c' is moved by two joints, 'j2' and 'x'"),

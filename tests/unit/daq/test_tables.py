@@ -244,6 +244,16 @@ def test_damaged_lines_are_gaps_and_named(tmp_path: Path) -> None:
     assert "the last line (403) is cut off" in notes
 
 
+def test_a_header_of_another_order_among_the_rows_is_refused(tmp_path: Path) -> None:
+    lines = written(tmp_path / "a.csv", motion()).read_text().splitlines()
+    for other, said in ((["t", "q2", "q1", *NAMES[3:]], "t,q2,q1"), (NAMES[:9], "t,q1,q2")):
+        (tmp_path / "b.csv").write_text("\n".join([*lines[:200], ",".join(other), *lines[200:]]) + "\n")
+        with pytest.raises(DataError, match=rf"line 201 is another header .*'{said},.* after 't,q1,q2,q3"):
+            import_recording(tmp_path / "b.csv", TX40)
+    (tmp_path / "c.csv").write_text("\n".join([*lines[:200], lines[0], *lines[200:]]) + "\n")
+    assert same(import_recording(tmp_path / "c.csv", TX40), motion())
+
+
 def test_rows_of_other_topics_are_passed_over_and_rows_of_one_time_joined(tmp_path: Path) -> None:
     values = motion(100)
     names = [*NAMES, "/tool/temp"]
@@ -327,6 +337,17 @@ def test_times_with_too_few_digits_need_a_rate(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"359 of 400 rows have the time of the row before: .* too few digits"):
         import_recording(path, TX40, resample_hz=1000.0)
     assert same(import_recording(path, TX40, rate_hz=1000.0), motion())
+
+
+def test_the_rate_of_the_hint_is_that_of_the_samples(tmp_path: Path) -> None:
+    values = motion(600, 3000.0)
+    values[:, 0] = np.round(values[:, 0], 4)
+    with pytest.raises(DataError, match=r"the times jitter.*--resample 3000 puts"):
+        import_recording(written(tmp_path / "a.csv", values), TX40)
+    values = np.delete(values, np.s_[100:300], axis=0)
+    values[:, 0] += np.random.default_rng(1).uniform(0, 1e-5, len(values))
+    with pytest.raises(DataError, match=r"the times jitter.*--resample 3[0-9]00 puts"):
+        import_recording(written(tmp_path / "b.csv", values), TX40)
 
 
 def test_rows_that_are_there_twice_are_taken_once(tmp_path: Path) -> None:
@@ -427,6 +448,30 @@ def test_joints_of_a_lerobot_data_set_are_found_by_name_and_its_effort_is_needed
         import_recording(data, TX40)
     lerobot(tmp_path / "c", None, "observation.current")
     assert "current" in import_recording(tmp_path / "c", TX40).samples.fields
+
+
+def test_names_of_efforts_in_a_lerobot_data_set_find_their_joints(tmp_path: Path) -> None:
+    order = (2, 1, 3, 4, 5, 6)
+    lerobot(tmp_path / "a", [f"joint_{j}.pos" for j in order])
+    info = tmp_path / "a" / "meta" / "info.json"
+    features = json.loads(info.read_text())["features"]
+    unnamed = import_recording(tmp_path / "a", TX40)
+    assert "observation.effort has no names of joints: taken in the order" in unnamed.metadata["source_remarks"]
+    effort = {"names": [f"joint_{j}.effort" for j in range(1, N + 1)]}
+    info.write_text(json.dumps({"features": features | {"observation.effort": effort}}))
+    named = import_recording(tmp_path / "a", TX40)
+    assert np.allclose(named.samples.raw["torque"], motion(300, 50.0)[:, N + 1 :])
+    assert np.allclose(unnamed.samples.raw["torque"][:, [1, 0]], motion(300, 50.0)[:, N + 1 : N + 3])
+
+
+def test_a_demand_that_is_not_found_can_be_omitted(tmp_path: Path) -> None:
+    names = [*NAMES, *(f"tool_{axis}/target position" for axis in "xyz")]
+    path = written(tmp_path / "a.csv", np.hstack([motion(), np.zeros((400, 3))]), names)
+    with pytest.raises(
+        DataError, match=r"demand: no joint joint_1, .* the file has tool_x, .*; --map demand=- omits it"
+    ):
+        import_recording(path, TX40)
+    assert same(import_recording(path, TX40, names={"demand": "-"}), motion())
 
 
 def test_times_of_a_lerobot_data_set_that_are_no_numbers_are_refused(tmp_path: Path) -> None:
