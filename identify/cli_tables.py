@@ -262,7 +262,7 @@ def prediction_table(document: "PredictionDocument") -> None:
     console.print(document.sentence, highlight=False, soft_wrap=True)
     table = Table(title=f"{document.robot}: torque errors by joint", title_justify="left")
     for heading in ("joint", "error %", "own data %", "error rms", "torque rms", "unit"):
-        table.add_column(heading, justify="left" if heading in ("joint", "unit") else "right", no_wrap=True)
+        table.add_column(heading, justify="left" if heading in ("joint", "unit") else "right")
     for name, error in document.relative_error_pct_by_joint.items():
         own = document.identification_error_pct_by_joint.get(name)
         row = [name, f"{error:.2f}", "" if own is None else f"{own:.2f}"]
@@ -276,7 +276,7 @@ def predictions_table(document: "PredictionsDocument") -> None:
     table = Table(title=f"{document.robot}: torque errors by recording", title_justify="left")
     headings = ("recording", "error %", "worst joint", "its error %", "held out", "samples")
     for heading in headings:
-        table.add_column(heading, justify="right" if "%" in heading or heading == "samples" else "left", no_wrap=True)
+        table.add_column(heading, justify="right" if "%" in heading or heading == "samples" else "left")
     for each in document.predictions:
         joint, error = max(each.relative_error_pct_by_joint.items(), key=lambda pair: pair[1])
         held_out = "yes" if each.held_out else "no"

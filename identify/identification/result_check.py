@@ -130,7 +130,7 @@ def loop_reasons(
         message = f"The simulated closed loop misses the measured velocities by {100 * velocity_error:.0f} %"
     else:
         return []
-    step = "record the reference, or give the controller in the configuration (--controller known)"
+    step = "record the reference if it is missing, or give the controller in the configuration (--controller known)"
     return [Reason(level, message, step, kind="loop")]
 
 
@@ -212,7 +212,7 @@ def instrument_reasons(diagnostics: Diagnostics, parameters: int, criteria: Iden
         return []
     of = f"all {parameters} parameters" if len(weak) == parameters else listed(weak, criteria.max_listed)
     message = f"The instruments of {of} are weak: the estimate may be biased like least squares"
-    return [Reason("doubtful", message, "record the reference, or move faster", kind="instruments")]
+    return [Reason("doubtful", message, "record the reference if it is missing, or move faster", kind="instruments")]
 
 
 def delay_reasons(delay: TorqueDelay | None, robot: RobotConfig, criteria: IdentificationCriteria) -> list[Reason]:

@@ -98,6 +98,7 @@ def test_several_recordings_are_predicted_and_the_worst_is_named(folder: Path, t
         assert json.loads((tmp_path / file.stem / "prediction.json").read_text()) == each
     shown = call("predict", *files[:2], "--model", folder / "one", "--out", tmp_path)
     assert f"Worst torque error {max(errors[:2]):.2f} %" in shown.stdout
+    assert "…" not in shown.stdout
     twice = call("predict", files[0], files[0], "--model", folder / "one", "--out", tmp_path)
     assert twice.exit_code == 2
     assert twice.stderr.count("\n") == 1
