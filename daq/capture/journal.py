@@ -65,7 +65,7 @@ class JournalHandler(StderrHandler):
 def in_journal() -> bool:
     """Return True if stderr is a stream of the journal (systemd.exec(5), ``$JOURNAL_STREAM``)."""
     device, _, inode = os.environ.get("JOURNAL_STREAM", "").partition(":")
-    if not (device.isdigit() and inode.isdigit()):
+    if not (device.isdecimal() and inode.isdecimal()):
         return False
     try:
         found = os.fstat(sys.stderr.fileno())

@@ -63,7 +63,7 @@ def _source(source: str, ask: Ask) -> dict[str, Any]:
 
 def _number(ask: Ask, question: str, default: str) -> int:
     answer = ask(question, default)
-    while not answer.strip().isdigit() or int(answer) == 0:
+    while not answer.strip().isdecimal() or int(answer) == 0:
         answer = ask(f"{question}, a whole number", default)
     return int(answer)
 

@@ -220,7 +220,7 @@ class AscLines:
             self._now_ns = t_ns = max(0, min(self._now_ns + t_ns, LATEST_NS - self._start_ns))
         if what.upper() == "CANFD":
             return Line.FOREIGN
-        return self._frame(self._start_ns + t_ns, what, rest) if what.isdigit() else Line.COMMENT
+        return self._frame(self._start_ns + t_ns, what, rest) if what.isdecimal() else Line.COMMENT
 
     def _heading(self, line: str) -> Line:
         words = line.lower()
@@ -342,7 +342,7 @@ class TrcLines:
         time = _STAMP.match(column.get("O", ""))
         length = column.get("l", column.get("L", ""))
         identifier = column.get("I", "")
-        if kind != "DT" or time is None or not length.isdigit() or not re.fullmatch("[0-9A-Fa-f]{4,8}", identifier):
+        if kind != "DT" or time is None or not length.isdecimal() or not re.fullmatch("[0-9A-Fa-f]{4,8}", identifier):
             return Line.MALFORMED
         return self._frame(time[1], time[2], column.get("B", "1"), identifier, length, column.get("D", ""))
 
