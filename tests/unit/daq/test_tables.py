@@ -465,10 +465,10 @@ def test_names_of_efforts_in_a_lerobot_data_set_find_their_joints(tmp_path: Path
 
 
 def test_a_demand_that_is_not_found_can_be_omitted(tmp_path: Path) -> None:
-    names = [*NAMES, *(f"tool_{axis}/target position" for axis in "xyz")]
-    path = written(tmp_path / "a.csv", np.hstack([motion(), np.zeros((400, 3))]), names)
+    names = [*NAMES, *(f"qr{j + 1}" for j in range(N + 1))]
+    path = written(tmp_path / "a.csv", np.hstack([motion(), np.zeros((400, N + 1))]), names)
     with pytest.raises(
-        DataError, match=r"demand: no joint joint_1, .* the file has tool_x, .*; --map demand=- omits it"
+        DataError, match=r"demand: has a column qr7, but the robot has 6 joints.*; --map demand=- omits it"
     ):
         import_recording(path, TX40)
     assert same(import_recording(path, TX40, names={"demand": "-"}), motion())
