@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from armident.configs.schema.base import FrozenModel, WithBlanks
 from armident.configs.schema.robot import JointName, Name, Positive
@@ -136,6 +136,13 @@ class Stream(FrozenModel):
     every: Every = 1
     pack: Annotated[int, Field(ge=1, le=64)] = 1
     objects: Annotated[tuple[ObjectName, ...], Field(min_length=1)]
+
+    @field_validator("objects")
+    @classmethod
+    def _each_once(cls, objects: tuple[ObjectName, ...]) -> tuple[ObjectName, ...]:
+        if len(set(objects)) < len(objects):
+            raise ValueError(f"each object once, found {', '.join(objects)}")
+        return objects
 
 
 class Setpoints(FrozenModel):
