@@ -97,7 +97,11 @@ class OtherClient(Oddity):
         The drive.
     """
 
+    ANSWER_S = 0.5
+    """Longest wait for an answer, s, as in the canopen library and ours."""
+
     def __init__(self, drive: Drive) -> None:
+        self._node = drive.node_id
         self._request = can.Message(
             arbitration_id=od.COB_SDO_REQUEST + drive.node_id,
             is_extended_id=False,
@@ -107,15 +111,25 @@ class OtherClient(Oddity):
         self._thread: threading.Thread | None = None
 
     def begin(self, bus: Bus) -> None:
-        """Read the error register at 200 Hz."""
+        """Read the error register at up to 200 Hz: a client waits for the answer to its last request."""
         self._thread = threading.Thread(target=self._run, args=(bus,), daemon=True)
         self._thread.start()
 
     def _run(self, bus: Bus) -> None:
-        with can.Bus(bus.channel, interface=bus.interface) as client:
+        answers = [{"can_id": od.COB_SDO_RESPONSE + self._node, "can_mask": 0x7FF, "extended": False}]
+        with can.Bus(bus.channel, interface=bus.interface, can_filters=answers) as client:
             while not self._over.wait(0.005):
                 with suppress(can.CanError, OSError):
                     client.send(self._request)
+                    self._wait_for_answer(client)
+
+    def _wait_for_answer(self, client: can.BusABC) -> None:
+        """Wait for the answer among those to other clients."""
+        until = time.monotonic() + self.ANSWER_S
+        while (left := until - time.monotonic()) > 0 and not self._over.is_set():
+            answer = client.recv(left)
+            if answer is not None and bytes(answer.data[1:4]) == bytes(self._request.data[1:4]):
+                return
 
     def end(self) -> None:
         """Stop reading."""

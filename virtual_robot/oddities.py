@@ -34,7 +34,7 @@ ODDITIES: Mapping[str, str] = {
     "twice_late": "every SDO answer comes again 20 ms later",
     "slow_sdo": "SDO answers take 50 ms",
     "short_answer": "SDO answers to writes have four bytes",
-    "other_client": "another client reads 1001h on the SDO channel at 200 Hz",
+    "other_client": "another client reads 1001h on the SDO channel at up to 200 Hz",
     "autostart": "becomes operational by itself 30 ms after each NMT command to pre-operational",
     "slow_boot": "is switched on with the first NMT command, and needs 2 s to boot",
     "emcy_burst": "3000 emergency messages within about a second, from 0.5 s after NMT start on",

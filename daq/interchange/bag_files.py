@@ -24,6 +24,7 @@ from mcap.records import Channel, Chunk, McapRecord, Message, Schema
 from mcap.stream_reader import breakup_chunk
 
 from armident.configs import ConfigError, DataError
+from armident.daq.interchange.text_files import shortened
 from armident.daq.recording.mcap_records import MAGIC, RECORD_HEAD, records
 
 SUFFIXES = (".mcap", ".db3", ".mcap.zstd", ".db3.zstd")
@@ -95,7 +96,7 @@ def bag_files(path: Path) -> tuple[list[Path], list[str]]:
         there = sorted(found, key=lambda file: (len(file.name), file.name))
     if not there:
         raise ConfigError(f"{path}: no bag in this folder; expected {METADATA} or files {', '.join(SUFFIXES)}")
-    return there, [file.name for file in listed if file not in there]
+    return there, [shortened(file.name) for file in listed if file not in there]
 
 
 class BagReader:

@@ -141,6 +141,8 @@ COMBINED = [
     ("bit30_kept", "write_late", "heartbeat_rounds"),
     ("bit30_demanded", "autostart", "short_answer", "slow_sdo"),
     ("pdo_fixed", "cob_fixed", "mode_when_enabled", "twice_late", "abort_busy"),
+    ("twice", "other_client", "no6075"),
+    ("twice_late", "other_client"),
 ]
 """Oddities of one drive that meet in the same steps of its configuration."""
 
