@@ -139,7 +139,7 @@ def _from_polled(rows: Rows, times: Floats | None, rate_hz: float, polled: bool,
     count = len(even.values["position"])
     if times is not None:
         lasts, motion = float(times[-1] - times[0]), (count - 1) / rate_hz
-        if abs(motion / lasts - 1.0) > _DURATION_TOLERANCE:
+        if abs(motion - lasts) > _DURATION_TOLERANCE * lasts:
             raise DataError(
                 f"the motion takes {motion:.6g} s at the {rate_hz:g} Hz of {'--polled' if polled else '--resample'}, "
                 f"but {lasts:.6g} s by the column of times: give the rate of the controller"
