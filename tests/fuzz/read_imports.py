@@ -92,9 +92,8 @@ def check_consistent(recording: Recording, folder: Path) -> None:
         raise MisreadError("what was imported is not what is read")
 
 
-def _check_table(suffix: str) -> Callable[[bytes, Path], bool]:
+def _check_table(suffix: str, seeds: Callable[[], list[bytes]]) -> Callable[[bytes, Path], bool]:
     robot = load_robot("tx40.yaml")
-    seeds = cache(_exported(suffix))
 
     def check(data: bytes, folder: Path) -> bool:
         path = folder / f"x{suffix}"
@@ -124,7 +123,8 @@ def _check_log(suffix: str) -> Callable[[bytes, Path], bool]:
 
 
 def _table(suffix: str, mutate: Mutator) -> Target:
-    return Target(f"import{suffix.replace('.', '-')}", _exported(suffix), mutate, _check_table(suffix))
+    seeds = cache(_exported(suffix))  # once: a MAT file holds the second in which it was written
+    return Target(f"import{suffix.replace('.', '-')}", seeds, mutate, _check_table(suffix, seeds))
 
 
 def _log(suffix: str, mutate: Mutator) -> Target:
