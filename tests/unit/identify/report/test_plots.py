@@ -14,6 +14,7 @@ from armident.identify.report.plots import Plot, Series, kept_points, plots_html
 
 SCRIPT = Path(plots_module.__file__).parent / "templates" / "plots.js"
 NODE = shutil.which("node")
+needs_node = pytest.mark.skipif(NODE is None, reason="needs Node.js, which runs the script of the page")
 
 PAGE = """
 const events = {};
@@ -83,13 +84,13 @@ def test_the_script_refers_to_nothing_outside() -> None:
     assert not re.search(r"https?:|import\s|fetch\(|XMLHttpRequest|\bsrc\b", text)
 
 
-@pytest.mark.skipif(NODE is None, reason="needs node")
+@needs_node
 def test_ticks_are_round_and_inside() -> None:
     found = node("console.log(JSON.stringify([p.ticks(-3.2, 7.9, 5), p.ticks(0, 0.0031, 4), p.ticks(1, 1, 4)]))")
     assert found == [[-2, 0, 2, 4, 6], [0, 0.001, 0.002, 0.003], [1]]
 
 
-@pytest.mark.skipif(NODE is None, reason="needs node")
+@needs_node
 def test_the_page_draws_reads_and_zooms() -> None:
     code = """
     const group = p.build()[0];
@@ -117,7 +118,7 @@ def test_the_page_draws_reads_and_zooms() -> None:
     assert found["whole"] == [0, 10]
 
 
-@pytest.mark.skipif(NODE is None, reason="needs node")
+@needs_node
 def test_a_gap_in_the_data_is_a_gap_in_the_curve() -> None:
     code = """
     p.build();
@@ -131,7 +132,7 @@ def test_a_gap_in_the_data_is_a_gap_in_the_curve() -> None:
     assert two == one + 1
 
 
-@pytest.mark.skipif(NODE is None, reason="needs node")
+@needs_node
 def test_points_with_intervals_have_names_on_the_axis_and_are_read_in_words() -> None:
     code = """
     const plot = p.build()[0].plots[0];
