@@ -5,6 +5,7 @@ import re
 import struct
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 import can
 import numpy as np
@@ -347,10 +348,10 @@ def test_a_single_frame_with_an_odd_time_is_left_out(tmp_path: Path) -> None:
     assert found.samples.sync.size >= ROWS - 2
 
 
-def messages(**changes: object) -> list[can.Message]:
+def messages(**changes: Any) -> list[can.Message]:
     """Return the frames of ``ROWS`` SYNCs, with changes to every one."""
     found = bus_log._messages(captured(ROWS), SESSION, captured_streams(SESSION, ROBOT))
-    plain = {"is_extended_id": False, "channel": 0}
+    plain: dict[str, Any] = {"is_extended_id": False, "channel": 0}
     return [
         can.Message(**plain | {"timestamp": m.timestamp, "arbitration_id": m.arbitration_id, "data": m.data} | changes)
         for m in found
