@@ -14,14 +14,10 @@ from numpy.typing import NDArray
 
 from armident.configs import ConfigError, DataError, RobotConfig, Trajectory, load_robot
 from armident.daq.recording import Recording, read_recording
-from armident.identify.document import (
-    DiagnosisDocument,
-    IdentificationDocument,
-    load_document,
-    reference,
-    to_json,
-    write_atomically,
-)
+from armident.identify.documents.base import reference
+from armident.identify.documents.diagnosis import DiagnosisDocument
+from armident.identify.documents.files import load_document, to_json, write_atomically
+from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.effects.effect import Effect as Effect
 from armident.identify.effects.registry import catalogue
 from armident.identify.experiment import Experiment
