@@ -36,7 +36,8 @@ from armident.daq.capture.publisher import Publisher
 from armident.daq.recording import RecordingWriter, StreamLayout, read_recording, write_recording
 from armident.daq.streaming import Block, Keys, encode_event, open_session
 from armident.daq.streaming.codec import end_content, start_content
-from armident.identify.document import IdentificationDocument, load_document
+from armident.identify.documents.files import load_document
+from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.identification.options import Options
 from armident.identify.monitoring.history import History, recorded_at
 from armident.identify.monitoring.ledger import FILE, Ledger

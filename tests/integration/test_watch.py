@@ -16,7 +16,8 @@ from armident.configs import ConfigError, DataError, SessionConfig, load_session
 from armident.daq.capture.publisher import Publisher
 from armident.daq.recording import Recording, write_recording
 from armident.daq.streaming import Keys, encode_block, open_session
-from armident.identify.document import IdentificationDocument, to_json
+from armident.identify.documents.files import to_json
+from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.monitoring.recursive.block_order import LONGEST_HOLD_S, BlockOrder
 from armident.identify.monitoring.recursive.estimator import RecursiveEstimator
 from armident.identify.monitoring.recursive.replay import blocks_of

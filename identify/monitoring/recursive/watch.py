@@ -22,7 +22,8 @@ from rich.live import Live
 from armident.configs import ConfigError, DataError, RobotConfig, SessionConfig, load_robot, load_session
 from armident.daq.recording import read_recording
 from armident.daq.streaming import Block, Keys, decode_block, open_session
-from armident.identify.document import IdentificationDocument, load_document
+from armident.identify.documents.files import load_document
+from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.monitoring.recursive.block_order import BlockOrder
 from armident.identify.monitoring.recursive.estimator import RecursiveEstimator, RecursiveResult
 from armident.identify.monitoring.recursive.replay import blocks_of, has_reference
