@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from armident.configs.errors import ConfigError
 from armident.configs.urdf import mdh_of
-from armident.configs.urdf_tree import UrdfTree, end_link, read_chain, read_tree
+from armident.configs.urdf_tree import UrdfTree, end_link, only, read_chain, read_tree
 
 INERTIAL = ("xx", "xy", "xz", "yy", "yz", "zz", "mx", "my", "mz", "m")
 """Standard inertial parameters of a link: inertia about the origin of its frame, first moment, mass (thesis 2.1.2)."""
@@ -113,7 +113,10 @@ def carried_links(tree: UrdfTree, base: str, chain: list[str]) -> Iterator[tuple
             if moves and name not in chain and owner < 0:
                 continue  # a branch at the base
             here = chain.index(name) if name in chain else owner
-            child, frame = end_link(element, "child"), placement @ tree.origin(element, element.find("origin"))
+            child, frame = (
+                end_link(element, "child"),
+                placement @ tree.origin(element, only(tree.file, element, "origin")),
+            )
             yield child, here, frame, name if moves and name not in chain else None
             todo.append((child, here, frame))
 
@@ -123,12 +126,12 @@ def _moments(tree: UrdfTree, link: ET.Element) -> tuple[Floats, bool]:
 
     The pseudo-inertia holds the second moments, the first moment and the mass (Wensing, Kim and Slotine 2018).
     """
-    inertial = link.find("inertial")
+    inertial = only(tree.file, link, "inertial")
     if inertial is None:
         return np.zeros((4, 4)), True
     where = f"{tree.file}: link {link.get('name')!r}: inertial"
-    mass = _number(tree, link, inertial.find("mass"), "value")
-    cells = inertial.find("inertia")
+    mass = _number(tree, link, only(tree.file, inertial, "mass", link), "value")
+    cells = only(tree.file, inertial, "inertia", link)
     inertia = np.zeros((3, 3))
     for i, j in zip(*np.triu_indices(3), strict=True):
         inertia[i, j] = inertia[j, i] = _number(tree, link, cells, f"i{'xyz'[i]}{'xyz'[j]}")
@@ -137,7 +140,7 @@ def _moments(tree: UrdfTree, link: ET.Element) -> tuple[Floats, bool]:
     if mass < 0.0 or smallest < -ROUNDING * largest:
         raise ConfigError(f"{where}: mass and moments of inertia must not be negative; correct them in the URDF")
     second = 0.5 * np.trace(inertia) * np.eye(3) - inertia
-    frame = tree.origin(link, inertial.find("origin"))
+    frame = tree.origin(link, only(tree.file, inertial, "origin", link))
     body = np.zeros((4, 4))
     body[:3, :3], body[3, 3] = second, mass
     return frame @ body @ frame.T, bool(np.linalg.eigvalsh(second)[0] >= -ROUNDING * largest)
@@ -151,7 +154,7 @@ def _friction(tree: UrdfTree, path: list[ET.Element], chain: list[str]) -> dict[
     """Friction of the moving joints from ``dynamics``; zero and negative values are placeholders."""
     out = {}
     for element in path:
-        found = element.find("dynamics")
+        found = only(tree.file, element, "dynamics")
         if found is None or element.get("name") not in chain:
             continue
         number = chain.index(str(element.get("name"))) + 1

@@ -79,7 +79,7 @@ def read_chain(file: Path, base: str | None = None, tip: str | None = None) -> t
     base, path = tree.path(base, tip)
     placement, chain = np.eye(4), []
     for element in path:
-        placement = placement @ tree.origin(element, element.find("origin"))
+        placement = placement @ tree.origin(element, only(file, element, "origin"))
         if tree.type_of(element) != "fixed":
             chain.append(tree.moving_joint(element, placement))
     if not chain:
@@ -158,7 +158,7 @@ def orientation(file: Path, link: str) -> Floats:
     turned = np.eye(3)
     element = tree.above.get(tree.known(link, "urdf.base"))
     while element is not None:
-        turned = tree.origin(element, element.find("origin"))[:3, :3] @ turned
+        turned = tree.origin(element, only(file, element, "origin"))[:3, :3] @ turned
         element = tree.above.get(end_link(element, "parent"))
     return turned
 
@@ -379,7 +379,7 @@ class UrdfTree:
             raise ConfigError(f"{where}: type {kind!r} cannot be identified; expected {', '.join(MOVING)} or fixed")
         if element.find("mimic") is not None:
             raise ConfigError(f"{where}: follows another joint (mimic), which a serial chain does not")
-        found = element.find("axis")
+        found = only(self.file, element, "axis")
         axis = np.array([1.0, 0.0, 0.0])
         if found is not None:
             axis = np.array([float(w) for w in self.words(element, found, "xyz", default=None)])
@@ -391,7 +391,7 @@ class UrdfTree:
     def _limits(self, element: ET.Element) -> dict[str, Any]:
         """Limits of the file; zero and negative velocities and efforts are placeholders."""
         limits: dict[str, Any] = {}
-        found = element.find("limit")
+        found = only(self.file, element, "limit")
         values = {
             key: self._limit(element, found, key)
             for key in ("lower", "upper", "velocity", "effort")
@@ -464,7 +464,10 @@ def read_tree(file: Path) -> UrdfTree:
     root = parse_urdf(file)
     if root.tag != "robot":
         raise ConfigError(f"{file}: expected a URDF with the root element robot, found {root.tag:.40}")
-    links = {str(link.get("name")): link for link in root.findall("link")}
+    links: dict[str, ET.Element] = {}
+    for found in root.findall("link"):
+        if links.setdefault(str(found.get("name")), found) is not found:
+            raise ConfigError(f"{file}: link {found.get('name')!r}: there are two of this name")
     above: dict[str, ET.Element] = {}
     below: dict[str, list[ET.Element]] = {}
     names: set[str] = set()
@@ -477,6 +480,7 @@ def read_tree(file: Path) -> UrdfTree:
             raise ConfigError(f"{file}: joint {name!r}: there are two of this name")
         names.add(name)
         for end in ends:
+            only(file, element, end)
             if end_link(element, end) not in links:
                 raise ConfigError(f"{file}: joint {name!r}: {end}: no link {end_link(element, end)!r}")
         child = end_link(element, "child")
@@ -503,6 +507,32 @@ def _is_finite(word: str) -> bool:
         return abs(Decimal(word)) <= LARGEST
     except InvalidOperation:
         return False
+
+
+def only(file: Path, element: ET.Element, tag: str, of: ET.Element | None = None) -> ET.Element | None:
+    """Return the element of a name in another one, or ``None``.
+
+    Parameters
+    ----------
+    file
+        Path of the URDF, for messages.
+    element, tag
+        Element of a joint or link, or one below it, and the name.
+    of
+        Joint or link around the element, for messages; ``None``: it is one.
+
+    Raises
+    ------
+    ConfigError
+        If there are two that differ.
+    """
+    found = element.findall(tag)
+    contents = {tuple((part.tag, *sorted(part.items())) for part in each.iter()) for each in found}
+    if len(contents) > 1:
+        owner = element if of is None else of
+        where = f"{file}: {owner.tag} {owner.get('name')!r}" + (f": {element.tag}" if of is not None else "")
+        raise ConfigError(f"{where}: there are {len(found)} elements {tag}, expected one")
+    return found[0] if found else None
 
 
 def end_link(element: ET.Element, end: Literal["parent", "child"]) -> str:

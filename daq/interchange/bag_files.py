@@ -4,6 +4,7 @@ Damaged parts are passed over and described, so that a torn bag gives what is wh
 """
 
 import mmap
+import re
 import shutil
 import sqlite3
 import tempfile
@@ -24,6 +25,7 @@ from mcap.records import Channel, Chunk, McapRecord, Message, Schema
 from mcap.stream_reader import breakup_chunk
 
 from armident.configs import ConfigError, DataError
+from armident.daq.interchange.text_files import listed as listed_names
 from armident.daq.interchange.text_files import shortened
 from armident.daq.recording.mcap_records import MAGIC, RECORD_HEAD, records
 
@@ -31,10 +33,15 @@ SUFFIXES = (".mcap", ".db3", ".mcap.zstd", ".db3.zstd")
 """Suffixes of the files of a bag."""
 METADATA = "metadata.yaml"
 """File of a bag folder that lists the other files."""
+ROS_1 = ".bag"
+"""Suffix of the bags of ROS 1, which are refused with the command that converts them."""
 
 _CDR = "cdr"
+_NUMBER_AT_END = re.compile(r"[-_.]?\d+$")
+"""Number that rosbag2 adds to the name of a bag for each of its files."""
 _LARGEST = 1 << 30
 """Largest uncompressed chunk or message that is read, bytes."""
+_ZSTD = ".zstd"
 _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 _SIDECARS = ("-wal", "-journal")
 """Suffixes of the files in which SQLite keeps what is not in the database yet."""
@@ -61,14 +68,14 @@ class BagMessage(NamedTuple):
 
 
 def is_bag(path: Path) -> bool:
-    """Return True if a path has the name of a bag file, or is a folder.
+    """Return True if a path has the name of a bag file, one of ROS 1 included, or is a folder.
 
     Parameters
     ----------
     path
         The file or folder.
     """
-    return path.name.lower().endswith(SUFFIXES) or path.is_dir()
+    return path.name.lower().endswith((*SUFFIXES, ROS_1)) or path.is_dir()
 
 
 def bag_files(path: Path) -> tuple[list[Path], list[str]]:
@@ -82,21 +89,49 @@ def bag_files(path: Path) -> tuple[list[Path], list[str]]:
     Raises
     ------
     ConfigError
-        If there is no such file or folder, or the folder has no bag file.
+        If there is no such file or folder, or the folder has no bag file, those of several bags, or bags of ROS 1.
     """
     if not path.is_dir():
         if not path.is_file():
             raise ConfigError(f"{path}: no such file")
+        if path.suffix.lower() == ROS_1:
+            raise ConfigError(_of_ros_1(path))
         return [path], []
-    listed = [path / Path(name).name for name in _listed_files(path)]
-    present = [file for file in path.iterdir() if file.is_file()]
-    there = [file for file in listed if file in present]
+    present = {file.name: file for file in path.iterdir() if file.is_file()}
+    listed = [Path(name).name for name in _listed_files(path)]
+    found = [(name, present.get(name) or present.get(_other_name(name))) for name in listed]
+    there = [file for _, file in found if file is not None]
     if not there:
-        found = [file for file in present if file.name.lower().endswith(SUFFIXES)]
-        there = sorted(found, key=lambda file: (len(file.name), file.name))
-    if not there:
-        raise ConfigError(f"{path}: no bag in this folder; expected {METADATA} or files {', '.join(SUFFIXES)}")
-    return there, [shortened(file.name) for file in listed if file not in there]
+        there = _unlisted(path, list(present.values()))
+    return there, [shortened(name) for name, file in found if file is None and name not in {f.name for f in there}]
+
+
+def _other_name(name: str) -> str:
+    """Return the name of a file after compression with zstd, or of a compressed one after decompression."""
+    return name[: -len(_ZSTD)] if name.endswith(_ZSTD) else name + _ZSTD
+
+
+def _unlisted(folder: Path, present: list[Path]) -> list[Path]:
+    """Return the files of the only bag in a folder without usable metadata, in the order of their numbers."""
+    found = [file for file in present if file.name.lower().endswith(SUFFIXES)]
+    if not found:
+        for file in present:
+            if file.suffix.lower() == ROS_1:
+                raise ConfigError(_of_ros_1(file))
+        inner = sorted(each.parent.name for suffix in SUFFIXES for each in folder.glob(f"*/*{suffix}"))
+        hint = f"; bags are in {listed_names(list(dict.fromkeys(inner)))}: give one of them" if inner else ""
+        raise ConfigError(f"{folder}: no bag in this folder; expected {METADATA} or files {', '.join(SUFFIXES)}{hint}")
+    bags = sorted({_NUMBER_AT_END.sub("", file.name.split(".")[0]) for file in found})
+    if len(bags) > 1:
+        raise ConfigError(
+            f"{folder}: files of several bags without {METADATA}: {listed_names(sorted(f.name for f in found))}; "
+            "give one file"
+        )
+    return sorted(found, key=lambda file: (len(file.name.removesuffix(_ZSTD)), file.name))
+
+
+def _of_ros_1(file: Path) -> str:
+    return f"{file}: a bag of ROS 1; `rosbags-convert --src {file.name} --dst {file.stem}` makes one of ROS 2"
 
 
 class BagReader:
@@ -154,7 +189,7 @@ class BagReader:
             raise DataError(f"{file}: empty, not a bag")
         where, opened = f"{name}: " if name else "", file
         with tempfile.TemporaryDirectory() as folder:
-            if file.suffix.lower() == ".zstd":
+            if file.suffix.lower() == _ZSTD:
                 opened = Path(folder, file.stem)
                 self._decompress(file, opened, where)
             try:

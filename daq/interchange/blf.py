@@ -6,6 +6,7 @@ continue in the next container. The layout of header and objects is that of the 
 
 import struct
 import zlib
+from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -17,9 +18,16 @@ _OBJECT = struct.Struct("<4sHHLL")
 _OBJECT_TIME = struct.Struct("<LHHQ")
 _CONTAINER = struct.Struct("<H6xL4x")
 _CLASSIC = struct.Struct("<HBBL8s")
-_CONTAINER_TYPE, _CLASSIC_TYPES = 10, (1, 86)
-_OTHER_FRAMES = (73, 100, 101)
-"""Error frames and CAN FD frames."""
+_CONTAINER_TYPE = 10
+_FD = struct.Struct("<HBBLLBBB5x")
+"""Frame of a CAN FD channel: channel, flags, DLC, identifier, ., ., FD flags, valid bytes; data follow."""
+_FD_64 = struct.Struct("<BBBBLLLLLLLHBBL")
+"""The same in the later form: channel, DLC, valid bytes, ., identifier, ., flags, ..., begin of further data, .; data
+follow."""
+_EDL, _EDL_64, _REMOTE_64 = 0x1, 0x1000, 0x10
+"""Extended data length, which classic frames of a CAN FD channel lack, and remote frames of the later form."""
+_OTHER_FRAMES = (73, 104)
+"""Error frames."""
 _UNCOMPRESSED, _DEFLATED = 0, 2
 _EXTENDED, _REMOTE = 0x8000_0000, 0x80
 _IN_TEN_MICROSECONDS = 1
@@ -158,21 +166,53 @@ class _Objects:
         if kind in _OTHER_FRAMES:
             self._into.foreign += 1
             return
-        if kind not in _CLASSIC_TYPES:
+        read = _FRAMES.get(kind)
+        if read is None:
             return
         header_size = int.from_bytes(data[4:6], "little")
-        if header_size < _OBJECT.size + _OBJECT_TIME.size or len(data) < header_size + _CLASSIC.size:
+        if header_size < _OBJECT.size + _OBJECT_TIME.size:
+            self.damaged += 1
+            return
+        try:
+            channel, can_id, octets = read(data, header_size)
+        except struct.error:
             self.damaged += 1
             return
         unit, _, _, time = _OBJECT_TIME.unpack_from(data, _OBJECT.size)
-        channel, flags, length, can_id, octets = _CLASSIC.unpack_from(data, header_size)
         t_ns = self._start_ns + time * (10_000 if unit == _IN_TEN_MICROSECONDS else 1)
-        if can_id & _EXTENDED or flags & _REMOTE:
+        if can_id & _EXTENDED or octets is None:
             self._into.foreign += 1
         elif can_id > 0x7FF or t_ns > LATEST_NS:
             self.damaged += 1
         else:
-            self._into.add(t_ns, can_id, octets[: min(length, 8)], str(channel - 1))
+            self._into.add(t_ns, can_id, octets[:8], str(channel - 1))
+
+
+_Frame = tuple[int, int, bytes | None]
+"""Channel from 1, identifier with its flags, data; ``None`` for the data of a remote or CAN FD frame."""
+
+
+def _classic(data: bytes, at: int) -> _Frame:
+    channel, flags, length, can_id, octets = _CLASSIC.unpack_from(data, at)
+    return channel, can_id, None if flags & _REMOTE else octets[: min(length, 8)]
+
+
+def _fd(data: bytes, at: int) -> _Frame:
+    channel, flags, _, can_id, _, _, fd_flags, valid = _FD.unpack_from(data, at)
+    begin = at + _FD.size
+    return channel, can_id, None if flags & _REMOTE or fd_flags & _EDL else data[begin : begin + valid]
+
+
+def _fd_64(data: bytes, at: int) -> _Frame:
+    channel, _, valid, _, can_id, _, flags, *_, extra, _ = _FD_64.unpack_from(data, at)
+    begin = at + _FD_64.size
+    # Zeros at the end may be absent, and further data may follow from ``extra`` on.
+    octets = data[begin : min(begin + valid, extra or len(data))].ljust(valid, b"\0")
+    return channel, can_id, None if flags & (_EDL_64 | _REMOTE_64) else octets
+
+
+_FRAMES: Mapping[int, Callable[[bytes, int], _Frame]] = {1: _classic, 86: _classic, 100: _fd, 101: _fd_64}
+"""Readers of frames by type of the object."""
 
 
 def _system_time_ns(parts: tuple[int, ...]) -> int:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from armident.configs import ConfigError, DataError, RobotConfig, SessionConfig
 from armident.daq.interchange.log_clock import check_sync_period, clock_steps
 from armident.daq.interchange.log_file import SUFFIXES, read_log
+from armident.daq.interchange.log_frames import LogFrames
 from armident.daq.matching.assembler import Assembler, Batch
 from armident.daq.matching.streams import CapturedStream, bus_numbers, captured_streams, unknown_phase
 from armident.daq.recording import Gap, Recording, Stream
@@ -56,7 +57,8 @@ def recording_from_log(path: Path, session: SessionConfig, robot: RobotConfig) -
     _check_classic(session, str(path))
     streams = captured_streams(session, robot)
     log = read_log(path)
-    read = [log.of(path, bus.channel, len(session.all_buses) > 1) for bus in session.all_buses]
+    names, chosen = _buses(log, session, streams)
+    read = [log.of(path, name, len(session.all_buses) > 1) for name in names]
     for bus, frames_of_it in zip(session.all_buses, read, strict=True):
         if not np.any(frames_of_it["can_id"] == COB_SYNC):
             where = f" of {bus.channel}" if len(read) > 1 else ""
@@ -83,7 +85,7 @@ def recording_from_log(path: Path, session: SessionConfig, robot: RobotConfig) -
         raise DataError(f"{path}: no SYNC was answered by all drives; the session expects TPDOs {wanted}{silent}")
     phase = None if assembler.has_counter else unknown_phase(session)
     stepped = clock_steps(found["samples"].sync, found["samples"].t_ns, session)
-    notes = (*log.notes, *wrong, *stepped, *([phase] if phase else []))
+    notes = (*log.notes, *chosen, *wrong, *stepped, *([phase] if phase else []))
     for note in notes:
         logging.getLogger(__name__).warning("%s: %s", path, note)
     gaps: list[Gap] = [gap for part in parts for gap in part.gaps]
@@ -97,6 +99,20 @@ def recording_from_log(path: Path, session: SessionConfig, robot: RobotConfig) -
         counters=assembler.counters | {"log.foreign": log.foreign, "log.skipped": log.skipped},
         metadata={"source": path.name, "source_sha256": _digest(path)} | ({NOTES: "; ".join(notes)} if notes else {}),
     )
+
+
+def _buses(log: LogFrames, session: SessionConfig, streams: Sequence[CapturedStream]) -> tuple[list[str], list[str]]:
+    """Return the names in the log of the session's buses, and a note if the frames tell the only one.
+
+    Logs of Vector and PEAK number the buses, so that their names tell nothing.
+    """
+    names = [bus.channel for bus in session.all_buses]
+    if len(names) > 1 or len(log.buses) < 2 or names[0] in log.buses:
+        return names, []
+    found = log.buses_with([COB_SYNC, *streams[0].bus.cob_ids])
+    if len(found) != 1:
+        return names, []
+    return found, [f"bus {found[0]} of {', '.join(log.buses)} is read: only it has SYNC and the TPDOs of the session"]
 
 
 def _wrong_lengths(

@@ -4,7 +4,7 @@ import csv
 import math
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -56,11 +56,12 @@ class CsvTable:
 
 @dataclass
 class _Head:
-    """Beginning of a file: the columns and the first line of values, from 1."""
+    """Beginning of a file: the columns, those of text among them, and the first line of values, from 1."""
 
     delimiter: str | None
     columns: int
     first: int
+    text: frozenset[int] = frozenset()
     header: list[str] | None = None
     units: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
@@ -70,8 +71,9 @@ def read_csv(path: Path) -> CsvTable:
     """Return the table of a text file.
 
     Lines of comments are passed over. Lines with another number of columns, or with a cell that is no number, are
-    damaged: their rows are NaN. Columns are separated by commas, semicolons, tabs or spaces; decimal commas are read
-    where they are not the separator. The first column, and those named after time, may hold dates (ISO 8601).
+    damaged: their rows are NaN. Columns of text are NaN. Columns are separated by commas, semicolons, tabs or spaces;
+    decimal commas are read where they are not the separator. The first column, and those named after time, may hold
+    dates (ISO 8601).
 
     Parameters
     ----------
@@ -145,6 +147,7 @@ def seconds_of_date(text: str) -> float | None:
 def _head(path: Path, lines: Iterator[str]) -> _Head:
     """Find the first line of values and the header before it."""
     before: list[tuple[int, str, bool]] = []
+    mixed: _Head | None = None
     for number, line in enumerate(lines, start=1):
         text = line.strip().strip("\0")
         if number > _LONGEST_HEAD or len(text) > 1_000_000:
@@ -154,11 +157,26 @@ def _head(path: Path, lines: Iterator[str]) -> _Head:
         comment = text.startswith(_COMMENTS)
         delimiter = _delimiter(text)
         cells = cells_of(text, delimiter)
-        if comment or not _are_values(cells):
+        words = None if comment else _text_columns(cells)
+        if (head := _after_words(mixed, cells, words)) is not None:
+            return _with_header(head, before[:-1])
+        if words is None or words:
+            own_names = any(len(cells_of(each, delimiter)) == len(cells) for _, each, _ in before)
+            mixed = _Head(delimiter, len(cells), number, words) if words and own_names else None
             before.append((number, text.lstrip("#%/ ") if comment else text, comment))
             continue
-        return _with_header(_Head(delimiter, len(cells), number), before)
+        return _with_header(_Head(delimiter, len(cells), number), before, ends_empty=not cells[-1])
     raise DataError(f"{path}: no values in it{_no_values(before)}")
+
+
+def _after_words(line: _Head | None, cells: Sequence[str], words: frozenset[int] | None) -> _Head | None:
+    """Return the beginning at a line with words if the next one continues it: ``None`` if it does not.
+
+    Two lines with words have columns of text; a line of numbers alone follows a damaged one.
+    """
+    if line is None or words is None or len(cells) != line.columns or not words <= line.text:
+        return None
+    return replace(line, text=words) if all(cells[k][0].isalpha() for k in words) else None
 
 
 def _no_values(before: Sequence[tuple[int, str, bool]]) -> str:
@@ -173,8 +191,14 @@ def _no_values(before: Sequence[tuple[int, str, bool]]) -> str:
     return f": line {number} has {excerpt(odd)}, expected numbers{dates}"
 
 
-def _with_header(head: _Head, before: Sequence[tuple[int, str, bool]]) -> _Head:
-    """Find header and units among the lines before the values: those with as many cells."""
+def _with_header(head: _Head, before: Sequence[tuple[int, str, bool]], *, ends_empty: bool = False) -> _Head:
+    """Find header and units among the lines before the values: those with as many cells.
+
+    Where the first line ``ends_empty`` and no header names a last column, lines end in a separator.
+    """
+    lengths = [len(cells_of(text, head.delimiter)) for _, text, _ in before]
+    if ends_empty and head.columns > 1 and head.columns not in lengths:
+        head.columns -= 1
     fits = [cells for _, text, _ in before if len(cells := cells_of(text, head.delimiter)) in _widths(head.columns)]
     if not fits and before and not before[-1][2]:
         # A header that does not fit the values is named by the caller.
@@ -206,11 +230,11 @@ def _delimiter(text: str) -> str | None:
     return next((each for each in _DELIMITERS if each in text), None)
 
 
-def _are_values(cells: Sequence[str]) -> bool:
-    """Return ``True`` if a line holds values: numbers, dates and empty cells, and at least one number."""
-    numbers = [_number(cell) for cell in cells]
-    known = all(value is not None or not cell for cell, value in zip(cells, numbers, strict=True))
-    return known and any(value is not None for value in numbers)
+def _text_columns(cells: Sequence[str]) -> frozenset[int] | None:
+    """Return the columns whose cells are no numbers, dates or empty; ``None`` if most of a line is such text."""
+    text = frozenset(k for k, cell in enumerate(cells) if cell and _number(cell) is None)
+    numbers = sum(1 for cell in cells if cell) - len(text)
+    return text if numbers > len(text) else None
 
 
 def _number(cell: str) -> float | None:
@@ -293,6 +317,7 @@ def _slow(path: Path, encoding: str, head: _Head) -> CsvTable:
     bad = _Bad()
     signs = _DecimalSigns()
     commas = repeated = 0
+    worded: set[int] = set()
     cells: list[str] = []
     ends: list[int] = []
     line = ""
@@ -311,6 +336,7 @@ def _slow(path: Path, encoding: str, head: _Head) -> CsvTable:
                 commas += signs.add(number, cells)
             if problem:
                 bad.add(f"line {number}{problem}")
+                worded.update(k for k, cell in enumerate(cells) if cell[:1].isalpha() and _number(cell) is None)
             rows.append(row)
             numbers.append(number)
             ends = [*ends[-_TAIL:], len(cells[-1])]
@@ -324,7 +350,11 @@ def _slow(path: Path, encoding: str, head: _Head) -> CsvTable:
         notes.append(f"the last line ({numbers[-1]}) is cut off and left out")
         rows.pop()
         numbers.pop()
+    values = np.array(rows, dtype=np.float64)
     if bad.count > max(1, _MOST_BAD_SHARE * len(rows)) or (bad.count and len(rows) == 1):
+        of_text = frozenset(k for k in worded if k < head.columns and np.isnan(values[:, k]).all()) - head.text
+        if of_text and not np.isnan(values).all():
+            return _slow(path, encoding, replace(head, text=head.text | of_text))
         others = f" (and {bad.count - 1} more of {len(rows)} lines)" if bad.count > 1 else ""
         raise DataError(f"{path}: {bad.first}{others}{_commas_hint(len(cells), head)}")
     if bad.count:
@@ -336,7 +366,6 @@ def _slow(path: Path, encoding: str, head: _Head) -> CsvTable:
         notes.append(f"decimal commas are read as decimal points ({commas} lines)")
     if repeated:
         notes.append(f"header repeated and passed over: {repeated} times")
-    values = np.array(rows, dtype=np.float64)
     return CsvTable(head.header, head.units, values, np.array(numbers), tuple(notes))
 
 
@@ -358,7 +387,7 @@ def _row(cells: list[str], head: _Head) -> tuple[list[float], str]:
         return [math.nan] * head.columns, f" has {len(cells)} columns, expected {head.columns}"
     values: list[float] = []
     for k, cell in enumerate(cells, start=1):
-        value = _number(cell) if cell else math.nan
+        value = _number(cell) if cell and k - 1 not in head.text else math.nan
         if value is None:
             return [math.nan] * head.columns, f", column {k}: expected a number, found {excerpt(cell)}"
         values.append(value)
@@ -372,6 +401,8 @@ def _is_cut(row: Sequence[float], ends: Sequence[int]) -> bool:
 
 def _commas_hint(columns: int, head: _Head) -> str:
     names = len(head.header or ())
+    if columns == names + 1 > 2:
+        return "; a column without a name, such as an index: name it in the header"
     if head.delimiter == "," and names < columns <= 2 * names:
         return "; decimal commas in a table with commas between columns: write it with semicolons"
     return ""

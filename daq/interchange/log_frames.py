@@ -1,5 +1,6 @@
 """Frames of a bus log in arrays, with everything that was left out and the reason for it."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -59,9 +60,24 @@ class LogFrames:
         if len(self.buses) < 2 and not (self.buses and several):
             return self.frames
         if bus not in self.buses:
-            raise ConfigError(f"{path}: holds the buses {', '.join(self.buses)}; the session's is {bus}")
+            raise ConfigError(
+                f"{path}: holds the buses {', '.join(self.buses)}; the session's is {bus}: "
+                "name the one to read as its channel (bus.channel)"
+            )
         chosen: Frames = self.frames[self.bus == self.buses.index(bus)]
         return chosen
+
+    def buses_with(self, identifiers: Sequence[int]) -> list[str]:
+        """Return the names of the buses with frames of all identifiers.
+
+        Parameters
+        ----------
+        identifiers
+            The identifiers.
+        """
+        wanted = np.array(identifiers)
+        own = [self.frames["can_id"][self.bus == number] for number in range(len(self.buses))]
+        return [name for name, found in zip(self.buses, own, strict=True) if np.isin(wanted, found).all()]
 
 
 @dataclass
@@ -135,7 +151,7 @@ class FrameCollector:
         """
         self._flush()
         if not self._parts or not sum(part[0].size for part in self._parts):
-            others = f", only {self.foreign} others" if self.foreign else ""
+            others = f", only {self.foreign} CAN FD, extended, remote or error frames" if self.foreign else ""
             raise DataError(f"{path}: no data frames with 11-bit identifiers in it{others}")
         frames = np.concatenate([part[0] for part in self._parts])
         bus = np.concatenate([part[1] for part in self._parts])

@@ -150,6 +150,8 @@ _MONTHS = {
 """Beginnings of the names of months: English, German, French, Spanish, Italian, Portuguese."""
 _ASC_EVENT = re.compile(r"(-?)(\d+)(?:[.,](\d+))?\s+(\S+)\s*(.*)$")
 _ASC_CLOCK = re.compile(r"(\d{1,2}):(\d\d):(\d\d)(?:[.,:](\d+))?(?:\s*([ap])\.?m\.?\b)?", re.IGNORECASE)
+_EDL, _RTR = 0x1000, 0x10
+"""Flags of frames of a CAN FD channel: extended data length, which classic frames lack, and remote frame."""
 _ASC_BASE = re.compile(r"base\s+(hex|dec)(?:\s+timestamps\s+(absolute|relative))?", re.IGNORECASE)
 
 
@@ -219,7 +221,7 @@ class AscLines:
         if self._relative:
             self._now_ns = t_ns = max(0, min(self._now_ns + t_ns, LATEST_NS - self._start_ns))
         if what.upper() == "CANFD":
-            return Line.FOREIGN
+            return self._of_fd_channel(self._start_ns + t_ns, rest.split())
         return self._frame(self._start_ns + t_ns, what, rest) if what.isdecimal() else Line.COMMENT
 
     def _heading(self, line: str) -> Line:
@@ -266,6 +268,25 @@ class AscLines:
         if data is None or words[2].lower() != "d" or not 0 <= can_id <= 0x7FF:
             return Line.MALFORMED
         return t_ns, can_id, data, str(int(channel[:9]) - 1)
+
+    def _of_fd_channel(self, t_ns: int, words: list[str]) -> FrameLine | Line:
+        """Return a classic frame of a CAN FD channel; another frame if it is CAN FD, extended, remote or an error.
+
+        The words are channel, direction, identifier, perhaps a name, BRS, ESI, DLC, length, data, duration, bits and
+        flags, among others.
+        """
+        if len(words) > 3 and not words[3].isdecimal():
+            del words[3]
+        try:
+            channel, identifier, length = int(words[0][:9]) - 1, words[2], int(words[6][:2])
+            flags, can_id = int(words[9 + length], 16), int(identifier, self._base)
+            dlc = int(words[5], 16)
+        except (ValueError, IndexError):
+            return Line.FOREIGN
+        data = _octets(words[7:], length, self._base)
+        if flags & (_EDL | _RTR) or can_id > 0x7FF or data is None or length != min(_MOST_BYTES, dlc):
+            return Line.FOREIGN
+        return t_ns, can_id, data, str(channel)
 
 
 _TRC_1 = re.compile(

@@ -108,8 +108,9 @@ def _choose(
     """Return the messages of the topic, the robot's joints in them, and a remark on other topics."""
     topics = sorted(name for name, kind in reader.topics.items() if kind == MESSAGE_TYPE)
     if not topics:
-        have = ", ".join(f"{name} ({kind})" for name, kind in sorted(reader.topics.items())) or "no topic"
-        raise DataError(f"no topic of {MESSAGE_TYPE} in CDR; found {have}")
+        have = ", ".join(f"{name} ({kind})" for name, kind in sorted(reader.topics.items()))
+        found_instead = f"{have}; record a topic of this type, such as {TOPIC}" if have else "no topic"
+        raise DataError(f"no topic of {MESSAGE_TYPE} in CDR; found {found_instead}")
     if topic is not None:
         name = topic if topic in topics else f"/{topic}"
         if name not in topics:

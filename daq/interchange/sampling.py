@@ -87,12 +87,12 @@ def sampled(
     DataError
         If times, rate and motion contradict each other, or there is neither a time nor a rate.
     """
-    if source.t_ns is not None and not polled and resample_hz is None:
-        numbers, rate = sample_numbers(source.t_ns[rows.row], rate_hz)
-        return Sampled(rate, numbers, rows.values)
-    times, notes = _times(source, rows, robot, time_unit)
     everything = np.concatenate([values for name, values in rows.values.items() if name != "demand"], axis=1)
     repeated = repeated_share(everything) if len(everything) > 1 else 0.0
+    if source.t_ns is not None and not polled and resample_hz is None:
+        numbers, rate = sample_numbers(source.t_ns[rows.row], rate_hz)
+        return Sampled(rate, numbers, rows.values, notes=_polled_note(repeated))
+    times, notes = _times(source, rows, robot, time_unit)
     if polled or (resample_hz is not None and (times is None or repeated > _POLLED_SHARE)):
         return _from_polled(rows, times, resample_hz or rate_hz or 0.0, polled, notes)
     if resample_hz is not None and times is not None:
@@ -104,15 +104,10 @@ def sampled(
                 f"found {listed(list(source.table))}"
             )
         numbers = rows.row - rows.row[0]
-        if repeated > _POLLED_SHARE:
-            notes.append(
-                f"{100 * repeated:.1f} % of the rows repeat the row before, as samples that were polled do: "
-                f"--resample {rate_hz:g} puts them on the clock of the controller"
-            )
-        return Sampled(rate_hz, numbers, rows.values, notes=tuple(notes))
+        return Sampled(rate_hz, numbers, rows.values, notes=(*notes, *_polled_note(repeated)))
     clock = clock_of(times, rate_hz, repeated)
     missing = int(clock.numbers[-1]) + 1 - clock.numbers.size
-    notes += clock.notes
+    notes += [*clock.notes, *_polled_note(repeated)]
     if missing:
         notes.append(f"{missing} samples are missing between the rows: recorded as gaps")
     return Sampled(clock.rate_hz, clock.numbers, rows.values, notes=tuple(notes))
@@ -128,6 +123,16 @@ def _times(source: Source, rows: Rows, robot: RobotConfig, unit: str | None) -> 
         raise DataError(f"{where}: time does not increase")
     times, notes = in_seconds(rows.times, rows.values["position"], robot, named=rows.time_unit, stated=unit)
     return times, list(notes)
+
+
+def _polled_note(repeated: float) -> tuple[str, ...]:
+    """Return a sentence on rows that repeat the row before, if their share is that of polled samples."""
+    if repeated <= _POLLED_SHARE:
+        return ()
+    return (
+        f"{100 * repeated:.1f} % of the rows repeat the row before, as samples that were polled do: "
+        "--resample RATE, with the rate of the controller, puts them on its clock",
+    )
 
 
 def _from_polled(rows: Rows, times: Floats | None, rate_hz: float, polled: bool, notes: list[str]) -> Sampled:

@@ -8,6 +8,8 @@ from armident.configs import ConfigError
 
 _HEAD = 65536
 """Bytes at the beginning of a file that decide its encoding."""
+_ZEROS_OF_UTF16 = 0.9
+"""Share of zeros among every second byte of a text of mostly Latin letters and digits in UTF-16."""
 _LONGEST = 60
 """Longest part of a file in a message, characters."""
 _LISTED = 40
@@ -15,7 +17,7 @@ _LISTED = 40
 
 
 def encoding_of(path: Path) -> str:
-    """Return the encoding of a text file: UTF-8, UTF-16 by its mark, or Windows-1252.
+    """Return the encoding of a text file: UTF-8, UTF-16 by its mark or its zeros, or Windows-1252.
 
     Parameters
     ----------
@@ -31,6 +33,10 @@ def encoding_of(path: Path) -> str:
         head = file.read(_HEAD)
     if head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         return "utf-16"
+    for first, encoding in ((1, "utf-16-le"), (0, "utf-16-be")):
+        zeros = head[first::2].count(0)
+        if zeros > _ZEROS_OF_UTF16 * len(head) / 2 and zeros > 2 * head[1 - first :: 2].count(0):
+            return encoding
     try:
         codecs.getincrementaldecoder("utf-8")().decode(head)
     except UnicodeDecodeError:

@@ -1,6 +1,7 @@
 """Robots from URDF: conversion to modified Denavit-Hartenberg parameters, and refused files."""
 
 import itertools
+import re
 from pathlib import Path
 
 import numpy as np
@@ -250,6 +251,15 @@ MIMIC = LIMIT + '<mimic joint="j1"/>'
         ([joint("x", "c d"), joint("y", "a e", more=LIMIT)], r"link 'a' branches into joints 'j1' and 'y'"),
         (['<joint name="x" type="fixed"><child link="d"/></joint>'], r"joint 'x': parent: no link ''"),
         (['<joint type="fixed"/>'], r"joint number 3: has no name"),
+        ([joint("x", "c d", more='<origin xyz="1 0 0"/>')], r"joint 'x': there are 2 elements origin, expected one"),
+        ([joint("x", "c d", more='<parent link="a"/>')], r"joint 'x': there are 2 elements parent"),
+        ([joint("x", "c d", more='<axis xyz="1 2 3"/>')], r"joint 'x': there are 2 elements axis"),
+        ([joint("x", "c d", more=LIMIT + '<limit upper="1"/>')], r"joint 'x': there are 2 elements limit"),
+        ([joint("x", "c d"), '<link name="d"/>'], r"link 'd': there are two of this name"),
+        ([joint("x", "c d").replace("origin", "Origin")], r"joint 'x': Origin is no name of URDF, which has origin"),
+        ([joint("x", "c d").replace("xyz=", "XYZ=")], r"joint 'x': origin: XYZ is no name of URDF, which has xyz"),
+        ([joint("x", "c d").replace("joint", "Joint")], r"robot: Joint is no name of URDF, which has joint"),
+        ([joint("${side}_x", "c d")], r"joint '\$\{side\}_x': this is xacro, expand it first"),
     ],
 )
 def test_what_is_no_serial_chain_is_refused_with_file_and_element(
@@ -261,6 +271,27 @@ def test_what_is_no_serial_chain_is_refused_with_file_and_element(
         read_chain(file)
     assert str(caught.value).startswith(f"{file}: ")
     assert "\n" not in str(caught.value)
+
+
+def test_the_file_may_have_a_namespace_a_first_line_and_letters_of_other_tools(tmp_path: Path) -> None:
+    text = urdf(tmp_path, joint("j1", "a b"), joint("j2", "b c", xyz="0 0 0.3"), links="a b c").read_text()
+    plain = read_chain(tmp_path / "arm.urdf")
+    for other in (
+        text.replace("<robot", '<robot xmlns="http://drake.mit.edu"').encode(),
+        f'\n\n<?xml version="1.0"?>\n{text}'.encode(),
+        text.replace("</robot>", "<!-- für 5 µm --></robot>").encode("cp1252"),
+    ):
+        (tmp_path / "other.urdf").write_bytes(other)
+        for found, expected in zip(read_chain(tmp_path / "other.urdf"), plain, strict=True):
+            np.testing.assert_array_equal(found.placement, expected.placement)
+
+
+def test_an_element_that_is_repeated_without_a_change_is_one(tmp_path: Path) -> None:
+    text = urdf(tmp_path, joint("j1", "a b"), joint("j2", "b c", xyz="0 0 0.3"), links="a b c").read_text()
+    element = re.search(r"<origin[^>]*/>", text)
+    assert element is not None
+    (tmp_path / "arm.urdf").write_text(text.replace(element[0], 2 * element[0]))
+    assert [joint.name for joint in read_chain(tmp_path / "arm.urdf")] == ["j1", "j2"]
 
 
 @pytest.mark.parametrize(

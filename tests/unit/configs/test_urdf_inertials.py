@@ -94,3 +94,16 @@ def test_a_link_without_mass_and_moments_that_no_body_has_are_named(tmp_path: Pa
 def test_impossible_numbers_are_refused_by_element(numbers: dict[str, Any], message: str, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=message):
         read_inertials(chain(tmp_path, **numbers), tip="arm")
+
+
+def test_two_masses_of_a_link_are_refused_but_not_the_same_one_twice(tmp_path: Path) -> None:
+    file = chain(tmp_path, mass=2.0)
+    text = file.read_text()
+    file.write_text(text.replace('<mass value="2.0"/>', '<mass value="2.0"/><mass value="2.0"/>'))
+    read_inertials(file, tip="arm")
+    file.write_text(text.replace('<mass value="2.0"/>', '<mass value="2.0"/><mass value="3.0"/>'))
+    with pytest.raises(ConfigError, match=r"link 'arm': inertial: there are 2 elements mass, expected one"):
+        read_inertials(file, tip="arm")
+    file.write_text(text.replace("</inertial>", '</inertial><inertial><mass value="3"/></inertial>'))
+    with pytest.raises(ConfigError, match=r"link '\w+': there are 2 elements inertial, expected one"):
+        read_inertials(file, tip="arm")

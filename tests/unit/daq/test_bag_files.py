@@ -150,6 +150,35 @@ def test_damaged_bags_raise_no_error_of_a_library(tmp_path: Path, suffix: str) -
             assert (np.diff(found.t_ns) > 0).all()
 
 
+def test_a_bag_of_ros_1_is_refused_with_the_command_that_converts_it(tmp_path: Path) -> None:
+    (tmp_path / "run.bag").write_bytes(b"#ROSBAG V2.0\n")
+    for path in (tmp_path / "run.bag", tmp_path):
+        with pytest.raises(ConfigError, match=r"run.bag: a bag of ROS 1; `rosbags-convert --src run.bag --dst run`"):
+            import_recording(path, TX40)
+
+
+def test_files_of_two_bags_are_not_joined(tmp_path: Path) -> None:
+    (tmp_path / "day").mkdir()
+    for name in ("morning_0.mcap", "evening_0.mcap"):
+        mcap_bag(tmp_path / "day" / name, states())
+    with pytest.raises(ConfigError, match=r"several bags without metadata.yaml: evening_0.mcap, morning_0.mcap"):
+        import_recording(tmp_path / "day", TX40)
+    with pytest.raises(ConfigError, match=r"no bag in this folder.*; bags are in day: give one"):
+        import_recording(tmp_path, TX40)
+
+
+def test_a_listed_file_may_have_been_decompressed_since(tmp_path: Path) -> None:
+    for k, pack in ((0, zstd), (1, bytes), (2, zstd)):
+        plain = mcap_bag(tmp_path / f"run_{k}.mcap", states()[k * 40 : k * 40 + 40])
+        plain.write_bytes(pack(plain.read_bytes()))
+        if pack is zstd:
+            plain.rename(tmp_path / f"run_{k}.mcap.zstd")
+    metadata(tmp_path, [f"run_{k}.mcap.zstd" for k in range(3)], ROWS)
+    recording = import_recording(tmp_path, TX40)
+    np.testing.assert_array_equal(recording.samples.raw["position"], Q)
+    assert "source_remarks" not in recording.metadata
+
+
 def test_what_is_no_bag_is_said(tmp_path: Path) -> None:
     (tmp_path / "a.db3").write_bytes(b"no database, but long enough to be one" * 40)
     with pytest.raises(DataError, match=r"a\.db3: not a readable bag in SQLite: damaged, or without"):

@@ -1,17 +1,24 @@
 """Logs as tools write them: damaged, in other spellings, and with clocks that contradict the session."""
 
 import logging
+import re
+import struct
+from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
+import can
 import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from armident.configs import DataError
+from armident.configs import ConfigError, DataError
 from armident.daq.cli import application
+from armident.daq.interchange import bus_log
 from armident.daq.interchange.bus_log import recording_from_log, write_log
 from armident.daq.interchange.log_file import read_log
 from armident.daq.interchange.log_lines import asc_date_ns
+from armident.daq.matching.streams import captured_streams
 from armident.daq.recording import Recording
 from tests.unit.daq.test_bus_log import PERIOD_NS, ROBOT, SESSION, captured
 
@@ -339,3 +346,67 @@ def test_a_single_frame_with_an_odd_time_is_left_out(tmp_path: Path) -> None:
     assert "time is far from that of both neighbours: 1, the first is 701" in found.metadata["source_remarks"]
     assert found.counters["samples.in_gaps"] <= 2
     assert found.samples.sync.size >= ROWS - 2
+
+
+def messages(**changes: Any) -> list[can.Message]:
+    """Return the frames of ``ROWS`` SYNCs, with changes to every one."""
+    found = bus_log._messages(captured(ROWS), SESSION, captured_streams(SESSION, ROBOT))
+    plain: dict[str, Any] = {"is_extended_id": False, "channel": 0}
+    return [
+        can.Message(**plain | {"timestamp": m.timestamp, "arbitration_id": m.arbitration_id, "data": m.data} | changes)
+        for m in found
+    ]
+
+
+def logged(path: Path, frames: Iterable[can.Message]) -> Path:
+    with can.Logger(path) as logger:
+        for frame in frames:
+            logger.on_message_received(frame)
+    return path
+
+
+def test_classic_frames_of_a_can_fd_channel_are_read(tmp_path: Path) -> None:
+    text = logged(tmp_path / "a.asc", messages(is_fd=True)).read_text()
+    with pytest.raises(DataError, match=r"no data frames with 11-bit identifiers.*CAN FD, extended, remote or error"):
+        read(tmp_path / "a.asc")
+    # The flag of extended data length is 1000h.
+    (tmp_path / "b.asc").write_text(re.sub(r" 1000( +0){5}$", r"    0\1", text, flags=re.MULTILINE))
+    assert same(read(tmp_path / "b.asc"))
+    (tmp_path / "c.asc").write_text(
+        re.sub(r"(CANFD +1 [TR]x +[0-9A-F]+) {6}", r"\1 Servo", text).replace(" 1000 ", " 0 ")
+    )
+    assert same(read(tmp_path / "c.asc"))
+
+
+@pytest.mark.parametrize("kind", [100, 101])
+@pytest.mark.parametrize("extended", [False, True])
+def test_classic_frames_of_a_can_fd_channel_in_blf_are_read(tmp_path: Path, kind: int, extended: bool) -> None:
+    path = tmp_path / "a.blf"
+    with can.BLFWriter(path) as writer:
+        for m in messages():
+            head: tuple[int, ...] = (1, 0, len(m.data), m.arbitration_id, 0, 0, int(extended), len(m.data))
+            body = struct.pack("<HBBLLBBB5x64s", *head, bytes(m.data))
+            if kind == 101:
+                # Zeros at the end of the data may be absent, and further data may follow.
+                data = bytes(m.data).rstrip(b"\0")
+                head = (1, len(m.data), len(m.data), 0, m.arbitration_id, 0, 0x1000 * extended, 0, 0, 0, 0, 0, 0)
+                body = struct.pack("<BBBBLLLLLLLHBBL", *head, 32 + 40 + len(data), 0) + data + b"\x55" * 8
+            writer._add_object(kind, body, m.timestamp)
+    if extended:
+        with pytest.raises(DataError, match="no data frames"):
+            read(path)
+    else:
+        assert same(read(path))
+
+
+@pytest.mark.parametrize("suffix", [".asc", ".blf", ".trc"])
+def test_the_bus_that_has_the_tpdos_is_read_where_names_of_buses_are_numbers(tmp_path: Path, suffix: str) -> None:
+    ours = messages(channel=1)
+    others = [can.Message(timestamp=m.timestamp, arbitration_id=0x7A0, is_extended_id=False, channel=0) for m in ours]
+    both = [frame for pair in zip(ours, others, strict=True) for frame in pair]
+    found = read(logged(tmp_path / f"a{suffix}", both))
+    assert same(found)
+    assert "is read: only it has SYNC and the TPDOs" in found.metadata["source_remarks"]
+    twice = [frame for pair in zip(ours, messages(), strict=True) for frame in pair]
+    with pytest.raises(ConfigError, match=r"holds the buses \d, \d; .*name the one to read.*bus\.channel"):
+        read(logged(tmp_path / f"b{suffix}", twice))

@@ -2,6 +2,7 @@
 
 import json
 import warnings
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -244,6 +245,48 @@ def test_damaged_lines_are_gaps_and_named(tmp_path: Path) -> None:
     assert "the last line (403) is cut off" in notes
 
 
+@pytest.mark.parametrize(
+    "said", [lambda k: "RUN", lambda k: "RUN" if k % 7 == 3 else "", lambda k: "RUN" if k > 150 else ""]
+)
+@pytest.mark.parametrize("first", [True, False])
+def test_columns_of_text_are_left_out(tmp_path: Path, said: Callable[[int], str], first: bool) -> None:
+    head, *rows = written(tmp_path / "a.csv", motion()).read_text().splitlines()
+    lines = [f"{said(k)},{row}" if first else f"{row},{said(k)}" for k, row in enumerate(rows)]
+    (tmp_path / "b.csv").write_text("\n".join([f"state,{head}" if first else f"{head},state", *lines]) + "\n")
+    found = import_recording(tmp_path / "b.csv", TX40)
+    assert same(found, motion())
+    assert not found.gaps
+
+
+def test_words_in_a_column_of_numbers_are_damage(tmp_path: Path) -> None:
+    lines = written(tmp_path / "a.csv", motion()).read_text().splitlines()
+    lines[1] = lines[1].replace(",", ",x", 1)
+    (tmp_path / "b.csv").write_text("\n".join(lines) + "\n")
+    found = import_recording(tmp_path / "b.csv", TX40)
+    assert same(found, motion()[1:])
+    assert "damaged and left out: line 2, column 2" in found.metadata["source_remarks"]
+    every = [line.replace(",", ",none", 1) if k % 5 == 4 else line for k, line in enumerate(lines)]
+    (tmp_path / "c.csv").write_text("\n".join(every) + "\n")
+    with pytest.raises(DataError, match=r"line 2, column 2: expected a number, found 'x"):
+        import_recording(tmp_path / "c.csv", TX40)
+
+
+def test_lines_may_end_in_a_separator(tmp_path: Path) -> None:
+    head, *rows = written(tmp_path / "a.csv", motion()).read_text().splitlines()
+    (tmp_path / "b.csv").write_text("\n".join([head, *(f"{row}," for row in rows)]) + "\n")
+    assert same(import_recording(tmp_path / "b.csv", TX40), motion())
+    (tmp_path / "c.csv").write_text("\n".join([head, *(f"{k},{row}" for k, row in enumerate(rows))]) + "\n")
+    with pytest.raises(DataError, match=r"13 names in the header, 14 columns of values; a column without a name"):
+        import_recording(tmp_path / "c.csv", TX40)
+
+
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16", "utf-16-le", "utf-16-be"])
+def test_the_encoding_is_found_with_and_without_a_mark(tmp_path: Path, encoding: str) -> None:
+    path = written(tmp_path / "a.csv", motion())
+    path.write_bytes(path.read_text().encode(encoding))
+    assert same(import_recording(path, TX40), motion())
+
+
 def test_a_header_of_another_order_among_the_rows_is_refused(tmp_path: Path) -> None:
     lines = written(tmp_path / "a.csv", motion()).read_text().splitlines()
     for other, said in ((["t", "q2", "q1", *NAMES[3:]], "t,q2,q1"), (NAMES[:9], "t,q1,q2")):
@@ -286,6 +329,16 @@ def test_times_in_another_unit_are_recognised(tmp_path: Path, unit: str, factor:
         assert found.sample_rate_hz == pytest.approx(rate, rel=1e-6)
     with pytest.raises(ConfigError, match="--time-unit: expected one of s, ms, us, ns, found min"):
         import_recording(path, TX40, time_unit="min")
+
+
+@pytest.mark.parametrize("step", [1e-10, 1e-200, 5e-324])
+@pytest.mark.parametrize("repeats", [1, 2])
+def test_steps_below_a_nanosecond_are_no_clock(tmp_path: Path, step: float, repeats: int) -> None:
+    values = motion(500, 1000.0)
+    values[:, 0] = np.arange(500) // repeats * step
+    path = written(tmp_path / "a.csv", values, cell="{:.17g}")
+    with pytest.raises(DataError, match=r"shorter than 1 ns.*--time-unit"):
+        import_recording(path, TX40)
 
 
 def test_slow_motion_and_low_rates_are_seconds(tmp_path: Path) -> None:
@@ -383,6 +436,16 @@ def test_uneven_times_are_resampled_when_asked_and_said(tmp_path: Path) -> None:
     assert import_recording(path, TX40, resample_hz=250.0).sample_rate_hz == 250.0
     out = ["import", str(path), "--config", "tx40.yaml", "--resample", "1000", "--out", str(tmp_path / "a.mcap")]
     assert CliRunner().invoke(application(["import"]), out).exit_code == 0
+
+
+def test_rows_that_were_polled_twice_as_fast_are_said(tmp_path: Path) -> None:
+    values = np.repeat(motion(), 2, axis=0)
+    values[:, 0] = np.arange(len(values)) / 2000
+    path = written(tmp_path / "a.csv", values)
+    remarks = import_recording(path, TX40).metadata["source_remarks"]
+    assert "50.1 % of the rows repeat the row before" in remarks
+    assert "--resample RATE, with the rate of the controller" in remarks
+    assert same(import_recording(path, TX40, resample_hz=1000), motion())
 
 
 def test_polled_rows_with_times_are_put_on_the_clock_of_the_controller(tmp_path: Path) -> None:
