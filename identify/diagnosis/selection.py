@@ -1,8 +1,9 @@
 """Stepwise selection of the effects that a model lacks.
 
-1. Screening: the score statistic of every candidate at every place, in one factorisation of the model's equations.
+1. Screening: the score statistic of every candidate at every place, in one factorisation of the model's equations
+   (`armident.identify.diagnosis.shortlist`).
 2. Closed loop: each of the best candidates is added to the model, and the loop with it is simulated. All parameters are
-   estimated with instruments from that loop.
+   estimated with instruments from that loop (`armident.identify.diagnosis.candidate_models`).
 3. Ranking by cross-validated log-likelihood (`armident.identify.diagnosis.comparison`).
 4. Admission of the best one that is significant, material and physically possible; then the next step.
 5. Findings that later ones made superfluous are removed. Each finding competes once more with the effects that act on a
