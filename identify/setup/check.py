@@ -1,5 +1,6 @@
 """Check of the set-up: wiring, units, transmission, gravity and clocks, before anything else."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -17,9 +18,12 @@ from armident.identify.setup.describe import described
 from armident.identify.setup.fit import Hypothesis, joint_errors
 from armident.identify.setup.result import SetupCheck, SetupFinding, TorqueShift
 from armident.identify.setup.search import NOT_UNDERSTOOD, STRUCTURED, Search, Step
-from armident.identify.setup.torque_shift import SHIFT_RATE, torque_shift
+from armident.identify.setup.torque_shift import SHIFT_RATE, long_torque_shift, torque_shift
 
 Array = NDArray[np.float64]
+
+LONGEST_SHIFT_S = 0.05
+"""Longest common shift of the torques that references are asked for, s: filters of drives are faster."""
 
 TRIED = {
     "position_sign": "wrong sign of positions, or of positions and torques, of each joint and of all",
@@ -123,7 +127,49 @@ def _searched(
 ) -> tuple[Bench, Search, Step]:
     bench = make_bench(experiments, robot, moving)
     search = Search(bench)
-    return bench, search, search.run(_as_configured(robot))
+    best = search.run(_as_configured(robot))
+    if "time_shift" in best.families:
+        best = _with_exact_shift(experiments, bench, best)
+    elif moving.sum() > 1 and all(e.q_ref is not None for e in experiments):
+        best = _with_instrumented_shift(experiments, bench, best)
+    return bench, search, best
+
+
+def _with_exact_shift(experiments: Sequence[Experiment], bench: Bench, best: Step) -> Step:
+    """Replace a common shift that the search has found, if it can be estimated to a factor of 2.
+
+    The search takes the shift that predicts best. This is too short where the torque of the closed loop follows
+    disturbances, and where a joint stops suddenly.
+    """
+    common = float(np.median(best.h.shift[bench.moving]))
+    found = long_torque_shift(experiments, bench, best.h, common, abs(common))
+    if found is None or found.std > abs(found.samples) / 2.0:
+        return best
+    return _with_shift(best, bench, (found.samples * bench.period - common) * bench.moving, found)
+
+
+def _with_instrumented_shift(experiments: Sequence[Experiment], bench: Bench, best: Step) -> Step:
+    """Add a common shift that the recorded references show and the search has not found, if two joints confirm it.
+
+    Prediction hardly gains by it where disturbances in the closed loop hide it; the instruments are free of them.
+    """
+    found = long_torque_shift(experiments, bench, best.h, 0.0, LONGEST_SHIFT_S)
+    if found is None or not found.confirmed:
+        return best
+    probability = math.erf(abs(found.samples) / found.std / math.sqrt(2.0))
+    named = replace(
+        best,
+        families=(*best.families, "time_shift"),
+        words=(*best.words, TRIED["time_shift"]),
+        made=(*best.made, (np.eye(bench.n), np.eye(bench.n), False)),
+        rivals=(*best.rivals, ()),
+        probability=(*best.probability, probability),
+    )
+    return _with_shift(named, bench, found.samples * bench.period * bench.moving, found)
+
+
+def _with_shift(step: Step, bench: Bench, more_s: NDArray[np.floating], found: TorqueShift) -> Step:
+    return replace(step, h=replace(step.h, shift=step.h.shift + more_s), shift_std=found.std * bench.period)
 
 
 def _clipped(bench: Bench, best: Step, robot: RobotConfig, known: set[str]) -> list[SetupFinding]:

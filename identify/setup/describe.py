@@ -296,6 +296,8 @@ def _late(step: Step, k: int, robot: RobotConfig, bench: Bench) -> tuple[SetupFi
     entries = [Effect(effect="time_delay", joint=name, parameters={"delay": delay}) for name in names]
     direction = "late" if shift > 0 else "early"
     message = f"all torques are {1000 * abs(shift):.3g} ms {direction} against the positions"
+    if np.isfinite(step.shift_std):
+        message += f" (standard deviation {1000 * step.shift_std:.2g} ms)"
     return SetupFinding("time_shift", names, step.probability[k], message, _lines(entries), True), entries
 
 

@@ -119,6 +119,18 @@ class TorqueShift:
         return len(self.by_joint) >= 2 and self.std > MOST_UNCERTAIN
 
     @property
+    def confirmed(self) -> bool:
+        """True if it is longer than shifts of sampling, and two joints show it alone while none denies it.
+
+        Without instruments it never is: friction and elasticity that the model lacks look like a shift, too.
+        """
+        size = abs(self.samples)
+        telling = [(own, std) for own, std in self.by_joint.values() if SIGNIFICANT * std <= size]
+        agree = all(abs(own - self.samples) <= SIGNIFICANT * std for own, std in telling)
+        significant = size > max(LONGEST, SIGNIFICANT * self.std)
+        return self.instrumented and significant and len(telling) >= 2 and agree
+
+    @property
     def applied(self) -> bool:
         """True if a shift is corrected."""
         return self.correction != 0.0

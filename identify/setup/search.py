@@ -105,6 +105,8 @@ class Step:
         For each mistake, others of the same kind that explain the recordings equally well.
     probability
         Posterior share of each mistake.
+    shift_std
+        Standard deviation of a common shift of the torques, s; NaN if it is that of the best prediction.
     """
 
     h: Hypothesis
@@ -114,6 +116,7 @@ class Step:
     rank: float = np.inf
     rivals: tuple[tuple[str, ...], ...] = ()
     probability: tuple[float, ...] = ()
+    shift_std: float = np.nan
 
 
 @dataclass(eq=False)

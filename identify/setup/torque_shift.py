@@ -18,8 +18,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from armident.configs import DataError
+from armident.identify.experiment import Experiment
 from armident.identify.regression.ar_noise import ArModel, fit_ar
-from armident.identify.setup.bench import Bench
+from armident.identify.setup.bench import Bench, make_bench
 from armident.identify.setup.fit import Hypothesis
 from armident.identify.setup.result import CONVENTIONS, TorqueShift
 
@@ -46,6 +48,12 @@ LAGS = 16
 
 RANGE = 5.0
 """Largest shift, samples: longer ones are mistakes of the set-up."""
+
+ROUNDS = 12
+"""Most rounds in which a longer shift is estimated again around the value of the round before."""
+
+CONVERGED = 0.1
+"""Change from round to round, standard deviations, below which the rest does not matter."""
 
 STEPS = 2001
 """Values of the shift between these limits: a two-hundredth of a sample apart."""
@@ -79,7 +87,47 @@ class _Columns:
     fine: list[Array]
 
 
-def torque_shift(bench: Bench, h: Hypothesis) -> TorqueShift:
+def long_torque_shift(
+    experiments: Sequence[Experiment], bench: Bench, h: Hypothesis, first_s: float, reach_s: float
+) -> TorqueShift | None:
+    """Estimate a common shift of many samples; ``None`` where none is determined within reach.
+
+    `torque_shift` is linear in the shift. Its estimate is repeated with the torques moved by the value of the round
+    before, until it changes no more.
+
+    Parameters
+    ----------
+    experiments
+        The recordings.
+    bench
+        Bench of the same recordings.
+    h
+        Corrections of the signals; its shift is not used.
+    first_s
+        Value to begin with, s.
+    reach_s
+        Largest difference of the result from it, s.
+    """
+    first, reach = first_s / bench.period, reach_s / bench.period
+    shift = first
+    for _ in range(ROUNDS):
+        moved = [replace(e, torque_shift=e.torque_shift + shift) for e in experiments]
+        try:
+            finer = make_bench(moved, bench.robot, bench.moving, SHIFT_RATE, bench.model)
+            rest = torque_shift(finer, h, max(RANGE, reach))
+        except (DataError, np.linalg.LinAlgError):
+            return None
+        shift += rest.samples
+        if abs(shift - first) > reach:
+            return None
+        if abs(rest.samples) <= CONVERGED * rest.std:
+            break
+    before = shift - rest.samples
+    by_joint = {name: (value + before, std) for name, (value, std) in rest.by_joint.items()}
+    return replace(rest, samples=shift, by_joint=by_joint)
+
+
+def torque_shift(bench: Bench, h: Hypothesis, reach: float = RANGE) -> TorqueShift:
     """Estimate the common shift of the torques, and that of every joint.
 
     Parameters
@@ -88,6 +136,8 @@ def torque_shift(bench: Bench, h: Hypothesis) -> TorqueShift:
         Signals, made with the working rate `SHIFT_RATE`.
     h
         Corrections of the signals; its shift is not used.
+    reach
+        Largest shift, samples.
 
     Raises
     ------
@@ -120,7 +170,7 @@ def torque_shift(bench: Bench, h: Hypothesis) -> TorqueShift:
             for k, j in enumerate(joints)
         ]
     c, samples = basis.shape[1], segments.period
-    return _common(theta[c:] / samples, covariance[c:, c:] / samples**2, segments, instrumented)
+    return _common(theta[c:] / samples, covariance[c:, c:] / samples**2, segments, instrumented, reach)
 
 
 def _shortened(bench: Bench) -> Bench:
@@ -234,7 +284,7 @@ def _solved(
     return inverse @ right, covariance
 
 
-def _common(samples: Array, covariance: Array, bench: Bench, instrumented: bool) -> TorqueShift:
+def _common(samples: Array, covariance: Array, bench: Bench, instrumented: bool, reach: float) -> TorqueShift:
     """Common shift of the joints; some have effects of their own that look like a shift, such as a slow actuator."""
     std = np.sqrt(np.diag(covariance))
     if not (np.isfinite(samples).all() and np.isfinite(std).all()):
@@ -243,9 +293,9 @@ def _common(samples: Array, covariance: Array, bench: Bench, instrumented: bool)
     def log_likelihood(shift: Array) -> Array:
         apart = (samples - shift[:, None]) / std
         common = np.exp(-0.5 * apart**2) / (std * np.sqrt(2 * np.pi))
-        return np.asarray(np.log((1.0 - OWN_CAUSE) * common + OWN_CAUSE / (2 * RANGE)).sum(axis=1))
+        return np.asarray(np.log((1.0 - OWN_CAUSE) * common + OWN_CAUSE / (2 * reach)).sum(axis=1))
 
-    grid = np.linspace(-RANGE, RANGE, STEPS)
+    grid = np.linspace(-reach, reach, STEPS)
     density = np.exp(log_likelihood(grid) - log_likelihood(grid).max())
     density /= density.sum()
     mean = float(density @ grid)

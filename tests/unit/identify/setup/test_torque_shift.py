@@ -15,8 +15,11 @@ from armident.identify.identification.equations import aligned_torque
 from armident.identify.identification.from_recording import experiments_from_recording
 from armident.identify.identification.options import Options
 from armident.identify.identification.pipeline import identify_experiment
+from armident.identify.setup.bench import make_bench
 from armident.identify.setup.check import check_setup
+from armident.identify.setup.fit import Hypothesis
 from armident.identify.setup.result import TorqueShift, with_torque_shift
+from armident.identify.setup.torque_shift import long_torque_shift
 from tests.fixtures import setups
 from tests.fixtures.arms import FAST, recording
 
@@ -31,6 +34,14 @@ def late(experiments: list[Experiment], samples: NDArray[np.float64]) -> list[Ex
         moved = [CubicSpline(k, x)(k - s) for x, s in zip(e.tau.T, samples, strict=True)]
         made.append(replace(e, tau=np.stack(moved, axis=1)[5:-5], q=e.q[5:-5]))
     return made
+
+
+def moved(e: Experiment, samples: int) -> Experiment:
+    """Experiment whose torques are late by a number of samples; early if it is negative."""
+    count = e.q.shape[0] - abs(samples)
+    positions, torques = slice(max(samples, 0), None), slice(max(-samples, 0), None)
+    q_ref = None if e.q_ref is None else e.q_ref[positions][:count]
+    return Experiment(e.q[positions][:count], e.tau[torques][:count], q_ref, e.dt)
 
 
 @pytest.fixture(scope="module")
@@ -135,6 +146,42 @@ def test_the_virtual_arm_with_references_is_not_shifted() -> None:
     assert found.instrumented
     assert abs(found.samples) < 3 * found.std
     assert not found.applied
+
+
+@pytest.mark.parametrize("samples", [4, -4])
+def test_torques_late_by_milliseconds_are_found_by_the_references(samples: int) -> None:
+    """Prediction gains too little by such a shift: noise in the closed loop looks like early torques."""
+    robot = load_robot("tx40")
+    experiments = experiments_from_recording(recording("tx40", "tx40_excitation", 3, period=FAST), robot)[0]
+    check = check_setup([moved(e, samples) for e in experiments], robot)
+    (finding,) = check.findings
+    assert (finding.kind, len(finding.joints)) == ("time_shift", robot.n)
+    assert f"{'late' if samples > 0 else 'early'} against the positions (standard deviation" in finding.message
+    assert check.corrected_robot is not None
+    delays = [effect.parameters["delay"] for effect in check.corrected_robot.effects]
+    assert delays == pytest.approx([samples * FAST] * robot.n, abs=1.5e-3)
+
+
+def test_a_long_shift_is_estimated_from_any_start(healthy: list[Experiment], arm: RobotConfig) -> None:
+    shifted = [moved(e, 6) for e in healthy]
+    bench = make_bench(shifted, arm, np.ones(arm.n, dtype=np.bool_))
+    h = Hypothesis(np.eye(arm.n), np.eye(arm.n), np.array(arm.gravity), np.zeros(arm.n))
+    for first in (0.0, 0.01, 0.05):
+        found = long_torque_shift(shifted, bench, h, first, 0.06)
+        assert found is not None
+        assert found.samples == pytest.approx(6.0, abs=max(0.1, 4 * found.std))
+    assert long_torque_shift(shifted, bench, h, 0.0, 0.01) is None
+
+
+def test_a_long_shift_needs_references_and_two_joints_that_agree() -> None:
+    joints = {"axis_1": (4.0, 0.5), "axis_2": (4.5, 0.6), "axis_3": (-2.0, 3.0)}
+    shift = TorqueShift(4.2, 0.4, 1e-3, joints, 1.0, instrumented=True)
+    assert shift.confirmed
+    assert not replace(shift, instrumented=False).confirmed
+    assert not replace(shift, by_joint=joints | {"axis_3": (0.0, 0.5)}).confirmed
+    assert not replace(shift, by_joint=joints | {"axis_2": (4.5, 3.0)}).confirmed
+    assert not replace(shift, std=1.5).confirmed
+    assert not replace(shift, samples=0.8, std=0.1).confirmed
 
 
 def test_aligned_torques_are_interpolated_at_the_instants_of_the_positions() -> None:
