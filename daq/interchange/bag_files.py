@@ -182,7 +182,7 @@ class BagReader:
         for topic, expected in sorted(self._expected.items()):
             read = self._read[topic]
             if self.topics.get(topic, self._type) == self._type and read < expected:
-                self.losses.append(f"{expected - read} of {expected} messages of {topic} are missing")
+                self.losses.append(f"{expected - read} of {expected} messages of {shortened(topic)} are missing")
 
     def _file(self, file: Path, name: str) -> Iterator[BagMessage]:
         if file.stat().st_size == 0:
