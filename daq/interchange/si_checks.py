@@ -123,7 +123,8 @@ def fast_note(robot: RobotConfig, position: NDArray[np.float64], rate_hz: float)
     rate_hz
         Sampling rate, 1/s.
     """
-    apart = max(1, len(position) // _WINDOWS)
+    # An odd number of rows, so that the values of two sources in turn show.
+    apart = len(position) // _WINDOWS | 1
     if len(position) <= apart:
         return ()
     limits = np.array([joint.limits.velocity or np.inf for joint in robot.joints])
@@ -131,9 +132,10 @@ def fast_note(robot: RobotConfig, position: NDArray[np.float64], rate_hz: float)
     fast = [joint.name for joint, share in zip(robot.joints, speeds / limits, strict=True) if share > _FASTEST]
     if not fast:
         return ()
+    most = float((speeds / limits).max())
     return (
-        f"{', '.join(fast)}: velocities of up to {float((speeds / limits).max()):.3g} times the limit; positions in "
-        "degrees need --units position=deg, and times in another unit --time-unit",
+        f"{', '.join(fast)}: velocities of up to {most:.3g} times the limit, as of positions in degrees "
+        "(--units position=deg), times in another unit (--time-unit), or two sources of one joint",
     )
 
 

@@ -92,6 +92,13 @@ def test_messages_of_a_gripper_and_of_another_arm_are_passed_over(tmp_path: Path
     assert f"{ROWS + len(fingers)} messages of other joints passed over: left, right, right_joint_1" in remark
 
 
+def test_two_sources_that_alternate_on_one_topic_are_said(tmp_path: Path) -> None:
+    other = [replace(m, at=m.at + STEP_NS // 2, q=np.asarray(m.q) + 0.5) for m in states()]
+    recording = import_recording(mcap_bag(tmp_path / "a.mcap", [*states(), *other]), TX40)
+    assert "times the limit" in recording.metadata["source_remarks"]
+    assert "two sources of one joint" in recording.metadata["source_remarks"]
+
+
 def test_two_arms_need_a_choice(tmp_path: Path) -> None:
     left, right = ([f"{side}_{name}" for name in NAMES] for side in ("left", "right"))
     messages = states(left) + [replace(m, at=m.at + 300) for m in states(right, EXCHANGED)]

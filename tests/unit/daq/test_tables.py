@@ -558,7 +558,7 @@ def test_positions_in_degrees_and_torques_in_mn_m_name_the_option(tmp_path: Path
     endless = TX40.model_copy(update={"joints": tuple(j.model_copy(update={"limits": free}) for j in TX40.joints)})
     values[:, 1 : N + 1] *= 180 / np.pi
     remarks = import_recording(written(tmp_path / "c.csv", values), endless).metadata["source_remarks"]
-    assert "times the limit; positions in degrees need --units position=deg" in remarks
+    assert "times the limit, as of positions in degrees (--units position=deg)" in remarks
     assert "source_remarks" not in import_recording(written(tmp_path / "d.csv", motion()), endless).metadata
 
 
