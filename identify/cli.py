@@ -297,7 +297,7 @@ def trajectory(
 
     Example: armident trajectory --config configs/tx40.yaml --out excitation.yaml --known identification.json
     """
-    from armident.identify.document import write_atomically
+    from armident.identify.documents.files import write_atomically
     from armident.identify.excitation.cli import TrajectoryOptions, trajectory_command
     from armident.identify.report.trajectory import trajectory_report
 

@@ -14,13 +14,14 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, Ti
 from rich.table import Table
 
 from armident.configs import RobotConfig
-from armident.identify.document import DiagnosisDocument, IdentificationDocument
+from armident.identify.documents.diagnosis import DiagnosisDocument
+from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.effects.terms import arm_model
 from armident.identify.print_table import print_table
 from armident.identify.setup.result import SetupCheck
 
 if TYPE_CHECKING:
-    from armident.identify.model_documents import PredictionDocument, PredictionsDocument
+    from armident.identify.documents.prediction import PredictionDocument, PredictionsDocument
 
 SHOW_AFTER_S = 2.0
 """Duration after which progress is shown, s."""

@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from armident.configs import ConfigError, DataError
-from armident.identify.document import IdentificationDocument, load_document, to_json, write_atomically
+from armident.identify.documents.files import load_document, to_json, write_atomically
+from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.identification.options import parse_decimation, parse_nvr
 
 UNUSABLE = DataError.exit_code
@@ -193,7 +194,7 @@ def predict_command(paths: Sequence[Path], model: Path, config: Path | None, out
     from armident.configs import load_robot
     from armident.daq.recording import read_recording
     from armident.identify.cli_tables import prediction_table, predictions_table, progress, warn
-    from armident.identify.model_documents import predictions_document
+    from armident.identify.documents.prediction import predictions_document
     from armident.identify.prediction import predict_recording
     from armident.identify.report.prediction import prediction_report
     from armident.identify.saved_model import load_model

@@ -12,7 +12,8 @@ from threadpoolctl import threadpool_limits
 
 from armident.configs import DataError
 from armident.daq.recording import Recording
-from armident.identify.document import reference, versions
+from armident.identify.documents.base import reference, versions
+from armident.identify.documents.prediction import PredictionDocument
 from armident.identify.effects.recorded import put_right
 from armident.identify.experiment import Experiment
 from armident.identify.identification.api import experiments_of
@@ -28,7 +29,6 @@ from armident.identify.identification.pipeline import (
 from armident.identify.identification.residual_statistics import SPEED_QUANTILE
 from armident.identify.identification.result import relative_errors
 from armident.identify.identification.solvers import decimation_of
-from armident.identify.model_documents import PredictionDocument
 from armident.identify.regression.equations import ExperimentEquations
 from armident.identify.saved_model import SavedModel
 from armident.identify.setup.check import check_setup

@@ -10,7 +10,9 @@ from pydantic import ValidationError
 
 from armident.configs import ConfigError, DataError, RobotConfig, load_robot
 from armident.daq.recording import read_recording
-from armident.identify.document import DiagnosisDocument, IdentificationDocument, load_document, read_json
+from armident.identify.documents.diagnosis import DiagnosisDocument
+from armident.identify.documents.files import load_document, read_json
+from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.effects.terms import arm_model
 from armident.identify.identification.api import identify_recording
 from armident.identify.identification.options import Options

@@ -5,7 +5,7 @@ from html import escape
 from typing import TYPE_CHECKING, Any
 
 from armident.configs import ConfigError
-from armident.identify.document import Parameter
+from armident.identify.documents.identification import Parameter
 from armident.identify.effects.effect import Effect
 
 if TYPE_CHECKING:

@@ -7,7 +7,8 @@ import pytest
 from numpy.typing import NDArray
 
 from armident.configs import RobotConfig
-from armident.identify.document import IdentificationDocument, RecordingReference, parameter
+from armident.identify.documents.base import RecordingReference
+from armident.identify.documents.identification import IdentificationDocument, parameter
 from armident.identify.effects.terms import arm_model
 from armident.identify.model_export.exported_model import ExportedModel, exported_model
 from armident.identify.robot.arm import ArmModel

@@ -14,6 +14,8 @@ SLOWEST_HZ, FASTEST_HZ = 10.0, 100e3
 """Sampling rates of recordings of arms; a rate beyond them may be that of times in another unit, 1/s."""
 SLOWEST_SHARE, FASTEST_SHARE = 2e-3, 3.0
 """Shares of the joints' velocity limits that a motion reaches; beyond them times may be in another unit."""
+SHORTEST_STEP_S = 1e-9
+"""Resolution of the times of a recording, s: shorter steps are none."""
 EVEN = 0.01
 """Largest deviation of a step from the period, relative, of samples that are taken as even."""
 _WHOLE = 0.1
@@ -118,8 +120,7 @@ def in_seconds(
 
 
 def _plausible(step_s: float, share: float) -> bool:
-    rate = 1.0 / step_s
-    return SLOWEST_HZ <= rate <= FASTEST_HZ and (share == 0.0 or SLOWEST_SHARE <= share <= FASTEST_SHARE)
+    return 1.0 / FASTEST_HZ <= step_s <= 1.0 / SLOWEST_HZ and (share == 0.0 or SLOWEST_SHARE <= share <= FASTEST_SHARE)
 
 
 def _velocity_share(times: Floats, q: Floats, robot: RobotConfig) -> float:
@@ -172,6 +173,12 @@ def clock_of(times: Floats, rate_hz: float | None, repeated: float = 0.0) -> Clo
     if steps.size == 0:
         raise DataError("a single row is not a recording")
     median = float(np.median(steps))
+    usual = median if median > 0 else float(steps.max())
+    if 0.0 < usual < SHORTEST_STEP_S:
+        raise DataError(
+            f"steps of {usual:.3g} s are shorter than 1 ns, the resolution of a recording; state the unit of the times "
+            "with --time-unit, or another column with --map time=NAME"
+        )
     if median <= 0 or np.any(steps <= 0):
         return _coarse(times, rate_hz, repeated)
     ratio = steps / median

@@ -13,7 +13,8 @@ from armident.configs.schema.scenario import Scenario
 from armident.configs.schema.session import SessionConfig
 from armident.configs.schema.trajectory import Trajectory
 from armident.daq.cli import GROUP, application
-from armident.identify.document import DiagnosisDocument, IdentificationDocument
+from armident.identify.documents.diagnosis import DiagnosisDocument
+from armident.identify.documents.identification import IdentificationDocument
 
 Schema = dict[str, Any]
 

@@ -65,6 +65,10 @@ _VARIABLE_KEYS = (
 NO_TYPE = "objects without DataType, left out"
 """Remark on objects whose size is therefore unknown."""
 
+LACKING = "objects that the lists of the file name, but that it does not describe (is it cut off?)"
+"""Remark on objects of ``[MandatoryObjects]`` and the like (CiA 306) without any section."""
+
+_LISTS = ("mandatoryobjects", "optionalobjects", "manufacturerobjects")
 _ACCESS = {"ro", "wo", "rw", "rwr", "rww", "const"}
 _WORDS = {"true": 1, "yes": 1, "false": 0, "no": 0}
 _NODE_ID = re.compile(r"\$NODEID", re.IGNORECASE)
@@ -110,6 +114,8 @@ def read_eds(file: Path, node_id: int) -> DataSheet:
     objects = list(_Cleaner(sections, remarks, file.suffix.lower() == ".dcf").objects())
     if not objects:
         raise ConfigError(f"{file}: not an EDS file: no object in it, expected sections such as [1000]")
+    for index in _lacking(sections):
+        remarks.add(LACKING, label(index))
     about = [("DeviceInfo", _device(sections)), ("DummyUsage", _dummies(sections))]
     source = io.StringIO(rendered([*about, *objects]))
     source.name = "clean.eds"
@@ -163,6 +169,17 @@ def _device(sections: dict[str, Section]) -> Section:
 def _dummies(sections: dict[str, Section]) -> Section:
     found = sections.get("DummyUsage", {})
     return {f"Dummy{k:04d}": str(_flag(found.get(f"Dummy{k:04d}")) or 0) for k in range(1, 8)}
+
+
+def _lacking(sections: dict[str, Section]) -> list[int]:
+    """Indices that the lists of objects name, without a section, in ascending order."""
+    listed = {
+        index
+        for name in _LISTS
+        for key, value in sections.get(name, {}).items()
+        if key.isdecimal() and (index := parse_number(value)) is not None and index >= FIRST_OBJECT
+    }
+    return sorted(listed - {place[0] for place in map(object_of, sections) if place is not None})
 
 
 def _flag(text: str | None) -> int | None:

@@ -9,7 +9,7 @@ from scipy import linalg
 
 from armident.configs import DataError
 from armident.identify.diagnosis.regression import MAX_AR_ORDER, Fit
-from armident.identify.document import IdentificationDocument
+from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.effects.effect import Effect, Place
 from armident.identify.regression.equations import COVARIANCE_PASSES, noise_models
 

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
+from armident.identify.diagnosis.criteria import Criteria
 from armident.identify.diagnosis.model_state import ModelState, acted_on
 from armident.identify.diagnosis.predictive_score import SUMS
 from armident.identify.regression.equations import applied
@@ -69,6 +70,11 @@ class Confirmation:
     def smaller(self) -> bool:
         """True if the errors are smaller with the effect."""
         return self.reduction > 0.0
+
+    def is_material(self, criteria: Criteria) -> bool:
+        """True if the errors of one joint on which it acts fall by enough, relative to them and to its torque."""
+        enough = (self.share >= criteria.least_share) & (self.change >= criteria.material_pct)
+        return bool((enough & self.acts).any())
 
 
 def confirmed(with_it: ModelState, without: ModelState) -> Confirmation:

@@ -58,3 +58,11 @@ class Criteria:
         """Division of the false-alarm rate: selection of effects, lack of fit, and changed parameters."""
         rate = self.false_alarm_rate
         return {"selection": 0.5 * rate, "lack_of_fit": 0.25 * rate, "changed_parameters": 0.25 * rate}
+
+    def selection_level(self, tests: int) -> float:
+        """Significance level of the selection for one of a number of candidates."""
+        return self.alpha["selection"] / max(tests, 1)
+
+    def needed_gain(self, tests: int) -> float:
+        """Gain of log-likelihood of a significant effect, found among a number of candidates, nats."""
+        return -float(np.log(self.selection_level(tests)))

@@ -10,7 +10,7 @@ from armident.identify.diagnosis.criteria import Criteria
 from armident.identify.diagnosis.model_state import ModelState
 from armident.identify.diagnosis.precision import variance_of_sum
 from armident.identify.diagnosis.screening import directions_beside
-from armident.identify.document import DetectionLimit
+from armident.identify.documents.diagnosis import DetectionLimit
 from armident.identify.effects.transmission import MotorOrder
 from armident.identify.effects.unnamed import NAME as UNNAMED
 

@@ -26,21 +26,14 @@ from armident.identify.diagnosis.lack_of_fit import Dependence, unexplained
 from armident.identify.diagnosis.lack_of_fit import dependences as dependences_of
 from armident.identify.diagnosis.model_state import ModelState, with_report_part
 from armident.identify.diagnosis.numbers import stale_numbers
-from armident.identify.diagnosis.selection import Selected, StepwiseSelection
+from armident.identify.diagnosis.selected import Selected
+from armident.identify.diagnosis.selection import StepwiseSelection
 from armident.identify.diagnosis.setup_stage import set_up
 from armident.identify.diagnosis.simulated import SimulatedErrors, simulated_errors
 from armident.identify.diagnosis.study import build_study
-from armident.identify.document import (
-    BeforeAfter,
-    DiagnosisDocument,
-    Finding,
-    Gaps,
-    IdentificationDocument,
-    RecordingReference,
-    Unexplained,
-    Verdict,
-    versions,
-)
+from armident.identify.documents.base import RecordingReference, versions
+from armident.identify.documents.diagnosis import BeforeAfter, DiagnosisDocument, Finding, Gaps, Unexplained, Verdict
+from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.effects.friction import TRANSITION
 from armident.identify.effects.recorded import of_recording
 from armident.identify.effects.unnamed import NAME as UNNAMED

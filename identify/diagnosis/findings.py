@@ -13,8 +13,8 @@ from armident.identify.diagnosis.model_state import ModelState
 from armident.identify.diagnosis.numbers import NumbersFinding
 from armident.identify.diagnosis.precision import standard_deviations
 from armident.identify.diagnosis.regression import relative_errors
-from armident.identify.diagnosis.selection import Selected
-from armident.identify.document import Alternative, Finding, Gap, Negligible, NotVisible, Unexplained
+from armident.identify.diagnosis.selected import Selected
+from armident.identify.documents.diagnosis import Alternative, Finding, Gap, Negligible, NotVisible, Unexplained
 from armident.identify.effects.effect import Effect
 from armident.identify.effects.numbers import ParameterChange
 from armident.identify.effects.registry import catalogue, known, of_entry

@@ -54,7 +54,7 @@ OCTAVES = (0.0, 0.125, 0.25, 0.5, 1.0, 2.0, 4.0)
 
 
 class Fitted(Protocol):
-    """A fitted model: `armident.identify.diagnosis.selection.ModelState`."""
+    """A fitted model: `armident.identify.diagnosis.model_state.ModelState`."""
 
     @property
     def fit(self) -> Fit:

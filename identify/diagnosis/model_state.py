@@ -1,6 +1,6 @@
 """Model of one step of a diagnosis: the data with its closed loop, the fit, and the predictive score."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -141,6 +141,10 @@ class ModelState:
             found = {**term.shapes, **linear, **dict((shapes or {}).get(k, {}))}
             entries[k] = entry.model_copy(update={"parameters": found})
         return self.robot.model_copy(update={"effects": tuple(entries)})
+
+
+Fitter = Callable[[RobotConfig, ModelState], ModelState | None]
+"""``(robot, before)`` to the fitted model of a configuration; ``None`` if the motion does not determine it."""
 
 
 def fitted(study: Study, robot: RobotConfig, before: ModelState | None) -> ModelState:

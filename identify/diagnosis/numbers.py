@@ -21,7 +21,7 @@ from armident.identify.diagnosis.changes import changes, p_value, ranked
 from armident.identify.diagnosis.criteria import Criteria
 from armident.identify.diagnosis.precision import variance_of_sum
 from armident.identify.diagnosis.regression import Fit, relative_errors
-from armident.identify.document import IdentificationDocument
+from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.regression.multiple_testing import holm
 
 Array = NDArray[np.float64]

@@ -1,8 +1,9 @@
 """Stepwise selection of the effects that a model lacks.
 
-1. Screening: the score statistic of every candidate at every place, in one factorisation of the model's equations.
+1. Screening: the score statistic of every candidate at every place, in one factorisation of the model's equations
+   (`armident.identify.diagnosis.shortlist`).
 2. Closed loop: each of the best candidates is added to the model, and the loop with it is simulated. All parameters are
-   estimated with instruments from that loop.
+   estimated with instruments from that loop (`armident.identify.diagnosis.candidate_models`).
 3. Ranking by cross-validated log-likelihood (`armident.identify.diagnosis.comparison`).
 4. Admission of the best one that is significant, material and physically possible; then the next step.
 5. Findings that later ones made superfluous are removed. Each finding competes once more with the effects that act on a
@@ -20,16 +21,15 @@ from numpy.typing import NDArray
 
 from armident.configs import DataError, RobotConfig
 from armident.configs.schema.robot import Effect as Entry
-from armident.identify.diagnosis.candidates import Candidate, ColumnCache, Key, Shapes, candidates
+from armident.identify.diagnosis.candidate_models import model_with
+from armident.identify.diagnosis.candidates import Key
 from armident.identify.diagnosis.comparison import Addition, Made, Step, advantage, compared, gain, materiality
-from armident.identify.diagnosis.confirmation import Confirmation, confirmed
-from armident.identify.diagnosis.corrections import screened_correction
+from armident.identify.diagnosis.confirmation import confirmed
 from armident.identify.diagnosis.criteria import Criteria
 from armident.identify.diagnosis.model_state import (
     ModelState,
     acted_on,
     fitted,
-    viscous_friction_rises,
     with_entries,
     with_first_motions,
     with_own_noise,
@@ -37,89 +37,16 @@ from armident.identify.diagnosis.model_state import (
     with_report_part,
     without_entry,
 )
-from armident.identify.diagnosis.order_analysis import motor_orders, nearby_orders
 from armident.identify.diagnosis.precision import p_value
-from armident.identify.diagnosis.screening import contained, refined, screened
-from armident.identify.diagnosis.shaping import both_ends
+from armident.identify.diagnosis.selected import Selected
+from armident.identify.diagnosis.shortlist import Contested, shortlist
 from armident.identify.diagnosis.study import Study
 from armident.identify.diagnosis.transitions import with_transitions
-from armident.identify.effects.drive import Correction
-from armident.identify.effects.recorded import of_recording
-from armident.identify.effects.registry import known
 from armident.identify.effects.tables import FreeShape
-from armident.identify.effects.terms import entry_of
-from armident.identify.effects.transmission import MotorOrder
-from armident.identify.effects.unnamed import NAME as UNNAMED
 
 Array = NDArray[np.float64]
-Starts = tuple[float, ...]
-"""Values from which the correction of a recorded torque starts; empty for a term of the model."""
-
-CORRECTIONS = 3
-"""Values of a correction from each start, each refined by the expansion that remains."""
 CLEAR = 3.0
 """Gain of log-likelihood from which another shift of all torques is chosen: odds of 20 to 1."""
-
-
-@dataclass(frozen=True, eq=False)
-class Selected:
-    """An effect that was selected.
-
-    Parameters
-    ----------
-    entry
-        Its entry in the configuration.
-    step
-        Step in which it was compared with the others, without it in the model.
-    addition
-        Test of the effect in that step.
-    confirmation
-        Comparison of the final models with and without it on the report part; ``None`` before that.
-    without
-        Final model without it; ``None`` before the comparison.
-    p_value
-        Probability of its parameters in the final model if it is not there.
-    """
-
-    entry: Entry
-    step: Step
-    addition: Addition
-    confirmation: Confirmation | None = None
-    without: ModelState | None = None
-    p_value: float = 0.0
-
-    def conventional(self, state: ModelState, uncertain: float) -> bool:
-        """True if the effect is a part of every model, or within the sampling convention of drives: no finding.
-
-        Parameters
-        ----------
-        state
-            Final model.
-        uncertain
-            Time by which the common instant of all torques is uncertain, s.
-        """
-        effect = self.addition.candidate.effect
-        if of_recording(self.entry):
-            values = np.array([self.entry.parameters[p.name] for p in effect.linear])
-        else:
-            values = state.values_of(state.term_of(self.entry))[0]
-        return effect.is_convention(values, uncertain)
-
-
-@dataclass(frozen=True, eq=False)
-class Contested:
-    """A finding with which other effects compete.
-
-    Parameters
-    ----------
-    gain
-        Its gain of log-likelihood beside the other findings, nats.
-    joints
-        Joints on whose torques it acts, (n,). An effect that acts on none of them cannot take its place.
-    """
-
-    gain: float
-    joints: NDArray[np.bool_]
 
 
 @dataclass
@@ -228,27 +155,21 @@ class StepwiseSelection:
         key = _key(state.robot)
         if key in self._steps:
             return self._steps[key]
-        shortlist, tests = self._shortlist(state, contested)
+        found = shortlist(state, self.criteria, contested)
+        if not self._steps:
+            self.hidden = found.hidden
         made: list[Made] = []
-        for k, one in enumerate(shortlist):
-            self.tested(k / len(shortlist))
+        for k, one in enumerate(found.chosen):
+            self.tested(k / len(found.chosen))
             if self._late():
                 # An effect is admitted only against all others.
-                return Step(state, (), (), (), tests)
-            made += [m for m in (self._made(state, *one),) if m is not None]
-        step = compared(state, made, tests, self.passes)
+                return Step(state, (), (), (), found.tests)
+            made += [m for m in (model_with(state, *one, self._state),) if m is not None]
+        step = compared(state, made, found.tests, self.passes)
         if contested is None:
             self._steps[key] = step
         self._release()
         return step
-
-    def _needed(self, tests: int) -> float:
-        """Gain of log-likelihood of a significant effect, found among a number of candidates."""
-        return -float(np.log(self._level(tests)))
-
-    def _level(self, tests: int) -> float:
-        """Significance level of one of a number of candidates."""
-        return self.criteria.alpha["selection"] / max(tests, 1)
 
     def _release(self) -> None:
         """Free the equations of all models: hundreds are compared, and few are used again."""
@@ -287,10 +208,10 @@ class StepwiseSelection:
         """
         return (
             addition.allowed
-            and addition.gain > self._needed(tests)
+            and addition.gain > self.criteria.needed_gain(tests)
             and addition.share >= self.criteria.least_share
             and addition.material_pct >= self.criteria.material_pct
-            and addition.p_value < self._level(tests)
+            and addition.p_value < self.criteria.selection_level(tests)
         )
 
     def admitted(self, step: Step) -> Addition | None:
@@ -350,115 +271,6 @@ class StepwiseSelection:
         study = models[best].study
         return replace(models[best], study=replace(study, warnings=(*study.warnings, line)))
 
-    def _shortlist(
-        self, state: ModelState, contested: Contested | None
-    ) -> tuple[list[tuple[Candidate, Shapes, Starts]], int]:
-        """Candidates with the highest statistics less their numbers of parameters, and the number of all.
-
-        Each has its nonlinear parameters, or the values from which its correction of recorded torques starts.
-        """
-        column_cache = ColumnCache(state.study, state.fit.theta)
-        noise = state.fit.renoised(state.weights)
-        looks: list[tuple[float, Candidate, tuple[float, Shapes], Starts]] = []
-        tests, hidden = 0, set()
-        for every in candidates(column_cache):
-            candidate = every
-            tests += 1
-            if contested is not None and not contested.joints[column_cache.joints(candidate)].any():
-                continue
-            if isinstance(candidate.effect, MotorOrder):
-                candidate = replace(candidate, grid=motor_orders(state.study, state.fit.theta, candidate.place.joint))
-            found: tuple[float, Shapes] | None
-            starts: Starts = ()
-            if isinstance(candidate.effect, Correction):
-                statistic, starts = screened_correction(noise, candidate, column_cache)
-                found = statistic, ()
-            else:
-                found = screened(noise, candidate, column_cache)
-            if found is None:
-                hidden.add(candidate.key)
-            else:
-                looks.append((found[0] - 2.0 * len(candidate.effect.linear), candidate, found, starts))
-        if not self._steps:
-            self.hidden = frozenset(hidden)
-        # A score statistic is twice the gain of log-likelihood that it promises. A correction needs all of it: its
-        # likelihood also rewards smaller noise.
-        needed, promising = self._needed(tests), self.criteria.promising
-        present = 0.0 if contested is None else contested.gain
-        looks = [x for x in looks if 0.5 * x[2][0] > max(needed * (1.0 if x[3] else promising), promising * present)]
-        looks.sort(key=lambda look: -look[0])
-        named = [x for x in looks if x[1].effect.name != UNNAMED][: self.criteria.shortlist]
-        unnamed = [x for x in looks if x[1].effect.name == UNNAMED][: self.criteria.unnamed]
-        chosen: list[tuple[Candidate, Shapes, Starts]] = []
-        for _, own, first, starts in (*named, *unnamed):
-            candidate, found = own, first
-            if starts:
-                chosen.append((candidate, (), starts))
-                continue
-            if isinstance(candidate.effect, MotorOrder):
-                near = nearby_orders(state.study, candidate.place.joint, found[1][0][1])
-                candidate = replace(candidate, grid=near)
-                found = screened(noise, candidate, column_cache) or found
-            shapes = refined(noise, candidate, column_cache, found)
-            for ends in both_ends(noise, candidate, column_cache, shapes):
-                without = contained(noise, candidate, column_cache, ends)
-                chosen.append((replace(candidate, without=without), ends, ()))
-        return chosen, tests
-
-    def _made(self, state: ModelState, candidate: Candidate, shapes: Shapes, starts: Starts) -> Made | None:
-        effect, whole = candidate.effect, known(candidate.effect.key)
-        spared = (*(p.name for p in whole.linear if p not in effect.linear), *candidate.without)
-        entry = entry_of(effect, candidate.place, state.robot, dict(shapes), spared)
-        made = self._state(with_entries(state.robot, [entry]), state)
-        if made is None:
-            return None
-        term = made.term_of(entry)
-        values, std = made.values_of(term)
-        allowed = whole.allows(term.of_effect(values), term.of_effect(std), dict(term.shapes))
-        allowed = allowed and viscous_friction_rises(made, term)
-        one = Made(candidate, shapes, entry, made, allowed)
-        if not starts:
-            return one
-        corrected = self._corrected(state, candidate, entry, (float(values[0]), *starts) if allowed else starts)
-        return one if corrected is None else max((one, corrected), key=lambda m: (m.allowed, gain(m.state, state)))
-
-    def _corrected(self, state: ModelState, candidate: Candidate, entry: Entry, starts: Starts) -> Made | None:
-        """Model in which the recordings are corrected for an effect on a recorded torque.
-
-        The first-order expansion beside the corrected torque refines the value, until what remains is within its
-        standard deviation. Where that does not come about, the value with the largest gain is chosen.
-
-        Parameters
-        ----------
-        state
-            Model without the effect.
-        candidate
-            The effect.
-        entry
-            Its entry without a value: the first-order expansion.
-        starts
-            Values to start from.
-        """
-        name = candidate.effect.linear[0].name
-        found: list[Made] = []
-        for start in starts:
-            value = start
-            for _ in range(CORRECTIONS):
-                right = entry.model_copy(update={"parameters": {**entry.parameters, name: value}})
-                exact = self._state(with_entries(state.robot, [right]), state)
-                further = None if exact is None else self._state(with_entries(exact.robot, [entry]), exact)
-                if exact is None:
-                    break
-                allowed = candidate.effect.allows(np.array([value]), np.zeros(1), {})
-                found.append(Made(candidate, (), right, exact, allowed))
-                if further is None:
-                    break
-                rest, std = (float(x[0]) for x in further.values_of(further.term_of(entry)))
-                if abs(rest) < std and allowed:
-                    return found[-1]
-                value += rest
-        return max(found, key=lambda made: (made.allowed, gain(made.state, state)), default=None)
-
     def _state(self, robot: RobotConfig, before: ModelState) -> ModelState | None:
         """Fit of a model in its own closed loop, cached; ``None`` if the motion does not determine its parameters."""
         key = _key(robot)
@@ -501,7 +313,7 @@ class StepwiseSelection:
         """
         share, changed = materiality(less, state)
         material = share >= self.criteria.least_share and changed >= self.criteria.material_pct
-        return not material or gain(state, less) < self._needed(tests)
+        return not material or gain(state, less) < self.criteria.needed_gain(tests)
 
     def _exchanged(
         self, state: ModelState, found: tuple[Selected, ...], changed: NDArray[np.bool_] | None = None
@@ -562,7 +374,7 @@ class StepwiseSelection:
                 failed, key=lambda one: 1.0 if one[0].confirmation is None else one[0].confirmation.p_value
             )
             assert gone.confirmation is not None
-            if not self._material(gone.confirmation):
+            if not gone.confirmation.is_material(self.criteria):
                 self.immaterial = (*self.immaterial, gone.addition)
             found = tuple(one for one in found if one.entry is not gone.entry)
 
@@ -573,14 +385,9 @@ class StepwiseSelection:
         """
         report = one.confirmation
         assert report is not None
-        determined = one.p_value < self._level(one.step.tests)
+        determined = one.p_value < self.criteria.selection_level(one.step.tests)
         significant = report.p_value < self.criteria.confirmation_level
-        return determined and significant and report.smaller and self._material(report)
-
-    def _material(self, report: Confirmation) -> bool:
-        """True if the errors of one joint on which it acts fall by enough, relative to them and to its torque."""
-        enough = (report.share >= self.criteria.least_share) & (report.change >= self.criteria.material_pct)
-        return bool((enough & report.acts).any())
+        return determined and significant and report.smaller and report.is_material(self.criteria)
 
 
 def _order(one: Selected) -> tuple[bool, float]:

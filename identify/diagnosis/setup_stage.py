@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from armident.configs import DataError, RobotConfig
-from armident.identify.document import Finding, Gap, Unexplained
+from armident.identify.documents.diagnosis import Finding, Gap, Unexplained
 from armident.identify.experiment import Experiment
 from armident.identify.setup.check import check_setup
 from armident.identify.setup.result import CONVENTIONS, SetupCheck, SetupFinding, with_torque_shift

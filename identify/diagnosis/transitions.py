@@ -1,13 +1,10 @@
 """Transitions of dry friction at the reversals of the joints: a part of the friction model, found before any effect."""
 
-from collections.abc import Callable
-
 import numpy as np
 
-from armident.configs import RobotConfig
 from armident.configs.schema.robot import Effect as Entry
 from armident.identify.diagnosis.candidates import ColumnCache, Shapes
-from armident.identify.diagnosis.model_state import ModelState, fitted_in_loop_of, with_entries, without_entry
+from armident.identify.diagnosis.model_state import Fitter, ModelState, fitted_in_loop_of, with_entries, without_entry
 from armident.identify.effects.effect import SIGN_TOLERANCE, Place
 from armident.identify.effects.friction import TRANSITION
 from armident.identify.effects.registry import known
@@ -25,11 +22,8 @@ LARGEST = 2.0
 level of slow motion (Armstrong-Helouvry, Dupont, Canudas de Wit 1994, Automatica 30(7)), and a joint that sticks looks
 like that."""
 
-Model = Callable[[RobotConfig, ModelState], ModelState | None]
-"""``(robot, before)`` to the fitted model of a configuration; ``None`` if the motion does not determine it."""
 
-
-def with_transitions(state: ModelState, model: Model) -> ModelState:
+def with_transitions(state: ModelState, model: Fitter) -> ModelState:
     """Model with the transition of dry friction at the reversals of each joint, where it predicts better.
 
     The smoothed sign of the model approaches its limits slowly. Beside another law of the reversal it looks like

@@ -5,7 +5,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from armident.identify.document import Alternative, DetectionLimit, DiagnosisDocument, Finding, NotVisible
+from armident.identify.documents.diagnosis import Alternative, DetectionLimit, DiagnosisDocument, Finding, NotVisible
 from armident.identify.evaluation.cases import Case, InjectedEffect
 from armident.identify.evaluation.store import CaseResult
 

@@ -12,7 +12,7 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict, ValidationError, field_serializer, field_validator
 
 from armident.configs import DataError
-from armident.identify.document import DiagnosisDocument
+from armident.identify.documents.diagnosis import DiagnosisDocument
 
 DECIDING = ("armident.configs", "armident.identify", "armident.virtual_robot", "armident.daq.recording")
 """Packages whose code and data determine a result."""

@@ -6,14 +6,10 @@ from pathlib import Path
 
 from armident.configs import ConfigError, RobotConfig, load_robot
 from armident.daq.recording import read_recording
-from armident.identify.document import (
-    DiagnosisDocument,
-    IdentificationDocument,
-    load_document,
-    reference,
-    to_json,
-    write_atomically,
-)
+from armident.identify.documents.base import reference
+from armident.identify.documents.diagnosis import DiagnosisDocument
+from armident.identify.documents.files import load_document, to_json, write_atomically
+from armident.identify.documents.identification import IdentificationDocument
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,8 @@ import yaml
 
 from armident.configs import ConfigError, RobotConfig, load_robot, load_trajectory
 from armident.identify.cli_tables import design_table, progress, wanted_table
-from armident.identify.document import IdentificationDocument, load_document, write_atomically
+from armident.identify.documents.files import load_document, write_atomically
+from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.effects.terms import arm_model
 from armident.identify.excitation.design import (
     ASSUMED_NOISE,

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from scipy import signal
 
 from armident.configs import DataError, RobotConfig
-from armident.identify.document import IdentificationDocument
+from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.effects.terms import arm_model
 from armident.identify.identification.criteria import IdentificationCriteria
 from armident.identify.identification.equations import LS_CUTOFF

@@ -10,7 +10,7 @@ import numpy as np
 from armident.configs import ConfigError, RobotConfig
 from armident.configs.loading import load_inertials, load_shapes
 from armident.configs.urdf_inertials import UrdfInertials
-from armident.identify.document import read_json
+from armident.identify.documents.files import read_json
 from armident.identify.effects.terms import arm_model
 from armident.identify.excitation.collision import CollisionModel
 from armident.identify.excitation.design import ASSUMED_NOISE, PERIOD, Design, excesses, predict_precision

@@ -6,8 +6,9 @@ from itertools import chain
 
 from armident.configs import DataError, RobotConfig
 from armident.daq.recording import Recording
-from armident.identify.document import IdentificationDocument, identification_document
+from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.experiment import Experiment
+from armident.identify.identification.document import identification_document
 from armident.identify.identification.from_recording import WHOLE, StretchRule, experiments_from_recording
 from armident.identify.identification.options import Options
 from armident.identify.identification.pipeline import identify_experiment

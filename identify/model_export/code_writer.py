@@ -11,7 +11,8 @@ from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
-from armident.identify.document import versions, write_atomically
+from armident.identify.documents.base import versions
+from armident.identify.documents.files import write_atomically
 from armident.identify.effects.link import GravityDirection
 from armident.identify.effects.numbers import ParameterChange
 from armident.identify.effects.registry import of_entry

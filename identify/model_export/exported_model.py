@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from armident.configs import DataError, RobotConfig, load_robot
-from armident.identify.document import IdentificationDocument
+from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.effects.recorded import of_recording
 from armident.identify.effects.registry import of_entry
 from armident.identify.effects.terms import effect_terms

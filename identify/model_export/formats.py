@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from armident.configs import ConfigError
-from armident.identify.document import write_atomically
+from armident.identify.documents.files import write_atomically
 from armident.identify.model_export.code_writer import write_c, write_python
 from armident.identify.model_export.csv_writer import write_csv
 from armident.identify.model_export.exported_model import ExportedModel

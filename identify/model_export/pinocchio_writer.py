@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from armident.configs import ConfigError
-from armident.identify.document import write_atomically
+from armident.identify.documents.files import write_atomically
 from armident.identify.model_export.exported_model import ExportedModel
 from armident.identify.model_export.rigid_effects import with_rigid_effects
 from armident.identify.model_export.sheet import LimitationSheet, limitation_sheet

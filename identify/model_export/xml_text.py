@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from armident.identify.document import write_atomically
+from armident.identify.documents.files import write_atomically
 from armident.identify.robot.chain import Floats
 
 VERTICAL = 1e-12

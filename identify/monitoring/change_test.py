@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from armident.configs import DataError
-from armident.identify.document import IdentificationDocument, Parameter
+from armident.identify.documents.identification import IdentificationDocument, Parameter
 from armident.identify.monitoring.residual_test import ResidualChange, ResidualTest, compare_residuals
 from armident.identify.regression.multiple_testing import holm
 

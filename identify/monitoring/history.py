@@ -13,7 +13,8 @@ import sqlalchemy as sa
 
 from armident.configs import ConfigError
 from armident.daq.recording import Recording
-from armident.identify.document import IdentificationDocument, from_json, to_json
+from armident.identify.documents.files import from_json, to_json
+from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.monitoring.change_test import ParameterChangeTest
 from armident.identify.monitoring.history_schema import (
     comparisons,

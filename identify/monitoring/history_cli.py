@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from armident.configs import ConfigError
-from armident.identify.document import IdentificationDocument, load_document
+from armident.identify.documents.files import load_document
+from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.monitoring.change_test import Inconclusive, ParameterChangeTest, compare
 from armident.identify.monitoring.history import History, Run, recorded_at
 

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from armident.identify.document import IdentificationDocument
+from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.identification.sign_smoothing import SATURATION
 
 Configuration = Mapping[str, Any]

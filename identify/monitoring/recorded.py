@@ -9,7 +9,8 @@ from pathlib import Path
 from armident.configs import ArmidentError, DataError
 from armident.daq.recording import Recording, is_recording, join_parts, read_recording
 from armident.daq.recording.retention import is_being_written
-from armident.identify.document import IdentificationDocument, load_document
+from armident.identify.documents.files import load_document
+from armident.identify.documents.identification import IdentificationDocument
 
 _PART = re.compile(r"(?P<name>.+?)(?:\.\d{4,})?\.mcap")
 

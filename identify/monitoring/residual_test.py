@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from armident.identify.document import IdentificationDocument, ResidualStatistics
+from armident.identify.documents.identification import IdentificationDocument, ResidualStatistics
 from armident.identify.regression.multiple_testing import holm
 
 Array = NDArray[np.float64]

@@ -5,26 +5,24 @@ import queue
 import signal
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import closing, suppress
 from pathlib import Path
 from types import FrameType
 from typing import TypeVar
 
 from armident.configs import ArmidentError, DataError, RobotConfig, SessionConfig, load_robot, load_session
-from armident.daq.recording import Recording
 from armident.daq.streaming import Keys
 from armident.identify.identification.api import identify_recording
 from armident.identify.identification.options import Options
+from armident.identify.monitoring.intake import Intake, reason_of
 from armident.identify.monitoring.ledger import FILE, MOST_ATTEMPTS, Entry, Ledger, LedgerError, State, unique_owner
 from armident.identify.monitoring.recorded import (
     Captured,
-    captured_as,
     captured_in,
-    is_of,
     result_of,
 )
-from armident.identify.monitoring.stream_buffer import LARGEST_BLOCK, LARGEST_EVENT, Assembly, StreamBuffer, drop_oldest
+from armident.identify.monitoring.stream_buffer import LARGEST_BLOCK, LARGEST_EVENT, StreamBuffer
 from armident.identify.monitoring.worker_link import LinkDown, WorkerLink
 from armident.identify.report.files import write_identification
 from armident.systemd import Notifier
@@ -81,8 +79,7 @@ class Worker:
         self._results: queue.SimpleQueue[int] = queue.SimpleQueue()
         self._buffer = StreamBuffer()
         self._lock = threading.Lock()
-        self._known: dict[Path, str] = {}
-        self._streams: dict[str, Recording] = {}
+        self._intake = Intake(session.cell, robot.name, self._folder, self._buffer, self._lock, self._refuse)
         self._last: bytes | None = None
         self._problem: str | None = None
         self._progress = progress
@@ -163,11 +160,11 @@ class Worker:
                 with self._lock:
                     ended = self._buffer.take_ended()
                 for assembly in ended:
-                    self._take_stream(ledger, assembly)
+                    self._intake.take_stream(ledger, assembly)
                 if time.monotonic() - scanned >= SCAN_S:
-                    self._add_files(ledger, captured_in(self._folders, self._robot.name))
+                    self._intake.add_files(ledger, captured_in(self._folders, self._robot.name))
                     scanned = time.monotonic()
-                entry = ledger.claim(held=tuple(self._streams), announce=self._link.is_open)
+                entry = ledger.claim(held=tuple(self._intake.streams), announce=self._link.is_open)
                 self._problem = None
                 if entry is not None:
                     self._process(ledger, entry)
@@ -175,7 +172,7 @@ class Worker:
             except _Closing:
                 return
             except (ArmidentError, OSError) as error:
-                self._say_problem(str(error) if isinstance(error, ArmidentError) else _reason(error))
+                self._say_problem(str(error) if isinstance(error, ArmidentError) else reason_of(error))
             except Exception as error:
                 # The worker must survive any failure of one recording.
                 self._say_problem(f"internal error ({type(error).__name__})")
@@ -197,98 +194,9 @@ class Worker:
             log.warning("%s; trying again", text)
             self._link.status("waiting", message=text)
 
-    def _take_stream(self, ledger: Ledger, assembly: Assembly) -> None:
-        """Enter the files of a capture that has ended; without them the stream itself."""
-        found = captured_as(assembly.files)
-        if any(not captured.finished for captured in found):
-            with self._lock:
-                self._buffer.keep(assembly)
-                self._buffer.refuse("early", f"capture {assembly.capture}: its file is being written, its end is not")
-            return
-        try:
-            streamed = None
-            if not found or (assembly.complete and not assembly.too_long and not assembly.triggered):
-                streamed = assembly.recording()
-                if not found and not is_of(streamed, None, self._robot.name):
-                    raise DataError(
-                        f"capture {assembly.capture}: of robot {streamed.robot.name}, not {self._robot.name}"
-                    )
-        except DataError as error:
-            if not found:
-                self._refuse_stream(assembly, error)
-                return
-            log.warning("%s", error)
-        if found:
-            self._add_files(ledger, found, None if streamed is None else streamed.sha256, announced=True)
-        elif streamed is not None:
-            digest = streamed.sha256
-            self._streams[digest] = streamed
-            drop_oldest(self._streams)
-            name = assembly.capture if streamed.path is None else streamed.path.name.removesuffix(".mcap")
-            ledger.add(digest, name, ())
-
-    def _refuse_stream(self, assembly: Assembly, error: DataError) -> None:
-        paths = [str(path) for path in (assembly.end or {}).get("paths", ())]
-        where = f"its file {paths[0]} is not here" if paths else "it was not written to a file"
-        message = f"{error}, and {where}"
-        log.error("%s", message)
-        self._link.status("failed", capture=assembly.capture, message=message)
-        self._results.put(error.exit_code)
-
-    def _add_files(
-        self, ledger: Ledger, found: Sequence[Captured], streamed: str | None = None, *, announced: bool = False
-    ) -> None:
-        """Enter finished recordings of this cell that the ledger does not know.
-
-        ``streamed`` is the hash of the stream of these files. ``announced`` is true for files that were announced on
-        the keys of this cell.
-        """
-        for captured in found:
-            try:
-                stamp = captured.stamp
-            except OSError:
-                continue
-            first = captured.paths[0]
-            if (self._known.get(first) == stamp and not announced) or not captured.finished:
-                continue
-            known = ledger.file_hash(first, stamp)
-            if announced and known == (None,):
-                known = None
-            try:
-                digest = known[0] if known else self._read_and_enter(ledger, captured, announced)
-            except OSError as error:
-                # Other recordings are not held up; this one is tried again.
-                with self._lock:
-                    self._buffer.refuse("files", f"{first}: cannot be read: {_reason(error)}; trying again")
-                continue
-            self._known[first] = stamp
-            if known is None:
-                ledger.enter_file(first, stamp, digest)
-            if streamed is not None and digest is not None and streamed != digest:
-                log.warning("%s: the stream has other samples than the file, which counts", first)
-
-    def _read_and_enter(self, ledger: Ledger, captured: Captured, announced: bool) -> str | None:
-        """Return the hash of a recording after entering it; ``None`` if it is not one of this cell."""
-        try:
-            recording = captured.read()
-            if not is_of(recording, None if announced else self._cell, self._robot.name):
-                return None
-        except ArmidentError as error:
-            log.warning("%s", error)
-            return None
-        except OSError:
-            raise
-        except Exception as error:
-            log.warning("%s: internal error (%s); it is not identified", captured.paths[0], type(error).__name__)
-            log.debug("internal error", exc_info=True)
-            return None
-        digest = recording.sha256
-        found = result_of(digest, self._folder(captured.name))
-        if found is not None and ledger.entry(digest) is None:
-            ledger.adopt(digest, captured.name, captured.paths, found[0], found[1].verdict or "")
-        elif ledger.add(digest, captured.name, captured.paths):
-            log.debug("found %s", captured.name)
-        return digest
+    def _refuse(self, capture: str, message: str, code: int) -> None:
+        self._link.status("failed", capture=capture, message=message)
+        self._results.put(code)
 
     def _folder(self, name: str) -> Path:
         return self._out / f"{name}.identification"
@@ -320,7 +228,7 @@ class Worker:
                 if not self._enter(ledger, entry, "done", path, verdict):
                     return
                 code = _exit_code("done", verdict)
-        self._streams.pop(entry.sha256, None)
+        self._intake.streams.pop(entry.sha256, None)
         # Without Zenoh the other recordings come first; the next claim is for the announcement.
         with suppress(LinkDown):
             self._until_possible("announcement", lambda: self._announce(ledger, entry.sha256))
@@ -342,7 +250,7 @@ class Worker:
         found = result_of(entry.sha256, folder)
         if found is not None:
             return found[0], found[1].verdict or ""
-        recording = Captured(entry.name, entry.paths).read() if entry.paths else self._streams[entry.sha256]
+        recording = Captured(entry.name, entry.paths).read() if entry.paths else self._intake.streams[entry.sha256]
         source = "file" if entry.paths else "stream"
         self._advance(f"identifying {entry.name}")
         print(f"worker: {recording.samples.sync.size} samples from the {source}, identifying", flush=True)
@@ -395,7 +303,7 @@ class Worker:
             try:
                 done = action()
             except (OSError, LedgerError) as error:
-                reason = _reason(error) if isinstance(error, OSError) else str(error)
+                reason = reason_of(error) if isinstance(error, OSError) else str(error)
             else:
                 if said:
                     log.info("%s: done after all", what)
@@ -412,11 +320,6 @@ class Worker:
 
 def _exit_code(state: State, message: str | None) -> int:
     return DataError.exit_code if state == "failed" or message == "unusable" else 0
-
-
-def _reason(error: OSError) -> str:
-    where = f"{error.filename}: " if error.filename else ""
-    return f"{where}{error.strerror or type(error).__name__}"
 
 
 def run_worker(config: Path, *, once: bool, out: Path | None) -> int:

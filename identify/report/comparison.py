@@ -4,8 +4,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from armident.identify.document import IdentificationDocument
-from armident.identify.model_documents import LEVEL_95, ComparedParameter, ComparisonDocument
+from armident.identify.documents.comparison import LEVEL_95, ComparedParameter, ComparisonDocument
+from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.report.glossary import identification_entries, in_words
 from armident.identify.report.page import MODEL, MUTED, RESIDUAL, render
 from armident.identify.report.plots import Plot, Series, plots_html

@@ -5,7 +5,7 @@ from pathlib import Path
 import yaml
 
 from armident.configs import RobotConfig
-from armident.identify.document import to_json, write_atomically
+from armident.identify.documents.files import to_json, write_atomically
 from armident.identify.identification.api import IdentificationOutcome
 
 

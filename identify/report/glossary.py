@@ -6,7 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import get_args
 
-from armident.identify.document import DiagnosisDocument, Finding, IdentificationDocument, Verdict, write_atomically
+from armident.identify.documents.diagnosis import DiagnosisDocument, Finding, Verdict
+from armident.identify.documents.files import write_atomically
+from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.effects.effect import Effect
 from armident.identify.effects.registry import catalogue
 from armident.identify.effects.tables import KNOTS

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from armident.configs import RobotConfig
 from armident.daq.recording import Recording
-from armident.identify.document import IdentificationDocument
+from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.identification.result import Identification
 from armident.identify.report.glossary import identification_entries
 from armident.identify.report.page import BAND, CONFIGURED, INK, MEASURED, MODEL, MUTED, RESIDUAL, figure, render

@@ -1,7 +1,7 @@
 """HTML report of a prediction: held-out error, measured against predicted torques."""
 
 from armident.configs import RobotConfig
-from armident.identify.document import IdentificationDocument
+from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.prediction import TorquePrediction
 from armident.identify.report.glossary import identification_entries
 from armident.identify.report.identification import torque_plots

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from armident.configs import ConfigError
 from armident.identify.cli_tables import Report, progress
-from armident.identify.document import write_atomically
+from armident.identify.documents.files import write_atomically
 from armident.identify.thesis import chapter4, chapter5, chapter6
 from armident.identify.thesis.cached_estimates import Laboratory
 from armident.identify.thesis.claims import Claim, judged

@@ -102,9 +102,9 @@ def simulate(
     if not json:
         print(out)
         return
-    from armident.identify.document import reference as reference_to
-    from armident.identify.document import to_json
-    from armident.identify.model_documents import SimulationDocument
+    from armident.identify.documents.base import reference as reference_to
+    from armident.identify.documents.files import to_json
+    from armident.identify.documents.simulation import SimulationDocument
 
     document = SimulationDocument(
         robot=recording.robot.name,

@@ -22,6 +22,7 @@ from collections import Counter
 from collections.abc import Callable
 from contextlib import closing, suppress
 from dataclasses import dataclass, field, replace
+from functools import partial
 from multiprocessing.context import ForkServerProcess
 from pathlib import Path
 from typing import Any
@@ -36,7 +37,8 @@ from armident.daq.capture.publisher import Publisher
 from armident.daq.recording import RecordingWriter, StreamLayout, read_recording, write_recording
 from armident.daq.streaming import Block, Keys, encode_event, open_session
 from armident.daq.streaming.codec import end_content, start_content
-from armident.identify.document import IdentificationDocument, load_document
+from armident.identify.documents.files import load_document
+from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.identification.options import Options
 from armident.identify.monitoring.history import History, recorded_at
 from armident.identify.monitoring.ledger import FILE, Ledger
@@ -291,21 +293,31 @@ def run_rounds(rounds: int, seed: int, folder: Path) -> list[str]:
     return wrong
 
 
-def main() -> int:
-    """Run the rounds; return 1 if there are violations."""
-    parser = argparse.ArgumentParser(prog="python -m tests.faults.service", description=__doc__)
+def options_of_rounds(module: str, description: str | None) -> argparse.ArgumentParser:
+    """Return the parser of the options that the programs of rounds share."""
+    parser = argparse.ArgumentParser(prog=f"python -m {module}", description=description)
     parser.add_argument("--rounds", type=int, default=200)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--keep", action="store_true", help="keep the folder")
-    options = parser.parse_args()
+    return parser
+
+
+def run_in_new_folder(run: Callable[[Path], list[str]], *, keep: bool) -> int:
+    """Print what a run finds wrong; return 1 if there is anything, whose folder is kept, otherwise 0."""
     folder = Path(tempfile.mkdtemp(prefix="armident-service-"))
-    wrong = run_rounds(options.rounds, options.seed, folder)
-    if not wrong and not options.keep:
+    wrong = run(folder)
+    if not wrong and not keep:
         shutil.rmtree(folder)
     else:
         print(f"files: {folder}")
     print(*wrong, sep="\n")
     return int(bool(wrong))
+
+
+def main() -> int:
+    """Run the rounds; return 1 if there are violations."""
+    options = options_of_rounds("tests.faults.service", __doc__).parse_args()
+    return run_in_new_folder(partial(run_rounds, options.rounds, options.seed), keep=options.keep)
 
 
 if __name__ == "__main__":

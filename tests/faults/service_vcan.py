@@ -7,14 +7,11 @@ the kill has torn, then has exactly one result, which was announced once, and on
 are not killed end without an error, and none is left running. Runs under ``python -m armident.drivers.vcan``.
 """
 
-import argparse
 import math
 import os
 import random
-import shutil
 import signal
 import sys
-import tempfile
 import time
 from collections import Counter
 from contextlib import closing, suppress
@@ -28,7 +25,15 @@ from armident.configs import ArmidentError, load_session
 from armident.daq.recording import read_recording
 from armident.drivers.vcan import ensure_vcan, remove_vcan
 from armident.identify.monitoring.recorded import captured_in
-from tests.faults.service import Audience, recorded, store_of, violations, wait_for_results
+from tests.faults.service import (
+    Audience,
+    options_of_rounds,
+    recorded,
+    run_in_new_folder,
+    store_of,
+    violations,
+    wait_for_results,
+)
 from tests.fixtures.processes import ForkedProcess, armident
 from tests.statistics.weeks import cell_file, robot_on
 
@@ -248,25 +253,19 @@ def run_rounds(rounds: int, seed: int, folder: Path, bus: str, minutes: float = 
 
 def main() -> int:
     """Run the rounds; return 1 if there are violations."""
-    parser = argparse.ArgumentParser(prog="python -m tests.faults.service_vcan", description=__doc__)
-    parser.add_argument("--rounds", type=int, default=200)
-    parser.add_argument("--seed", type=int, default=1)
+    parser = options_of_rounds("tests.faults.service_vcan", __doc__)
     parser.add_argument("--minutes", type=float, default=math.inf, help="begin no round after this time")
-    parser.add_argument("--keep", action="store_true", help="keep the folder")
     options = parser.parse_args()
-    folder = Path(tempfile.mkdtemp(prefix="armident-service-"))
     bus = f"ks{os.getpid() % 10**6}"
+
+    def run(folder: Path) -> list[str]:
+        return run_rounds(options.rounds, options.seed, folder, bus, options.minutes)
+
     ensure_vcan(bus)
     try:
-        wrong = run_rounds(options.rounds, options.seed, folder, bus, options.minutes)
+        return run_in_new_folder(run, keep=options.keep)
     finally:
         remove_vcan(bus)
-    if not wrong and not options.keep:
-        shutil.rmtree(folder)
-    else:
-        print(f"files: {folder}")
-    print(*wrong, sep="\n")
-    return int(bool(wrong))
 
 
 if __name__ == "__main__":

@@ -22,6 +22,9 @@ from mcap.opcode import Opcode
 from armident.daq.recording import mcap_records as mcap
 from armident.daq.streaming.codec import VERSION
 
+MOST_BYTES = 64 << 20
+"""Largest uncompressed chunk that is spoiled, bytes."""
+
 Mutator = Callable[[random.Random, Sequence[bytes]], bytes]
 """Makes an input of some that are known."""
 
@@ -125,6 +128,8 @@ def forge_recording(rng: random.Random, seeds: Sequence[bytes]) -> bytes:
     data = memoryview(rng.choice(seeds))
     records = [(opcode, bytes(body)) for opcode, _, body in mcap.records(data, len(mcap.MAGIC))]
     for _ in range(rng.choice((1, 1, 2))):
+        if not records:
+            return spoil_bytes(rng, seeds)
         k = rng.randrange(len(records))
         opcode, body = records[k]
         match rng.randrange(6):
@@ -140,8 +145,6 @@ def forge_recording(rng: random.Random, seeds: Sequence[bytes]) -> bytes:
                 records[k] = opcode, _forged_json(rng, body)
             case _:
                 records[k] = opcode, spoil_bytes(rng, [body])
-        if not records:
-            break
     return mcap.MAGIC + b"".join(mcap.record(opcode, body) for opcode, body in records) + mcap.MAGIC
 
 
@@ -252,8 +255,13 @@ def either(*mutators: Mutator) -> Mutator:
 
 
 def _forged_chunk(rng: random.Random, body: bytes) -> bytes:
-    chunk = mcap.read_chunk(memoryview(body))
-    raw = zstandard.ZstdDecompressor().decompress(bytes(chunk.data), max_output_size=max(chunk.size, 1))
+    try:
+        chunk = mcap.read_chunk(memoryview(body))
+        size = min(max(chunk.size, 1), MOST_BYTES)
+        raw = zstandard.ZstdDecompressor().decompress(bytes(chunk.data), max_output_size=size)
+    except (mcap.MalformedRecord, zstandard.ZstdError):
+        # A known input that is spoiled inside its chunk already.
+        return spoil_bytes(rng, [body])
     raw = spoil_bytes(rng, [raw])
     forged = mcap.chunk(chunk.start_ns, chunk.end_ns, raw, zstandard.ZstdCompressor().compress(raw))
     content = bytearray(forged[mcap.RECORD_HEAD.size :])

@@ -16,18 +16,14 @@ from armident.configs import ConfigError, DataError, SessionConfig, load_session
 from armident.daq.capture.publisher import Publisher
 from armident.daq.recording import Recording, write_recording
 from armident.daq.streaming import Keys, encode_block, open_session
-from armident.identify.document import IdentificationDocument, to_json
+from armident.identify.documents.files import to_json
+from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.monitoring.recursive.block_order import LONGEST_HOLD_S, BlockOrder
 from armident.identify.monitoring.recursive.estimator import RecursiveEstimator
+from armident.identify.monitoring.recursive.live_watch import LiveWatch, live_estimator
 from armident.identify.monitoring.recursive.replay import blocks_of
 from armident.identify.monitoring.recursive.saved_state import state_of
-from armident.identify.monitoring.recursive.watch import (
-    LiveWatch,
-    WatchOptions,
-    live_estimator,
-    watch_cell,
-    watch_recordings,
-)
+from armident.identify.monitoring.recursive.watch import WatchOptions, watch_cell, watch_recordings
 from armident.identify.monitoring.stream_buffer import LARGEST_BLOCK
 from tests.fixtures import arms
 from tests.integration.test_worker import blocks_of as published_blocks

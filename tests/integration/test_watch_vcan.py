@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 from armident.configs import config_path
-from armident.identify.document import to_json
+from armident.identify.documents.files import to_json
 from tests.fixtures import arms
 from tests.fixtures.processes import ForkedProcess, armident
 from tests.integration.test_capture_vcan import session_file

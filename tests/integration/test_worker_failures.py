@@ -18,7 +18,8 @@ from armident.configs.schema.session import IdentificationOptions
 from armident.daq.recording import Recording, RecordingWriter, StreamLayout, read_recording, write_recording
 from armident.daq.streaming import Keys, encode_block, encode_event, open_session
 from armident.daq.streaming.codec import end_content, start_content
-from armident.identify.document import IdentificationDocument, load_document
+from armident.identify.documents.files import load_document
+from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.identification.api import identify_recording
 from armident.identify.monitoring import worker as module
 from armident.identify.monitoring.ledger import FILE, Ledger

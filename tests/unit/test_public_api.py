@@ -14,7 +14,7 @@ from armident.daq.recording import write_recording
 from tests.fixtures import arms
 
 REPOSITORY = Path(__file__).resolve().parents[2]
-DIAGNOSE = "armident.identify.api.diagnose"
+DIAGNOSE = "armident.identify.api.diagnosis.diagnose"
 
 
 @pytest.fixture(scope="module")
@@ -185,7 +185,11 @@ def test_a_mistake_is_one_clear_line(call: object, expected: str) -> None:
     "module",
     [
         "armident",
-        "armident.identify.api",
+        "armident.identify.api.comparison",
+        "armident.identify.api.diagnosis",
+        "armident.identify.api.identification",
+        "armident.identify.api.prediction",
+        "armident.identify.api.trajectory",
         "armident.identify.robot_model",
         "armident.virtual_robot.api",
         "armident.identify.robot.arm",

@@ -15,7 +15,7 @@ from queue import Empty, SimpleQueue
 from typing import Any, Literal
 
 from armident.configs import ArmidentError
-from armident.identify.document import DiagnosisDocument
+from armident.identify.documents.diagnosis import DiagnosisDocument
 from armident.identify.evaluation.diagnosis_process import DiagnosisProcess
 from armident.identify.evaluation.plant_process import PlantProcess
 from armident.identify.evaluation.random_arms.score import RandomScore, Truth, score_case, truth_from

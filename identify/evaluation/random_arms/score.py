@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, cast
 
-from armident.identify.document import DiagnosisDocument
+from armident.identify.documents.diagnosis import DiagnosisDocument
 from armident.identify.evaluation.cases import Case, InjectedEffect
 from armident.identify.evaluation.score import LOW_CONFIDENCE, UNNAMED, closed_share
 

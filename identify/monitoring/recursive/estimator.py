@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armident.configs import RobotConfig
-from armident.identify.document import IdentificationDocument
+from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.monitoring.recursive.change_detection import FrictionTest
 from armident.identify.monitoring.recursive.equations import Instant, StreamEquations
 from armident.identify.monitoring.recursive.kernels import update

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armident.configs import ConfigError, DataError, RobotConfig
-from armident.identify.document import IdentificationDocument
+from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.identification.torque_delay import HELD
 from armident.identify.monitoring.recursive.kernels import solve
 from armident.identify.monitoring.recursive.settings import RecursiveSettings

@@ -6,7 +6,7 @@ import numpy as np
 from rich.table import Table
 
 from armident.configs import RobotConfig
-from armident.identify.document import plain
+from armident.identify.documents.base import plain
 from armident.identify.monitoring.recursive.estimator import RecursiveResult
 
 SCHEMA = "armident/recursive/1"

@@ -4,7 +4,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from armident.configs import ConfigError, DataError
-from armident.identify.document import IdentificationDocument, load_document, to_json, write_atomically
+from armident.identify.documents.files import load_document, to_json, write_atomically
+from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.monitoring.history import History
 
 

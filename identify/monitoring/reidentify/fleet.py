@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Any
 from armident.configs import ArmidentError, ConfigError, DataError, RobotConfig, load_robot
 from armident.daq.recording import Recording, read_recording
 from armident.extras import install_line
-from armident.identify.document import IdentificationDocument, from_json, load_document, to_json
+from armident.identify.documents.files import from_json, load_document, to_json
+from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.identification.api import identify_recording
 from armident.identify.identification.options import Options
 from armident.identify.monitoring.change_test import ParameterChangeTest, compare

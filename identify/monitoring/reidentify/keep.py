@@ -7,7 +7,7 @@ from pathlib import Path
 
 from armident.configs import ConfigError
 from armident.daq.recording import Recording
-from armident.identify.document import IdentificationDocument
+from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.monitoring.change_test import ParameterChangeTest
 from armident.identify.monitoring.history import History
 from armident.identify.monitoring.history_schema import wait_and_try

@@ -20,7 +20,9 @@ from armident.configs import (
     load_trajectory,
 )
 from armident.daq.recording import Recording
-from armident.identify.document import DiagnosisDocument, IdentificationDocument, from_json, to_json
+from armident.identify.documents.diagnosis import DiagnosisDocument
+from armident.identify.documents.files import from_json, to_json
+from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.effects.terms import arm_model
 from armident.identify.excitation.point_to_point import sample_trajectory
 from armident.identify.excitation.previous_estimate import previous_estimate

@@ -5,7 +5,7 @@ import re
 import numpy as np
 
 from armident.configs import RobotConfig
-from armident.identify.document import DiagnosisDocument
+from armident.identify.documents.diagnosis import DiagnosisDocument
 from armident.identify.monitoring.change_test import ParameterChangeTest
 
 _NAME = re.compile(r"([a-z]+)(\d+)r?(?:_\d+)?$")

@@ -331,6 +331,16 @@ def test_times_in_another_unit_are_recognised(tmp_path: Path, unit: str, factor:
         import_recording(path, TX40, time_unit="min")
 
 
+@pytest.mark.parametrize("step", [1e-10, 1e-200, 5e-324])
+@pytest.mark.parametrize("repeats", [1, 2])
+def test_steps_below_a_nanosecond_are_no_clock(tmp_path: Path, step: float, repeats: int) -> None:
+    values = motion(500, 1000.0)
+    values[:, 0] = np.arange(500) // repeats * step
+    path = written(tmp_path / "a.csv", values, cell="{:.17g}")
+    with pytest.raises(DataError, match=r"shorter than 1 ns.*--time-unit"):
+        import_recording(path, TX40)
+
+
 def test_slow_motion_and_low_rates_are_seconds(tmp_path: Path) -> None:
     for rate, share in ((30.0, 1.0), (1000.0, 0.001), (5000.0, 1.0)):
         values = motion(600, rate)

@@ -215,6 +215,13 @@ def test_undecided_numbers_are_said(tmp_path: Path, value: str, number: int | No
     assert said is None or (said in sheet.remarks[0] and f"1018h:01 DefaultValue={value}" in sheet.remarks[0])
 
 
+@pytest.mark.parametrize("heading", ["[OptionalObjects]", "[OPTIONALOBJECTS]"])
+def test_objects_of_the_lists_without_a_section_are_named(tmp_path: Path, heading: str) -> None:
+    text = f"{heading}\nSupportedObjects=3\n1=0x1000\n2=0x1018\n3=0x6064\n" + PLAIN
+    sheet = read_eds(written(tmp_path, text.replace("[1018]\n", "[stray]\n")), NODE)
+    assert sheet.remarks == (f"{eds.LACKING}: 6064h",)
+
+
 def test_a_dcf_is_read(tmp_path: Path) -> None:
     text = PLAIN.replace("DefaultValue=0x2AB", "DefaultValue=0x2AB\nParameterValue=0x2AC")
     objects = read_eds(written(tmp_path, text, name="drive.DCF"), NODE).objects

@@ -9,7 +9,8 @@ import armident
 from armident.configs import ConfigError
 from armident.daq.cli import application
 from armident.daq.recording import write_recording
-from armident.identify.document import DiagnosisDocument, load_document
+from armident.identify.documents.diagnosis import DiagnosisDocument
+from armident.identify.documents.files import load_document
 from tests.fixtures.arms import FAST, recording
 from tests.fixtures.diagnoses import SPRING
 

@@ -10,7 +10,7 @@ from armident.identify.diagnosis.findings import gap_of
 from armident.identify.diagnosis.model_state import with_report_part
 from armident.identify.diagnosis.selection import StepwiseSelection
 from armident.identify.diagnosis.study import build_study
-from armident.identify.document import Gap
+from armident.identify.documents.diagnosis import Gap
 from tests.fixtures.diagnoses import measured_diagnosis
 from tests.statistics.measured import tx40
 

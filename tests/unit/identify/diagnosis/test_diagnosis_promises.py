@@ -11,7 +11,7 @@ import pytest
 from armident.configs.schema.scenario import HiddenEffect
 from armident.daq.recording import write_recording
 from armident.identify.diagnosis.diagnose import diagnose
-from armident.identify.document import Finding
+from armident.identify.documents.diagnosis import Finding
 from armident.identify.identification.from_recording import experiments_from_recording
 from tests.fixtures.arms import recording
 from tests.fixtures.diagnoses import WORN_AND_SPRUNG, diagnosis

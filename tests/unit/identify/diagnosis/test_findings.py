@@ -3,7 +3,7 @@
 import pytest
 
 from armident.identify.diagnosis.findings import less_certain
-from armident.identify.document import Finding, Unexplained
+from armident.identify.documents.diagnosis import Finding, Unexplained
 from armident.identify.effects.unnamed import NAME as UNNAMED
 
 

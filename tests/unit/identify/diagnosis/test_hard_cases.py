@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from armident.configs.loading import load_suite
-from armident.identify.document import to_json
+from armident.identify.documents.files import to_json
 from armident.identify.evaluation.cases import all_cases
 from armident.identify.evaluation.tasks import DiagnosisTask, diagnose_file
 from armident.virtual_robot.json_server import simulate_request

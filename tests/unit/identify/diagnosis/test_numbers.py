@@ -13,7 +13,7 @@ from armident.identify.diagnosis.candidates import ColumnCache
 from armident.identify.diagnosis.numbers import NumbersFinding, stale_numbers
 from armident.identify.diagnosis.regression import Fit, fit
 from armident.identify.diagnosis.study import build_study
-from armident.identify.document import IdentificationDocument
+from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.identification.from_recording import experiments_from_recording
 from tests.fixtures.arms import FAST, recording, tx40_baseline
 

@@ -11,7 +11,9 @@ from armident.identify.diagnosis.comparison import Addition, Step, advantage
 from armident.identify.diagnosis.criteria import Criteria
 from armident.identify.diagnosis.diagnose import diagnose
 from armident.identify.diagnosis.model_state import ModelState
-from armident.identify.diagnosis.selection import Contested, Selected, StepwiseSelection
+from armident.identify.diagnosis.selected import Selected
+from armident.identify.diagnosis.selection import StepwiseSelection
+from armident.identify.diagnosis.shortlist import Contested, shortlist
 from armident.identify.effects.registry import known
 from armident.identify.effects.terms import arm_model
 from armident.identify.identification.from_recording import experiments_from_recording
@@ -110,18 +112,18 @@ def test_an_effect_beside_which_a_finding_stays_does_not_take_its_place() -> Non
 def test_only_effects_on_a_joint_of_a_finding_compete_with_it() -> None:
     worn = hide("asymmetric_viscous_friction", "joint_2", ratio=0.3)
     steps, first = selection(5, worn, arm="tx40", motion="tx40_excitation")
-    every, tests = steps._shortlist(first, None)
+    every = shortlist(first, steps.criteria, None)
     joints = np.arange(6) == 1
-    chosen, same = steps._shortlist(first, Contested(0.0, joints))
+    chosen = shortlist(first, steps.criteria, Contested(0.0, joints))
     motion = first.study.motion(first.study.train[0], "measured", first.fit.theta)
 
     def acts(candidate: Candidate, shapes: Shapes) -> bool:
         return bool(candidate.effect.torque(motion, candidate.place, dict(shapes))[:, 1].any())
 
-    assert same == tests
-    assert not all(acts(candidate, shapes) for candidate, shapes, _ in every)
-    assert all(acts(candidate, shapes) for candidate, shapes, _ in chosen)
-    assert ("asymmetric_viscous_friction", 1) in [(one.effect.key, one.place.joint) for one, *_ in chosen]
+    assert chosen.tests == every.tests
+    assert not all(acts(candidate, shapes) for candidate, shapes, _ in every.chosen)
+    assert all(acts(candidate, shapes) for candidate, shapes, _ in chosen.chosen)
+    assert ("asymmetric_viscous_friction", 1) in [(one.effect.key, one.place.joint) for one, *_ in chosen.chosen]
 
 
 def test_a_finding_does_not_compete_again_while_its_joints_have_not_changed() -> None:

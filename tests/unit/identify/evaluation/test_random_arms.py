@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from armident.identify.document import DiagnosisDocument, Finding
+from armident.identify.documents.diagnosis import DiagnosisDocument, Finding
 from armident.identify.evaluation.random_arms import run
 from armident.identify.evaluation.random_arms.run import RandomOptions, RandomRun, run_cases, run_random_suite
 from armident.identify.evaluation.random_arms.score import Claim, RandomScore, Truth, is_right, score_case, truth_from

@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 from scipy import stats
 
-from armident.identify.document import DetectionLimit, DiagnosisDocument, Finding
+from armident.identify.documents.diagnosis import DetectionLimit, DiagnosisDocument, Finding
 from armident.identify.evaluation.cases import Case, InjectedEffect
 from armident.identify.evaluation.markdown import report, shortfalls
 from armident.identify.evaluation.score import Score, closed_share, matches, score, within

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from armident.configs import ArmidentError, ConfigError, DataError, load_robot
-from armident.identify.document import DiagnosisDocument
+from armident.identify.documents.diagnosis import DiagnosisDocument
 from armident.identify.evaluation import plant_process
 from armident.identify.evaluation.cases import Case
 from armident.identify.evaluation.diagnosis_process import DiagnosisProcess

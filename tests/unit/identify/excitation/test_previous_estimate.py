@@ -8,7 +8,8 @@ from scipy.signal import lfilter
 
 from armident.configs import DataError, load_robot, load_trajectory
 from armident.identify.cli import trajectory as trajectory_command
-from armident.identify.document import IdentificationDocument, to_json, write_atomically
+from armident.identify.documents.files import to_json, write_atomically
+from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.excitation.previous_estimate import _deviation_below, physical_estimate, previous_estimate
 from armident.identify.identification.equations import LS_CUTOFF
 from tests.fixtures.arms import identified

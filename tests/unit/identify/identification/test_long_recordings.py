@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from armident.daq.recording import Recording
-from armident.identify.document import IdentificationDocument
+from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.identification import from_recording
 from armident.identify.identification.api import identify_recording
 from armident.identify.identification.from_recording import StretchRule, experiments_from_recording

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from armident.configs import ConfigError
-from armident.identify.document import to_json
+from armident.identify.documents.files import to_json
 from armident.identify.effects.terms import arm_model
 from armident.identify.identification.api import IdentificationOutcome, identify_recording
 from armident.identify.identification.options import METHODS, Method, Options, parse_decimation, parse_nvr

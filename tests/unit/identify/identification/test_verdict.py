@@ -9,7 +9,8 @@ from scipy.signal import lfilter
 
 from armident.configs import DataError, Trajectory, load_robot
 from armident.configs.schema.robot import RobotConfig
-from armident.identify.document import IdentificationDocument, from_json, to_json
+from armident.identify.documents.files import from_json, to_json
+from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.effects.terms import arm_model
 from armident.identify.estimators.diagnostics import Diagnostics
 from armident.identify.experiment import Experiment

@@ -15,7 +15,8 @@ import armident
 from armident.configs import ConfigError, DataError, RobotConfig, load_robot
 from armident.configs.schema.robot import Effect
 from armident.daq.cli import application
-from armident.identify.document import VerdictReason, to_json
+from armident.identify.documents.files import to_json
+from armident.identify.documents.identification import VerdictReason
 from armident.identify.effects.terms import arm_model
 from armident.identify.model_export.exported_model import ExportedModel, load_exported_model
 from armident.identify.model_export.formats import FORMATS, export_model

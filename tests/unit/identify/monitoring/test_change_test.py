@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from armident.configs import DataError
-from armident.identify.document import IdentificationDocument, Parameter, RecordingReference
+from armident.identify.documents.base import RecordingReference
+from armident.identify.documents.identification import IdentificationDocument, Parameter
 from armident.identify.monitoring.change_test import FALSE_ALARMS, Inconclusive, compare
 
 NAMES = [f"p{k}" for k in range(30)]

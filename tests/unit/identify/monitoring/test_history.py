@@ -17,7 +17,8 @@ from typer.testing import CliRunner
 
 from armident.configs import ConfigError
 from armident.daq.cli import application
-from armident.identify.document import IdentificationDocument, to_json
+from armident.identify.documents.files import to_json
+from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.monitoring import history_schema
 from armident.identify.monitoring.history import History, recorded_at
 from tests.fixtures.postgresql import postgresql, programs

@@ -17,7 +17,8 @@ from armident.configs import ConfigError, DataError, config_path, load_robot, lo
 from armident.configs.schema.scenario import Scenario
 from armident.daq.cli import application
 from armident.daq.recording import Recording, write_recording
-from armident.identify.document import IdentificationDocument, load_document, to_json
+from armident.identify.documents.files import load_document, to_json
+from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.identification.api import identify_recording
 from armident.identify.monitoring.change_test import compare
 from armident.identify.monitoring.history import History

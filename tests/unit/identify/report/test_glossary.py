@@ -7,8 +7,7 @@ import pytest
 
 from armident.configs import load_robot
 from armident.identify.diagnosis.free_functions import Kind
-from armident.identify.document import (
-    EVIDENCE_1,
+from armident.identify.documents.diagnosis import (
     BeforeAfter,
     DiagnosisDocument,
     Finding,
@@ -17,6 +16,7 @@ from armident.identify.document import (
     Unexplained,
     Verdict,
 )
+from armident.identify.documents.diagnosis_version_1 import EVIDENCE_1
 from armident.identify.effects.registry import catalogue
 from armident.identify.effects.terms import arm_model
 from armident.identify.effects.wiring import Wiring

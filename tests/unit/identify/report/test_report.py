@@ -6,7 +6,8 @@ from pathlib import Path
 import pytest
 from markupsafe import escape
 
-from armident.identify.document import IdentificationDocument, VerdictReason, load_document
+from armident.identify.documents.files import load_document
+from armident.identify.documents.identification import IdentificationDocument, VerdictReason
 from armident.identify.identification.api import IdentificationOutcome, identify_recording
 from armident.identify.identification.options import Options
 from armident.identify.report.files import write_identification

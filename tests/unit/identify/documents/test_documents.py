@@ -14,21 +14,11 @@ from armident.configs.schema.scenario import Scenario
 from armident.configs.schema.session import SessionConfig
 from armident.configs.schema.suite import SuiteConfig
 from armident.configs.schema.trajectory import Trajectory
-from armident.identify.document import (
-    BeforeAfter,
-    DiagnosisDocument,
-    Gap,
-    Gaps,
-    IdentificationDocument,
-    from_json,
-    load_document,
-    parameter,
-    plain,
-    schema_files,
-    schema_text,
-    to_json,
-    write_atomically,
-)
+from armident.identify.documents.base import plain
+from armident.identify.documents.diagnosis import BeforeAfter, DiagnosisDocument, Gap, Gaps
+from armident.identify.documents.files import from_json, load_document, to_json, write_atomically
+from armident.identify.documents.identification import IdentificationDocument, parameter
+from armident.identify.documents.schemas import SCHEMA_FILES, schema_text
 
 
 def diagnosis() -> DiagnosisDocument:
@@ -50,14 +40,14 @@ def diagnosis() -> DiagnosisDocument:
     )
 
 
-@pytest.mark.parametrize("name", sorted(schema_files()))
+@pytest.mark.parametrize("name", sorted(SCHEMA_FILES))
 def test_shipped_schema_is_the_one_of_the_code(name: str) -> None:
     text = (Path(configs.__file__).parent / "json_schemas" / name).read_text(encoding="utf-8")
-    assert text == schema_text(schema_files()[name]), "run: python -m armident.identify.document"
+    assert text == schema_text(SCHEMA_FILES[name]), "run: python -m armident.identify.documents"
 
 
 @pytest.mark.parametrize(
-    "kind", [*schema_files().values(), RobotConfig, SessionConfig, Trajectory, Scenario, SuiteConfig]
+    "kind", [*SCHEMA_FILES.values(), RobotConfig, SessionConfig, Trajectory, Scenario, SuiteConfig]
 )
 def test_every_field_of_a_schema_is_described(kind: type[DescribedModel]) -> None:
     schema = kind.model_json_schema(by_alias=True)

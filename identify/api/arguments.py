@@ -1,0 +1,50 @@
+"""Arguments that several public functions take: recordings and robots, as objects or by path or name."""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from armident.configs import ConfigError, RobotConfig, load_robot
+from armident.daq.recording import Recording, read_recording
+
+Progress = Callable[[str, float], None]
+Robot = RobotConfig | str | Path
+Recorded = Recording | str | Path
+
+
+def recordings_of(recordings: Recorded | Sequence[Recorded]) -> tuple[Recording, ...]:
+    """Return the recordings; those given by their path are read.
+
+    Parameters
+    ----------
+    recordings
+        A recording, the path of one, or a sequence of them.
+
+    Raises
+    ------
+    ConfigError
+        If none is given or a file does not exist.
+    """
+    given = [recordings] if isinstance(recordings, Recording | str | Path) else list(recordings)
+    if not given:
+        raise ConfigError("no recording was given")
+    return tuple(one if isinstance(one, Recording) else read_recording(Path(one)) for one in given)
+
+
+def robot_of(robot: Robot | None, recordings: Sequence[Recording]) -> RobotConfig:
+    """Return the configuration to use.
+
+    Parameters
+    ----------
+    robot
+        Configuration, or the path or shipped name of one; ``None``: the one inside the first recording.
+    recordings
+        Recordings, at least one if ``robot`` is ``None``.
+
+    Raises
+    ------
+    ConfigError
+        If there is no such configuration, or it lacks what an identification needs.
+    """
+    if robot is None:
+        return recordings[0].robot
+    return robot if isinstance(robot, RobotConfig) else load_robot(robot, "identify")

@@ -1,0 +1,115 @@
+"""Shortlist of a step: the candidates whose score statistics promise the largest gains of log-likelihood."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armident.identify.diagnosis.candidates import Candidate, ColumnCache, Key, Shapes, candidates
+from armident.identify.diagnosis.corrections import screened_correction
+from armident.identify.diagnosis.criteria import Criteria
+from armident.identify.diagnosis.model_state import ModelState
+from armident.identify.diagnosis.order_analysis import motor_orders, nearby_orders
+from armident.identify.diagnosis.screening import contained, refined, screened
+from armident.identify.diagnosis.shaping import both_ends
+from armident.identify.effects.drive import Correction
+from armident.identify.effects.transmission import MotorOrder
+from armident.identify.effects.unnamed import NAME as UNNAMED
+
+Starts = tuple[float, ...]
+"""Values from which the correction of a recorded torque starts; empty for a term of the model."""
+
+
+@dataclass(frozen=True, eq=False)
+class Contested:
+    """A finding with which other effects compete.
+
+    Parameters
+    ----------
+    gain
+        Its gain of log-likelihood beside the other findings, nats.
+    joints
+        Joints on whose torques it acts, (n,). An effect that acts on none of them cannot take its place.
+    """
+
+    gain: float
+    joints: NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class Shortlist:
+    """Candidates of a step that are tested in their own closed loops.
+
+    Parameters
+    ----------
+    chosen
+        The candidates, each with its nonlinear parameters, or with the values from which its correction of recorded
+        torques starts.
+    tests
+        Number of all candidates.
+    hidden
+        Candidates that the motion does not show.
+    """
+
+    chosen: list[tuple[Candidate, Shapes, Starts]]
+    tests: int
+    hidden: frozenset[Key]
+
+
+def shortlist(state: ModelState, criteria: Criteria, contested: Contested | None) -> Shortlist:
+    """Return the candidates with the highest statistics less their numbers of parameters.
+
+    Parameters
+    ----------
+    state
+        Model without them.
+    criteria
+        Thresholds.
+    contested
+        Finding that the model is without, if only effects that could take its place are compared.
+    """
+    column_cache = ColumnCache(state.study, state.fit.theta)
+    noise = state.fit.renoised(state.weights)
+    looks: list[tuple[float, Candidate, tuple[float, Shapes], Starts]] = []
+    tests, hidden = 0, set()
+    for every in candidates(column_cache):
+        candidate = every
+        tests += 1
+        if contested is not None and not contested.joints[column_cache.joints(candidate)].any():
+            continue
+        if isinstance(candidate.effect, MotorOrder):
+            candidate = replace(candidate, grid=motor_orders(state.study, state.fit.theta, candidate.place.joint))
+        found: tuple[float, Shapes] | None
+        starts: Starts = ()
+        if isinstance(candidate.effect, Correction):
+            statistic, starts = screened_correction(noise, candidate, column_cache)
+            found = statistic, ()
+        else:
+            found = screened(noise, candidate, column_cache)
+        if found is None:
+            hidden.add(candidate.key)
+        else:
+            looks.append((found[0] - 2.0 * len(candidate.effect.linear), candidate, found, starts))
+    # A score statistic is twice the gain of log-likelihood that it promises. A correction needs all of it: its
+    # likelihood also rewards smaller noise.
+    needed, promising = criteria.needed_gain(tests), criteria.promising
+    present = 0.0 if contested is None else contested.gain
+    looks = [x for x in looks if 0.5 * x[2][0] > max(needed * (1.0 if x[3] else promising), promising * present)]
+    looks.sort(key=lambda look: -look[0])
+    named = [x for x in looks if x[1].effect.name != UNNAMED][: criteria.shortlist]
+    unnamed = [x for x in looks if x[1].effect.name == UNNAMED][: criteria.unnamed]
+    chosen: list[tuple[Candidate, Shapes, Starts]] = []
+    for _, own, first, starts in (*named, *unnamed):
+        candidate, found = own, first
+        if starts:
+            chosen.append((candidate, (), starts))
+            continue
+        if isinstance(candidate.effect, MotorOrder):
+            near = nearby_orders(state.study, candidate.place.joint, found[1][0][1])
+            candidate = replace(candidate, grid=near)
+            found = screened(noise, candidate, column_cache) or found
+        shapes = refined(noise, candidate, column_cache, found)
+        for ends in both_ends(noise, candidate, column_cache, shapes):
+            without = contained(noise, candidate, column_cache, ends)
+            chosen.append((replace(candidate, without=without), ends, ()))
+    return Shortlist(chosen, tests, frozenset(hidden))

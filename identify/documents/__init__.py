@@ -1,0 +1,1 @@
+"""Result documents, their JSON Schemas, and reading and writing them."""

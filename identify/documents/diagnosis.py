@@ -1,0 +1,305 @@
+"""The document ``diagnosis.json``."""
+
+from collections.abc import Mapping
+from typing import Any, Literal
+
+from pydantic import Field, model_validator
+
+from armident.identify.documents.base import Document, RecordingReference
+from armident.identify.documents.diagnosis_version_1 import DIAGNOSIS_1, diagnosis_from_version_1
+
+DERIVATIVE_NOISE = 0.98
+"""Ratio of the gap without derivative noise to the gap; below it both are shown."""
+
+Verdict = Literal["no_gap", "explained", "partly_explained", "unexplained"]
+
+
+class Alternative(Document):
+    """Another effect in place of a finding.
+
+    Parameters
+    ----------
+    effect
+        Name of the effect.
+    joint
+        Name of its joint.
+    score
+        Its gain in log-likelihood, training and held-out data.
+    """
+
+    effect: str
+    joint: str
+    score: float
+
+
+class Finding(Document):
+    """One effect that the model lacks; gaps are relative torque errors in percent on held-out data.
+
+    Parameters
+    ----------
+    effect
+        Name of the effect; ``unnamed``: a regular torque without a known cause.
+    law
+        Formula of the effect: empty for the first one of the catalogue, ``table`` for a free shape. For ``unnamed`` the
+        variable that the torque depends on.
+    joint
+        Joint at which it acts.
+    other
+        Second joint of an effect between two joints.
+    kind
+        ``structure``: the model lacks a term; ``numbers``: parameters differ from those of the baseline.
+    parameters
+        Estimated parameters, SI.
+    confidence
+        Probability that this effect is there, 0 to 1.
+    alternatives
+        Rivals of the finding, the best first.
+    gap_before
+        Torque error of the joint without the finding, percent.
+    gap_after
+        Torque error of the joint with it, percent.
+    evidence
+        Further figures: standard deviations, share of the error power, p-value of the confirmation.
+    """
+
+    effect: str
+    law: str = ""
+    joint: str
+    other: str | None = None
+    kind: Literal["structure", "numbers"]
+    parameters: dict[str, float]
+    confidence: float
+    alternatives: list[Alternative]
+    gap_before: float
+    gap_after: float
+    evidence: dict[str, Any]
+
+    @property
+    def gap_without_derivative_noise(self) -> float | None:
+        """Gap after the finding without derivative noise, percent; ``None`` if this noise makes no difference."""
+        without = self.evidence.get("gap_without_derivative_noise")
+        return None if without is None or without >= DERIVATIVE_NOISE * self.gap_after else float(without)
+
+    @property
+    def rejection(self) -> str:
+        """Effect, joint and the reason for the rejection, for the list of rejected effects."""
+        better = self.evidence.get("better_unnamed_dependences", [])
+        reason = f" (the {' and the '.join(better)} explains more)" if better else ""
+        return f"{self.effect.replace('_', ' ')} of {self.joint}{reason}"
+
+
+class Unexplained(Document):
+    """Part of a joint's residual that no effect of the catalogue explains.
+
+    Parameters
+    ----------
+    joint
+        Name of the joint.
+    share_of_residual
+        Share of the power of the residual, 0 to 1.
+    varies_with
+        Variable that it depends on.
+    hint
+        Probable causes.
+    """
+
+    joint: str
+    share_of_residual: float
+    varies_with: str
+    hint: str
+
+
+class Negligible(Document):
+    """Effect that is significant and smaller than what counts as a cause; it is not in the model.
+
+    Parameters
+    ----------
+    effect
+        Name of the effect.
+    joint
+        Name of the joint.
+    change_of_torque_pct
+        Its torque in percent of that of the joint.
+    share_of_residual
+        Share of the power of the joint's residual that it removes, 0 to 1.
+    """
+
+    effect: str
+    joint: str
+    change_of_torque_pct: float
+    share_of_residual: float
+
+
+class NotVisible(Document):
+    """Effect that these recordings cannot show at a joint at any size.
+
+    Parameters
+    ----------
+    effect
+        Name of the effect.
+    joint
+        Name of the joint.
+    reason
+        Reason for which it is invisible.
+    required_motion
+        Motion that would show it.
+    """
+
+    effect: str
+    joint: str
+    reason: str
+    required_motion: str
+
+
+class DetectionLimit(Document):
+    """Smallest size at which an effect at a joint would be detected with a probability of 0.9.
+
+    Parameters
+    ----------
+    effect
+        Name of the effect.
+    joint
+        Name of the joint.
+    other
+        Second joint of an effect between two joints.
+    limits
+        Size of each linear parameter with the others at zero.
+    units
+        Unit of each.
+    """
+
+    effect: str
+    joint: str
+    other: str | None = None
+    limits: dict[str, float]
+    units: dict[str, str]
+
+
+class Gap(Document):
+    """Relative torque error.
+
+    Parameters
+    ----------
+    all
+        Of all joints together, percent.
+    by_joint
+        Of each joint, percent.
+    rms
+        Root mean square of the torque error of each joint, N m or N.
+    """
+
+    all: float
+    by_joint: dict[str, float]
+    rms: dict[str, float] = Field(default_factory=dict)
+
+
+class BeforeAfter(Document):
+    """Gap of two models.
+
+    Parameters
+    ----------
+    before
+        Gap of the model as configured.
+    after
+        Gap of the model with the findings added.
+    """
+
+    before: Gap
+    after: Gap
+
+
+class Gaps(Document):
+    """Gap on both parts of the data.
+
+    Parameters
+    ----------
+    train
+        Gap on the training data.
+    validation
+        Gap on the held-out data.
+    """
+
+    train: BeforeAfter
+    validation: BeforeAfter
+
+
+class DiagnosisDocument(Document):
+    """``diagnosis.json``: effects that the model lacks, their share of the torque error, and the unexplained rest.
+
+    Parameters
+    ----------
+    schema_
+        Name and version of the document.
+    robot
+        Name of the robot.
+    recordings
+        Recordings that were diagnosed.
+    verdict
+        Summary of findings and unexplained parts.
+    findings
+        Effects that the model lacks, those with a name first.
+    unexplained
+        Parts of the residual that depend on the motion and have no cause.
+    gap
+        Torque errors before and after the findings.
+    noise_floor
+        Torque error that noise alone causes.
+    recommended_experiment
+        Motion or recording that would decide between alternatives.
+    model
+        Robot configuration with the findings; null if there are none or it was not written.
+    timing_s
+        Time of each step, s.
+    versions
+        Versions of Python and of the libraries.
+    warnings
+        Messages of conversion and diagnosis.
+    not_visible
+        Effects that these recordings cannot show.
+    detection_limits
+        Sizes from which effects would be detected.
+    simulated
+        Errors of the simulated closed loop with both models, percent.
+    considered
+        Effects that documents of former versions list beside the findings.
+    negligible
+        Effects below the least change that counts (``--material``).
+    sign_smoothing
+        ``g`` of each joint's ``sign(qd) -> (2/pi) atan(g qd)``, s/rad or s/m.
+    transitions
+        Velocity over which the dry friction of a joint reverses, rad/s or m/s, where the data show it.
+    criteria
+        All thresholds.
+    alpha
+        Division of the false-alarm rate among the tests.
+    """
+
+    schema_: Literal["armident/diagnosis/2"] = Field("armident/diagnosis/2", alias="schema")
+    robot: str
+    recordings: list[RecordingReference]
+    verdict: Verdict
+    findings: list[Finding]
+    unexplained: list[Unexplained]
+    gap: Gaps
+    noise_floor: Gap
+    recommended_experiment: str | None
+    model: str | None
+    timing_s: dict[str, float]
+    versions: dict[str, str]
+    warnings: list[str]
+    not_visible: list[NotVisible] = Field(default_factory=list)
+    detection_limits: list[DetectionLimit] = Field(default_factory=list)
+    simulated: dict[str, dict[str, float]] | None = None
+    considered: list[Finding] = Field(default_factory=list)
+    negligible: list[Negligible] = Field(default_factory=list)
+    sign_smoothing: dict[str, float] | None = None
+    transitions: dict[str, float] | None = None
+    criteria: dict[str, float] | None = None
+    alpha: dict[str, float] | None = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _from_version_1(cls, data: Any) -> Any:
+        if isinstance(data, Mapping) and data.get("schema") == DIAGNOSIS_1:
+            return diagnosis_from_version_1(data)
+        return data

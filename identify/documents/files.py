@@ -1,0 +1,134 @@
+"""Reading and writing of result documents, and of other files as a whole."""
+
+import json
+import os
+import tempfile
+from pathlib import Path
+from typing import Any, TypeVar
+
+from pydantic import BaseModel, ValidationError
+
+from armident.configs import ConfigError, DataError
+from armident.identify.documents.base import Document
+
+T = TypeVar("T", bound=BaseModel)
+
+
+def to_json(document: Document) -> str:
+    """Return the JSON text of a document, keys in the order of the schema."""
+    return document.model_dump_json(by_alias=True, indent=1) + "\n"
+
+
+def from_json(text: str, kind: type[T], where: str) -> T:
+    """Return the document of a JSON text; older versions are converted.
+
+    Parameters
+    ----------
+    text
+        JSON.
+    kind
+        Class of the document.
+    where
+        Source of the text, for messages.
+
+    Raises
+    ------
+    DataError
+        If the text is no such document; the message names ``where``, the key and the expected value.
+    """
+    try:
+        return kind.model_validate(json.loads(text))
+    except json.JSONDecodeError as error:
+        raise DataError(f"{where}: line {error.lineno}: not valid JSON: {error.msg}") from error
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = ".".join(str(part) for part in first["loc"]) or "document"
+        raise DataError(f"{where}: {key}: {first['msg'][0].lower() + first['msg'][1:]}") from error
+
+
+def load_document(path: Path, kind: type[T]) -> T:
+    """Read a document from a file; older versions are converted.
+
+    Parameters
+    ----------
+    path
+        JSON file.
+    kind
+        Class of the document.
+
+    Raises
+    ------
+    ConfigError
+        If there is no such file.
+    DataError
+        If the file cannot be read or is not such a document.
+    """
+    return from_json(_text(path), kind, str(path))
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Return the JSON object of a file, for instance to find out the schema of a document.
+
+    Parameters
+    ----------
+    path
+        JSON file.
+
+    Raises
+    ------
+    ConfigError
+        If there is no such file.
+    DataError
+        If the file cannot be read or is no JSON object.
+    """
+    try:
+        found = json.loads(_text(path))
+    except json.JSONDecodeError as error:
+        raise DataError(f"{path}: line {error.lineno}: not valid JSON: {error.msg}") from error
+    if not isinstance(found, dict):
+        raise DataError(f"{path}: expected a JSON object")
+    return found
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8")
+    except FileNotFoundError as error:
+        raise ConfigError(f"{path}: no such file") from error
+    except UnicodeDecodeError as error:
+        raise DataError(f"{path}: not a JSON document") from error
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read: {error.strerror}") from error
+
+
+def write_atomically(path: Path, text: str) -> None:
+    """Write a file so that a reader sees all of it or none of it; missing folders are created.
+
+    Parameters
+    ----------
+    path
+        File to write.
+    text
+        Its content, written as UTF-8.
+
+    Raises
+    ------
+    OSError
+        If it cannot be written; its file name is ``path``.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    try:
+        with os.fdopen(handle, "w", encoding="utf-8") as stream:
+            stream.write(text)
+            stream.flush()
+            os.fsync(stream.fileno())
+        # mkstemp restricts the file to its owner; results are readable like any other file.
+        os.chmod(temporary, 0o644)
+        os.replace(temporary, path)
+    except OSError as error:
+        Path(temporary).unlink(missing_ok=True)
+        raise OSError(error.errno, error.strerror, str(path)) from error
+    except BaseException:
+        Path(temporary).unlink(missing_ok=True)
+        raise
