@@ -156,7 +156,7 @@ class BagReader:
     ConfigError
         If there is no such bag, or it cannot be read. The iteration raises it.
     DataError
-        If a file is no bag file. The iteration raises it.
+        If no file is a bag file. The iteration raises it.
     """
 
     def __init__(self, path: Path, message_type: str) -> None:
@@ -171,6 +171,7 @@ class BagReader:
         """Yield the messages in CDR of the type, of every topic."""
         files, absent = bag_files(self._path)
         self.losses += [f"{name}, which {METADATA} lists, is not there" for name in absent]
+        unusable: list[DataError] = []
         for file in files:
             try:
                 for message in self._file(file, file.name if len(files) > 1 else ""):
@@ -178,11 +179,16 @@ class BagReader:
                     yield message
             except OSError as error:
                 raise ConfigError(f"{file}: cannot be read: {error.strerror or 'damaged'}") from error
+            except DataError as error:
+                unusable.append(error)
+                self.losses.append(f"{shortened(file.name)} is left out: {str(error).removeprefix(f'{file}: ')}")
+        if len(unusable) == len(files):
+            raise unusable[0]
         self._expected |= _listed_counts(self._path)
         for topic, expected in sorted(self._expected.items()):
             read = self._read[topic]
             if self.topics.get(topic, self._type) == self._type and read < expected:
-                self.losses.append(f"{expected - read} of {expected} messages of {topic} are missing")
+                self.losses.append(f"{expected - read} of {expected} messages of {shortened(topic)} are missing")
 
     def _file(self, file: Path, name: str) -> Iterator[BagMessage]:
         if file.stat().st_size == 0:

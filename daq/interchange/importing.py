@@ -16,7 +16,7 @@ from armident.daq.interchange.lerobot import data_files
 from armident.daq.interchange.rate_conversion import at_rate
 from armident.daq.interchange.sample_clock import gaps_and_counters
 from armident.daq.interchange.sampling import Sampled, sampled
-from armident.daq.interchange.si_checks import OMITTED, check_units, unit_of
+from armident.daq.interchange.si_checks import OMITTED, check_units, fast_note, unit_of
 from armident.daq.interchange.stated_units import in_si
 from armident.daq.interchange.table_columns import NAMES
 from armident.daq.interchange.table_files import Source, read_pair, read_table
@@ -131,6 +131,8 @@ def import_recording(
         shown = str(error)
         raise type(error)(shown if shown.startswith(str(path)) else f"{path}: {shown}") from error
     notes = (*source.notes, *rows.notes, *made.notes)
+    if not motor_side:
+        notes += fast_note(robot, made.values["position"], made.rate_hz)
     for note in notes:
         logging.getLogger(__name__).warning("%s: %s", path, note)
     facts = {"source": path.name, "source_sha256": _digest(path), **made.facts}

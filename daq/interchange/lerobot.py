@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armident.configs import DataError
+from armident.daq.interchange.bag_files import METADATA, SUFFIXES
 from armident.daq.interchange.text_files import listed
 
 STATE, ACTION, EPISODE = "observation.state", "action", "episode_index"
@@ -32,20 +33,44 @@ def is_lerobot(arrays: Mapping[str, Any]) -> bool:
     arrays
         Columns by name.
     """
-    return STATE in arrays
+    return STATE in arrays or {ACTION, EPISODE} <= set(arrays)
 
 
 def data_files(folder: Path) -> list[Path]:
-    """Return the Parquet files of a data set in order; none if the folder is no data set.
+    """Return the Parquet files of a data set in order; none if the folder is neither a data set nor a part of one.
 
     Parameters
     ----------
     folder
-        A folder with ``meta/info.json`` and ``data``.
+        A folder with ``data``, or one of the folders in it.
     """
-    if not (folder / "meta" / "info.json").is_file():
+    if not folder.is_dir() or any(file.name.endswith((METADATA, *SUFFIXES)) for file in folder.iterdir()):
         return []
-    return sorted((folder / "data").glob("**/*.parquet"))
+    parts = ("data/*/*.parquet", "data/*.parquet", "chunk-*/*.parquet", "*.parquet")
+    return next((found for pattern in parts if (found := sorted(folder.glob(pattern)))), [])
+
+
+def joined(parts: Mapping[Path, Mapping[str, Any]]) -> dict[str, Any]:
+    """Return the columns of the files of a data set, one after the other.
+
+    Parameters
+    ----------
+    parts
+        Columns by name, by file.
+
+    Raises
+    ------
+    DataError
+        If a file lacks a column of another one.
+    """
+    every = dict.fromkeys(name for part in parts.values() for name in part)
+    for file, part in parts.items():
+        if absent := [
+            name for name in every if name not in part and name.startswith((STATE[:12], ACTION, "timestamp"))
+        ]:
+            raise DataError(f"{file}: no column {', '.join(absent)}, which other files of the data set have")
+    common = [name for name in every if all(name in part for part in parts.values())]
+    return {name: np.concatenate([part[name] for part in parts.values()]) for name in common}
 
 
 def lerobot_table(path: Path, arrays: Mapping[str, Any]) -> tuple[dict[str, NDArray[np.float64]], list[str]]:
@@ -70,6 +95,8 @@ def lerobot_table(path: Path, arrays: Mapping[str, Any]) -> tuple[dict[str, NDAr
         base: next((name for name in arrays if name.startswith("observation.") and name.split(".")[-1] in words), None)
         for base, words in _EFFORTS.items()
     }
+    if STATE not in arrays:
+        raise DataError(f"{path}: this data set has no {STATE}, the measured positions; found {listed(list(arrays))}")
     if not any(efforts.values()):
         raise DataError(
             f"{path}: this data set has no effort or current of its joints, which a model is identified from; "
@@ -78,6 +105,7 @@ def lerobot_table(path: Path, arrays: Mapping[str, Any]) -> tuple[dict[str, NDAr
     sources = {"position": STATE, "demand": ACTION, "effort": efforts["tau"], "current": efforts["current"]}
     bases = {"position": "q", "demand": "qr", "effort": "tau", "current": "current"}
     state_names = _names(features, STATE)
+    unnamed: list[str] = []
     for quantity, source in sources.items():
         if source is None or source not in arrays:
             continue
@@ -91,6 +119,9 @@ def lerobot_table(path: Path, arrays: Mapping[str, Any]) -> tuple[dict[str, NDAr
             table |= {f"{name}/{word}": values[:, j] for j, name in enumerate(names)}
         else:
             table[bases[quantity]] = values
+            unnamed.append(source)
+    if unnamed:
+        notes.append(f"no names of joints in meta/info.json: {listed(unnamed)} taken in the order of the robot")
     if len({len(values) for values in table.values()}) > 1:
         raise DataError(f"{path}: its columns have unequal lengths")
     if "timestamp" in arrays:

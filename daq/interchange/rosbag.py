@@ -12,6 +12,7 @@ from armident.configs import DataError, RobotConfig
 from armident.daq.interchange.bag_files import BagReader
 from armident.daq.interchange.joint_messages import DEFINITION, MESSAGE_TYPE, MessageTable, TopicMessages
 from armident.daq.interchange.joint_names import JointMatch, match_joints
+from armident.daq.interchange.text_files import listed, printable, shortened
 from armident.daq.interchange.time_stamps import FASTEST_HZ, SLOWEST_HZ
 
 TOPIC = "/joint_states"
@@ -87,7 +88,7 @@ def read_joint_states(
     reader = BagReader(path, MESSAGE_TYPE)
     found: dict[str, TopicMessages] = {}
     for message in reader:
-        found.setdefault(message.topic, TopicMessages(message.topic)).add(message.logged_ns, message.data)
+        found.setdefault(message.topic, TopicMessages(printable(message.topic))).add(message.logged_ns, message.data)
     try:
         chosen, match, remarks = _choose(reader, found, robot, topic, joints, by_position)
         t_ns, q, tau, passed = _samples(chosen, match, robot)
@@ -108,17 +109,17 @@ def _choose(
     """Return the messages of the topic, the robot's joints in them, and a remark on other topics."""
     topics = sorted(name for name, kind in reader.topics.items() if kind == MESSAGE_TYPE)
     if not topics:
-        have = ", ".join(f"{name} ({kind})" for name, kind in sorted(reader.topics.items()))
+        have = ", ".join(f"{shortened(name)} ({shortened(kind)})" for name, kind in sorted(reader.topics.items()))
         found_instead = f"{have}; record a topic of this type, such as {TOPIC}" if have else "no topic"
         raise DataError(f"no topic of {MESSAGE_TYPE} in CDR; found {found_instead}")
     if topic is not None:
         name = topic if topic in topics else f"/{topic}"
         if name not in topics:
-            raise DataError(f"--topic: no joint states on {topic}; the bag has {', '.join(topics)}")
+            raise DataError(f"--topic: no joint states on {topic}; the bag has {', '.join(map(shortened, topics))}")
         topics = [name]
     full = [found[name] for name in topics if name in found]
     if not full:
-        raise DataError(f"no message on {', '.join(topics)}")
+        raise DataError(f"no message on {', '.join(map(shortened, topics))}")
     if len(full) == 1:
         full[0].refuse_unusable()
         return full[0], match_joints(full[0].names(), robot.joints, by_position=by_position, joints=joints), []
@@ -129,7 +130,7 @@ def _choose(
         except DataError:
             continue
         matches.append((messages, match))
-    contents = "; ".join(f"{m.topic}: {m.count} messages of {', '.join(m.names())}" for m in full)
+    contents = "; ".join(f"{m.topic}: {m.count} messages of {listed(m.names())}" for m in full)
     if len(matches) != 1:
         how = "joints of the robot on several topics" if matches else "no topic has the joints of the robot"
         wanted = ", ".join(joint.source_name or joint.name for joint in robot.joints)

@@ -15,6 +15,14 @@ OMITTED = "-"
 _POSITION_FACTOR, _TORQUE_FACTOR = 3.0, 10.0
 """Positions and torques beyond these multiples of the joint's limits are taken as a wrong unit."""
 
+_PLAUSIBLE = 1.5
+"""Positions and torques up to this multiple of the joint's limits make a unit plausible."""
+
+_FASTEST = 3.0
+"""Velocities beyond this multiple of the joint's limit are taken as a wrong unit."""
+_WINDOWS = 200
+"""Velocities are differences over this part of the recording."""
+
 _MOVED_SHARE = 1e-3
 """Share of its position range that a joint must move for its demand to be checked."""
 _UNEXPLAINED_SHARE = 0.5
@@ -85,9 +93,50 @@ def check_units(
             if not peak <= factor * limit:
                 raise DataError(
                     f"{path}: {name} of {axis.name} reaches {peak:.4g}, its limit is {limit:.4g}: expected {hint}"
+                    f"{_other_unit(name, axis.type, peaks / np.array(limits))}"
                 )
     if "demand" in raw:
         _check_demand(path, robot, raw["demand"][known], raw["position"][known])
+
+
+def _other_unit(name: str, kind: str, shares: NDArray[np.float64]) -> str:
+    """Return the option that reads another unit, if all values (shares of the limits, (n,)) are plausible in it."""
+    unit, factor = {
+        ("torque", "revolute"): ("torque=mnm", 1e-3),
+        ("position", "revolute"): ("position=deg", np.pi / 180.0),
+        ("position", "prismatic"): ("position=mm", 1e-3),
+    }.get((name, kind), ("", 1.0))
+    return (
+        f"; --units {unit} if they are in {unit.split('=')[1]}" if unit and factor * shares.max() <= _PLAUSIBLE else ""
+    )
+
+
+def fast_note(robot: RobotConfig, position: NDArray[np.float64], rate_hz: float) -> tuple[str, ...]:
+    """Return a sentence on joints that move far beyond their velocity limits; joints without one tell nothing.
+
+    Parameters
+    ----------
+    robot
+        The robot, for its limits.
+    position
+        Positions on the joint side, (N, n).
+    rate_hz
+        Sampling rate, 1/s.
+    """
+    # An odd number of rows, so that the values of two sources in turn show.
+    apart = len(position) // _WINDOWS | 1
+    if len(position) <= apart:
+        return ()
+    limits = np.array([joint.limits.velocity or np.inf for joint in robot.joints])
+    speeds = np.quantile(np.abs(position[apart:] - position[:-apart]), 0.99, axis=0) * rate_hz / apart
+    fast = [joint.name for joint, share in zip(robot.joints, speeds / limits, strict=True) if share > _FASTEST]
+    if not fast:
+        return ()
+    most = float((speeds / limits).max())
+    return (
+        f"{', '.join(fast)}: velocities of up to {most:.3g} times the limit, as of positions in degrees "
+        "(--units position=deg), times in another unit (--time-unit), or two sources of one joint",
+    )
 
 
 def _check_demand(path: Path, robot: RobotConfig, demand: NDArray[np.float64], position: NDArray[np.float64]) -> None:

@@ -1,6 +1,6 @@
 """Reading of tables of measurements: CSV, NPZ, MAT, Parquet, and data sets of LeRobot."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from armident.configs import ConfigError, DataError, RobotConfig
 from armident.configs.yaml_loader import is_file
 from armident.daq.interchange.csv_files import read_csv
-from armident.daq.interchange.lerobot import data_files, is_lerobot, lerobot_table
+from armident.daq.interchange.lerobot import data_files, is_lerobot, joined, lerobot_table
 from armident.daq.interchange.sandbox import read_in_subprocess
 from armident.daq.interchange.table_columns import without_units
 from armident.daq.interchange.text_files import printable, shortened
@@ -82,9 +82,7 @@ def read_table(path: Path) -> Source:
         raise ConfigError(f"{path}: no such file")
     kind = path.suffix.lower()
     if files:
-        parts = [_parquet(file) for file in files]
-        found = {name: np.concatenate([part[name] for part in parts if name in part]) for name in parts[0]}
-        return _from_arrays(path, found)
+        return _lerobot_folder(path, files)
     if kind in (".csv", ".txt", ".tsv"):
         return _csv(path)
     readers = {".npz": _npz, ".mat": _mat, ".parquet": _parquet}
@@ -149,6 +147,21 @@ def _csv(path: Path) -> Source:
     columns = {name: table.values[:, k] for k, name in enumerate(header) if name}
     units = [unit for name, unit in zip(header, table.units, strict=False) if name]
     return _converted(Source(path, columns, table.lines, notes=table.notes), units)
+
+
+def _lerobot_folder(path: Path, files: Sequence[Path]) -> Source:
+    """Return the arrays of a data set without the files that cannot be read, which are named."""
+    parts, damaged = {}, []
+    for file in files:
+        try:
+            parts[file] = _parquet(file)
+        except DataError:
+            damaged.append(shortened(file.name))
+    if not parts:
+        raise DataError(f"{path}: none of its {len(files)} Parquet files is readable: damaged, or cut off")
+    source = _from_arrays(path, joined(parts))
+    notes = (f"files that are damaged or cut off left out: {', '.join(damaged)}",) if damaged else ()
+    return replace(source, notes=(*source.notes, *notes))
 
 
 def _from_arrays(path: Path, arrays: Mapping[str, Any]) -> Source:

@@ -241,7 +241,10 @@ def _stream(rows: Rows, layout: StreamLayout, rewritten: bool) -> Stream:
         order = np.argsort(sync, kind="stable")
         sync, t_ns, raw = sync[order], t_ns[order], {name: values[order] for name, values in raw.items()}
     if np.any(sync[1:] <= sync[:-1]):
-        raise DataError(f"topic {layout.topic}: SYNC numbers do not increase")
+        raise DataError(
+            f"topic {layout.topic}: SYNC numbers do not increase: "
+            "messages are there twice, or are those of several recordings; give each recording by itself"
+        )
     return Stream(layout.name, layout.every, sync, t_ns, {f.name: f for f in layout.fields}, raw)
 
 

@@ -27,7 +27,8 @@ ROWS = 120
 def motion(rows: int = ROWS, joints: int = 6) -> tuple[np.ndarray, np.ndarray]:
     """Positions and torques that differ in every row and joint, within the limits of the TX40."""
     rng = np.random.default_rng(6)
-    return rng.uniform(-1, 1, (rows, joints)), rng.uniform(-3, 3, (rows, joints))
+    q = rng.uniform(-1, 1, joints) + rng.uniform(-1e-3, 1e-3, (rows, joints))
+    return q, rng.uniform(-3, 3, (rows, joints))
 
 
 Q, TAU = motion()

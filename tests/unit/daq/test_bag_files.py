@@ -62,6 +62,24 @@ def test_a_folder_of_several_files_is_one_bag(tmp_path: Path, make: Callable[...
     assert recording.metadata["source"] == tmp_path.name
 
 
+@pytest.mark.parametrize("content", [b"", b"no bag at all"])
+@pytest.mark.parametrize("make", [mcap_bag, sqlite_bag])
+def test_a_file_without_any_message_is_a_gap_and_said(
+    tmp_path: Path, make: Callable[..., Path], content: bytes
+) -> None:
+    files = [tmp_path / f"run_{k}{'.mcap' if make is mcap_bag else '.db3'}" for k in range(3)]
+    for k in (0, 2):
+        make(files[k], states()[k * 40 : k * 40 + 40])
+    files[1].write_bytes(content)
+    recording = import_recording(tmp_path, TX40)
+    assert [(gap.first, gap.last) for gap in recording.gaps] == [(40, 79)]
+    assert f"{files[1].name} is left out: " in recording.metadata["source_remarks"]
+    for file in files:
+        file.write_bytes(content)
+    with pytest.raises(DataError, match=r"run_0\.\w+: (empty, )?not a"):
+        import_recording(tmp_path, TX40)
+
+
 def test_a_file_that_is_not_there_is_a_gap_and_said(tmp_path: Path) -> None:
     files = [f"run_{k}.mcap" for k in range(3)]
     for k in (0, 2):

@@ -30,6 +30,7 @@ def rewritten(
     keep: Callable[[Record], bool] = lambda record: True,
     metadata: Callable[[Metadata], bool] = lambda entry: True,
     metadata_last: bool = False,
+    copies: int = 1,
     by_time: bool = True,
     channel_per_message: bool = False,
     **options: Any,
@@ -50,7 +51,7 @@ def rewritten(
 
         if not metadata_last:
             add_metadata()
-        for schema, channel, message in records:
+        for schema, channel, message in records * copies:
             assert schema is not None
             if channel.id not in known or channel_per_message:
                 known[channel.id] = writer.register_channel(
@@ -122,6 +123,12 @@ def test_rows_that_a_tool_left_out_are_counted(recording: Recording, tmp_path: P
     read = read_recording(copy)
     assert read.samples.sync.tolist() == recording.samples.sync[: read.samples.sync.size].tolist()
     assert f"{read.samples.sync.size} of 2000 messages of topic /samples are left" in str(read.missing)
+
+
+def test_recordings_that_a_tool_has_joined_are_refused(recording: Recording, tmp_path: Path) -> None:
+    twice = rewritten(source_of(recording), tmp_path / "twice.mcap", copies=2)
+    with pytest.raises(DataError, match=r"twice\.mcap: topic /samples: .*are there twice, or .* several recordings"):
+        read_recording(twice)
 
 
 def test_a_recording_that_was_torn_before_it_was_rewritten_is_not_taken_as_whole(

@@ -92,6 +92,13 @@ def test_messages_of_a_gripper_and_of_another_arm_are_passed_over(tmp_path: Path
     assert f"{ROWS + len(fingers)} messages of other joints passed over: left, right, right_joint_1" in remark
 
 
+def test_two_sources_that_alternate_on_one_topic_are_said(tmp_path: Path) -> None:
+    other = [replace(m, at=m.at + STEP_NS // 2, q=np.asarray(m.q) + 0.5) for m in states()]
+    recording = import_recording(mcap_bag(tmp_path / "a.mcap", [*states(), *other]), TX40)
+    assert "times the limit" in recording.metadata["source_remarks"]
+    assert "two sources of one joint" in recording.metadata["source_remarks"]
+
+
 def test_two_arms_need_a_choice(tmp_path: Path) -> None:
     left, right = ([f"{side}_{name}" for name in NAMES] for side in ("left", "right"))
     messages = states(left) + [replace(m, at=m.at + 300) for m in states(right, EXCHANGED)]
@@ -285,6 +292,8 @@ def test_an_invalid_bag_is_reported_in_one_line(tmp_path: Path) -> None:
         read_joint_states(tmp_path / "ours.mcap", TX40)
     with pytest.raises(DataError, match=r"no topic .*; found /joint_states \(sensor_msgs/msg/Imu\)"):
         read_joint_states(mcap_bag(tmp_path / "e.mcap", states(), message_type="sensor_msgs/msg/Imu"), TX40)
+    with pytest.raises(DataError, match=r"found /a b \(a b\); record a topic of this type"):
+        read_joint_states(mcap_bag(tmp_path / "g.mcap", states(topic="/a\x00\nb"), message_type="a\x07b"), TX40)
     with pytest.raises(ConfigError, match=r"--topic is an option of ROS 2 bags"):
         import_recording(tmp_path / "a.csv", TX40, topic="/a")
 

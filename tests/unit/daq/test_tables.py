@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from armident.configs import ConfigError, DataError, load_robot
+from armident.configs import ConfigError, DataError, Limits, load_robot
 from armident.daq.cli import application
 from armident.daq.interchange.importing import import_recording
 from armident.daq.recording import Recording
@@ -525,6 +525,51 @@ def test_names_of_efforts_in_a_lerobot_data_set_find_their_joints(tmp_path: Path
     named = import_recording(tmp_path / "a", TX40)
     assert np.allclose(named.samples.raw["torque"], motion(300, 50.0)[:, N + 1 :])
     assert np.allclose(unnamed.samples.raw["torque"][:, [1, 0]], motion(300, 50.0)[:, N + 1 : N + 3])
+
+
+def test_files_of_a_lerobot_data_set_that_cannot_be_read_are_left_out_and_named(tmp_path: Path) -> None:
+    first = lerobot(tmp_path / "a", None)
+    second = first.with_name("file-001.parquet")
+    second.write_bytes(first.read_bytes()[:500])
+    for folder in (tmp_path / "a", tmp_path / "a" / "data", first.parent):
+        found = import_recording(folder, TX40)
+        assert same(found, motion(300, 50.0))
+        assert "damaged or cut off left out: file-001.parquet" in found.metadata["source_remarks"]
+        assert "no names of joints in meta/info.json: observation.state" in found.metadata["source_remarks"]
+    first.write_bytes(second.read_bytes())
+    with pytest.raises(DataError, match="none of its 2 Parquet files is readable"):
+        import_recording(tmp_path / "a", TX40)
+    lerobot(tmp_path / "b", None).rename(second)
+    lerobot(tmp_path / "c", None, "observation.temperature").rename(first)
+    with pytest.raises(DataError, match=r"file-000\.parquet: no column observation\.effort, which other files"):
+        import_recording(tmp_path / "a", TX40)
+
+
+def test_a_lerobot_data_set_of_actions_alone_is_named(tmp_path: Path) -> None:
+    import pyarrow
+    import pyarrow.parquet
+
+    data = lerobot(tmp_path / "a", None)
+    pyarrow.parquet.write_table(pyarrow.parquet.read_table(data).drop(["observation.state"]), data)
+    with pytest.raises(DataError, match=r"no observation\.state, the measured positions; found action"):
+        import_recording(data, TX40)
+
+
+def test_positions_in_degrees_and_torques_in_mn_m_name_the_option(tmp_path: Path) -> None:
+    values = motion()
+    values[:, 1 : N + 1] *= 5 * 180 / np.pi
+    with pytest.raises(DataError, match=r"its limit is .*--units position=deg if they are in deg"):
+        import_recording(written(tmp_path / "a.csv", values), TX40)
+    values = motion()
+    values[:, N + 1 :] *= 1000
+    with pytest.raises(DataError, match=r"its limit is .*--units torque=mnm if they are in mnm"):
+        import_recording(written(tmp_path / "b.csv", values), TX40)
+    free = Limits(position=(-np.inf, np.inf), velocity=2.0)
+    endless = TX40.model_copy(update={"joints": tuple(j.model_copy(update={"limits": free}) for j in TX40.joints)})
+    values[:, 1 : N + 1] *= 180 / np.pi
+    remarks = import_recording(written(tmp_path / "c.csv", values), endless).metadata["source_remarks"]
+    assert "times the limit, as of positions in degrees (--units position=deg)" in remarks
+    assert "source_remarks" not in import_recording(written(tmp_path / "d.csv", motion()), endless).metadata
 
 
 def test_a_demand_that_is_not_found_can_be_omitted(tmp_path: Path) -> None:
