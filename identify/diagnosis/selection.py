@@ -114,6 +114,7 @@ class StepwiseSelection:
         """
         state = first
         found: tuple[Selected, ...] = ()
+        seen = {_key(first.robot)}
         while len(found) < self.criteria.most_findings and not self._late():
             step = self.step(state)
             best = self.admitted(step)
@@ -123,6 +124,10 @@ class StepwiseSelection:
             self.progress(f"adding {best.candidate.effect.name.replace('_', ' ')} of {name}")
             found = (*found, Selected(best.entry, step, best))
             state, found = self._reduced(best.state, found)
+            if _key(state.robot) in seen:
+                # Effects that make each other superfluous: one of them is in the model, and competes with the other.
+                break
+            seen.add(_key(state.robot))
             state = with_first_motions(state)
         # Removing a finding changes the comparison of the others of its joints.
         changed: NDArray[np.bool_] | None = None

@@ -86,6 +86,22 @@ def test_a_superfluous_finding_is_removed() -> None:
     assert FRICTION not in state.robot.effects
 
 
+class OneAtATime(StepwiseSelection):
+    """A selection in which every effect makes the earlier ones superfluous, as two that resemble each other do."""
+
+    def _superfluous(self, state: ModelState, less: ModelState, tests: int) -> bool:
+        return True
+
+
+@pytest.mark.timeout(300)
+def test_effects_that_make_each_other_superfluous_end_the_selection() -> None:
+    steps, first = selection(1, SPRING, WORN)
+    one_at_a_time = OneAtATime(steps.study)
+    _, found = one_at_a_time.run(first)
+    assert len(found) == 1
+    assert one_at_a_time.compared >= 3
+
+
 def test_a_wrong_finding_is_exchanged_for_the_right_one() -> None:
     steps, first = selection(1, SPRING)
     step = steps.step(first)

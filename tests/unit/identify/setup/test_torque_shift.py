@@ -22,6 +22,7 @@ from armident.identify.setup.result import TorqueShift, with_torque_shift
 from armident.identify.setup.torque_shift import long_torque_shift
 from tests.fixtures import setups
 from tests.fixtures.arms import FAST, recording
+from tests.statistics.late_torques import moved
 
 LATE = 0.5
 
@@ -34,14 +35,6 @@ def late(experiments: list[Experiment], samples: NDArray[np.float64]) -> list[Ex
         moved = [CubicSpline(k, x)(k - s) for x, s in zip(e.tau.T, samples, strict=True)]
         made.append(replace(e, tau=np.stack(moved, axis=1)[5:-5], q=e.q[5:-5]))
     return made
-
-
-def moved(e: Experiment, samples: int) -> Experiment:
-    """Experiment whose torques are late by a number of samples; early if it is negative."""
-    count = e.q.shape[0] - abs(samples)
-    positions, torques = slice(max(samples, 0), None), slice(max(-samples, 0), None)
-    q_ref = None if e.q_ref is None else e.q_ref[positions][:count]
-    return Experiment(e.q[positions][:count], e.tau[torques][:count], q_ref, e.dt)
 
 
 @pytest.fixture(scope="module")
