@@ -66,7 +66,7 @@ def joined(parts: Mapping[Path, Mapping[str, Any]]) -> dict[str, Any]:
     every = dict.fromkeys(name for part in parts.values() for name in part)
     for file, part in parts.items():
         if absent := [
-            name for name in every if name not in part and name.startswith((STATE[:12], ACTION, "timestamp"))
+            name for name in every if name not in part and name.startswith(("observation.", ACTION, "timestamp"))
         ]:
             raise DataError(f"{file}: no column {', '.join(absent)}, which other files of the data set have")
     common = [name for name in every if all(name in part for part in parts.values())]

@@ -164,6 +164,7 @@ def _with_instrumented_shift(experiments: Sequence[Experiment], bench: Bench, be
         made=(*best.made, (np.eye(bench.n), np.eye(bench.n), False)),
         rivals=(*best.rivals, ()),
         probability=(*best.probability, probability),
+        shift_decisive=False,
     )
     return _with_shift(named, bench, found.samples * bench.period * bench.moving, found)
 

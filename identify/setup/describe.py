@@ -298,7 +298,8 @@ def _late(step: Step, k: int, robot: RobotConfig, bench: Bench) -> tuple[SetupFi
     message = f"all torques are {1000 * abs(shift):.3g} ms {direction} against the positions"
     if np.isfinite(step.shift_std):
         message += f" (standard deviation {1000 * step.shift_std:.2g} ms)"
-    return SetupFinding("time_shift", names, step.probability[k], message, _lines(entries), True), entries
+    remedy = _lines(entries)
+    return SetupFinding("time_shift", names, step.probability[k], message, remedy, step.shift_decisive), entries
 
 
 def _gravity(family: str, step: Step, robot: RobotConfig, share: float) -> SetupFinding:

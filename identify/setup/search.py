@@ -107,6 +107,8 @@ class Step:
         Posterior share of each mistake.
     shift_std
         Standard deviation of a common shift of the torques, s; NaN if it is that of the best prediction.
+    shift_decisive
+        True if the prediction gains by that shift enough to be a mistake of the set-up.
     """
 
     h: Hypothesis
@@ -117,6 +119,7 @@ class Step:
     rivals: tuple[tuple[str, ...], ...] = ()
     probability: tuple[float, ...] = ()
     shift_std: float = np.nan
+    shift_decisive: bool = True
 
 
 @dataclass(eq=False)

@@ -141,14 +141,14 @@ def test_the_virtual_arm_with_references_is_not_shifted() -> None:
     assert not found.applied
 
 
-@pytest.mark.parametrize("samples", [4, -4])
-def test_torques_late_by_milliseconds_are_found_by_the_references(samples: int) -> None:
-    """Prediction gains too little by such a shift: noise in the closed loop looks like early torques."""
+@pytest.mark.parametrize(("samples", "decisive"), [(4, True), (-4, False)])
+def test_torques_late_by_milliseconds_are_found_by_the_references(samples: int, decisive: bool) -> None:
+    """Prediction gains too little by early torques: noise in the closed loop looks like them."""
     robot = load_robot("tx40")
     experiments = experiments_from_recording(recording("tx40", "tx40_excitation", 3, period=FAST), robot)[0]
     check = check_setup([moved(e, samples) for e in experiments], robot)
     (finding,) = check.findings
-    assert (finding.kind, len(finding.joints)) == ("time_shift", robot.n)
+    assert (finding.kind, len(finding.joints), finding.decisive) == ("time_shift", robot.n, decisive)
     assert f"{'late' if samples > 0 else 'early'} against the positions (standard deviation" in finding.message
     assert check.corrected_robot is not None
     delays = [effect.parameters["delay"] for effect in check.corrected_robot.effects]
