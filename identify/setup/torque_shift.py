@@ -115,6 +115,7 @@ def long_torque_shift(
         try:
             finer = make_bench(moved, bench.robot, bench.moving, SHIFT_RATE, bench.model)
             rest = torque_shift(finer, h, max(RANGE, reach))
+            experiments = _first_part(experiments, round(MOST_SAMPLES * finer.segments[0].dt / bench.period))
         except (DataError, np.linalg.LinAlgError):
             return None
         shift += rest.samples
@@ -171,6 +172,18 @@ def torque_shift(bench: Bench, h: Hypothesis, reach: float = RANGE) -> TorqueShi
         ]
     c, samples = basis.shape[1], segments.period
     return _common(theta[c:] / samples, covariance[c:, c:] / samples**2, segments, instrumented, reach)
+
+
+def _first_part(experiments: Sequence[Experiment], samples: int) -> Sequence[Experiment]:
+    """Experiments shortened alike to a number of samples together."""
+    share = samples / sum(e.q.shape[0] for e in experiments)
+    if share >= 1.0:
+        return experiments
+    kept = [max(round(share * e.q.shape[0]), 1) for e in experiments]
+    return [
+        replace(e, q=e.q[:k], tau=e.tau[:k], q_ref=None if e.q_ref is None else e.q_ref[:k])
+        for e, k in zip(experiments, kept, strict=True)
+    ]
 
 
 def _shortened(bench: Bench) -> Bench:
