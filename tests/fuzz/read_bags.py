@@ -14,7 +14,7 @@ from tests.fuzz.harness import MisreadError, Target
 from tests.fuzz.mutate import either, forge_database, forge_recording, spoil_bytes, spoil_text
 from tests.fuzz.read_imports import check_consistent
 from tests.unit.daq.bags import TX40, mcap_bag, metadata, sqlite_bag, states, zstd
-from tests.unit.daq.test_tables import lerobot
+from tests.unit.daq.tables import lerobot
 
 
 def _written(write: Callable[[Path], Path], name: str) -> bytes:

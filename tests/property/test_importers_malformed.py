@@ -14,9 +14,9 @@ from armident.daq.interchange.importing import import_recording
 from armident.daq.recording import Recording, write_recording
 from tests.fuzz.harness import FOREIGN_WORDS
 from tests.unit.daq.bags import mcap_bag, sqlite_bag, states
+from tests.unit.daq.tables import motion, written
 from tests.unit.daq.test_bus_log import ROBOT, SESSION, captured
 from tests.unit.daq.test_importing import TX40
-from tests.unit.daq.test_tables import motion, written
 
 TABLES = (".csv", ".npz", ".mat", ".parquet")
 BAGS = {".mcap": mcap_bag, ".db3": sqlite_bag}

@@ -1,0 +1,90 @@
+"""LeRobot data sets: files, names of joints, and damaged parts."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from armident.configs import DataError
+from armident.daq.interchange.importing import import_recording
+from tests.unit.daq.tables import N, lerobot, motion, same
+from tests.unit.daq.test_importing import TX40
+
+
+@pytest.mark.parametrize("names", [None, [f"joint_{j + 1}.pos" for j in range(N)]])
+def test_a_lerobot_data_set_is_imported_as_file_and_folder(tmp_path: Path, names: list[str] | None) -> None:
+    data = lerobot(tmp_path / "set", names)
+    for path in (data, tmp_path / "set"):
+        found = import_recording(path, TX40)
+        assert same(found, motion(300, 50.0))
+        assert found.sample_rate_hz == pytest.approx(50, rel=1e-4)
+        assert [(gap.first, gap.last) for gap in found.gaps if gap.stream == "samples"] == [(200, 248)]
+        assert "demand" in found.samples.fields
+        assert "2 episodes" in found.metadata["source_remarks"]
+
+
+def test_joints_of_a_lerobot_data_set_are_found_by_name_and_its_effort_is_needed(tmp_path: Path) -> None:
+    lerobot(tmp_path / "a", [f"joint_{j}.pos" for j in (2, 1, 3, 4, 5, 6)])
+    found = import_recording(tmp_path / "a", TX40)
+    assert np.allclose(found.samples.raw["position"][:, [1, 0, 2]], motion(300, 50.0)[:, 1:4])
+    data = lerobot(tmp_path / "b", None, "observation.temperature")
+    with pytest.raises(DataError, match=r"no effort or current .*found observation\.state, action, observation\.temp"):
+        import_recording(data, TX40)
+    lerobot(tmp_path / "c", None, "observation.current")
+    assert "current" in import_recording(tmp_path / "c", TX40).samples.fields
+
+
+def test_names_of_efforts_in_a_lerobot_data_set_find_their_joints(tmp_path: Path) -> None:
+    order = (2, 1, 3, 4, 5, 6)
+    lerobot(tmp_path / "a", [f"joint_{j}.pos" for j in order])
+    info = tmp_path / "a" / "meta" / "info.json"
+    features = json.loads(info.read_text())["features"]
+    unnamed = import_recording(tmp_path / "a", TX40)
+    assert "observation.effort has no names of joints: taken in the order" in unnamed.metadata["source_remarks"]
+    effort = {"names": [f"joint_{j}.effort" for j in range(1, N + 1)]}
+    info.write_text(json.dumps({"features": features | {"observation.effort": effort}}))
+    named = import_recording(tmp_path / "a", TX40)
+    assert np.allclose(named.samples.raw["torque"], motion(300, 50.0)[:, N + 1 :])
+    assert np.allclose(unnamed.samples.raw["torque"][:, [1, 0]], motion(300, 50.0)[:, N + 1 : N + 3])
+
+
+def test_files_of_a_lerobot_data_set_that_cannot_be_read_are_left_out_and_named(tmp_path: Path) -> None:
+    first = lerobot(tmp_path / "a", None)
+    second = first.with_name("file-001.parquet")
+    second.write_bytes(first.read_bytes()[:500])
+    for folder in (tmp_path / "a", tmp_path / "a" / "data", first.parent):
+        found = import_recording(folder, TX40)
+        assert same(found, motion(300, 50.0))
+        assert "damaged or cut off left out: file-001.parquet" in found.metadata["source_remarks"]
+        assert "no names of joints in meta/info.json: observation.state" in found.metadata["source_remarks"]
+    first.write_bytes(second.read_bytes())
+    with pytest.raises(DataError, match="none of its 2 Parquet files is readable"):
+        import_recording(tmp_path / "a", TX40)
+    lerobot(tmp_path / "b", None).rename(second)
+    lerobot(tmp_path / "c", None, "observation.temperature").rename(first)
+    with pytest.raises(DataError, match=r"file-000\.parquet: no column observation\.effort, which other files"):
+        import_recording(tmp_path / "a", TX40)
+
+
+def test_a_lerobot_data_set_of_actions_alone_is_named(tmp_path: Path) -> None:
+    import pyarrow
+    import pyarrow.parquet
+
+    data = lerobot(tmp_path / "a", None)
+    pyarrow.parquet.write_table(pyarrow.parquet.read_table(data).drop(["observation.state"]), data)
+    with pytest.raises(DataError, match=r"no observation\.state, the measured positions; found action"):
+        import_recording(data, TX40)
+
+
+def test_times_of_a_lerobot_data_set_that_are_no_numbers_are_refused(tmp_path: Path) -> None:
+    import pyarrow
+    import pyarrow.parquet
+
+    data = lerobot(tmp_path, None)
+    table = pyarrow.parquet.read_table(data)
+    times = pyarrow.array([{"s": 1}] * len(table))
+    table = table.set_column(table.column_names.index("timestamp"), "timestamp", times)
+    pyarrow.parquet.write_table(table, data)
+    with pytest.raises(DataError, match="timestamp has rows of unequal lengths, or values that are no numbers"):
+        import_recording(data, TX40)
