@@ -53,10 +53,10 @@ demo: install ## the whole story on this machine, ends with a report (DEMO="--ou
 lint: install
 	@$(LINT)
 
-check: lint ## ruff, mypy, import-linter and the quick tests, under two minutes
+check: lint ## ruff, mypy, import-linter and the quick tests, about four minutes on two cores
 	@$(PYTEST) -q $(PARALLEL) -m "not vcan and not slow and not proof"
 
-test: lint ## everything but the proofs, the tests on vcan included; a quarter of an hour on two cores
+test: lint ## everything but the proofs, the tests on vcan included; about twenty minutes on two cores
 	@$(MAKE) --no-print-directory -k -j2 NAME=tests SELECTED="not proof" off-bus on-bus && failed= || failed=1
 	echo
 	echo "Skipped, or failing as expected:"
