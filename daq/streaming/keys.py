@@ -58,6 +58,11 @@ class Keys:
         """Friction and parameters tracked on the live stream, every second (JSON, published and answered)."""
         return f"{self.base}/result/recursive"
 
+    @property
+    def sent(self) -> str:
+        """Key without messages; its declaration follows announcements, so that these have been sent."""
+        return f"{self.base}/sent"
+
     def command(self, name: str) -> str:
         """Key of a command to the capture (``save``, ``mark``, ``stop``), which is answered like a query."""
         return f"{self.base}/command/{name}"

@@ -8,6 +8,7 @@ from typing import Literal
 import zenoh
 
 from armident.configs import ConfigError, SessionConfig
+from armident.daq.streaming.announcer import SENT_IN_ORDER
 
 Role = Literal["capture", "worker", "observer"]
 
@@ -64,6 +65,9 @@ def configuration(session: SessionConfig, role: Role, *, any_port: bool = False)
             "connect/retry": {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 2},
         }
         for key, value in defaults.items():
+            config.insert_json5(key, json.dumps(value))
+    if role == "worker":
+        for key, value in SENT_IN_ORDER.items():
             config.insert_json5(key, json.dumps(value))
     if options.listen and role != "observer" and not any_port:
         config.insert_json5("listen/endpoints", json.dumps(options.listen))

@@ -2,7 +2,8 @@
 
 The ledger outlives the workers. A recording is known by its hash. It is claimed by one worker with a lease, which the
 worker renews; after a crash the lease ends, and another worker takes over. The result is written before it is entered,
-and entered before it is announced. The announcement and its entry are one transaction.
+and entered before it is announced. The announcement and its entry are one transaction. An announcement that a
+process has made, but not entered before its end, is entered by the others, which have heard it.
 """
 
 import json
@@ -279,6 +280,25 @@ class Ledger:
                 {"sha256": sha256} | self._me(),
             )
             yield bool(done.rowcount)
+
+    def unannounced(self) -> list[Entry]:
+        """Return the entries with a result or a failure that has not been announced."""
+        query = f"SELECT {_COLUMNS} FROM experiments WHERE announced = 0 AND state != 'waiting'"
+        with self._transaction() as db:
+            return [_entry(row) for row in db.execute(query)]
+
+    def enter_announced(self, sha256: str) -> None:
+        """Enter an announcement that another process has made, and end the claim.
+
+        Parameters
+        ----------
+        sha256
+            The recording.
+        """
+        with self._transaction() as db:
+            db.execute(
+                "UPDATE experiments SET announced = 1, owner = NULL WHERE sha256 = ? AND state != 'waiting'", (sha256,)
+            )
 
     def entry(self, sha256: str) -> Entry | None:
         """Return the entry of a recording, or ``None``."""

@@ -15,6 +15,7 @@ from armident.configs import ArmidentError, DataError, RobotConfig, SessionConfi
 from armident.daq.streaming import Keys
 from armident.identify.identification.api import identify_recording
 from armident.identify.identification.options import Options
+from armident.identify.monitoring.announcements import Announcements
 from armident.identify.monitoring.intake import Intake, reason_of
 from armident.identify.monitoring.ledger import FILE, MOST_ATTEMPTS, Entry, Ledger, LedgerError, State, unique_owner
 from armident.identify.monitoring.recorded import (
@@ -88,6 +89,7 @@ class Worker:
         self._ledger: Ledger | None = None
         limits = LARGEST_EVENT, LARGEST_BLOCK
         self._link = WorkerLink(session, self._keys, self._on_event, self._on_block, limits, lambda: self._last)
+        self._announcements = Announcements(self._keys, self._link)
         self._threads = [
             threading.Thread(target=self._identify_all, name="identify", daemon=True),
             threading.Thread(target=self._keep_alive, name="lease", daemon=True),
@@ -135,12 +137,13 @@ class Worker:
             self._buffer.take_block(data, size)
 
     def _keep_alive(self) -> None:
-        """Renew the leases, and keep the Zenoh session open; in a thread of its own."""
+        """Renew the leases, enter what others announced, and keep the Zenoh session open; in a thread of its own."""
         while not self._closing.wait(POLL_S):
             try:
                 if self._ledger is not None:
                     self._ledger.renew()
-            except ArmidentError as error:
+                    self._announcements.enter_heard(self._ledger)
+            except (ArmidentError, OSError) as error:
                 log.debug("lease not renewed: %s", error)
             self._link.check()
             if self._progress is not None and time.monotonic() - self._advanced < LONGEST_STAGE_S:
@@ -164,7 +167,7 @@ class Worker:
                 if time.monotonic() - scanned >= SCAN_S:
                     self._intake.add_files(ledger, captured_in(self._folders, self._robot.name))
                     scanned = time.monotonic()
-                entry = ledger.claim(held=tuple(self._intake.streams), announce=self._link.is_open)
+                entry = ledger.claim(held=tuple(self._intake.streams), announce=self._link.can_announce)
                 self._problem = None
                 if entry is not None:
                     self._process(ledger, entry)
@@ -274,27 +277,9 @@ class Worker:
         return document, level
 
     def _announce(self, ledger: Ledger, sha256: str) -> None:
-        """Publish the result or the failure; the entry in the ledger and the messages are one transaction."""
-        entry = ledger.entry(sha256)
-        if entry is None or entry.announced or entry.state == "waiting":
-            return
-        text, message = None, entry.message
-        if entry.result is not None:
-            try:
-                text = entry.result.read_bytes()
-            except FileNotFoundError:
-                message = f"{entry.result}: the result was removed before it was announced"
-        about = {"capture": entry.name, "sha256": sha256}
-        if not self._link.is_open:
-            raise LinkDown("zenoh: no session")
-        with ledger.announcement(sha256) as mine:
-            if mine and text is not None:
-                self._link.announce(self._keys.identification, text)
-                self._link.status("done", result=str(entry.result), verdict=entry.message, **about)
-            elif mine:
-                self._link.status("failed", message=message, **about)
-        if mine and text is not None:
-            self._last = text
+        document = self._announcements.make(ledger, sha256)
+        if document is not None:
+            self._last = document
 
     def _until_possible(self, what: str, action: Callable[[], T]) -> T:
         """Return the result of an action that is tried again while disk, ledger or Zenoh refuse it."""

@@ -72,7 +72,7 @@ class _Recorded:
     def publish_failure(self, message: str) -> None:
         """Publish the reason of a failure once, as a worker does."""
         if not self.published:
-            self.publisher.status("failed", message=message, capture=self.name, sha256=self.digest)
+            self.publisher.failure(message, self.name, self.digest)
         self.published = True
 
 
@@ -147,8 +147,10 @@ def _alone(recorded: _Recorded) -> OnceIdentified:
     try:
         done = recorded.identify()
     except DataError as error:
+        recorded.publisher.wait_for_listeners()
         recorded.publish_failure(str(error))
         raise
+    recorded.publisher.wait_for_listeners()
     with suppress(_NotPublished):
         recorded.publish(done)
     return done
@@ -173,6 +175,7 @@ def _claimed(ledger: Ledger, recorded: _Recorded, say: Say) -> OnceIdentified:
             _announce_failure(ledger, recorded, message)
             raise DataError(message)
         if done is not None:
+            recorded.publisher.wait_for_listeners()
             # A worker announces what Zenoh has not taken here.
             with suppress(_NotPublished), ledger.announcement(digest) as announced_here:
                 if announced_here:
@@ -197,6 +200,7 @@ def _entered(ledger: Ledger, recorded: _Recorded) -> OnceIdentified | None:
 
 
 def _announce_failure(ledger: Ledger, recorded: _Recorded, message: str) -> None:
+    recorded.publisher.wait_for_listeners()
     with ledger.announcement(recorded.digest) as announced_here:
         if announced_here:
             recorded.publish_failure(message)

@@ -1,6 +1,5 @@
 """Publisher of status and results on Zenoh, with the keys of the worker."""
 
-import json
 import logging
 import time
 from types import TracebackType
@@ -9,7 +8,10 @@ from typing import Any, Self
 import zenoh
 
 from armident.configs import ConfigError, RobotConfig, SessionConfig
-from armident.daq.streaming import Keys, open_session
+from armident.daq.streaming import Announcer, Keys, open_session
+from armident.daq.streaming.announcer import longest_retry_s
+from armident.daq.streaming.session import configuration
+from armident.identify.monitoring.announcements import failure_status, status
 
 log = logging.getLogger(__name__)
 
@@ -36,6 +38,7 @@ class StatusPublisher:
             self._session = open_session(session, "worker")
         except ConfigError:
             self._session = open_session(session, "worker", any_port=True)
+        self._announcer = Announcer(self._session, self._keys, longest_retry_s(configuration(session, "worker")))
         self._last: bytes | None = None
         self._queryable = self._session.declare_queryable(self._keys.identification, self._answer)
 
@@ -46,10 +49,17 @@ class StatusPublisher:
             else:
                 query.reply(self._keys.identification, self._last)
 
+    def wait_for_listeners(self) -> None:
+        """Wait until all listeners have had time to connect."""
+        time.sleep(self._announcer.ready_in_s)
+
     def status(self, state: str, **more: Any) -> None:
         """Publish the state of the job, with further keys."""
-        content = {"component": "reidentify", "state": state, **more}
-        self._put(self._keys.status, json.dumps(content).encode())
+        self._put(self._keys.status, status("reidentify", state, **more))
+
+    def failure(self, message: str, name: str, sha256: str) -> None:
+        """Publish why the recording of a name and a hash cannot be identified."""
+        self._put(self._keys.status, failure_status("reidentify", message, name, sha256))
 
     def result(self, text: str) -> bool:
         """Publish an identification document and answer queries with it; return False if Zenoh did not take it."""
@@ -63,8 +73,7 @@ class StatusPublisher:
     def _put(self, key: str, data: bytes) -> bool:
         """Publish a message; the job does not depend on it, because the result is in its file."""
         try:
-            # As the worker's announcements: dropped by no full queue.
-            self._session.put(key, data, express=True, congestion_control=zenoh.CongestionControl.BLOCK)
+            self._announcer.announce((key, data))
         except zenoh.ZError:
             log.warning("zenoh: the session failed; %s was not published", key)
             return False

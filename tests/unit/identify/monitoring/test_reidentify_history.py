@@ -36,6 +36,12 @@ class Published:
         self.states.append(state)
         self.more.append(more)
 
+    def failure(self, message: str, name: str, sha256: str) -> None:
+        self.status("failed", message=message, capture=name, sha256=sha256)
+
+    def wait_for_listeners(self) -> None:
+        """Return at once."""
+
     def result(self, text: str) -> bool:
         self.results.append(text)
         return self.reachable

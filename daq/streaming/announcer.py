@@ -1,0 +1,82 @@
+"""Announcements on Zenoh that neither a late listener nor the end of this process loses."""
+
+import json
+import time
+from typing import Any
+
+import zenoh
+
+from armident.daq.streaming.keys import Keys
+
+SENT_IN_ORDER: dict[str, Any] = {"transport/unicast/qos/enabled": False, "transport/link/tx/queue/size/data": 1}
+"""Settings of a session that announces: one queue for all messages to a peer, with room for one batch of them."""
+RETRY_S = 4.0
+"""Longest interval between two attempts of Zenoh to connect if its configuration gives none, s."""
+CONNECTING_S = 1.0
+"""Time in which a connection between peers is made, s."""
+
+
+class Announcer:
+    """Publishes messages that are not repeated, such as results.
+
+    ``put`` of Zenoh returns before the message is sent: another thread writes it to the network. A process that is
+    killed at once loses the message. Here a declaration follows each message in the same queue. The queue takes it
+    when the operating system has taken the message, which then arrives whatever becomes of this process.
+
+    Zenoh also forgets a message at once if nobody listens. Listeners that have lost a session try again after the
+    longest interval of their configuration, which is taken to be that of this session.
+
+    Parameters
+    ----------
+    session
+        Zenoh session with the settings `SENT_IN_ORDER`, which has just been opened.
+    keys
+        Keys of the robot.
+    retry_s
+        Longest interval between two attempts to connect, s.
+    """
+
+    def __init__(self, session: zenoh.Session, keys: Keys, retry_s: float) -> None:
+        self._session, self._keys = session, keys
+        self._ready = time.monotonic() + retry_s + CONNECTING_S
+
+    @property
+    def ready_in_s(self) -> float:
+        """Time until all listeners have had time to connect, s; 0 afterwards."""
+        return max(0.0, self._ready - time.monotonic())
+
+    def announce(self, *messages: tuple[str, bytes]) -> None:
+        """Publish messages, and return when the operating system has taken them.
+
+        Parameters
+        ----------
+        messages
+            Key expressions and contents.
+
+        Raises
+        ------
+        zenoh.ZError
+            If the session fails.
+        """
+        for key, content in messages:
+            # Express: not batched with later messages. Block: not dropped if the queue is full.
+            self._session.put(key, content, express=True, congestion_control=zenoh.CongestionControl.BLOCK)
+        self._session.declare_subscriber(self._keys.sent, _ignore).undeclare()
+
+
+def longest_retry_s(config: zenoh.Config) -> float:
+    """Return the longest interval between two attempts to connect, s.
+
+    Parameters
+    ----------
+    config
+        Zenoh configuration.
+    """
+    longest = (json.loads(config.get_json("connect/retry")) or {}).get("period_max_ms")
+    # One number, or one for each mode of a node.
+    numbers = longest.values() if isinstance(longest, dict) else [longest]
+    return max((number / 1e3 for number in numbers if number is not None), default=RETRY_S)
+
+
+def _ignore(_sample: zenoh.Sample) -> None:
+    """Take a message of a key on which nothing is published."""

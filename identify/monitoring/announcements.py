@@ -1,0 +1,134 @@
+"""Announcements of a worker: each result and each failure in the ledger is announced once, also if workers are killed."""
+
+import json
+
+from armident.daq.streaming import Keys
+from armident.identify.monitoring.ledger import Entry, Ledger
+from armident.identify.monitoring.worker_link import LinkDown, WorkerLink, content_hash
+
+COMPONENTS = ("worker", "reidentify")
+"""Programs that announce the entries of a ledger."""
+
+
+class Announcements:
+    """Announces the entries of a ledger.
+
+    An entry and its announcement are one transaction. A worker that is killed after the announcement and before the
+    end of the transaction leaves an entry that counts as not announced. Other workers have heard the announcement,
+    and enter it.
+
+    Parameters
+    ----------
+    keys
+        Keys of the robot.
+    link
+        Zenoh session of the worker.
+    """
+
+    def __init__(self, keys: Keys, link: WorkerLink) -> None:
+        self._keys, self._link = keys, link
+        self._heard: set[bytes] = set()
+        self._sent: set[str] = set()
+
+    def make(self, ledger: Ledger, sha256: str) -> bytes | None:
+        """Announce the result or the failure of a recording, and return the document that was announced.
+
+        Parameters
+        ----------
+        ledger
+            Ledger of the worker, which has a claim on the recording.
+        sha256
+            The recording.
+
+        Raises
+        ------
+        LinkDown
+            If the session is missing, too new, or fails.
+        LedgerError
+            If the ledger cannot be written; the announcement is not repeated when this is called again.
+        """
+        entry = ledger.entry(sha256)
+        if entry is None or entry.announced or entry.state == "waiting":
+            return None
+        if not self._link.can_announce:
+            raise LinkDown("zenoh: no session yet")
+        document, message = _outcome(entry)
+        with ledger.announcement(sha256) as mine:
+            if mine and sha256 not in self._sent:
+                if document is None:
+                    self._link.announce((self._keys.status, failure_status("worker", message, entry.name, sha256)))
+                else:
+                    done = status(
+                        "worker", "done", result=str(entry.result), verdict=message, capture=entry.name, sha256=sha256
+                    )
+                    self._link.announce((self._keys.identification, document), (self._keys.status, done))
+                self._sent.add(sha256)
+        self._sent.discard(sha256)
+        return document if mine else None
+
+    def enter_heard(self, ledger: Ledger) -> None:
+        """Enter the announcements that other workers have made, but not entered.
+
+        Parameters
+        ----------
+        ledger
+            Ledger that the workers share.
+
+        Raises
+        ------
+        LedgerError
+            If the ledger cannot be read or written; what was heard is kept for the next call.
+        """
+        self._heard |= self._link.take_heard()
+        if not self._heard:
+            return
+        for entry in ledger.unannounced():
+            if any(content_hash(content) in self._heard for content in _contents(entry)):
+                ledger.enter_announced(entry.sha256)
+        self._heard.clear()
+
+
+def status(component: str, state: str, **more: object) -> bytes:
+    """Return a message for the key of the status.
+
+    Parameters
+    ----------
+    component, state
+        Name of the program and of its state.
+    more
+        Further entries.
+    """
+    return json.dumps({"component": component, "state": state, **more}).encode()
+
+
+def failure_status(component: str, message: str, name: str, sha256: str) -> bytes:
+    """Return the announcement that a recording cannot be identified.
+
+    Parameters
+    ----------
+    component
+        Name of the program.
+    message
+        The reason.
+    name, sha256
+        Name of the recording and its hash.
+    """
+    return status(component, "failed", message=message, capture=name, sha256=sha256)
+
+
+def _outcome(entry: Entry) -> tuple[bytes | None, str]:
+    """Return the document of a result and its verdict; ``None`` and the reason if there is none."""
+    if entry.result is None:
+        return None, entry.message or ""
+    try:
+        return entry.result.read_bytes(), entry.message or ""
+    except FileNotFoundError:
+        return None, f"{entry.result}: the result was removed before it was announced"
+
+
+def _contents(entry: Entry) -> list[bytes]:
+    """Return the messages that announce an entry, by whichever program."""
+    document, message = _outcome(entry)
+    if document is not None:
+        return [document]
+    return [failure_status(component, message, entry.name, entry.sha256) for component in COMPONENTS]
