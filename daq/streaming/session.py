@@ -1,9 +1,10 @@
 """Zenoh sessions between peers on the loopback interface, without router and multicast."""
 
 import json
+import re
 import zlib
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import zenoh
 
@@ -66,6 +67,10 @@ def configuration(session: SessionConfig, role: Role, *, any_port: bool = False)
         }
         for key, value in defaults.items():
             config.insert_json5(key, json.dumps(value))
+    if any_port and options.config is not None:
+        config.insert_json5(
+            "listen/endpoints", json.dumps(_on_any_port(json.loads(config.get_json("listen/endpoints"))))
+        )
     if role == "worker":
         for key, value in SENT_IN_ORDER.items():
             config.insert_json5(key, json.dumps(value))
@@ -126,6 +131,15 @@ def unreadable_files(config: zenoh.Config) -> list[str]:
                 except OSError as error:
                     found.append(f"{section}/{key} {value} ({error.strerror})")
     return found
+
+
+def _on_any_port(endpoints: Any) -> Any:
+    """Return endpoints, or lists of them, with a free port in place of their own; `None` if there are none."""
+    if isinstance(endpoints, str):
+        return re.sub(r":\d+(?=$|[?#])", ":0", endpoints)
+    if isinstance(endpoints, dict):
+        return {mode: _on_any_port(each) for mode, each in endpoints.items()}
+    return endpoints and [_on_any_port(each) for each in endpoints]
 
 
 def _from_file(path: Path) -> zenoh.Config:

@@ -1,10 +1,11 @@
-"""Announcements of a worker: each result and each failure in the ledger is announced once, also if workers are killed."""
+"""Announcements of a worker: each result and failure in the ledger is announced once, also if workers are killed."""
 
 import json
 
 from armident.daq.streaming import Keys
 from armident.identify.monitoring.ledger import Entry, Ledger
-from armident.identify.monitoring.worker_link import LinkDown, WorkerLink, content_hash
+from armident.identify.monitoring.worker_link import LinkDown, WorkerLink
+from armident.identify.monitoring.worker_receiver import content_hash
 
 COMPONENTS = ("worker", "reidentify")
 """Programs that announce the entries of a ledger."""
@@ -79,7 +80,7 @@ class Announcements:
         LedgerError
             If the ledger cannot be read or written; what was heard is kept for the next call.
         """
-        self._heard |= self._link.take_heard()
+        self._heard |= self._link.receiver.take_heard()
         if not self._heard:
             return
         for entry in ledger.unannounced():

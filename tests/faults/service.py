@@ -194,8 +194,10 @@ class Service:
         """End a process by SIGKILL."""
         if process.is_alive():
             assert process.pid is not None
-            os.kill(process.pid, signal.SIGKILL)
-            self.kills[kind] += 1
+            # It may have ended meanwhile.
+            with suppress(ProcessLookupError):
+                os.kill(process.pid, signal.SIGKILL)
+                self.kills[kind] += 1
         process.join()
 
     def round(self, number: int) -> None:
