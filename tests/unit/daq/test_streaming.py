@@ -235,6 +235,19 @@ def test_the_shipped_zenoh_configurations_are_valid(name: str) -> None:
     zenoh.Config.from_file(str(config_path(f"zenoh/{name}.json5")))
 
 
+@pytest.mark.parametrize("listen", ['["{0}"]', '{{peer: ["{0}"], router: ["{0}"]}}'])
+def test_a_second_session_of_a_zenoh_file_listens_on_a_free_port(listen: str, tmp_path: Path) -> None:
+    file = tmp_path / "zenoh.json5"
+    place = listen.format("tcp/127.0.0.1:17911")
+    file.write_text(f'{{mode: "peer", listen: {{endpoints: {place}}}, scouting: {{multicast: {{enabled: false}}}}}}')
+    session = cell("file", config=file)
+    with open_session(session, "worker"):
+        with pytest.raises(ConfigError, match="another worker"):
+            open_session(session, "worker")
+        open_session(session, "worker", any_port=True).close()
+        open_session(session, "observer", any_port=True).close()
+
+
 def test_a_taken_port_does_not_stop_a_capture_and_is_taken_when_it_is_free(caplog: pytest.LogCaptureFixture) -> None:
     session = cell("port_taken")
     host, port = endpoints(session)["capture"].removeprefix("tcp/").split(":")
