@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from armident.configs.errors import ConfigError
 from armident.configs.urdf import mdh_of
-from armident.configs.urdf_tree import UrdfTree, end_link, only, read_chain, read_tree
+from armident.configs.urdf_element import end_link, only, words
+from armident.configs.urdf_tree import UrdfTree, read_chain, read_tree
 
 INERTIAL = ("xx", "xy", "xz", "yy", "yz", "zz", "mx", "my", "mz", "m")
 """Standard inertial parameters of a link: inertia about the origin of its frame, first moment, mass (thesis 2.1.2)."""
@@ -147,7 +148,7 @@ def _moments(tree: UrdfTree, link: ET.Element) -> tuple[Floats, bool]:
 
 
 def _number(tree: UrdfTree, link: ET.Element, found: ET.Element | None, key: str) -> float:
-    return 0.0 if found is None else float(tree.words(link, found, key, count=1, default="0")[0])
+    return 0.0 if found is None else float(words(tree.file, link, found, key, count=1, default="0")[0])
 
 
 def _friction(tree: UrdfTree, path: list[ET.Element], chain: list[str]) -> dict[str, float]:
@@ -159,7 +160,7 @@ def _friction(tree: UrdfTree, path: list[ET.Element], chain: list[str]) -> dict[
             continue
         number = chain.index(str(element.get("name"))) + 1
         for name, key in (("fv", "damping"), ("fc", "friction")):
-            value = float(tree.words(element, found, key, count=1, default="0")[0])
+            value = float(words(tree.file, element, found, key, count=1, default="0")[0])
             if value > 0.0:
                 out[f"{name}{number}"] = value
     return out

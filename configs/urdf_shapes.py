@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from armident.configs.errors import ConfigError
 from armident.configs.schema.collision import BASE
 from armident.configs.urdf import joint_names, link_placements, mdh_of
+from armident.configs.urdf_element import words
 from armident.configs.urdf_inertials import carried_links
 from armident.configs.urdf_tree import UrdfTree, read_chain, read_tree
 from armident.configs.yaml_loader import is_file
@@ -105,7 +106,7 @@ def _shapes_of(tree: UrdfTree, link: ET.Element, name: str, frame: Floats) -> It
             continue
         placement = frame @ tree.origin(link, element.find("origin"))
         if found.tag == "mesh":
-            scale = tuple(float(w) for w in tree.words(link, found, "scale", default="1 1 1"))
+            scale = tuple(float(w) for w in words(tree.file, link, found, "scale", default="1 1 1"))
             yield UrdfShape(name, placement, "mesh", scale, _mesh_file(tree.file, found.get("filename", "")))
         elif found.tag in ("box", "cylinder", "sphere"):
             yield UrdfShape(name, placement, found.tag, _size(tree, link, found))
@@ -113,8 +114,8 @@ def _shapes_of(tree: UrdfTree, link: ET.Element, name: str, frame: Floats) -> It
 
 def _size(tree: UrdfTree, link: ET.Element, found: ET.Element) -> tuple[float, ...]:
     keys = {"box": (("size", 3),), "cylinder": (("radius", 1), ("length", 1)), "sphere": (("radius", 1),)}[found.tag]
-    words = [w for key, count in keys for w in tree.words(link, found, key, count=count, default=None)]
-    size = tuple(float(word) for word in words)
+    numbers = [w for key, count in keys for w in words(tree.file, link, found, key, count=count, default=None)]
+    size = tuple(float(number) for number in numbers)
     if min(size) < 0.0:
         raise ConfigError(f"{tree.file}: link {link.get('name')!r}: {found.tag}: expected positive lengths")
     return size

@@ -6,7 +6,6 @@ import xml.etree.ElementTree as ET
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
-from decimal import Decimal, InvalidOperation
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, Literal
@@ -16,14 +15,12 @@ from numpy.typing import NDArray
 
 from armident.configs.errors import ConfigError
 from armident.configs.suspected_units import FULL_TURN, LONGEST_LINK
-from armident.configs.urdf_file import expand, parse_urdf
+from armident.configs.urdf_element import end_link, only, words
+from armident.configs.urdf_file import parse_urdf
 from armident.configs.urdf_origin import rotation, rotation_of_quaternion, rounded_angle
 
 MOVING = {"revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic"}
 """Joint type of the model by URDF joint type; a chain may have these and ``fixed``."""
-
-LARGEST = 1e9
-"""Largest magnitude of a coordinate in a URDF, SI units; larger ones are refused."""
 
 ENDLESS = (-math.inf, math.inf)
 """Position limits of a joint that has none."""
@@ -329,7 +326,7 @@ class UrdfTree:
         frame = np.eye(4)
         if found is not None:
             frame[:3, :3] = self._orientation(element, found)
-            frame[:3, 3] = [float(w) for w in self.words(element, found, "xyz")]
+            frame[:3, 3] = [float(w) for w in words(self.file, element, found, "xyz")]
             self._refuse_millimetres(element, frame[:3, 3])
         return frame
 
@@ -340,14 +337,14 @@ class UrdfTree:
             if re.search("quat|rpy|rot|euler", key, re.IGNORECASE):
                 raise ConfigError(f"{where}: unknown attribute {key:.40}; expected xyz, and rpy or quat_xyzw")
         if origin.get("quat_xyzw") is None:
-            angles = [rounded_angle(w) for w in self.words(element, origin, "rpy")]
+            angles = [rounded_angle(w) for w in words(self.file, element, origin, "rpy")]
             if max(abs(angle) for angle in angles) > FULL_TURN:
                 raise ConfigError(f"{where} rpy: {origin.get('rpy')!r:.80} looks like degrees; expected rad")
             return rotation(*angles)
         if origin.get("rpy") is not None:
             raise ConfigError(f"{where}: both rpy and quat_xyzw; expected one of them")
         try:
-            return rotation_of_quaternion([float(w) for w in self.words(element, origin, "quat_xyzw", count=4)])
+            return rotation_of_quaternion([float(w) for w in words(self.file, element, origin, "quat_xyzw", count=4)])
         except ValueError as error:
             raise ConfigError(f"{where} quat_xyzw: {error}") from error
 
@@ -382,7 +379,7 @@ class UrdfTree:
         found = only(self.file, element, "axis")
         axis = np.array([1.0, 0.0, 0.0])
         if found is not None:
-            axis = np.array([float(w) for w in self.words(element, found, "xyz", default=None)])
+            axis = np.array([float(w) for w in words(self.file, element, found, "xyz", default=None)])
         length = float(np.linalg.norm(axis))
         if not length > 0.0:
             raise ConfigError(f"{where}: axis: expected a direction, found 0 0 0")
@@ -414,38 +411,8 @@ class UrdfTree:
         except ValueError:
             value = math.nan
         if math.isnan(value) or "_" in text:
-            self.words(element, found, key, count=1)
+            words(self.file, element, found, key, count=1)
         return value
-
-    def words(
-        self, element: ET.Element, child: ET.Element, key: str, *, count: int = 3, default: str | None = "0 0 0"
-    ) -> list[str]:
-        """Finite numbers of an attribute, as written.
-
-        Parameters
-        ----------
-        element
-            Element of the joint or link, for messages.
-        child, key
-            Element below it, and the attribute.
-        count
-            Number of numbers.
-        default
-            Text if there is no such attribute; ``None``: it is required.
-
-        Raises
-        ------
-        ConfigError
-            If there are not that many finite numbers.
-        """
-        text = child.get(key, default)
-        words = (text or "").split()
-        if len(words) != count or not all(_is_finite(word) for word in words):
-            expected = "a number" if count == 1 else f"{count} numbers"
-            hint = f"; {expand(self.file)}" if "$" in (text or "") else ""
-            where = f"{self.file}: {element.tag} {element.get('name')!r}: {child.tag} {key}"
-            raise ConfigError(f"{where}: expected {expected}, found {text!r:.80}{hint}")
-        return words
 
 
 def read_tree(file: Path) -> UrdfTree:
@@ -497,53 +464,3 @@ def read_tree(file: Path) -> UrdfTree:
     if len(reached) < len(links):
         raise ConfigError(f"{file}: links {', '.join(sorted(links.keys() - set(reached)))} form a loop")
     return tree
-
-
-def _is_finite(word: str) -> bool:
-    # Python also reads underscores and the digits of other scripts; readers of URDF do not.
-    if "_" in word or not word.isascii():
-        return False
-    try:
-        return abs(Decimal(word)) <= LARGEST
-    except InvalidOperation:
-        return False
-
-
-def only(file: Path, element: ET.Element, tag: str, of: ET.Element | None = None) -> ET.Element | None:
-    """Return the element of a name in another one, or ``None``.
-
-    Parameters
-    ----------
-    file
-        Path of the URDF, for messages.
-    element, tag
-        Element of a joint or link, or one below it, and the name.
-    of
-        Joint or link around the element, for messages; ``None``: it is one.
-
-    Raises
-    ------
-    ConfigError
-        If there are two that differ.
-    """
-    found = element.findall(tag)
-    contents = {tuple((part.tag, *sorted(part.items())) for part in each.iter()) for each in found}
-    if len(contents) > 1:
-        owner = element if of is None else of
-        where = f"{file}: {owner.tag} {owner.get('name')!r}" + (f": {element.tag}" if of is not None else "")
-        raise ConfigError(f"{where}: there are {len(found)} elements {tag}, expected one")
-    return found[0] if found else None
-
-
-def end_link(element: ET.Element, end: Literal["parent", "child"]) -> str:
-    """Name of the ``parent`` or ``child`` link of a joint; empty if it has none.
-
-    Parameters
-    ----------
-    element
-        Element of the joint.
-    end
-        The end.
-    """
-    found = element.find(end)
-    return "" if found is None else found.get("link", "")
