@@ -27,6 +27,8 @@ pytestmark = pytest.mark.slow
 
 State = Literal["done", "failed"]
 STATES: list[State] = ["done", "failed"]
+LONG_S = 600.0
+"""Lease that does not end within a test, s."""
 
 
 class KilledAfterwards(WorkerLink):
@@ -62,16 +64,15 @@ def nothing(_data: bytes | None, _size: int) -> None:
 def entered(folder: Path, state: State, lease_s: float) -> Entry:
     """Return a recording whose result or failure was entered by the process ``one``, and not announced."""
     made = recorded(cell_of(folder), "a")
-    ledger = Ledger(folder / FILE, "one", lease_s)
     assert made.path is not None
+    path, message = None, "too short"
+    if state == "done":
+        path, _ = write_identification(identify_recording(made), folder / "emps-a.identification")
+        message = "usable"
+    ledger = Ledger(folder / FILE, "one", lease_s)
     ledger.add(made.sha256, "emps-a", [made.path])
     assert ledger.claim(made.sha256) is not None
-    if state == "done":
-        outcome = identify_recording(made)
-        path, _ = write_identification(outcome, folder / "emps-a.identification")
-        assert ledger.finish(made.sha256, state, path, "usable")
-    else:
-        assert ledger.finish(made.sha256, state, None, "too short")
+    assert ledger.finish(made.sha256, state, path, message)
     entry = ledger.entry(made.sha256)
     assert entry is not None
     return entry
@@ -85,7 +86,7 @@ def announced(folder: Path, sha256: str) -> bool:
 @pytest.mark.parametrize("state", STATES)
 def test_another_worker_enters_the_announcement_of_one_that_was_killed(tmp_path: Path, state: State) -> None:
     """Between announcement and entry, which is the worst moment."""
-    entry, session = entered(tmp_path, state, lease_s=60.0), cell_of(tmp_path)
+    entry, session = entered(tmp_path, state, lease_s=LONG_S), cell_of(tmp_path)
     robot = read_recording(entry.paths[0]).robot
     with closing(Audience(session, "emps")) as audience, Worker(session, robot, tmp_path) as other:
         process = multiprocessing.get_context("forkserver").Process(
@@ -94,7 +95,7 @@ def test_another_worker_enters_the_announcement_of_one_that_was_killed(tmp_path:
         process.start()
         process.join()
         assert process.exitcode == -signal.SIGKILL
-        until = time.monotonic() + 5.0
+        until = time.monotonic() + 30.0
         while not announced(tmp_path, entry.sha256):
             assert time.monotonic() < until
             time.sleep(0.1)
@@ -112,7 +113,7 @@ def test_a_listener_that_lost_a_worker_hears_the_next_one(tmp_path: Path, state:
             time.sleep(1.0)
         time.sleep(3.0)
         with Worker(session, read_recording(entry.paths[0]).robot, tmp_path) as worker:
-            assert worker.result(10.0) == (3 if state == "failed" else 0)
+            assert worker.result(60.0) == (3 if state == "failed" else 0)
             time.sleep(0.5)
             counted = audience.results if state == "done" else audience.failures
             assert counted == {entry.sha256: 1}
@@ -121,8 +122,8 @@ def test_a_listener_that_lost_a_worker_hears_the_next_one(tmp_path: Path, state:
 def test_an_announcement_is_not_repeated_if_the_ledger_refuses_its_entry(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    entry, session = entered(tmp_path, "done", lease_s=60.0), cell_of(tmp_path)
-    ledger, transaction = Ledger(tmp_path / FILE, "one", 60.0), Ledger.announcement
+    entry, session = entered(tmp_path, "done", lease_s=LONG_S), cell_of(tmp_path)
+    ledger, transaction = Ledger(tmp_path / FILE, "one", LONG_S), Ledger.announcement
 
     @contextmanager
     def full(self: Ledger, sha256: str) -> Iterator[bool]:

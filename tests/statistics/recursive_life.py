@@ -7,6 +7,7 @@ takes a tenth of real time.
 """
 
 import argparse
+import copy
 import json
 import math
 import time
@@ -174,17 +175,50 @@ def healthy_life(hours: float, seed: int = 1, *, simulated: bool = False, progre
     )  # fmt: skip
 
 
-def seconds_to_alarm(joint: str, motion: str, seed: int, factor: float = 1.1, period: float = PERIOD_S) -> float | None:
-    """Time from the change of a joint's friction to its alarm, s; ``None``: no alarm, or one of another joint."""
+def lived_for(hours: float, seed: int) -> RecursiveEstimator:
+    """Return an estimator after a healthy life of repeated motions at 1 kHz."""
+    estimator = RecursiveEstimator(load_robot("tx40"), reference(), 1.0 / PERIOD_S)
+    for piece in repeated_pieces(estimator, hours, seed):
+        estimator.start_capture()
+        piece.take()
+    return estimator
+
+
+def seconds_to_alarm(
+    joint: str,
+    motion: str,
+    seed: int,
+    factor: float = 1.1,
+    period: float = PERIOD_S,
+    lived: tuple[RecursiveEstimator, dict[str, float]] | None = None,
+) -> float | None:
+    """Time from the change of a joint's friction to its alarm, s; ``None``: no alarm, or one of another joint.
+
+    Parameters
+    ----------
+    joint, motion, seed
+        The joint, the trajectory that is repeated, and the seed of the noise.
+    factor
+        The new friction, relative to that before.
+    period
+        SYNC period, s.
+    lived
+        Estimator after a healthy life (which is copied) and the friction factors of the joints at its end; without
+        it, a new estimator sees the motion four times before the change.
+    """
     robot = load_robot("tx40")
-    estimator = RecursiveEstimator(robot, reference(period=period), 1.0 / period)
     syncs = round(BLOCK * PERIOD_S / period)
-    for block in blocks_of(play(motion, 1000 * seed, {}, period=period), syncs):
-        estimator.handle(block)
+    if lived is None:
+        estimator, factors = RecursiveEstimator(robot, reference(period=period), 1.0 / period), dict[str, float]()
+        for block in blocks_of(play(motion, 1000 * seed, {}, period=period), syncs):
+            estimator.handle(block)
+    else:
+        estimator, factors = copy.deepcopy(lived[0]), lived[1]
+    worn = {**factors, joint: factor * factors.get(joint, 1.0)}
     elapsed, k = 0.0, 1
     while elapsed < 90.0:
         estimator.start_capture()
-        for block in blocks_of(play(motion, 1000 * seed + k, {joint: factor}, period=period), syncs):
+        for block in blocks_of(play(motion, 1000 * seed + k, worn, period=period), syncs):
             estimator.handle(block)
             if block.layout.name == "samples":
                 elapsed += len(block.sync) * period
@@ -217,16 +251,20 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--period", type=float, default=PERIOD_S, help="SYNC period with --changes, s")
     parser.add_argument("--changes", action="store_true", help="time to see 10 %% more friction, every joint")
+    parser.add_argument("--healthy", type=float, help="hours of healthy life before each change, 1 kHz, with --changes")
     parser.add_argument("--simulate", action="store_true", help="simulate and filter every second of a life")
     parser.add_argument("--cost", action="store_true", help="CPU time of a replay at 5 kHz against real time")
     asked = parser.parse_args()
+    if asked.healthy is not None and asked.period != PERIOD_S:
+        parser.error("--healthy is for the default --period")
     if asked.cost:
         print(f"{100 * cost():.1f} % of a core")
         return
     if asked.changes:
+        lived = None if asked.healthy is None else (lived_for(asked.healthy, asked.seed), factors_at(asked.healthy))
         for motion in MOTIONS:
             for joint in load_robot("tx40").joints:
-                seconds = seconds_to_alarm(joint.name, motion, asked.seed, period=asked.period)
+                seconds = seconds_to_alarm(joint.name, motion, asked.seed, period=asked.period, lived=lived)
                 print(motion, joint.name, seconds, flush=True)
         return
     print(json.dumps(vars(healthy_life(asked.hours, asked.seed, simulated=asked.simulate, progress=True)), indent=1))
