@@ -58,7 +58,15 @@ class StatusPublisher:
         self._put(self._keys.status, status("reidentify", state, **more))
 
     def failure(self, message: str, name: str, sha256: str) -> None:
-        """Publish why the recording of a name and a hash cannot be identified."""
+        """Publish why a recording cannot be identified.
+
+        Parameters
+        ----------
+        message
+            The reason.
+        name, sha256
+            Name of the recording and its hash.
+        """
         self._put(self._keys.status, failure_status("reidentify", message, name, sha256))
 
     def result(self, text: str) -> bool:
