@@ -1,9 +1,8 @@
 """Announcements of a worker: each result and failure in the ledger is announced once, also if workers are killed."""
 
-import json
-
 from armident.daq.streaming import Keys
 from armident.identify.monitoring.ledger import Entry, Ledger
+from armident.identify.monitoring.status_messages import failure_status, status
 from armident.identify.monitoring.worker_link import LinkDown, WorkerLink
 from armident.identify.monitoring.worker_receiver import content_hash
 
@@ -87,34 +86,6 @@ class Announcements:
             if any(content_hash(content) in self._heard for content in _contents(entry)):
                 ledger.enter_announced(entry.sha256)
         self._heard.clear()
-
-
-def status(component: str, state: str, **more: object) -> bytes:
-    """Return a message for the key of the status.
-
-    Parameters
-    ----------
-    component, state
-        Name of the program and of its state.
-    more
-        Further entries.
-    """
-    return json.dumps({"component": component, "state": state, **more}).encode()
-
-
-def failure_status(component: str, message: str, name: str, sha256: str) -> bytes:
-    """Return the announcement that a recording cannot be identified.
-
-    Parameters
-    ----------
-    component
-        Name of the program.
-    message
-        The reason.
-    name, sha256
-        Name of the recording and its hash.
-    """
-    return status(component, "failed", message=message, capture=name, sha256=sha256)
 
 
 def _outcome(entry: Entry) -> tuple[bytes | None, str]:

@@ -1,6 +1,5 @@
 """Zenoh session of a worker: opened again after a failure, and beside other workers of the cell."""
 
-import json
 import logging
 import threading
 from collections.abc import Callable
@@ -12,6 +11,7 @@ from armident.configs import ArmidentError, ConfigError, SessionConfig
 from armident.daq.streaming import Announcer, Keys, open_session
 from armident.daq.streaming.announcer import longest_retry_s
 from armident.daq.streaming.session import configuration
+from armident.identify.monitoring.status_messages import status
 from armident.identify.monitoring.worker_receiver import Take, WorkerReceiver
 
 log = logging.getLogger(__name__)
@@ -123,7 +123,7 @@ class WorkerLink:
         more
             Further entries.
         """
-        content = json.dumps({"component": "worker", "state": state, **more}).encode()
+        content = status("worker", state, **more)
         with self._lock:
             if self._session is None:
                 return
