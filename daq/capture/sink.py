@@ -1,6 +1,6 @@
 """Output of captured rows: the recording, and Zenoh."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armident.configs import RobotConfig, SessionConfig
+from armident.daq.capture.batches import SamplesFirst, pieces
 from armident.daq.capture.publisher import Publisher
 from armident.daq.matching.assembler import Batch, Rows
 from armident.daq.matching.streams import CapturedStream
@@ -16,9 +17,6 @@ from armident.daq.recording import Gap, Mark, QueuedSeries
 from armident.daq.recording.model import MarkKind
 from armident.daq.streaming import Block, encode_event
 from armident.daq.streaming.codec import end_content, start_content
-
-PIECE_NS = 200_000_000
-"""Longest recorded time that is written and published at once, ns."""
 
 
 class Sink:
@@ -52,6 +50,7 @@ class Sink:
         self.last_ns = 0
         self._writer, self._publisher = writer, publisher
         self._streams, self._capture = tuple(streams), capture
+        self._samples_first = SamplesFirst()
         self._blocks = 0
         self._planned: list[tuple[MarkKind, int, str]] = []
 
@@ -140,7 +139,7 @@ class Sink:
         batch
             Rows and gaps from the assembler.
         """
-        for piece in pieces(batch):
+        for piece in pieces(self._samples_first.take(batch)):
             self._take(piece)
 
     def _take(self, batch: Batch) -> None:
@@ -178,6 +177,8 @@ class Sink:
         counters
             Counters of the capture; those of writer and publisher are added.
         """
+        if (rest := self._samples_first.rest()) is not None:
+            self._take(rest)
         self._place_marks(True)
         self._writer.flush()
         counters["writer.rows_lost"] = self._writer.lost_rows
@@ -201,35 +202,6 @@ class Sink:
             self.marks.append(mark)
             self._writer.add_marks([mark])
             self._publisher.event(encode_event("mark", {"capture": self._capture, **asdict(mark, dict_factory=_mark)}))
-
-
-def pieces(batch: Batch) -> Iterator[Batch]:
-    """Yield a batch in pieces of at most `PIECE_NS`, by the time of its samples.
-
-    A batch is long if drives lagged and answered all at once. The pieces give blocks the usual size, and let files end
-    at their limits. Rows of a stream are in the piece of their SYNC, a gap is in the piece of its first SYNC.
-
-    Parameters
-    ----------
-    batch
-        Rows and gaps.
-    """
-    samples = batch.rows["samples"]
-    if samples.sync.size == 0 or samples.t_ns[-1] - samples.t_ns[0] < PIECE_NS:
-        yield batch
-        return
-    number = (samples.t_ns - samples.t_ns[0]) // PIECE_NS
-    boundaries = samples.sync[np.flatnonzero(np.diff(number) > 0) + 1]
-    piece_of_gap = np.searchsorted(boundaries, [gap.first for gap in batch.gaps], side="right")
-    cuts = {
-        name: [0, *np.searchsorted(rows.sync, boundaries).tolist(), rows.sync.size] for name, rows in batch.rows.items()
-    }
-    for k in range(boundaries.size + 1):
-        part = {}
-        for name, rows in batch.rows.items():
-            rows_of_piece = slice(cuts[name][k], cuts[name][k + 1])
-            part[name] = Rows(rows.sync[rows_of_piece], rows.t_ns[rows_of_piece], rows.data[rows_of_piece])
-        yield Batch(part, tuple(gap for gap, at in zip(batch.gaps, piece_of_gap, strict=True) if at == k))
 
 
 def _mark(entries: list[tuple[str, Any]]) -> dict[str, Any]:

@@ -114,10 +114,13 @@ class Batch:
         Complete rows by stream.
     gaps
         Gaps that have ended.
+    certain
+        Number of the SYNC, by stream, before which all rows are known: they are complete, or in a gap.
     """
 
     rows: dict[str, Rows]
     gaps: tuple[Gap, ...]
+    certain: dict[str, int]
 
 
 class Assembler:
@@ -400,7 +403,8 @@ class Assembler:
             if final and stream.pack > 1:
                 gaps += self._incomplete_pack(s)
             gaps += self._gaps.ended(stream.name, int(sync[-1]) if sync.size else None, final)
-        return Batch(rows, tuple(sorted(gaps, key=lambda g: (g.first, g.stream, g.joint or ""))))
+        certain = {stream.name: self._emitted[s] for s, stream in enumerate(self._streams)}
+        return Batch(rows, tuple(sorted(gaps, key=lambda g: (g.first, g.stream, g.joint or ""))), certain)
 
     def _incomplete_pack(self, s: int) -> list[Gap]:
         """Return the SYNCs since the last packed TPDO as a gap."""

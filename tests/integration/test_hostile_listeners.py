@@ -104,7 +104,7 @@ def batches(session: SessionConfig, robot: RobotConfig, seconds: float = SECONDS
             wide = data[:, :, : stream.tpdo.dtype.itemsize]
             rows[stream.bus.name] = Rows(sync, 1_700_000_000_000_000_000 + sync * 200_000, np.ascontiguousarray(wide))
         gap = Gap("samples", k * ROWS, k * ROWS, "joint_1")
-        yield Batch(rows, (gap,) if k % 2 else ())
+        yield Batch(rows, (gap,) if k % 2 else (), dict.fromkeys(rows, (k + 1) * ROWS))
 
 
 def resident() -> int:
