@@ -84,6 +84,7 @@ RUNNING = [page for page in PAGES if (read := read_page(REPOSITORY / page)).comm
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(PAGE_S + 20)
 @pytest.mark.parametrize(
     "page", [pytest.param(p, marks=[pytest.mark.proof] if p.name in LONG else [], id=str(p)) for p in RUNNING]
 )
@@ -119,6 +120,7 @@ def test_every_block_has_a_language_and_every_exception_a_reason(page: Path) -> 
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(PAGE_S + 20)
 def test_the_site_builds_without_warnings(tmp_path: Path) -> None:
     pytest.importorskip("sphinx")
     command = [sys.executable, "-m", "sphinx", "-q", "-W", "--keep-going", "-b", "html", "docs", str(tmp_path)]
