@@ -1,10 +1,10 @@
 """Batches of matched rows for the recording: in the order of time, and in pieces."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 
-from armident.daq.matching.assembler import Batch, Rows
+from armident.daq.matching.assembler import LATE_S, Batch, Rows
 from armident.daq.recording import Gap
 
 PIECE_NS = 200_000_000
@@ -47,6 +47,36 @@ class SamplesFirst:
         rest = Batch(self._rows, self._gaps, {}) if self._rows else None
         self._rows, self._gaps = {}, ()
         return rest
+
+
+class FileBoundaries:
+    """Tells where a file may begin: before samples to which the other streams are certain.
+
+    A file without answers of its last SYNCs would not list them as a gap: they come with the next file. After
+    ``LATE_S`` without such a place, the next file begins anyway, so that a silent drive does not stop the files.
+    """
+
+    def __init__(self) -> None:
+        self._refused_ns: int | None = None
+
+    def allow(self, samples: Rows, certain: Mapping[str, int]) -> bool:
+        """Return True if a file may begin before these samples.
+
+        Parameters
+        ----------
+        samples
+            Samples, at least one.
+        certain
+            Number of the SYNC, by stream, before which all rows are known.
+        """
+        t_ns = int(samples.t_ns[0])
+        if all(until >= samples.sync[0] for until in certain.values()):
+            self._refused_ns = None
+            return True
+        if self._refused_ns is None or not 0 <= t_ns - self._refused_ns < LATE_S * 1e9:
+            allowed, self._refused_ns = self._refused_ns is not None, t_ns
+            return allowed
+        return False
 
 
 def pieces(batch: Batch) -> Iterator[Batch]:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armident.configs import RobotConfig, SessionConfig
-from armident.daq.capture.batches import SamplesFirst, pieces
+from armident.daq.capture.batches import FileBoundaries, SamplesFirst, pieces
 from armident.daq.capture.publisher import Publisher
 from armident.daq.matching.assembler import Batch, Rows
 from armident.daq.matching.streams import CapturedStream
@@ -50,7 +50,7 @@ class Sink:
         self.last_ns = 0
         self._writer, self._publisher = writer, publisher
         self._streams, self._capture = tuple(streams), capture
-        self._samples_first = SamplesFirst()
+        self._samples_first, self._file_boundaries = SamplesFirst(), FileBoundaries()
         self._blocks = 0
         self._planned: list[tuple[MarkKind, int, str]] = []
 
@@ -145,18 +145,21 @@ class Sink:
     def _take(self, batch: Batch) -> None:
         samples = batch.rows["samples"]
         if samples.sync.size:
-            self._writer.rotate(int(samples.t_ns[0]))
+            if self._file_boundaries.allow(samples, batch.certain):
+                self._writer.rotate(int(samples.t_ns[0]))
             self.last_ns = self.last_ns or int(samples.t_ns[0])
         if batch.gaps:
             # Before the rows that follow them: a truncated file then lists all gaps of its rows.
             self.gaps += batch.gaps
             self._writer.add_gaps(batch.gaps, self.last_ns)
+        decoded = {stream.bus.name: stream.decode(batch.rows[stream.bus.name]) for stream in self._streams}
+        self._writer.append(
+            {name: (batch.rows[name].sync, batch.rows[name].t_ns, raw) for name, raw in decoded.items()}
+        )
         for stream in self._streams:
-            rows = batch.rows[stream.bus.name]
+            rows, raw = batch.rows[stream.bus.name], decoded[stream.bus.name]
             if rows.sync.size == 0:
                 continue
-            raw = stream.decode(rows)
-            self._writer.append(stream.bus.name, rows.sync, rows.t_ns, raw)
             self._publisher.offer(Block(stream.layout, self._blocks, rows.sync, rows.t_ns, raw, self._capture))
             self._blocks += 1
             if stream.bus.name == "samples":

@@ -403,7 +403,10 @@ class Assembler:
             if final and stream.pack > 1:
                 gaps += self._incomplete_pack(s)
             gaps += self._gaps.ended(stream.name, int(sync[-1]) if sync.size else None, final)
-        certain = {stream.name: self._emitted[s] for s, stream in enumerate(self._streams)}
+        certain = {
+            stream.name: emitted - 1 + stream.every if emitted else 0
+            for stream, emitted in zip(self._streams, self._emitted, strict=True)
+        }
         return Batch(rows, tuple(sorted(gaps, key=lambda g: (g.first, g.stream, g.joint or ""))), certain)
 
     def _incomplete_pack(self, s: int) -> list[Gap]:

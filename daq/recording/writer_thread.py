@@ -24,7 +24,8 @@ CATCH_UP = 2.0
 """Largest write rate of a backlog, over the rate at which its rows came: reading the buses has priority."""
 
 _Task = Callable[[], object]
-_Rows = tuple[NDArray[np.int64], NDArray[np.int64], Mapping[str, NDArray[Any]]]
+Rows = tuple[NDArray[np.int64], NDArray[np.int64], Mapping[str, NDArray[Any]]]
+"""SYNC numbers, times (ns UTC) and raw values by field."""
 
 
 @dataclass(frozen=True)
@@ -52,16 +53,17 @@ class _Work:
 class _Chunk:
     """Rows of each stream, gaps with the time they were found, and marks that are handed over together."""
 
-    rows: dict[str, list[_Rows]] = field(default_factory=dict)
+    rows: dict[str, list[Rows]] = field(default_factory=dict)
     gaps: list[tuple[Sequence[Gap], int]] = field(default_factory=list)
     marks: list[Mark] = field(default_factory=list)
     since: int | None = None
+    may_begin_file: bool = False
     span_ns: int = 0
     began_ns: int = 0
     bytes: int = 0
     count: int = 0
 
-    def add(self, stream: str, rows: _Rows, size: int) -> None:
+    def add(self, stream: str, rows: Rows, size: int) -> None:
         """Add rows of a stream.
 
         Parameters
@@ -75,15 +77,16 @@ class _Chunk:
         """
         if not self.rows:
             self.began_ns = time.monotonic_ns()
+        if self.since is None:
+            self.since = int(rows[1][0])
         self.rows.setdefault(stream, []).append(rows)
-        if self.since is not None:
-            self.span_ns = max(self.span_ns, int(rows[1][-1]) - self.since)
+        self.span_ns = max(self.span_ns, int(rows[1][-1]) - self.since)
         self.bytes += size
         self.count += len(rows[0])
 
     def write(self, series: RecordingSeries | TriggeredSeries) -> None:
         """Write the content to a series."""
-        if self.since is not None:
+        if self.since is not None and self.may_begin_file:
             series.rotate(self.since)
         # Gaps first: a truncated file then lists the gaps of all rows it has.
         for gaps, found_ns in self.gaps:
@@ -202,37 +205,35 @@ class QueuedSeries:
     def rotate(self, t_ns: int) -> None:
         """Allow a new file to begin before the next rows, whose first time is ``t_ns`` (ns UTC)."""
         if self._chunk.since is None:
-            self._chunk.since = t_ns
+            self._chunk.since, self._chunk.may_begin_file = t_ns, True
 
-    def append(
-        self, stream: str, sync: NDArray[np.int64], t_ns: NDArray[np.int64], raw: Mapping[str, NDArray[Any]]
-    ) -> None:
-        """Add rows to a stream; the arrays must not change afterwards.
+    def append(self, rows: Mapping[str, Rows]) -> None:
+        """Add rows of the same time to several streams, which no file divides; the arrays must not change afterwards.
 
         Parameters
         ----------
-        stream
-            Name of the stream.
-        sync
-            SYNC numbers, (N,).
-        t_ns
-            Receive times of the SYNCs, ns UTC, (N,).
-        raw
-            Raw values of every field, (N, n) each.
+        rows
+            By stream: SYNC numbers, (N,), receive times of the SYNCs, ns UTC, (N,), and raw values of every field,
+            (N, n) each.
         """
-        if len(sync) == 0:
+        sizes = {
+            stream: sync.nbytes + t_ns.nbytes + sum(values.nbytes for values in raw.values())
+            for stream, (sync, t_ns, raw) in rows.items()
+            if len(sync)
+        }
+        if not sizes:
             return
         self._check()
-        size = sync.nbytes + t_ns.nbytes + sum(values.nbytes for values in raw.values())
         # Resume at half the limit: a slow disk causes a few long gaps instead of many short ones.
         allowed_bytes = self._most_bytes // 2 if self._left_out else self._most_bytes
-        if self._waiting_bytes + size > allowed_bytes:
-            self._left_out.add(stream, sync)
-            self._left_out_rows += len(sync)
+        if self._waiting_bytes + sum(sizes.values()) > allowed_bytes:
+            for stream in sizes:
+                self._left_out.add(stream, rows[stream][0])
+                self._left_out_rows += len(rows[stream][0])
             return
         self._report_left_out()
-        self.rotate(int(t_ns[0]))
-        self._chunk.add(stream, (sync, t_ns, raw), size)
+        for stream, size in sizes.items():
+            self._chunk.add(stream, rows[stream], size)
         if self._chunk.span_ns >= self._chunk_ns:
             self._hand_over()
 

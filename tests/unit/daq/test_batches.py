@@ -6,12 +6,13 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from armident.configs import load_robot, load_session
-from armident.daq.capture.batches import PIECE_NS, SamplesFirst, pieces
+from armident.daq.capture.batches import PIECE_NS, FileBoundaries, SamplesFirst, pieces
 from armident.daq.capture.files import open_series
 from armident.daq.capture.publisher import Publisher
 from armident.daq.capture.sink import Sink
@@ -66,51 +67,68 @@ def test_gaps_without_rows_are_a_piece_of_their_own() -> None:
     assert list(pieces(whole)) == [whole]
 
 
-def frames_of_lagging_drives(syncs: int, lag: int) -> Iterator[NDArray[np.void]]:
-    """Yield frames of every SYNC: six drives answer the demand at once, and the samples ``lag`` SYNCs later."""
-    nodes = range(1, 7)
-    for k in range(syncs):
-        ids = [0x80]
-        ids += [0x180 + node for node in nodes if k >= lag]
-        ids += [0x280 + node for node in nodes if k % 5 == 4]
+def frames_of_lagging_drives(syncs: int, lagging: str, always: bool) -> Iterator[NDArray[np.void]]:
+    """Yield frames of every SYNC and of the time after the last one.
+
+    Six drives answer one stream an interval late, always or in the first two thirds of every 0.6 s.
+    """
+    answers: dict[int, list[int]] = {}
+    for name, first_id, every in (("samples", 0x180, 1), ("demand", 0x280, 5)):
+        for k in range(every - 1, syncs, every):
+            late = name == lagging and (always or k % 3000 < 2000)
+            answers.setdefault(k + late * every, []).extend(first_id + node for node in range(1, 7))
+    for k in range(max(answers) + 1):
+        ids = ([0x80] if k < syncs else []) + answers.get(k, [])
         frames = np.zeros(len(ids), FRAME)
-        frames["can_id"], frames["length"], frames["t_ns"] = ids, 8, k * PERIOD_NS + np.arange(len(ids)) * 1000
-        frames["length"][0], frames["data"][0, 0] = 1, k % 240 + 1
-        frames["length"][frames["can_id"] > 0x280] = 4
+        frames["can_id"], frames["t_ns"] = ids, k * PERIOD_NS + np.arange(len(ids)) * 1000
+        frames["length"] = [1 if can_id == 0x80 else 8 if can_id < 0x280 else 4 for can_id in ids]
+        frames["data"][:, 0] = k % 240 + 1
         yield frames
-    # Answers to the last SYNCs.
-    last = np.concatenate([frames[1:7]] * lag)
-    last["t_ns"] += PERIOD_NS
-    yield last
 
 
-def test_streams_of_a_file_have_the_same_times_though_samples_lag(tmp_path: Path) -> None:
-    """Each file has the demand of its samples, which are certain only at the end."""
+@pytest.mark.parametrize(("lagging", "always"), [("samples", True), ("samples", False), ("demand", False)])
+def test_streams_of_a_file_have_the_same_times_though_one_of_them_lags(
+    tmp_path: Path, lagging: str, always: bool
+) -> None:
+    """Each file has the demand of its samples, which may be certain only at the end."""
     session = load_session("tx40_cell.yaml").model_copy(update={"cell": "lagging"})
-    recording = session.recording.model_copy(update={"rotate_minutes": 0.5 / 60})
+    recording = session.recording.model_copy(update={"rotate_minutes": 0.53 / 60})
     session = session.model_copy(update={"recording": recording})
     robot = load_robot(session.robot)
     streams = captured_streams(session, robot)
     joints = [joint.name for joint in robot.joints]
     assembler = Assembler([stream.bus for stream in streams], joints, PERIOD_NS)
     writer = open_series(session, robot, streams, tmp_path, "lagging", {})
-    demand_came_first = False
+    other = "demand" if lagging == "samples" else "samples"
+    other_came_first = False
     with closing(Publisher(session, Keys("lagging", robot.name), exclusive=False)) as publisher:
         sink = Sink(writer, publisher, streams, "lagging")
-        frames = list(frames_of_lagging_drives(syncs=10_000, lag=1))
-        for k in range(0, len(frames), 500):
-            batch = assembler.push(np.concatenate(frames[k : k + 500]), 10_000)
-            demand_came_first |= batch.certain["demand"] > batch.certain["samples"] + 5000
+        frames = list(frames_of_lagging_drives(10_000, lagging, always))
+        for k in range(0, len(frames), 130):
+            batch = assembler.push(np.concatenate(frames[k : k + 130]), 10_000)
+            other_came_first |= batch.certain[other] > batch.certain[lagging] + 1000
             sink.take(batch)
         sink.take(assembler.finish(10_000))
         sink.finish({})
-    assert demand_came_first
+    assert other_came_first
+    assert not sink.gaps
     parts = [read_recording(path) for path in sorted(tmp_path.glob("*.mcap"))]
-    assert len(parts) == 4
+    assert len(parts) in (3, 4)
     for part in parts:
         samples, demand = part.samples.sync, part.streams["demand"].sync
         assert np.array_equal(demand, samples[samples % 5 == 4])
     assert np.array_equal(np.concatenate([part.samples.sync for part in parts]), np.arange(10_000))
+
+
+def test_a_silent_stream_does_not_stop_the_files() -> None:
+    """A file may begin once in four seconds, the time after which a missing answer is lost."""
+    boundaries = FileBoundaries()
+    allowed = []
+    for k in range(0, 100_000, 100):
+        samples = Rows(np.array([k]), np.array([k * PERIOD_NS]), np.zeros((1, 2, 8), np.uint8))
+        if boundaries.allow(samples, {"samples": k + 100, "demand": max(0, k - 200)}):
+            allowed.append(k * PERIOD_NS / 1e9)
+    assert allowed == [0.0, 4.02, 8.02, 12.02, 16.02]
 
 
 @given(st.lists(st.tuples(st.integers(0, 30), st.integers(0, 30)), max_size=8))

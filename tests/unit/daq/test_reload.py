@@ -144,7 +144,7 @@ def test_no_row_is_lost_if_rotation_is_switched_on_during_a_capture(tmp_path: Pa
             part = slice(first, first + 100)
             writer.rotate(int(samples.t_ns[first]))
             raw = {name: values[part] for name, values in samples.raw.items()}
-            writer.append("samples", samples.sync[part], samples.t_ns[part], raw)
+            writer.append({"samples": (samples.sync[part], samples.t_ns[part], raw)})
         writer.close({})
     read = [read_recording(path) for path in writer.paths]
     assert len(read) > 3

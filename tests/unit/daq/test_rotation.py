@@ -44,10 +44,16 @@ def write(series: RecordingSeries | QueuedSeries, recording: Recording, step: in
     for first in range(0, samples.sync.size, step):
         part = slice(first, first + step)
         finished.append(series.rotate(int(samples.t_ns[part][0])))
+        rows = {}
         for stream in (samples, demand):
             here = (stream.sync >= samples.sync[part][0]) & (stream.sync <= samples.sync[part][-1])
-            rows = {name: values[here] for name, values in stream.raw.items()}
-            series.append(stream.name, stream.sync[here], stream.t_ns[here], rows)
+            raw = {name: values[here] for name, values in stream.raw.items()}
+            rows[stream.name] = stream.sync[here], stream.t_ns[here], raw
+        if isinstance(series, QueuedSeries):
+            series.append(rows)
+        else:
+            for name, columns in rows.items():
+                series.append(name, *columns)
     return [path for path in finished if path is not None]
 
 

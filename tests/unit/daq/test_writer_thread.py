@@ -53,7 +53,7 @@ def append(series: QueuedSeries, stream: Stream, first: int, last: int) -> None:
     """Add the rows from SYNC ``first`` to before ``last``."""
     here = (stream.sync >= first) & (stream.sync < last)
     rows = {name: values[here] for name, values in stream.raw.items()}
-    series.append(stream.name, stream.sync[here], stream.t_ns[here], rows)
+    series.append({stream.name: (stream.sync[here], stream.t_ns[here], rows)})
 
 
 def until(true: Callable[[], bool]) -> None:
@@ -315,7 +315,7 @@ def test_gaps_and_marks_are_kept_beyond_the_memory_limit_of_rows(tmp_path: Path,
 def test_an_error_in_the_thread_is_raised_in_append(tmp_path: Path) -> None:
     recording = make_recording(100)
     with QueuedSeries(RecordingSeries(beginner(recording), tmp_path, NAME), {"samples": 1}, CHUNK_NS) as series:
-        series.append("another", np.arange(3), np.arange(3), {})
+        series.append({"another": (np.arange(3), np.arange(3), {})})
         with pytest.raises(KeyError, match="another"):
             series.flush()
         with pytest.raises(KeyError, match="another"):
