@@ -152,7 +152,8 @@ def test_a_watch_reports_the_number_of_lost_blocks(session: SessionConfig, caplo
 def test_blocks_of_strangers_end_no_watch(session: SessionConfig) -> None:
     recording = recorded()
     estimator = live_estimator(session, recording.robot, reference())
-    with watching(session, estimator) as watch, open_session(session, "worker") as stranger:
+    # A session of a worker drops large messages on a busy machine: it keeps one batch for each peer.
+    with watching(session, estimator) as watch, open_session(session, "capture") as stranger:
         key = Keys(session.cell, recording.robot.name).samples
         (block, *_) = published_blocks(recording)
         others = replace(block.layout, joints=tuple(f"other_{joint}" for joint in block.layout.joints))
