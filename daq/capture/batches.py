@@ -58,6 +58,7 @@ class FileBoundaries:
 
     def __init__(self) -> None:
         self._refused_ns: int | None = None
+        """Time of the first samples refused since the last that were allowed, ns UTC."""
 
     def allow(self, samples: Rows, certain: Mapping[str, int]) -> bool:
         """Return True if a file may begin before these samples.
@@ -73,10 +74,13 @@ class FileBoundaries:
         if all(until >= samples.sync[0] for until in certain.values()):
             self._refused_ns = None
             return True
-        if self._refused_ns is None or not 0 <= t_ns - self._refused_ns < LATE_S * 1e9:
-            allowed, self._refused_ns = self._refused_ns is not None, t_ns
-            return allowed
-        return False
+        if self._refused_ns is None:
+            self._refused_ns = t_ns
+        # The clock may have been set back.
+        if 0 <= t_ns - self._refused_ns < LATE_S * 1e9:
+            return False
+        self._refused_ns = t_ns
+        return True
 
 
 def pieces(batch: Batch) -> Iterator[Batch]:

@@ -152,14 +152,13 @@ class Sink:
             # Before the rows that follow them: a truncated file then lists all gaps of its rows.
             self.gaps += batch.gaps
             self._writer.add_gaps(batch.gaps, self.last_ns)
-        decoded = {stream.bus.name: stream.decode(batch.rows[stream.bus.name]) for stream in self._streams}
-        self._writer.append(
-            {name: (batch.rows[name].sync, batch.rows[name].t_ns, raw) for name, raw in decoded.items()}
-        )
-        for stream in self._streams:
-            rows, raw = batch.rows[stream.bus.name], decoded[stream.bus.name]
-            if rows.sync.size == 0:
-                continue
+        decoded = [
+            (stream, rows, stream.decode(rows))
+            for stream in self._streams
+            if (rows := batch.rows[stream.bus.name]).sync.size
+        ]
+        self._writer.append({stream.bus.name: (rows.sync, rows.t_ns, raw) for stream, rows, raw in decoded})
+        for stream, rows, raw in decoded:
             self._publisher.offer(Block(stream.layout, self._blocks, rows.sync, rows.t_ns, raw, self._capture))
             self._blocks += 1
             if stream.bus.name == "samples":

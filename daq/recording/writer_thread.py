@@ -24,7 +24,7 @@ CATCH_UP = 2.0
 """Largest write rate of a backlog, over the rate at which its rows came: reading the buses has priority."""
 
 _Task = Callable[[], object]
-Rows = tuple[NDArray[np.int64], NDArray[np.int64], Mapping[str, NDArray[Any]]]
+Columns = tuple[NDArray[np.int64], NDArray[np.int64], Mapping[str, NDArray[Any]]]
 """SYNC numbers, times (ns UTC) and raw values by field."""
 
 
@@ -53,7 +53,7 @@ class _Work:
 class _Chunk:
     """Rows of each stream, gaps with the time they were found, and marks that are handed over together."""
 
-    rows: dict[str, list[Rows]] = field(default_factory=dict)
+    rows: dict[str, list[Columns]] = field(default_factory=dict)
     gaps: list[tuple[Sequence[Gap], int]] = field(default_factory=list)
     marks: list[Mark] = field(default_factory=list)
     since: int | None = None
@@ -63,7 +63,7 @@ class _Chunk:
     bytes: int = 0
     count: int = 0
 
-    def add(self, stream: str, rows: Rows, size: int) -> None:
+    def add(self, stream: str, rows: Columns, size: int) -> None:
         """Add rows of a stream.
 
         Parameters
@@ -207,7 +207,7 @@ class QueuedSeries:
         if self._chunk.since is None:
             self._chunk.since, self._chunk.may_begin_file = t_ns, True
 
-    def append(self, rows: Mapping[str, Rows]) -> None:
+    def append(self, rows: Mapping[str, Columns]) -> None:
         """Add rows of the same time to several streams, which no file divides; the arrays must not change afterwards.
 
         Parameters

@@ -187,12 +187,14 @@ def bus_off(setup: RoundSetup) -> Evidence:
     bus, begin = int(setup.rng.integers(len(setup.farm.buses))), setup.at(0.6)
     setup.actions.append((begin, lambda: setup.farm.inject(bus, _errors([0x40]))))
     setup.actions.append((begin + 0.1, lambda: setup.farm.inject(bus, _errors([0x100]))))
-    return lambda done: (
-        _was_down(done)
+
+    def evidence(done: Outcome) -> bool:
+        off, restarted = done.marked("bus-off)"), done.marked("restarted after bus-off")
         # Error frames may be among the frames that the kernel dropped.
-        or done.counters["kernel_drops"] > 0
-        or (done.counters["bus_off"] > 0 and done.marked("bus-off)", "restarted after bus-off"))
-    )
+        missing = 2 - off - restarted
+        return _was_down(done) or (missing <= done.counters["kernel_drops"] and off == (done.counters["bus_off"] > 0))
+
+    return evidence
 
 
 def emcy(setup: RoundSetup) -> Evidence:

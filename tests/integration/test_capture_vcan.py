@@ -160,8 +160,8 @@ def test_no_sample_is_lost_between_files(vcan_bus: str, tmp_path: Path) -> None:
     assert process.returncode == 0, err
     document = json.loads(out)
     parts = [read_recording(path) for path in document["recordings"]]
-    # A file for every 1.2 s of recorded time, or at the next SYNC to which all streams are known: drives may lag.
-    assert len(parts) >= 2
+    # A file for every 1.2 s of recorded time, even if answers of a longer time came at once.
+    assert len(parts) >= 5
     assert all(part.missing is None for part in parts)
     for part in parts:
         demand = part.streams["demand"].sync
