@@ -52,17 +52,8 @@ class Limits:
 def limits_of(robot: RobotConfig, following_s: float = FOLLOWING_S) -> Limits:
     """Return the limits of a robot.
 
-    Parameters
-    ----------
-    robot
-        Robot whose joints have limits.
-    following_s
-        Largest following error, as the time of motion at the velocity limit, s.
-
-    Raises
-    ------
-    ConfigError
-        If the robot lacks a limit.
+    ``robot``: robot whose joints have limits; ``following_s``: largest following error, as the time of motion at the
+    velocity limit, s. Raises ConfigError if the robot lacks a limit.
     """
     robot.check_movable()
     limits = [joint.limits for joint in robot.joints]
