@@ -78,6 +78,8 @@ NEEDED = (
 class Drive(canopen.LocalNode):
     """One virtual CiA 402 drive.
 
+    Raises ConfigError if the EDS cannot be read or lacks an object that the drive needs.
+
     Parameters
     ----------
     node_id, eds
@@ -94,11 +96,6 @@ class Drive(canopen.LocalNode):
         Called when the statusword has changed.
     fd
         ``True`` if its TPDOs are CAN FD frames.
-
-    Raises
-    ------
-    ConfigError
-        If the EDS cannot be read or lacks an object that the drive needs.
     """
 
     def __init__(

@@ -30,16 +30,8 @@ Floats = NDArray[np.float64]
 class Limits:
     """Limits of the joints.
 
-    Parameters
-    ----------
-    low, high
-        Range of position (n,), rad or m.
-    velocity
-        Largest speed (n,), rad/s or m/s.
-    torque
-        Largest effort (n,), N m or N.
-    following
-        Largest distance between demand and position (n,), rad or m.
+    ``low``, ``high``: range of position (n,), rad or m; ``velocity``: largest speed (n,), rad/s or m/s; ``torque``:
+    largest effort (n,), N m or N; ``following``: largest distance between demand and position (n,), rad or m.
     """
 
     low: Floats

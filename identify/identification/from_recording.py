@@ -54,12 +54,11 @@ def experiments_from_recording(
     Joint positions are ``R^-1 q_motor`` and joint torques ``R' tau_motor`` (thesis equation 2.14 and section B.1).
     The reference between two set points is the straight line that a CiA 402 drive interpolates (60C2h).
 
-    ``recording``: the recording; of a torn one the readable part is used. ``robot``: the robot to identify: the
-    recorded one, possibly with other numbers. ``stretches``: size from which pieces are cut into stretches, which are
-    kept on disk. Returns ``experiments``: one per uninterrupted piece or stretch, in time order; ``notes``: remarks for
-    the user, one line each. Raises ConfigError if the robot lacks a value that identification needs. Raises DataError
+    ``recording``: of a torn one the readable part is used. ``robot``: may have other numbers than the recorded one.
+    ``stretches``: size from which pieces are cut into stretches, which are kept on disk. Returns one experiment per
+    piece or stretch, in time order, and remarks for the user. Raises ConfigError if the robot lacks a value; DataError
     if the recording is of another robot, lacks a quantity or too many samples, contains NaN, or disagrees with its own
-    counters; names the file, where there is one.
+    counters.
     """
     try:
         robot.check_filled("identify")

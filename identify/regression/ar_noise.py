@@ -59,8 +59,7 @@ class ArModel:
         the relative variance of an AR spectrum, less the part to which the parameters are insensitive. The former is
         ``2 l / N`` on the average of the frequencies (Berk, Consistent autoregressive spectral estimates, 1974).
 
-        ``samples``: N, length of the residuals from which the model comes, of all experiments together; more than the
-        order.
+        ``samples``: N, length of the residuals behind the model, of all experiments together; more than the order.
         """
         factor = ((samples + self.order) / (samples - self.order)) ** 2
         return replace(self, variance=factor * self.variance)
@@ -74,12 +73,7 @@ WHITE = ArModel(np.empty(0), 1.0, 0.0)
 class Whiteness:
     """Autocorrelation of residuals against the 2-sigma band of white noise.
 
-    Parameters
-    ----------
-    autocorrelation
-        Autocorrelation at lags 1..L, shape (L,).
-    bound
-        Half width of the band.
+    ``autocorrelation``: autocorrelation at lags 1..L, shape (L,); ``bound``: half width of the band.
     """
 
     autocorrelation: NDArray[np.float64]

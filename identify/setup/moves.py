@@ -24,16 +24,9 @@ LEAST_SPREAD = 0.01
 class Move:
     """One mistake: what to do to the corrections found so far.
 
-    Parameters
-    ----------
-    family
-        Kind of the mistake, for the prior: all members of a family share its probability.
-    words
-        Description.
-    position, torque
-        Matrices (n, n) that multiply the corrections; ``None``: no change.
-    drives
-        True if raw numbers of two drives are exchanged, with the scales of both.
+    ``family``: kind of the mistake, for the prior: all members of a family share its probability. ``position``,
+    ``torque``: matrices (n, n) that multiply the corrections; ``None``: no change. ``drives``: True if raw numbers of
+    two drives are exchanged, with the scales of both.
     """
 
     family: str

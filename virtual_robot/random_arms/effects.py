@@ -62,16 +62,9 @@ Apply = Callable[[Plant, Place, float, Shapes], Plant]
 class HiddenEffect:
     """A hidden effect.
 
-    Parameters
-    ----------
-    apply
-        Adds the effect to a plant.
-    strengths
-        Smallest and largest strength; 1 is typical.
-    pair
-        ``True`` if the effect is between the joint and the next one.
-    arm
-        ``True`` if the effect belongs to the whole arm.
+    ``apply``: adds the effect to a plant. ``strengths``: smallest and largest strength; 1 is typical. ``pair``:
+    ``True`` if the effect is between the joint and the next one. ``arm``: ``True`` if the effect belongs to the whole
+    arm.
     """
 
     apply: Apply
