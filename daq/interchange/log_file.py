@@ -15,9 +15,6 @@ from armident.daq.interchange.log_frames import FrameCollector, LogFrames
 from armident.daq.interchange.log_lines import AscLines, CandumpLines, Line, LineParser, TrcLines
 from armident.daq.interchange.text_files import encoding_of, excerpt
 
-SUFFIXES = (".log", ".asc", ".blf", ".trc")
-"""File name suffixes of logs: candump -l, Vector ASC and BLF, PEAK TRC."""
-
 _SHOW_EVERY = 4096
 _LONGEST_LINE = 4096
 """Lines of text logs have some hundred characters; longer ones are no lines of a log."""

@@ -240,7 +240,7 @@ class AscLines:
             if start is not None:
                 self._start_ns = start
             elif trigger and not self._start_ns:
-                self.notes.append("its date is not understood: times begin at zero")
+                self.notes.append("unknown date format: times begin at zero")
             self._trigger = trigger
             return Line.COMMENT
         known = ("//", "internal events", "no internal events", "end trigger", "previous log", "", ";")
@@ -350,7 +350,7 @@ class TrcLines:
                 start = _TRC_ORIGIN + timedelta(days=float(value))
                 self._start_ns = max(0, int(start.timestamp() * 1000)) * 1_000_000
             except (ValueError, OverflowError):
-                self.notes.append("its start time is not understood: times begin at zero")
+                self.notes.append("invalid start time: times begin at zero")
 
     def _by_columns(self, line: str) -> FrameLine | Line:
         words = line.split(None, len(self._columns) - 1)

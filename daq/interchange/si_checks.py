@@ -134,7 +134,7 @@ def fast_note(robot: RobotConfig, position: NDArray[np.float64], rate_hz: float)
         return ()
     most = float((speeds / limits).max())
     return (
-        f"{', '.join(fast)}: velocities of up to {most:.3g} times the limit, as of positions in degrees "
+        f"{', '.join(fast)}: velocities of up to {most:.3g} times the limit; check for positions in degrees "
         "(--units position=deg), times in another unit (--time-unit), or two sources of one joint",
     )
 

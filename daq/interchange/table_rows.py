@@ -190,7 +190,7 @@ def _single(rows: Rows) -> Rows:
     twice = np.append(False, (np.diff(rows.times) == 0) & equal.all(axis=1))
     if not twice.any():
         return rows
-    note = f"{int(twice.sum())} rows are there twice, with the same time: one of each is kept"
+    note = f"{int(twice.sum())} duplicate rows with the same time: one of each is kept"
     return replace(rows.taken(~twice), notes=(*rows.notes, note))
 
 
@@ -236,9 +236,9 @@ def _complete(source: Source, rows: Rows) -> Rows:
         notes.append(f"{of}, the first: {_first_missing(source, rows, first)}")
     zero = [label for name in EFFORTS if name in rows.values for label in _zero(rows, name, whole)]
     if zero:
-        notes.append(f"0 in every row, as of drives that do not measure it: {listed(zero)}")
+        notes.append(f"all zero: probably not measured: {listed(zero)}")
     if passed:
-        notes.append(f"{passed} rows without positions and efforts passed over")
+        notes.append(f"{passed} rows without positions and efforts ignored")
     return replace(rows.taken(whole), notes=tuple(notes))
 
 
