@@ -24,7 +24,6 @@ from armident.daq.recording.names import (
     MARKS_TOPIC,
     RECORDING,
     RECOVERED,
-    RECOVERED_OLD,
     ROBOT,
     SCHEMA,
     SESSION,
@@ -108,7 +107,7 @@ def recovered_words(metadata: dict[str, dict[str, str]]) -> list[str]:
     metadata
         Entries of the file's metadata records, by name.
     """
-    entries = metadata.get(RECOVERED) or metadata.get(RECOVERED_OLD) or {}
+    entries = metadata.get(RECOVERED) or {}
     return [entries["missing"]] if "missing" in entries else []
 
 
@@ -243,7 +242,7 @@ def _stream(rows: Rows, layout: StreamLayout, rewritten: bool) -> Stream:
     if np.any(sync[1:] <= sync[:-1]):
         raise DataError(
             f"topic {layout.topic}: SYNC numbers do not increase: "
-            "messages are there twice, or are those of several recordings; give each recording by itself"
+            "duplicate messages, or several recordings in one file; give each recording by itself"
         )
     return Stream(layout.name, layout.every, sync, t_ns, {f.name: f for f in layout.fields}, raw)
 
