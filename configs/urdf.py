@@ -213,7 +213,7 @@ def _additions(
     Raises
     ------
     ConfigError
-        If the chain has no such joint, or a joint is there twice.
+        If the chain has no such joint, or a joint is a duplicate.
     """
     known = {joint_name(name).lower(): name for name in names}
     known |= {joint.name: name for joint, name in zip(joints, names, strict=True)}
@@ -224,7 +224,7 @@ def _additions(
             listed = ", ".join(joint.name for joint in joints)
             raise ConfigError(f"{where}: joints[{k}].name: the chain has no joint {more.name!r}; it has {listed}")
         if found in extra:
-            raise ConfigError(f"{where}: joints[{k}].name: {more.name!r} is there twice")
+            raise ConfigError(f"{where}: joints[{k}].name: duplicate joint {more.name!r}")
         extra[found] = more
     return extra
 

@@ -196,7 +196,7 @@ def _interface(bus: Bus) -> Iterator[Check]:
         timing = details.get(key)
         actual = timing.get("bitrate") if isinstance(timing, dict) else None
         if wanted is not None and actual is not None and actual != wanted:
-            yield Check("bus", "failed", f"{name} runs at {actual} bit/s ({key}), the configuration says {wanted}")
+            yield Check("bus", "failed", f"{name} runs at {actual} bit/s ({key}), the configuration has {wanted}")
             return
     state = details.get("state")
     if state not in (None, "ERROR-ACTIVE"):

@@ -316,7 +316,7 @@ def test_a_file_that_is_no_urdf_is_refused(tmp_path: Path, text: str, words: str
         ({"urdf_keys": ", base: b, tip: a"}, r"arm\.urdf: link 'a' \(urdf\.tip\) is not moved by link 'b'"),
         ({"urdf_keys": ", tipp: a"}, r"arm\.yaml: urdf\.tipp: unknown key; did you mean 'tip'\?"),
         ({"joints": "- {name: j9}"}, r"arm\.yaml: joints\[0\]\.name: the chain has no joint 'j9'; it has j1, j2"),
-        ({"joints": "- {name: j1}\n- {name: J1}"}, r"arm\.yaml: joints\[1\]\.name: 'J1' is there twice"),
+        ({"joints": "- {name: j1}\n- {name: J1}"}, r"arm\.yaml: joints\[1\]\.name: duplicate joint 'J1'"),
         ({"joints": "- {name: j1, mdh: {r: 1}}"}, r"arm\.yaml: joints\[0\]\.mdh: unknown key"),
         ({"joints": "- {name: j1, limits: {velocity: -1}}"}, r"joints\[0\]\.limits\.velocity: input should be greater"),
         ({"controller": "{kp: [1.0], kv: [1.0]}"}, r"arm\.yaml: controller: expected 2 numbers in kp and in kv"),
