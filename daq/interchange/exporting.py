@@ -16,12 +16,7 @@ def columns(recording: Recording) -> dict[str, NDArray[np.float64]]:
     """Return time ``t`` (s), joint positions ``q1..``, torques ``tau1..`` and references ``qr1..``, (N,) each.
 
     References are given where recorded, linear between set points, as drives interpolate (CiA 402, 60C0h = 0). Rows
-    outside the recorded set points are NaN.
-
-    Raises
-    ------
-    DataError
-        If the recording has no samples.
+    outside the recorded set points are NaN. Raises DataError if the recording has no samples.
     """
     robot, samples = recording.robot, recording.samples
     if samples.sync.size == 0:

@@ -38,22 +38,8 @@ def import_recording(
 ) -> Recording:
     """Return measured motion and effort as a recording, after checks of content, units and clock.
 
-    Parameters
-    ----------
-    path
-        A file of one of the formats in `armident.daq.interchange.readers`.
-    config
-        The robot that was measured; the session of a bus log; ``None`` for a recording: the robot inside it.
-    **options
-        Options that the format takes.
-
-    Raises
-    ------
-    ConfigError
-        If a file or option is wrong.
-    DataError
-        If the content is wrong: missing columns, wrong number of axes, too many damaged rows, times that jitter or
-        contradict the rate, values far outside the limits, or a demand that no joint followed.
+    ``config`` is the robot that was measured, the session of a bus log, or ``None`` for a recording: the robot inside
+    it. Raises ConfigError if a file or option is wrong, DataError if the content is.
     """
     reader = reader_of(path)
     check_options(path, reader, options)
