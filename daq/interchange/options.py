@@ -4,7 +4,7 @@ import inspect
 from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from types import NoneType
-from typing import Annotated, Any, TypedDict, TypeVar, get_args, get_type_hints
+from typing import Annotated, Any, TypedDict, TypeVar, cast, get_args, get_type_hints
 
 import typer
 
@@ -91,7 +91,7 @@ FLAGS: Mapping[str, str] = {name: hint.__metadata__[0].default for name, hint in
 def given(options: Mapping[str, Any], names: Collection[str] = tuple(FLAGS)) -> ImportOptions:
     """Return the options that have an effect, of some names."""
     chosen = {name: value for name, value in options.items() if name in names and value not in (None, False, {}, [])}
-    return ImportOptions(**chosen)  # type: ignore[typeddict-item]
+    return cast(ImportOptions, chosen)
 
 
 def with_import_options(*without: str) -> Callable[[Function], Function]:
