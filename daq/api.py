@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Unpack
 
 from armident.configs import RobotConfig, SessionConfig, load_robot, load_session
-from armident.daq.interchange.options import ImportOptions, with_import_options
+from armident.daq.interchange.import_options import ImportOptions, with_import_options
 from armident.daq.interchange.readers import reader_of
 from armident.daq.recording import Recording
 

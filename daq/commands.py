@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, Unpack
 
 import typer
 
-from armident.daq.interchange.options import ImportOptions, with_import_options
+from armident.daq.interchange.import_options import ImportOptions, with_import_options
 from armident.daq.interchange.readers import help_of_formats, names_of_formats, reader_of, written_suffixes
 
 if TYPE_CHECKING:

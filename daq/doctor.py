@@ -27,9 +27,9 @@ from armident.configs.blanks import listed, needed, pattern
 from armident.configs.loading import is_session
 from armident.configs.schema.session import Bus
 from armident.daq.capture.clock import clock_state
-from armident.daq.capture.files import chunk_duration_ns
+from armident.daq.capture.recording_files import chunk_duration_ns
 from armident.daq.matching.streams import captured_streams, unknown_phase
-from armident.daq.streaming.session import configuration, endpoints, unreadable_files
+from armident.daq.streaming.zenoh_session import configuration, endpoints, unreadable_files
 from armident.drivers.can.socketcan import RECEIVE_BUFFER, RawSocket
 from armident.drivers.can.timestamps import has_hardware_timestamps
 from armident.drivers.canopen.bus_load import check_fits

@@ -38,7 +38,7 @@ _WORDS = {"d": "folder ", "z": ""}
 
 
 @dataclass(frozen=True)
-class Step:
+class InstallStep:
     """One part of an installation: its name, a check that it is there, and the function that makes it."""
 
     name: str
@@ -92,19 +92,19 @@ class System:
             raise ArmidentError(f"{' '.join(command)}: {reason}") from None
 
 
-def steps(system: System, cell: str) -> Iterator[Step]:
+def steps(system: System, cell: str) -> Iterator[InstallStep]:
     """Return the steps of the installation of a cell, in their order: its parts, and a reload of systemd."""
     found = list(parts(system, cell))
     changed = not all(step.is_done() for step in found if step.name.startswith("unit "))
     yield from found
     if changed and system.has_systemd:
-        yield Step("units known to systemd", lambda: False, lambda: system.run("systemctl", "daemon-reload"))
+        yield InstallStep("units known to systemd", lambda: False, lambda: system.run("systemctl", "daemon-reload"))
 
 
-def parts(system: System, cell: str) -> Iterator[Step]:
+def parts(system: System, cell: str) -> Iterator[InstallStep]:
     """Return the parts of the installation of a cell, in their order."""
     yield _file(system, Path("etc/sysusers.d/armident.conf"), shipped_text("armident.sysusers"), "users")
-    yield Step(
+    yield InstallStep(
         f"system group {ACCOUNT} and user {ACCOUNT}, without login",
         system.has_account,
         lambda: system.run("systemd-sysusers", "armident.conf"),
@@ -115,7 +115,7 @@ def parts(system: System, cell: str) -> Iterator[Step]:
         for line in text.splitlines():
             kind, path, mode, owner, group = line.split()
             if kind == "d" or (system.root / path[1:]).is_file():
-                yield Step(
+                yield InstallStep(
                     f"{_WORDS[kind]}{path} ({owner}:{group}, {mode})",
                     partial(_agrees, system, path, mode, owner, group),
                     partial(system.run, "systemd-tmpfiles", "--create", f"{name}.conf"),
@@ -136,7 +136,7 @@ def _agrees(system: System, path: str, mode: str, owner: str, group: str) -> boo
     return (found.st_uid, found.st_gid, stat.S_IMODE(found.st_mode)) == wanted
 
 
-def _file(system: System, path: Path, plain: str, kind: str) -> Step:
+def _file(system: System, path: Path, plain: str, kind: str) -> InstallStep:
     """Return the step that writes a file of ours; one of other origin is refused."""
     target = system.root / path
     wanted = HEADER + plain
@@ -159,7 +159,7 @@ def _file(system: System, path: Path, plain: str, kind: str) -> Step:
         whole.chmod(0o644)
         whole.replace(target)
 
-    return Step(f"{kind} /{path}", is_done, apply)
+    return InstallStep(f"{kind} /{path}", is_done, apply)
 
 
 def _unit_names() -> list[str]:
@@ -219,7 +219,7 @@ def install(cell: str, root: Path = Path("/"), executable: Path | None = None, d
     return [*(lines or [f"nothing to do: the service of cell {cell} is installed"]), *remaining]
 
 
-def _carry_out(open_steps: Sequence[Step], dry_run: bool) -> list[str]:
+def _carry_out(open_steps: Sequence[InstallStep], dry_run: bool) -> list[str]:
     """Carry out steps, and return one line for each."""
     lines = []
     for step in open_steps:
@@ -258,7 +258,7 @@ def status(cell: str, root: Path = Path("/"), executable: Path | None = None) ->
     return lines, all(state == INSTALLED for state, _ in states)
 
 
-def _state(step: Step) -> str:
+def _state(step: InstallStep) -> str:
     """Return the state of a part of an installation in words."""
     try:
         return INSTALLED if step.is_done() else "missing or different"
@@ -308,11 +308,11 @@ def _activity(system: System, name: str) -> str:
     return f"{enabled}, {'active' if _is_active(system, name) else 'not active'}"
 
 
-def _removals(system: System, cell: str) -> Iterator[Step]:
+def _removals(system: System, cell: str) -> Iterator[InstallStep]:
     """Return the parts of the removal of a cell that are needed, in their order."""
 
-    def step(name: str, apply: Callable[[], object]) -> Step:
-        return Step(name, lambda: False, apply)
+    def step(name: str, apply: Callable[[], object]) -> InstallStep:
+        return InstallStep(name, lambda: False, apply)
 
     for name in _instances(cell):
         if _is_active(system, name):

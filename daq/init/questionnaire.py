@@ -5,8 +5,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from armident.daq.init.command import InitOptions
 from armident.daq.init.geometry import URDF_SUFFIXES, identifier
+from armident.daq.init.initialize import InitOptions
 from armident.daq.interchange.readers import names_of_formats
 
 Ask = Callable[[str, str], str]

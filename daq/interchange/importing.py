@@ -13,15 +13,15 @@ from numpy.typing import NDArray
 from armident.configs import ConfigError, DataError, RobotConfig, SessionConfig
 from armident.daq.interchange.bag_files import bag_files
 from armident.daq.interchange.clocks import gaps_and_counters
+from armident.daq.interchange.import_options import ImportOptions
 from armident.daq.interchange.lerobot import data_files
-from armident.daq.interchange.options import ImportOptions
 from armident.daq.interchange.readers import check_options, reader_of
 from armident.daq.interchange.resampling import Sampled, at_rate, sampled
-from armident.daq.interchange.si_checks import OMITTED, check_units, fast_note, unit_of
+from armident.daq.interchange.si_checks import OMITTED, check_units, fast_note, si_unit_of
 from armident.daq.interchange.stated_units import in_si
 from armident.daq.interchange.table_columns import NAMES
 from armident.daq.interchange.table_files import Source
-from armident.daq.interchange.table_rows import Rows, complete_rows
+from armident.daq.interchange.table_rows import TableRows, complete_rows
 from armident.daq.recording import Field, Recording, Stream, read_recording
 from armident.daq.recording.model import Side
 
@@ -61,7 +61,7 @@ def _from_table(path: Path, robot: RobotConfig, source: Source, options: ImportO
     side: Side = "motor" if motor_side else "joint"
     fields: dict[str, Field] = {
         name: Field(
-            name, name, unit_of(name, robot), "motor" if name in ("current", "voltage") else side, (1.0,) * robot.n
+            name, name, si_unit_of(name, robot), "motor" if name in ("current", "voltage") else side, (1.0,) * robot.n
         )
         for name in rows.values
     }
@@ -103,7 +103,7 @@ def _from_table(path: Path, robot: RobotConfig, source: Source, options: ImportO
     return at_rate(recording, resample_hz)
 
 
-def read_rows(path: Path, robot: RobotConfig, **options: Unpack[ImportOptions]) -> tuple[Source, Rows]:
+def read_rows(path: Path, robot: RobotConfig, **options: Unpack[ImportOptions]) -> tuple[Source, TableRows]:
     """Return a table, and its complete rows in the units of the file."""
     reader = reader_of(path)
     check_options(path, reader, options)
@@ -113,7 +113,7 @@ def read_rows(path: Path, robot: RobotConfig, **options: Unpack[ImportOptions]) 
     return source, table_rows(source, robot, options)
 
 
-def table_rows(source: Source, robot: RobotConfig, options: ImportOptions) -> Rows:
+def table_rows(source: Source, robot: RobotConfig, options: ImportOptions) -> TableRows:
     """Return the complete rows of a table in the units of the file."""
     chosen = dict(options.get("names") or {})
     unknown = sorted(chosen.keys() - NAMES.keys())
@@ -179,7 +179,7 @@ def resampled_recording(path: Path, robot: RobotConfig | None, rate_hz: float | 
     return replace(made, path=None, robot=robot or recording.robot, metadata=facts)
 
 
-def _refuse_immense(source: Source, rows: Rows) -> None:
+def _refuse_immense(source: Source, rows: TableRows) -> None:
     """Refuse values whose squares are no numbers: no measurement is so large, and least squares needs them."""
     most = np.sqrt(np.finfo(np.float64).max)
     for name, values in rows.values.items():
@@ -190,7 +190,7 @@ def _refuse_immense(source: Source, rows: Rows) -> None:
             raise DataError(f"{where}: {values[row, column]:.3g} is too large for a measurement")
 
 
-def _rows_with_demand(source: Source, rows: Rows) -> slice:
+def _rows_with_demand(source: Source, rows: TableRows) -> slice:
     """Return the rows from the first to the last with a demand; a capture has none before the first set point."""
     demand = rows.values.get("demand")
     if demand is None:

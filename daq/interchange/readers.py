@@ -9,7 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
-from armident.daq.interchange.options import FLAGS, ImportOptions, given
+from armident.daq.interchange.import_options import FLAGS, ImportOptions, given
 
 if TYPE_CHECKING:
     from armident.daq.interchange.table_files import Source

@@ -17,7 +17,7 @@ from armident.daq.interchange.clocks import (
     stamped_clock,
 )
 from armident.daq.interchange.table_files import Source
-from armident.daq.interchange.table_rows import Rows
+from armident.daq.interchange.table_rows import TableRows
 from armident.daq.interchange.text_files import listed
 from armident.daq.recording import Gap, Mark, Recording, Stream
 from armident.daq.recording.model import Quantity
@@ -74,7 +74,7 @@ class Sampled:
 
 def sampled(
     source: Source,
-    rows: Rows,
+    rows: TableRows,
     robot: RobotConfig,
     *,
     rate_hz: float | None = None,
@@ -116,7 +116,7 @@ def sampled(
     return Sampled(clock.rate_hz, clock.numbers, rows.values, notes=tuple(notes))
 
 
-def _times(source: Source, rows: Rows, robot: RobotConfig, unit: str | None) -> tuple[Floats | None, list[str]]:
+def _times(source: Source, rows: TableRows, robot: RobotConfig, unit: str | None) -> tuple[Floats | None, list[str]]:
     """Return the times of the rows in s, and notes."""
     if rows.times is None:
         return None, []
@@ -137,7 +137,7 @@ def _interpolated(name: str, at: Floats | Ints, known: Floats | Ints, values: Fl
     return np.stack([np.interp(at, known, column) for column in values.T], axis=1)
 
 
-def _from_polled(rows: Rows, times: Floats | None, rate_hz: float, polled: bool, notes: list[str]) -> Sampled:
+def _from_polled(rows: TableRows, times: Floats | None, rate_hz: float, polled: bool, notes: list[str]) -> Sampled:
     """Put polled rows on the clock of the controller: repeated ones are dropped, missed ones interpolated.
 
     A program that polls an arm gets some samples twice and misses others, and its own times tell nothing. The motion
@@ -200,7 +200,7 @@ def usual_rate(times: Floats) -> float:
     return 1.0 / float(np.median(np.diff(times)))
 
 
-def _from_jitter(rows: Rows, times: Floats, rate_hz: float, notes: list[str]) -> Sampled:
+def _from_jitter(rows: TableRows, times: Floats, rate_hz: float, notes: list[str]) -> Sampled:
     """Put rows on even times, nothing across holes; below the rate of the rows, at that rate (a filter follows)."""
     first = np.append(True, np.diff(times) > 0)
     if float(np.mean(~first)) > EQUAL:

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from armident.configs import DataError, RobotConfig
 from armident.daq.interchange.bag_files import BagReader
 from armident.daq.interchange.clocks import FASTEST_HZ, SLOWEST_HZ
+from armident.daq.interchange.import_options import ImportOptions
 from armident.daq.interchange.joint_messages import DEFINITION, MESSAGE_TYPE, MessageTable, TopicMessages
 from armident.daq.interchange.joint_names import JointMatch, match_joints
-from armident.daq.interchange.options import ImportOptions
 from armident.daq.interchange.table_files import Source
 from armident.daq.interchange.text_files import listed, printable, shortened
 

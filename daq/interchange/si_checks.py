@@ -29,7 +29,7 @@ _UNEXPLAINED_SHARE = 0.5
 """Largest share of the power of a joint's motion that its demand may leave unexplained."""
 
 
-def unit_of(quantity: str, robot: RobotConfig) -> str:
+def si_unit_of(quantity: str, robot: RobotConfig) -> str:
     """Return the SI unit of a quantity of a robot's joints.
 
     ``quantity``: ``position``, ``demand``, ``torque``, ``current`` or ``voltage``; ``robot``: for the types of its

@@ -18,7 +18,7 @@ from armident.configs.mdh import modified_dh
 from armident.configs.urdf import mdh_of
 from armident.configs.urdf_origin import fixed_axis_angles, rotation, rotation_of_quaternion
 from armident.configs.urdf_tree import read_chain
-from armident.daq.guard.limits import limits_of
+from armident.daq.guard.motion_limits import motion_limits_of
 from armident.daq.recording import Recording, Stream, read_recording, write_recording
 from armident.daq.recording.model import Field
 from armident.identify.effects.drive import NOMINAL_TORQUE, motor_limit
@@ -370,7 +370,7 @@ def test_an_acceleration_and_a_transmission_are_needed_only_where_the_arm_moves(
         "move.yaml: to move the arm, the robot configuration needs also limits.acceleration of j1, j2; "
         "limits.position of j2; limits.velocity of j2; limits.torque of j2; transmission (2 rows of 2 numbers)"
     )
-    for needs in (limits_of, design_trajectory):
+    for needs in (motion_limits_of, design_trajectory):
         with pytest.raises(ConfigError, match=r"robot arm: to move the arm, .* transmission"):
             needs(robot)
 

@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 
 from armident.configs import DataError, RobotConfig
 from armident.daq.interchange.clocks import UNITS, JitterError, in_seconds
+from armident.daq.interchange.import_options import FLAGS, given
 from armident.daq.interchange.importing import import_recording, read_rows
-from armident.daq.interchange.options import FLAGS, given
 from armident.daq.interchange.resampling import usual_rate
 from armident.daq.interchange.stated_units import in_si, suspected
-from armident.daq.interchange.table_rows import EFFORTS, Rows
+from armident.daq.interchange.table_rows import EFFORTS, TableRows
 from armident.daq.recording import Recording, is_recording, read_recording
 
 SMOOTHED_S = 0.1
@@ -117,7 +117,7 @@ def _quiet() -> Iterator[None]:
         log.setLevel(level)
 
 
-def _time_unit(rows: Rows, robot: RobotConfig, named: str) -> str | None:
+def _time_unit(rows: TableRows, robot: RobotConfig, named: str) -> str | None:
     """Unit of the times if it is not the one of their name; seconds are that of a column without a unit."""
     assert rows.times is not None
     try:

@@ -9,12 +9,12 @@ from typing import Any
 from armident.configs import ConfigError, RobotConfig, load_robot, load_session
 from armident.configs.blanks import MARK, NEEDS, grouped, pattern
 from armident.daq.init.dh_table import Convention, from_dh_table
-from armident.daq.init.files import CellFacts, robot_content, session_content
 from armident.daq.init.geometry import Geometry, from_library, from_urdf, of_axes
-from armident.daq.init.recorded import RecordedFacts, examine
+from armident.daq.init.recorded_facts import RecordedFacts, examine
+from armident.daq.init.yaml_contents import CellFacts, robot_content, session_content
 from armident.daq.init.yaml_text import Noted, yaml_text
+from armident.daq.interchange.import_options import given
 from armident.daq.interchange.importing import read_rows, table_rows
-from armident.daq.interchange.options import given
 from armident.daq.interchange.readers import reader_of
 from armident.daq.interchange.table_files import Source
 from armident.daq.recording import is_recording

@@ -6,7 +6,7 @@ from typing import Annotated, Literal, Unpack
 
 import typer
 
-from armident.daq.interchange.options import ImportOptions, with_import_options
+from armident.daq.interchange.import_options import ImportOptions, with_import_options
 from armident.daq.interchange.readers import names_of_formats
 
 
@@ -64,7 +64,7 @@ def init(
     Example: armident init arm.urdf --recording data.csv --out my_arm
     """
     from armident.configs import ConfigError
-    from armident.daq.init.command import InitOptions, run_init
+    from armident.daq.init.initialize import InitOptions, run_init
 
     def numbers(option: str, text: str) -> list[float]:
         try:
