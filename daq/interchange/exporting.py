@@ -113,10 +113,3 @@ def export_rosbag(recording: Recording, path: Path) -> None:
         np.int64
     )
     write_joint_states(path, [j.source_name or j.name for j in recording.robot.joints], t_ns, table)
-
-
-def export_bus_log(recording: Recording, path: Path) -> None:
-    """Write the SYNCs and TPDOs of a recording as a log."""
-    from armident.daq.interchange.bus_log import write_log
-
-    write_log(recording, path)

@@ -163,8 +163,9 @@ def _digest(path: Path) -> str:
     return digest.hexdigest()
 
 
-def resampled_recording(path: Path, robot: RobotConfig | None, rate_hz: float | None) -> Recording:
+def resampled_recording(path: Path, robot: RobotConfig | None, options: ImportOptions) -> Recording:
     """Return a recording of armident at another sampling rate, of a configuration with the same joints."""
+    rate_hz = options.get("rate_hz") or options.get("resample_hz")
     if rate_hz is None:
         raise ConfigError(f"{path}: a recording already; --rate resamples it")
     recording = read_recording(path)

@@ -6,6 +6,7 @@ The module is imported for the help of the command line: what is slow to import 
 from __future__ import annotations
 
 from collections.abc import Callable
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
@@ -19,36 +20,29 @@ _OF_TABLES = frozenset(FLAGS) - {"topic", "effort"}
 
 
 class Reader(Protocol):
-    """Reader of a format, and writer if it has a method ``write``.
+    """Reader of a format, and writer if ``writer`` names one.
 
-    Attributes
-    ----------
-    name, suffixes, reads
-        Name and file name suffixes of the format, and what is read of it, for help and docs.
-    folders
-        True if folders may have this format.
-    extra
-        Extra of the distribution that it needs.
-    options
-        Names of the options of an import that it takes.
-    session, own
-        True if it needs the configuration of the session, not that of the robot; or none, as it is inside the file.
-    by_robot
-        True if a file is read for a robot: its joints are found while reading.
-    write
-        Function (recording, path) that writes the format; ``None``: it is only read.
+    ``reader`` and ``writer`` are ``module:function`` in this package: (path, config, options) and (recording, path).
     """
 
     name: ClassVar[str]
     suffixes: ClassVar[tuple[str, ...]]
     reads: ClassVar[str]
-    folders: ClassVar[bool] = False
-    extra: ClassVar[str | None] = None
+    """What is read of it, for help and docs."""
+    reader: ClassVar[str] = ""
+    writer: ClassVar[str] = ""
+    extra: ClassVar[str] = ""
+    """Extra of the distribution that it needs."""
     options: ClassVar[frozenset[str]] = _OF_TABLES
+    """Options of an import that it takes."""
+    folders: ClassVar[bool] = False
+    """Folders may have this format."""
     session: ClassVar[bool] = False
+    """It needs the configuration of the session, not that of the robot."""
     own: ClassVar[bool] = False
+    """The configuration is in the file."""
     by_robot: ClassVar[bool] = False
-    write: ClassVar[Callable[[Recording, Path], None] | None] = None
+    """A file is read for a robot: its joints are found while reading."""
 
     def matches(self, path: Path) -> bool:
         """Return True if a file or folder has this format, by its name if that tells it."""
@@ -56,26 +50,78 @@ class Reader(Protocol):
 
     def read(self, path: Path, config: Any, options: ImportOptions) -> Source | Recording:
         """Return the named arrays of a file, or a recording if the file needs no other step."""
-        ...
+        found: Source | Recording | dict[str, Any] = _function(self.reader)(path, config, options)
+        return _function("table_files:from_arrays")(path, found) if isinstance(found, dict) else found
 
 
-def _writer(name: str) -> Callable[[Recording, Path], None]:
-    """Return a function of `armident.daq.interchange.exporting`, which is imported when it is called."""
+def _function(place: str) -> Callable[..., Any]:
+    """Return a function of this package, whose module is imported only when a file is read or written."""
+    module, _, name = place.partition(":")
+    function: Callable[..., Any] = getattr(import_module(f"armident.daq.interchange.{module}"), name)
+    return function
 
-    def write(recording: Recording, path: Path) -> None:
-        from armident.daq.interchange import exporting
 
-        getattr(exporting, name)(recording, path)
+class Csv(Reader):
+    """Text with columns, in one file or in a pair of files."""
 
-    return write
+    name = "CSV"
+    suffixes = (".csv", ".txt", ".tsv")
+    reads = "columns `t`, `q1..qn`, `tau1..taun` or `current1..`, optionally the demand `qr1..`; or named after joints"
+    reader, writer = "table_files:read_columns", "exporting:export_csv"
+    options = _OF_TABLES | {"effort"}
+
+
+class Npz(Reader):
+    """Archives of numpy."""
+
+    name = "NPZ"
+    suffixes = (".npz",)
+    reads = "arrays with the names of columns of CSV, or `positions`, `torques`, `times`"
+    reader, writer = "table_files:npz_arrays", "exporting:export_npz"
+
+
+class Mat(Reader):
+    """Files of MATLAB."""
+
+    name = "MAT"
+    suffixes = (".mat",)
+    reads = "the same, up to version 7 (`-v7`)"
+    reader, writer = "table_files:mat_arrays", "exporting:export_mat"
+    extra = "identify"
+
+
+class Parquet(Reader):
+    """Tables of Apache Parquet, those of LeRobot included."""
+
+    name = "Parquet"
+    suffixes = (".parquet",)
+    reads = "the same, or a file of a LeRobot data set"
+    reader, writer = "table_files:parquet_arrays", "exporting:export_parquet"
+    extra = "parquet"
+
+
+class LeRobot(Reader):
+    """Folders of LeRobot data sets, or parts of them."""
+
+    name = "LeRobot data set"
+    suffixes = ()
+    reads = "`observation.state`, and an effort or current"
+    reader = "table_files:lerobot_folder"
+    extra = "parquet"
+    folders = True
+
+    def matches(self, path: Path) -> bool:
+        """Return True for a folder with Parquet files."""
+        return bool(_function("lerobot:data_files")(path))
 
 
 class OwnRecording(Reader):
-    """Recordings of armident, to be resampled."""
+    """Recordings of armident."""
 
     name = "recording of armident"
     suffixes = (".mcap",)
     reads = "everything, resampled to `--rate`"
+    reader = "importing:resampled_recording"
     options = frozenset({"rate_hz", "resample_hz"})
     own = True
 
@@ -85,133 +131,21 @@ class OwnRecording(Reader):
 
         return path.suffix.lower() in self.suffixes and is_recording(path)
 
-    def read(self, path: Path, config: Any, options: ImportOptions) -> Recording:
-        """Return the recording at another sampling rate."""
-        from armident.daq.interchange.importing import resampled_recording
-
-        return resampled_recording(path, config, options.get("rate_hz") or options.get("resample_hz"))
-
-
-class Csv(Reader):
-    """Text with columns."""
-
-    name = "CSV"
-    suffixes = (".csv", ".txt", ".tsv")
-    reads = "columns `t`, `q1..qn`, `tau1..taun` or `current1..`, optionally the demand `qr1..`; or named after joints"
-    options = _OF_TABLES | {"effort"}
-    write = staticmethod(_writer("export_csv"))
-
-    def read(self, path: Path, config: Any, options: ImportOptions) -> Source:
-        """Return the columns of one file, or of a pair of files."""
-        from armident.daq.interchange.table_files import read_header_csv, read_pair
-
-        effort = options.get("effort")
-        return read_header_csv(path) if effort is None else read_pair(path, effort, config)
-
-
-class _Arrays(Reader, Protocol):
-    """Format of named arrays."""
-
-    def read(self, path: Path, config: Any, options: ImportOptions) -> Source:
-        """Return the arrays of a file."""
-        from armident.daq.interchange.table_files import from_arrays
-
-        return from_arrays(path, self.arrays(path))
-
-    def arrays(self, path: Path) -> dict[str, Any]:
-        """Return the arrays of a file by name."""
-        ...
-
-
-class Npz(_Arrays):
-    """Archives of numpy."""
-
-    name = "NPZ"
-    suffixes = (".npz",)
-    reads = "arrays with the names of columns of CSV, or `positions`, `torques`, `times`"
-    write = staticmethod(_writer("export_npz"))
-
-    def arrays(self, path: Path) -> dict[str, Any]:
-        """Return the arrays of an archive."""
-        from armident.daq.interchange.table_files import npz_arrays
-
-        return npz_arrays(path)
-
-
-class Mat(_Arrays):
-    """Files of MATLAB, up to version 7."""
-
-    name = "MAT"
-    suffixes = (".mat",)
-    reads = "the same, up to version 7 (`-v7`)"
-    extra = "identify"
-    write = staticmethod(_writer("export_mat"))
-
-    def arrays(self, path: Path) -> dict[str, Any]:
-        """Return the arrays of a file of MATLAB."""
-        from armident.daq.interchange.table_files import mat_arrays
-
-        return mat_arrays(path)
-
-
-class Parquet(_Arrays):
-    """Tables of Apache Parquet, those of LeRobot included."""
-
-    name = "Parquet"
-    suffixes = (".parquet",)
-    reads = "the same, or a file of a LeRobot data set"
-    extra = "parquet"
-    write = staticmethod(_writer("export_parquet"))
-
-    def arrays(self, path: Path) -> dict[str, Any]:
-        """Return the columns of a table."""
-        from armident.daq.interchange.table_files import parquet_arrays
-
-        return parquet_arrays(path)
-
-
-class LeRobot(Reader):
-    """Folders of LeRobot data sets."""
-
-    name = "LeRobot data set"
-    suffixes = ()
-    reads = "`observation.state`, and an effort or current"
-    folders = True
-    extra = "parquet"
-
-    def matches(self, path: Path) -> bool:
-        """Return True for the folder of a data set, or of a part of one."""
-        from armident.daq.interchange.lerobot import data_files
-
-        return bool(data_files(path))
-
-    def read(self, path: Path, config: Any, options: ImportOptions) -> Source:
-        """Return the columns of all readable files of a data set."""
-        from armident.daq.interchange.table_files import lerobot_folder
-
-        return lerobot_folder(path)
-
 
 class RosBag(Reader):
-    """Bags of ROS 2."""
+    """Bags of ROS 2; those of ROS 1 are refused with the command that converts them."""
 
     name = "ROS 2 bag"
     suffixes = (".mcap", ".db3", ".mcap.zstd", ".db3.zstd", ".bag")
     reads = "joint states (`sensor_msgs/msg/JointState`), joints by their names"
-    folders = True
+    reader, writer = "rosbag:joint_state_table", "exporting:export_rosbag"
     options = frozenset(FLAGS) - {"effort", "time_unit"}
+    folders = True
     by_robot = True
-    write = staticmethod(_writer("export_rosbag"))
 
     def matches(self, path: Path) -> bool:
-        """Return True for a file with the name of a bag, those of ROS 1 included, or a folder."""
+        """Return True for a file with the name of a bag, or a folder."""
         return path.is_dir() or path.name.lower().endswith(self.suffixes)
-
-    def read(self, path: Path, config: Any, options: ImportOptions) -> Source:
-        """Return the joint states of a robot."""
-        from armident.daq.interchange.rosbag import joint_state_table
-
-        return joint_state_table(path, config, options)
 
 
 class BusLog(Reader):
@@ -220,17 +154,9 @@ class BusLog(Reader):
     name = "bus log"
     suffixes = (".log", ".asc", ".blf", ".trc")
     reads = "SYNC and TPDOs as the session configuration maps them: candump, Vector ASC and BLF, PEAK TRC"
+    reader, writer = "bus_log:import_log", "bus_log:write_log"
     options = frozenset()
     session = True
-    write = staticmethod(_writer("export_bus_log"))
-
-    def read(self, path: Path, config: Any, options: ImportOptions) -> Recording:
-        """Return the recording of a log."""
-        from armident.configs import load_robot
-        from armident.configs.blanks import LOG
-        from armident.daq.interchange.bus_log import recording_from_log
-
-        return recording_from_log(path, config, load_robot(config.robot, LOG))
 
 
 READERS: tuple[Reader, ...] = (
@@ -282,7 +208,7 @@ def table_of_formats() -> str:
     """Return the table of the documentation."""
     rows = [
         f"| {each.name} | {', '.join(f'`{form}`' for form in _forms(each))} | {each.reads} | "
-        f"{f'`{each.extra}`' if each.extra else ''} | {'yes' if each.write else ''} |"
+        f"{f'`{each.extra}`' if each.extra else ''} | {'yes' if each.writer else ''} |"
         for each in READERS
     ]
     return "\n".join(["| format | suffixes | read | extra | `armident export` |", "| --- " * 5 + "|", *rows])
@@ -299,11 +225,11 @@ def writer_of(path: Path) -> Callable[[Recording, Path], None]:
 
     suffix = path.suffix.lower()
     for reader in READERS:
-        if reader.write is not None and suffix in written(reader):
-            return reader.write
+        if suffix in written(reader):
+            return _function(reader.writer)
     raise ConfigError(f"{path}: cannot export {path.suffix or 'without suffix'}; expected {written_suffixes()}")
 
 
 def written(reader: Reader) -> tuple[str, ...]:
     """Return the suffixes under which a format is written: all of a bus log, the first of others."""
-    return () if reader.write is None else reader.suffixes if reader.session else reader.suffixes[:1]
+    return () if not reader.writer else reader.suffixes if reader.session else reader.suffixes[:1]

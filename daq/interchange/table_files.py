@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from armident.configs import ConfigError, DataError, RobotConfig
 from armident.configs.yaml_loader import is_file
 from armident.daq.interchange.csv_files import read_csv
+from armident.daq.interchange.import_options import ImportOptions
 from armident.daq.interchange.lerobot import data_files, is_lerobot, joined, lerobot_table
 from armident.daq.interchange.sandbox import read_in_subprocess
 from armident.daq.interchange.table_columns import without_units
@@ -46,13 +47,14 @@ class Source:
         return f"{self.path}: {where}, column {name}"
 
 
-def read_pair(path: Path, effort: Path, robot: RobotConfig) -> Source:
-    """Return two tables with free or no headers as one; effort is torque or the drive's own signal.
+def read_columns(path: Path, config: RobotConfig, options: ImportOptions) -> Source:
+    """Return the columns of a text file with a header, or of a pair of files."""
+    effort = options.get("effort")
+    return _header_csv(path) if effort is None else _pair(path, effort, config)
 
-    ``path``, ``effort``: text files of positions and efforts, with one column per joint, or a single column sample by
-    sample; ``robot``: for the number of its joints. Raises ConfigError if there is no such file; DataError if the
-    numbers of columns or rows differ.
-    """
+
+def _pair(path: Path, effort: Path, robot: RobotConfig) -> Source:
+    """Return positions and efforts of two tables with free or no headers: a column per joint, or a single column."""
     columns: Table = {}
     notes: list[str] = []
     lines = None
@@ -78,8 +80,7 @@ def read_pair(path: Path, effort: Path, robot: RobotConfig) -> Source:
     return Source(path, columns, lines, notes=tuple(notes))
 
 
-def read_header_csv(path: Path) -> Source:
-    """Return the columns of a text file with a header."""
+def _header_csv(path: Path) -> Source:
     table = read_csv(path)
     if table.header is None:
         raise DataError(f"{path}: no header line; expected t,q1..,tau1.. (or a pair of files with --effort)")
@@ -92,7 +93,7 @@ def read_header_csv(path: Path) -> Source:
     return _converted(Source(path, columns, table.lines, notes=table.notes), units)
 
 
-def lerobot_folder(path: Path) -> Source:
+def lerobot_folder(path: Path, *_: Any) -> Source:
     """Return the arrays of a data set without the files that cannot be read, which are named."""
     files = data_files(path)
     parts, damaged = {}, []
@@ -139,7 +140,7 @@ def _numeric(arrays: Mapping[str, Any]) -> Table:
     return table
 
 
-def npz_arrays(path: Path) -> dict[str, Any]:
+def npz_arrays(path: Path, *_: Any) -> dict[str, Any]:
     """Return the arrays of an archive of numpy."""
     try:
         with np.load(path, allow_pickle=False) as archive:
@@ -148,7 +149,7 @@ def npz_arrays(path: Path) -> dict[str, Any]:
         raise DataError(f"{path}: not a readable NPZ file: damaged, or not an archive of numeric arrays") from error
 
 
-def parquet_arrays(path: Path) -> dict[str, Any]:
+def parquet_arrays(path: Path, *_: Any) -> dict[str, Any]:
     """Return the columns of a Parquet file."""
     try:
         import pyarrow
@@ -162,7 +163,7 @@ def parquet_arrays(path: Path) -> dict[str, Any]:
         raise DataError(f"{path}: not a readable Parquet file: damaged, or cut off") from error
 
 
-def mat_arrays(path: Path) -> dict[str, Any]:
+def mat_arrays(path: Path, *_: Any) -> dict[str, Any]:
     """Return the arrays of a MAT file up to version 7."""
     from scipy.io import loadmat
 

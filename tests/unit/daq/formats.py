@@ -17,7 +17,7 @@ def example(reader: Reader, suffix: str, folder: Path, recording: Recording) -> 
     The test module of a class ``Xyz`` is ``test_xyz``.
     """
     path = folder / f"example{suffix}"
-    if reader.write is not None:
+    if reader.writer:
         export_recording(recording, path)
     else:
         importlib.import_module(f"tests.unit.daq.test_{type(reader).__name__.lower()}").example(path)
