@@ -9,7 +9,6 @@ from armident.identify.estimators.auxiliary_model import AuxiliaryModel
 from armident.identify.estimators.grey_box import InverseController
 from armident.identify.regression.ar_noise import ArModel
 from armident.identify.regression.equations import (
-    MAX_AR_ORDER,
     Estimate,
     ExperimentEquations,
     instrumented,
@@ -20,6 +19,7 @@ from armident.identify.regression.equations import (
 )
 from armident.identify.regression.iterations import ITERATIONS, iterate
 from armident.identify.regression.iv import IvProducts, iv_products
+from armident.identify.regression.orders import MAX_AR_ORDER
 from armident.identify.streamed import mapped
 
 NOISE_UPDATES = 6

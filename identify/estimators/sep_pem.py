@@ -9,7 +9,6 @@ from armident.identify.estimators.auxiliary_model import AuxiliaryModel
 from armident.identify.estimators.didim import solve_didim
 from armident.identify.regression.equations import (
     COVARIANCE_PASSES,
-    MAX_AR_ORDER,
     Estimate,
     ExperimentEquations,
     joint_variances,
@@ -19,6 +18,7 @@ from armident.identify.regression.equations import (
 )
 from armident.identify.regression.iterations import ITERATIONS
 from armident.identify.regression.least_squares import Triangle
+from armident.identify.regression.orders import MAX_AR_ORDER
 
 
 def sep_pem(

@@ -14,7 +14,7 @@ the base parameters have a small weight.
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal, Protocol, TypeVar
+from typing import Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -25,6 +25,7 @@ from armident.identify.effects.terms import arm_model
 from armident.identify.excitation.collision import ClosestApproach, CollisionModel
 from armident.identify.excitation.fourier_series import FourierSearch
 from armident.identify.excitation.objective import EffectObjective, effect_objective
+from armident.identify.excitation.options import Shape
 from armident.identify.excitation.point_to_point import (
     CUTOFF,
     SEARCH_RATE,
@@ -40,7 +41,6 @@ from armident.identify.robot.arm import ArmModel
 from armident.identify.robot.chain import Floats
 from armident.identify.signals.decimate import design
 
-Shape = Literal["moves", "fourier"]
 C = TypeVar("C")
 
 PERIOD = 1e-3

@@ -9,13 +9,14 @@ import numpy as np
 from scipy import linalg
 
 from armident.configs import DataError
+from armident.identify.estimators.registry import Method
 from armident.identify.identification.auxiliary_loop import velocity_error
 from armident.identify.identification.criteria import IdentificationCriteria
 from armident.identify.identification.equations import Prepared
 from armident.identify.identification.excitation_check import Support, excitation_reasons
 from armident.identify.identification.motion_dependence import motion_dependence
 from armident.identify.identification.moving_joints import MOVE
-from armident.identify.identification.options import Method, Options
+from armident.identify.identification.options import Options
 from armident.identify.identification.physics_check import physics_reasons
 from armident.identify.identification.result import LeastSquares, MethodResult, Statistics, relative_errors
 from armident.identify.identification.result_check import (

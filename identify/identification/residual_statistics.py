@@ -15,13 +15,13 @@ from numpy.typing import NDArray
 from armident.identify.identification.equations import Prepared
 from armident.identify.regression.ar_noise import ArModel
 from armident.identify.regression.equations import (
-    MAX_AR_ORDER,
     Estimate,
     ExperimentEquations,
     instants,
     noise_models,
     residuals,
 )
+from armident.identify.regression.orders import MAX_AR_ORDER
 from armident.identify.regression.whitening import whitened
 
 Array = NDArray[np.float64]

@@ -7,9 +7,9 @@ from numpy.typing import NDArray
 
 from armident.configs import RobotConfig
 from armident.identify.estimators.diagnostics import Diagnostics
+from armident.identify.estimators.registry import Method
 from armident.identify.identification.criteria import IdentificationCriteria
 from armident.identify.identification.motion_dependence import Dependence
-from armident.identify.identification.options import Method
 from armident.identify.identification.torque_delay import HELD, TorqueDelay
 from armident.identify.identification.verdict import Level, Reason, listed
 from armident.identify.regression.ar_noise import whiteness

@@ -16,7 +16,6 @@ from scipy import signal, stats
 from armident.identify.estimators.auxiliary_model import AuxiliaryModel
 from armident.identify.experiment import Experiment
 from armident.identify.identification.equations import Prepared, aligned_torque
-from armident.identify.identification.options import DerivativesName
 from armident.identify.regression.ar_noise import ArModel
 from armident.identify.regression.equations import (
     Estimate,
@@ -33,6 +32,7 @@ from armident.identify.robot.controller import DiscreteController
 from armident.identify.robot.simulation import Simulation
 from armident.identify.signals.bandpass import central_difference
 from armident.identify.signals.bandwidth import position_noise
+from armident.identify.signals.choices import DerivativesName
 from armident.identify.signals.decimate import Decimation
 from armident.identify.signals.differentiate import Derivatives, differentiate
 from armident.identify.streamed import kept, mapped

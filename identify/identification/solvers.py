@@ -14,6 +14,7 @@ from armident.identify.estimators.diagnostics import Diagnostics, diagnose_estim
 from armident.identify.estimators.didim import didim
 from armident.identify.estimators.idim_iv import idim_iv
 from armident.identify.estimators.idim_piv import idim_piv
+from armident.identify.estimators.registry import Method
 from armident.identify.estimators.sep_pem import sep_pem
 from armident.identify.identification.equations import (
     LS_CUTOFF,
@@ -24,7 +25,7 @@ from armident.identify.identification.equations import (
     tested,
 )
 from armident.identify.identification.interval_doubts import doubts_of_serial_correlation
-from armident.identify.identification.options import Method, Options
+from armident.identify.identification.options import Options
 from armident.identify.identification.simulated_bias import (
     DOMINANT,
     FEW,

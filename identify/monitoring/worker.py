@@ -11,7 +11,9 @@ from pathlib import Path
 from types import FrameType
 from typing import TypeVar
 
-from armident.configs import ArmidentError, DataError, RobotConfig, SessionConfig, load_robot, load_session
+from pydantic import TypeAdapter, ValidationError
+
+from armident.configs import ArmidentError, ConfigError, DataError, RobotConfig, SessionConfig, load_robot, load_session
 from armident.daq.streaming import Keys
 from armident.identify.identification.api import identify_recording
 from armident.identify.identification.options import Options
@@ -46,6 +48,18 @@ class _Closing(Exception):
     """The worker is being closed while it waits."""
 
 
+def options_of(session: SessionConfig) -> Options:
+    """Options of the worker of a cell; a ConfigError names the key that is wrong."""
+    # The filters of a published fit are for a comparison with it, not for a cell.
+    given = {"derivatives": "irwsm"} | session.identification
+    try:
+        return TypeAdapter(Options).validate_python(given)
+    except ValidationError as error:
+        problem = error.errors()[0]
+        keys = ".".join(str(key) for key in ("identification", *problem["loc"]))
+        raise ConfigError(f"session of cell {session.cell}: {keys}: {problem['msg']}") from error
+
+
 class Worker:
     """Identifies every recording of one robot in one cell.
 
@@ -74,7 +88,7 @@ class Worker:
     ) -> None:
         self._robot, self._cell, self._out = robot, session.cell, out
         self._folders = (session.recording.directory, out)
-        self._options = Options(**session.identification.model_dump())
+        self._options = options_of(session)
         self._keys = Keys(session.cell, robot.name)
         self._owner = unique_owner()
         self._results: queue.SimpleQueue[int] = queue.SimpleQueue()

@@ -23,14 +23,16 @@ from armident.identify.estimators.sep_pem import sep_pem
 from armident.identify.identification.auxiliary_loop import RUNAWAY, initial_parameters
 from armident.identify.identification.equations import equations
 from armident.identify.identification.result import relative_errors
-from armident.identify.regression.equations import MAX_AR_ORDER, Estimate, ExperimentEquations
+from armident.identify.regression.equations import Estimate, ExperimentEquations
+from armident.identify.regression.orders import MAX_AR_ORDER
 from armident.identify.robot.arm import ArmModel
 from armident.identify.robot.controller import DiscreteController
 from armident.identify.robot.simulation import Simulation
 from armident.identify.robot.subset import restricted_to
 from armident.identify.signals.bandpass import butterworth, central_difference
+from armident.identify.signals.choices import NvrRule
 from armident.identify.signals.decimate import Decimation, design
-from armident.identify.signals.differentiate import Derivatives, NvrRule, differentiate, encoder_resolution
+from armident.identify.signals.differentiate import Derivatives, differentiate, encoder_resolution
 from armident.identify.thesis.recordings import Recorded
 from armident.identify.thesis.reference import essential_names
 from armident.identify.thesis.tables import Cell, Column, Source

@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 
 from armident.daq.cli import application
 from armident.daq.recording import Recording, write_recording
-from armident.identify.identification.options import METHODS
+from armident.identify.estimators.registry import METHODS
 from armident.identify.identification.result_check import SIMULATED
 from tests.fixtures.arms import FAST, recording
 

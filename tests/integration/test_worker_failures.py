@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 
 from armident.configs import SessionConfig
-from armident.configs.schema.session import IdentificationOptions
 from armident.daq.recording import Recording, RecordingWriter, StreamLayout, read_recording, write_recording
 from armident.daq.streaming import Keys, encode_block, encode_event, open_session
 from armident.daq.streaming.codec import end_content, start_content
@@ -43,7 +42,7 @@ pytestmark = pytest.mark.slow
 @pytest.fixture
 def session(request: pytest.FixtureRequest, tmp_path: Path) -> SessionConfig:
     """A cell whose recordings are in the folder of the test."""
-    session = in_a_cell("emps", request.node.name, IdentificationOptions(method="idim-ls"))
+    session = in_a_cell("emps", request.node.name, {"method": "idim-ls"})
     recording = session.recording.model_copy(update={"directory": tmp_path})
     return session.model_copy(update={"recording": recording})
 

@@ -6,7 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from armident.identify.identification.options import Method, Options
+from armident.identify.estimators.registry import Method
+from armident.identify.identification.options import Options
 from armident.identify.identification.pipeline import identify_experiment
 from armident.identify.identification.result import Identification
 from armident.identify.identification.simulated_bias import RELEVANT_BIAS, SIMULATION_ERROR, SimulatedBias, corrected

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from armident.configs import load_robot
+from armident.identify.estimators.registry import Method
 from armident.identify.experiment import Experiment
-from armident.identify.identification.options import Method, Options
+from armident.identify.identification.options import Options
 from armident.identify.identification.pipeline import identify_experiment
 from armident.identify.identification.result import Identification
 from tests.tx40_reference import TABLE_B4, published_estimate

@@ -13,6 +13,7 @@ from armident.identify.documents.files import from_json, to_json
 from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.effects.terms import arm_model
 from armident.identify.estimators.diagnostics import Diagnostics
+from armident.identify.estimators.registry import METHODS, Method
 from armident.identify.experiment import Experiment
 from armident.identify.identification.criteria import IdentificationCriteria
 from armident.identify.identification.equations import Prepared
@@ -20,7 +21,7 @@ from armident.identify.identification.excitation_check import workspace_postures
 from armident.identify.identification.from_recording import experiments_from_recording
 from armident.identify.identification.motion_dependence import motion_dependence
 from armident.identify.identification.moving_joints import joint_ranges, moving_joints
-from armident.identify.identification.options import METHODS, Method, Options
+from armident.identify.identification.options import Options
 from armident.identify.identification.pipeline import identify_experiment
 from armident.identify.identification.result import Identification
 from armident.identify.identification.result_check import (
