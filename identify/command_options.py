@@ -25,7 +25,7 @@ def documented(model: type[M]) -> type[M]:
 def with_options(command: Callable[..., None]) -> Callable[..., None]:
     """Return a command of typer with one option for each field of the dataclasses among its parameters."""
     signature = inspect.signature(command)
-    models = {p.name: p.annotation for p in signature.parameters.values() if is_dataclass(p.annotation)}
+    models: dict[str, Any] = {p.name: p.annotation for p in signature.parameters.values() if is_dataclass(p.annotation)}
     expanded = inspect.Signature(
         [q for p in signature.parameters.values() for q in (_parameters(models[p.name]) if p.name in models else [p])]
     )

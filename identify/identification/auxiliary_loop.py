@@ -14,10 +14,10 @@ from armident.identify.controller.nominal import known_controller, nominal_contr
 from armident.identify.controller.parametric import ControlLaw, identify_parametric
 from armident.identify.estimators.auxiliary_model import AuxiliaryModel
 from armident.identify.estimators.measured_instruments import MotionInstruments
+from armident.identify.estimators.registry import estimator
 from armident.identify.experiment import Experiment
 from armident.identify.identification.equations import PIV_CUTOFF, Prepared
 from armident.identify.identification.options import CONTROLLERS, Options
-from armident.identify.identification.solvers import MEASURED
 from armident.identify.robot.arm import ArmModel
 from armident.identify.robot.controller import DiscreteController
 from armident.identify.robot.simulation import Simulation
@@ -122,7 +122,7 @@ def closed_loop(
                 fastest,
                 anchor=start,
                 # Methods without a measured regressor have the torque's band in both their sides.
-                band_hz=PIV_CUTOFF * bandwidth if options.method in MEASURED else np.inf,
+                band_hz=PIV_CUTOFF * bandwidth if estimator(options.method).measured else np.inf,
                 starts=[e.start for e in experiments],
                 measured=_bandpassed(options, bandwidth, dt),
                 feedback=description["kind"] in CONTROLLERS,
@@ -138,7 +138,7 @@ def closed_loop(
         if closest is not None and closest[0] < RELEVANT:
             break
     if closest is None:
-        if options.method not in MEASURED or options.noise_model == "grey-box":
+        if not estimator(options.method).measured or options.noise_model == "grey-box":
             raise DataError(
                 f"{options.method} needs a simulated closed loop, which diverges with every controller and start "
                 "tried. Next: judge the recording by --method idim-ls, or armident check RECORDING"
@@ -156,7 +156,7 @@ def _bandpassed(options: Options, bandwidth: float, dt: float) -> Callable[[Arra
     Without it the instruments of IDIM-PIV hold frequencies that the measured regressor lacks, and the prefilter takes
     them for information.
     """
-    if options.derivatives != "bandpass" or options.method not in MEASURED:
+    if options.derivatives != "bandpass" or not estimator(options.method).measured:
         return None
     return lambda q, _: differentiate(q, dt, "bandpass", bandwidth_hz=bandwidth)
 

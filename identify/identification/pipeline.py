@@ -14,8 +14,12 @@ from armident.identify.effects.terms import arm_model
 from armident.identify.estimators.diagnostics import diagnose_estimate
 from armident.identify.estimators.essential import essential_parameters
 from armident.identify.estimators.idim_ls import idim_ls
+from armident.identify.estimators.reason import Reason
+from armident.identify.estimators.registry import estimator
 from armident.identify.experiment import Experiment, check_one_rate
 from armident.identify.identification.auxiliary_loop import RELEVANT, ClosedLoop, closed_loop, velocity_error
+from armident.identify.identification.checks.interval import doubts_of_least_squares, interval_reason
+from armident.identify.identification.checks.judged import Judged
 from armident.identify.identification.criteria import IdentificationCriteria
 from armident.identify.identification.equations import (
     Prepared,
@@ -25,9 +29,7 @@ from armident.identify.identification.equations import (
     published_equations,
     tested,
 )
-from armident.identify.identification.excitation_check import examine_support
-from armident.identify.identification.interval_doubts import doubts_of_least_squares
-from armident.identify.identification.judgement import Judged, Notes, judgement, refusing_singular, require_finite
+from armident.identify.identification.judgement import Notes, judgement, refusing_singular, require_finite
 from armident.identify.identification.moving_joints import MOVE, moving_joints, require_motion
 from armident.identify.identification.noise_decimation import decimation_from_noise
 from armident.identify.identification.options import CONTROLLERS, Options
@@ -41,8 +43,9 @@ from armident.identify.identification.result import (
     make_result,
 )
 from armident.identify.identification.sign_smoothing import unsaturated_joints, with_sign_smoothing
-from armident.identify.identification.solvers import MEASURED, PREFILTERED, Problem, Solution, decimation_of, solve
-from armident.identify.identification.verdict import Reason, SetupCheck, judge
+from armident.identify.identification.solvers import Problem, Solution, decimation_of, solve
+from armident.identify.identification.support import examine_support
+from armident.identify.identification.verdict import SetupCheck, judge
 from armident.identify.regression.equations import Estimate, ExperimentEquations, residuals_of
 from armident.identify.robot.arm import ArmModel
 from armident.identify.robot.consistent import nearest_consistent
@@ -134,7 +137,7 @@ def _identify(
         or motion_bandwidth(mapped(lambda e: e.q, experiments), experiments[0].dt)
     )
     given, robot = robot, with_sign_smoothing(robot, experiments, bandwidth)
-    notes.reasons += [_interval_reason(line) for line in unsaturated_joints(given, robot, experiments, bandwidth)]
+    notes.reasons += [interval_reason(line) for line in unsaturated_joints(given, robot, experiments, bandwidth)]
     model = arm_model(robot)
 
     clock.enter("derivatives", 0.05)
@@ -149,7 +152,7 @@ def _identify(
 
     with refusing_singular(options.method, model, support, criteria):
         doubts: tuple[str, ...] = ()
-        if options.method == "idim-ls":
+        if estimator(options.method).solve is None:
             solution, found = None, MethodResult(ls.estimate, ls.blocks, {"kind": "none"})
             doubts = doubts_of_least_squares(prepared, options, ls, bandwidth)
         else:
@@ -172,8 +175,7 @@ def _identify(
 
     clock.enter("verdict", 0.97)
     reasons = judgement(Judged(prepared, options, ls, found, solution, statistics, support), criteria)
-    doubtful = [_interval_reason(line) for line in statistics.interval_warnings]
-    verdict = judge([*notes.reasons, *reasons, *doubtful], setup)
+    verdict = judge([*notes.reasons, *reasons], setup)
     if verdict.of_kind("excitation"):
         statistics = replace(statistics, essential=statistics.essential & support.supported)
     clock.done()
@@ -214,7 +216,7 @@ def _least_squares(
 
     # A factor chosen by the user is that of the method; a method with a noise model keeps its own for the comparison.
     factor = options.decimation if isinstance(options.decimation, int) else None
-    plain = decimation(None if options.method in PREFILTERED else factor)
+    plain = decimation(None if estimator(options.method).prefiltered else factor)
     published = model.robot.preprocessing
     as_published = has_published_filters(model.robot, options)
     if as_published and published is not None:
@@ -224,7 +226,7 @@ def _least_squares(
     ls = estimate(blocks)
     if options.decimation == "noise":
         factor = _memory_of_noise(prepared, ls.theta, notes.reasons)
-        if options.method not in PREFILTERED:
+        if not estimator(options.method).prefiltered:
             plain = decimation(factor)
             blocks = prepared.equations(plain)
             ls = estimate(blocks)
@@ -293,7 +295,7 @@ def _solve_in_closed_loop(
     clock.enter(options.method, 0.5)
     solution = in_loop(loop)
     kind = loop.controller["kind"]
-    if options.method in MEASURED and kind in CONTROLLERS:
+    if estimator(options.method).measured and kind in CONTROLLERS:
         defect = _defect_of_loop(solution, prepared.signals)
         if defect:
             other = closed_loop(prepared, options, ls.estimate.theta, decimation, bandwidth, excluded=kind)
@@ -328,13 +330,6 @@ def _statistics(prepared: Prepared, found: MethodResult, solution: Solution | No
         return Statistics(essential, diagnostics, interval_warnings=solution.interval_warnings, bias=solution.bias)
     delay = solution.delay()
     return Statistics(essential, diagnostics, delay, interval_warnings=solution.interval_warnings, bias=solution.bias)
-
-
-def _interval_reason(line: str) -> Reason:
-    """Reason for the verdict from a line about intervals, which ends with the next step."""
-    message, _, step = line.partition(" Next: ")
-    message = message.rstrip(".")
-    return Reason("doubtful", message[0].lower() + message[1:], step.rstrip("."), kind="uncertainty")
 
 
 def _defect_of_loop(solution: Solution, signals: Sequence[Derivatives]) -> str:

@@ -2,44 +2,13 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal, Protocol
+from typing import Any, Protocol
 
+from armident.identify.estimators.reason import LEVELS, Kind, Level, Reason
 from armident.identify.setup.result import TorqueShift
-
-Level = Literal["trustworthy", "doubtful", "unusable"]
-LEVELS: tuple[Level, ...] = ("trustworthy", "doubtful", "unusable")
 
 AT_REST = ("standstill", "joint_at_rest")
 """Findings of the set-up that are a matter of the excitation."""
-
-Kind = Literal[
-    "setup", "error", "physics", "excitation", "convergence", "loop", "residual", "uncertainty", "instruments", "delay"
-]
-
-
-@dataclass(frozen=True)
-class Reason:
-    """One defect of a result.
-
-    Parameters
-    ----------
-    level
-        Level of the verdict that the defect causes.
-    message
-        The defect in one sentence, with figures.
-    next_step
-        Action that removes it.
-    joint
-        Joint concerned; ``None``: several, or none in particular.
-    kind
-        Property that was judged.
-    """
-
-    level: Level
-    message: str
-    next_step: str
-    joint: str | None = None
-    kind: Kind = "error"
 
 
 @dataclass(frozen=True)

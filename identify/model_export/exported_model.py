@@ -11,7 +11,7 @@ from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.effects.recorded import of_recording
 from armident.identify.effects.registry import of_entry
 from armident.identify.effects.terms import effect_terms
-from armident.identify.identification.excitation_check import workspace_postures
+from armident.identify.identification.checks.excitation import workspace_postures
 from armident.identify.model_export.link_frames import LinkFrames, mdh_link_frames
 from armident.identify.model_export.source_urdf import SourceUrdf, known_bodies, source_for, source_frames, source_of
 from armident.identify.robot.arm import ArmModel

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from armident.configs import load_robot
 from armident.identify.effects.terms import arm_model
+from armident.identify.estimators.reason import Reason
 from armident.identify.estimators.registry import Method
 from armident.identify.experiment import Experiment
 from armident.identify.identification.equations import (
@@ -21,7 +22,6 @@ from armident.identify.identification.equations import (
     sufficient,
 )
 from armident.identify.identification.solvers import decimation_of
-from armident.identify.identification.verdict import Reason
 from armident.identify.signals.decimate import design
 from armident.identify.signals.differentiate import differentiate
 

@@ -1,25 +1,27 @@
-"""Reasons why intervals are doubtful: of IDIM-LS, without instruments, and of methods without a noise model."""
-
-from collections.abc import Sequence
-
-import numpy as np
+"""Check of the standard deviations: bias and serial correlation that they neglect."""
 
 from armident.identify.estimators.idim_ls import idim_ls
-from armident.identify.estimators.residual_tests import ljung_box
+from armident.identify.estimators.reason import Reason
+from armident.identify.identification.checks.judged import Judged
+from armident.identify.identification.criteria import IdentificationCriteria
 from armident.identify.identification.equations import Prepared
 from armident.identify.identification.options import Options
 from armident.identify.identification.result import Array, LeastSquares
 from armident.identify.identification.simulated_bias import RELEVANT_BIAS, least_squares_bias
-from armident.identify.regression.equations import Estimate
+from armident.identify.identification.solvers import doubts_of_serial_correlation
 from armident.identify.signals.differentiate import Derivatives, differentiate
 
-UNDERSTATED = 1.25
-"""Ratio of standard deviations with and without serial correlation above which intervals are doubtful: a 2-sigma
-interval that is too narrow by this factor holds the truth in 89 % of the cases."""
 
-FEW_LAGS, CORRELATED = 5, 1e-3
-"""Lags and level of the test for serial correlation. The parallel filter alone, whose cut-off is the decimated Nyquist
-frequency, correlates neighbours by about 0.1, which is no reason for doubt."""
+def interval(judged: Judged, criteria: IdentificationCriteria) -> list[Reason]:
+    """Reasons for which intervals are doubtful, as estimator and statistics found them."""
+    return [interval_reason(line) for line in judged.statistics.interval_warnings]
+
+
+def interval_reason(line: str) -> Reason:
+    """Reason for the verdict from a line about intervals, which ends with the next step."""
+    message, _, step = line.partition(" Next: ")
+    message = message.rstrip(".")
+    return Reason("doubtful", message[0].lower() + message[1:], step.rstrip("."), kind="uncertainty")
 
 
 def doubts_of_least_squares(
@@ -57,28 +59,3 @@ def doubts_of_least_squares(
     serial = idim_ls(ls.blocks, names, weighted=options.weighted, serial_order=options.max_ar_order)
     doubts += doubts_of_serial_correlation("IDIM-LS", names, ls.estimate, serial.std)
     return tuple(doubts)
-
-
-def doubts_of_serial_correlation(method: str, names: Sequence[str], estimate: Estimate, std: Array) -> tuple[str, ...]:
-    """Warning if the residuals of a joint are not white (Ljung and Box 1978) and intervals are too narrow for it.
-
-    Parameters
-    ----------
-    method
-        Name of the method.
-    names
-        Base parameters (b,).
-    estimate
-        Estimate whose covariance takes the residuals for white.
-    std
-        Standard deviations (b,) that allow for serial correlation, SI.
-    """
-    ratio = std / estimate.std
-    worst = int(np.argmax(ratio))
-    white = all(ljung_box(series, FEW_LAGS)[2] >= CORRELATED for series in estimate.residuals)
-    if white or ratio[worst] <= UNDERSTATED:
-        return ()
-    return (
-        f"The residuals of {method} are serially correlated, which its covariance neglects (the std of {names[worst]} "
-        f"would be {ratio[worst]:.1f} times as large): its intervals are doubtful. Next: IDIM-IV or IDIM-PIV.",
-    )
