@@ -14,8 +14,8 @@ from armident.identify.identification.options import Options
 from armident.identify.identification.pipeline import identify_experiment
 from armident.identify.identification.result import Identification
 from armident.identify.identification.sign_smoothing import with_numbers
-from armident.identify.identification.verdict import SetupCheck
 from armident.identify.setup.check import check_setup
+from armident.identify.setup.result import SetupCheck
 from armident.identify.streamed import OnDisk, Streamed
 
 CHECKED_VALUES = 6_000_000

@@ -16,6 +16,7 @@ from armident.identify.estimators.auxiliary_model import AuxiliaryModel
 from armident.identify.estimators.measured_instruments import MotionInstruments
 from armident.identify.estimators.registry import estimator
 from armident.identify.experiment import Experiment
+from armident.identify.identification.criteria import IdentificationCriteria
 from armident.identify.identification.equations import PIV_CUTOFF, Prepared
 from armident.identify.identification.options import CONTROLLERS, Options
 from armident.identify.robot.arm import ArmModel
@@ -28,9 +29,6 @@ from armident.identify.streamed import kept, mapped
 
 RUNAWAY = 3.0
 """Speed of a simulated joint, over the highest measured speed, beyond which the simulation has diverged."""
-
-RELEVANT = 0.3
-"""Relative velocity error of the auxiliary model below which its instruments are relevant enough."""
 
 NO_REFERENCE = (
     "There is no reference trajectory in the recording. Instruments: simulation of a stiff PD controller that "
@@ -135,7 +133,7 @@ def closed_loop(
                 found = description | {"start": origin, "velocity_error_pct": 100 * error}
                 closest = error, ClosedLoop(auxiliary, start, found)
             break
-        if closest is not None and closest[0] < RELEVANT:
+        if closest is not None and closest[0] < IdentificationCriteria.max_velocity_error:
             break
     if closest is None:
         if not estimator(options.method).measured or options.noise_model == "grey-box":

@@ -273,7 +273,7 @@ def _check_counters(recording: Recording) -> None:
     for name, stream in recording.streams.items():
         counted = recording.counters.get(f"{name}.rows")
         if counted is not None and counted != stream.sync.size:
-            raise DataError(f"the recording's counter says {counted} samples of {name!r}, it holds {stream.sync.size}")
+            raise DataError(f"the recording holds {stream.sync.size} samples of {name!r}, its counter is {counted}")
 
 
 def _finite(stream: Stream, name: str, robot: RobotConfig) -> Array:

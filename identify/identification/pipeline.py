@@ -17,7 +17,7 @@ from armident.identify.estimators.idim_ls import idim_ls
 from armident.identify.estimators.reason import Reason
 from armident.identify.estimators.registry import estimator
 from armident.identify.experiment import Experiment, check_one_rate
-from armident.identify.identification.auxiliary_loop import RELEVANT, ClosedLoop, closed_loop, velocity_error
+from armident.identify.identification.auxiliary_loop import ClosedLoop, closed_loop, velocity_error
 from armident.identify.identification.checks.interval import doubts_of_least_squares, interval_reason
 from armident.identify.identification.checks.judged import Judged
 from armident.identify.identification.criteria import IdentificationCriteria
@@ -45,11 +45,11 @@ from armident.identify.identification.result import (
 from armident.identify.identification.sign_smoothing import unsaturated_joints, with_sign_smoothing
 from armident.identify.identification.solvers import Problem, Solution, decimation_of, solve
 from armident.identify.identification.support import examine_support
-from armident.identify.identification.verdict import SetupCheck, judge
+from armident.identify.identification.verdict import judge
 from armident.identify.regression.equations import Estimate, ExperimentEquations, residuals_of
 from armident.identify.robot.arm import ArmModel
 from armident.identify.robot.consistent import nearest_consistent
-from armident.identify.setup.result import with_torque_shift
+from armident.identify.setup.result import SetupCheck, with_torque_shift
 from armident.identify.signals.bandwidth import motion_bandwidth
 from armident.identify.signals.decimate import Decimation
 from armident.identify.signals.differentiate import Derivatives, differentiate, encoder_resolution
@@ -341,7 +341,7 @@ def _defect_of_loop(solution: Solution, signals: Sequence[Derivatives]) -> str:
     runs = solution.runs
     if runs is None:
         defect = "diverges with"
-    elif (error := velocity_error(runs, signals)) >= RELEVANT:
+    elif (error := velocity_error(runs, signals)) >= IdentificationCriteria.max_velocity_error:
         defect = f"misses the measured velocities by {100 * error:.0f} % with"
     elif solution.estimate.converged:
         return ""

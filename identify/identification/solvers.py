@@ -13,6 +13,7 @@ from armident.identify.estimators.estimator import JOINT_TORQUE
 from armident.identify.estimators.reason import Reason
 from armident.identify.estimators.registry import Method, estimator
 from armident.identify.estimators.residual_tests import ljung_box
+from armident.identify.identification.criteria import IdentificationCriteria
 from armident.identify.identification.equations import (
     LS_CUTOFF,
     PIV_CUTOFF,
@@ -25,7 +26,6 @@ from armident.identify.identification.options import Options
 from armident.identify.identification.simulated_bias import (
     DOMINANT,
     FEW,
-    RELEVANT_BIAS,
     SimulatedBias,
     corrected,
     simulated_bias,
@@ -47,13 +47,8 @@ from armident.identify.streamed import chosen
 NOT_FINITE = "infs or NaNs"
 """Text of scipy's ``ValueError`` for arrays that are not finite."""
 
-UNDERSTATED = 1.25
-"""Ratio of standard deviations with and without serial correlation above which intervals are doubtful: a 2-sigma
-interval that is too narrow by this factor holds the truth in 89 % of the cases."""
-
-FEW_LAGS, CORRELATED = 5, 1e-3
-"""Lags and level of the test for serial correlation. The parallel filter alone, whose cut-off is the decimated Nyquist
-frequency, correlates neighbours by about 0.1, which is no reason for doubt."""
+FEW_LAGS = 5
+"""Lags of the test for serial correlation: the correlation that widens intervals is that of near neighbours."""
 
 Array = NDArray[np.float64]
 
@@ -326,7 +321,7 @@ def _without_bias(solution: Solution) -> Solution:
     if found is None:
         return solution
     worst, share = found.largest(estimate)
-    if share <= RELEVANT_BIAS:
+    if share <= IdentificationCriteria.max_bias_std:
         return solution
     name = problem.auxiliary.model.base.names[worst]
     line = (
@@ -372,8 +367,8 @@ def doubts_of_serial_correlation(method: str, names: Sequence[str], estimate: Es
     """
     ratio = std / estimate.std
     worst = int(np.argmax(ratio))
-    white = all(ljung_box(series, FEW_LAGS)[2] >= CORRELATED for series in estimate.residuals)
-    if white or ratio[worst] <= UNDERSTATED:
+    white = all(ljung_box(series, FEW_LAGS)[2] >= IdentificationCriteria.serial_level for series in estimate.residuals)
+    if white or ratio[worst] <= IdentificationCriteria.max_serial_std_ratio:
         return ()
     return (
         f"The residuals of {method} are serially correlated, which its covariance neglects (the std of {names[worst]} "

@@ -7,7 +7,7 @@ from armident.identify.identification.criteria import IdentificationCriteria
 from armident.identify.identification.equations import Prepared
 from armident.identify.identification.options import Options
 from armident.identify.identification.result import Array, LeastSquares
-from armident.identify.identification.simulated_bias import RELEVANT_BIAS, least_squares_bias
+from armident.identify.identification.simulated_bias import least_squares_bias
 from armident.identify.identification.solvers import doubts_of_serial_correlation
 from armident.identify.signals.differentiate import Derivatives, differentiate
 
@@ -51,7 +51,7 @@ def doubts_of_least_squares(
     names, doubts = prepared.model.base.names, []
     found = least_squares_bias(prepared, ls.decimation, ls.blocks, ls.estimate, smooth)
     worst, share = found.largest(ls.estimate)
-    if share > RELEVANT_BIAS:
+    if share > IdentificationCriteria.max_bias_std:
         doubts.append(
             f"Derivatives and encoder noise bias IDIM-LS ({names[worst]} by about {share:.1f} std): its intervals are "
             "doubtful. Next: IDIM-IV or IDIM-PIV."

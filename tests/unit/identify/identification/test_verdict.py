@@ -1,7 +1,7 @@
 """Verdict of an identification: each defect has one line, impossible results are unusable, healthy ones trustworthy."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -34,7 +34,7 @@ from armident.identify.identification.result import Identification
 from armident.identify.identification.torque_delay import TorqueDelay
 from armident.identify.identification.verdict import judge
 from armident.identify.regression.equations import Estimate, ExperimentEquations
-from armident.identify.setup.result import TorqueShift
+from armident.identify.setup.result import SetupCheck, SetupFinding
 from armident.identify.signals.decimate import design
 from armident.identify.signals.differentiate import Derivatives, differentiate
 from armident.virtual_robot.offline import simulate_recording
@@ -74,22 +74,19 @@ def judged(method: Method = "idim-piv", **parts: Any) -> Any:
     return SimpleNamespace(options=Options(method), prepared=prepared, unusable=False, solution=None, **parts)
 
 
-@dataclass(frozen=True)
-class Finding:
-    kind: str = "torque_unit"
-    joints: tuple[str, ...] = ("joint_1",)
-    probability: float = 0.999
-    message: str = "The torques are in kN m."
-    remedy: str = "joints[].drive.gain: multiply by 1000"
-    decisive: bool = True
+WRONG_UNIT = SetupFinding(
+    "torque_unit",
+    ("joint_1",),
+    0.999,
+    "The torques are in kN m.",
+    "joints[].drive.gain: multiply by 1000",
+    decisive=True,
+)
 
 
-@dataclass(frozen=True)
-class Setup:
-    findings: tuple[Finding, ...] = ()
-    joints_not_understood: tuple[str, ...] = ()
-    tried: tuple[str, ...] = ("signs", "order")
-    torque_shift: TorqueShift | None = None
+def set_up(*findings: SetupFinding, not_understood: tuple[str, ...] = ()) -> SetupCheck:
+    """A check of the set-up with these findings."""
+    return SetupCheck(findings, (), (), not_understood, ("signs", "order"), None)
 
 
 @pytest.mark.slow
@@ -231,7 +228,7 @@ def test_late_torques_are_doubtful_in_one_line(arm: RobotConfig) -> None:
 
 def test_the_parameters_do_not_depend_on_the_verdict(healthy: list[Experiment], arm: RobotConfig) -> None:
     one = identify_experiment(healthy, arm, LEAST_SQUARES)
-    other = identify_experiment(healthy, arm, LEAST_SQUARES, setup=Setup((Finding(),)))
+    other = identify_experiment(healthy, arm, LEAST_SQUARES, setup=set_up(WRONG_UNIT))
     assert other.verdict.level == "unusable"
     np.testing.assert_array_equal(one.theta, other.theta)
     np.testing.assert_array_equal(one.std, other.std)
@@ -239,7 +236,7 @@ def test_the_parameters_do_not_depend_on_the_verdict(healthy: list[Experiment], 
 
 
 def test_a_decisive_finding_of_the_set_up_is_unusable_and_comes_first() -> None:
-    verdict = judge([Reason("unusable", "The model leaves 80 %", "check")], Setup((Finding(),)))
+    verdict = judge([Reason("unusable", "The model leaves 80 %", "check")], set_up(WRONG_UNIT))
     assert verdict.level == "unusable"
     assert verdict.reasons[0].kind == "setup"
     assert verdict.reasons[0].message == "The torques are in kN m (probability 1.00)"
@@ -249,28 +246,28 @@ def test_a_decisive_finding_of_the_set_up_is_unusable_and_comes_first() -> None:
 
 def test_a_refusal_states_the_finding_of_the_set_up_too(healthy: list[Experiment], arm: RobotConfig) -> None:
     turned = changed(healthy, lambda e: replace(e, tau=-e.tau))
-    sign = replace(Finding(), kind="torque_sign", message="the torque of joint_1 has the wrong sign", remedy="turn it")
+    sign = replace(WRONG_UNIT, kind="torque_sign", message="the torque of joint_1 has the wrong sign", remedy="turn it")
     with pytest.raises(DataError, match=r"Set-up: The torque of joint_1 has the wrong sign .* Next: turn it"):
-        identify_experiment(turned, arm, Options(method="didim"), setup=Setup((sign,)))
+        identify_experiment(turned, arm, Options(method="didim"), setup=set_up(sign))
 
 
 def test_other_findings_are_doubtful_and_joints_not_understood_unusable() -> None:
-    assert judge([], Setup((replace(Finding(), decisive=False),))).level == "doubtful"
-    verdict = judge([], Setup(joints_not_understood=("joint_4", "joint_5")))
+    assert judge([], set_up(replace(WRONG_UNIT, decisive=False))).level == "doubtful"
+    verdict = judge([], set_up(not_understood=("joint_4", "joint_5")))
     assert verdict.level == "unusable"
     assert "joint_4 and joint_5 (tried: signs, order)" in verdict.reasons[0].message
-    assert judge([], Setup()).level == "trustworthy"
+    assert judge([], set_up()).level == "trustworthy"
 
 
 def test_set_up_and_result_state_each_defect_once() -> None:
     error = Reason("unusable", "The model leaves more than 33 % of the torque of joint_4 (69 %)", "check", "joint_4")
-    (reason,) = judge([error], Setup(joints_not_understood=("joint_4",))).reasons
+    (reason,) = judge([error], set_up(not_understood=("joint_4",))).reasons
     assert reason.message == f"{error.message}; no hypothesis of the set-up explains it (tried: signs, order)"
     rest = Reason("doubtful", "joint_4 does not move", "move it", kind="excitation")
-    still = replace(Finding(), kind="joint_at_rest", decisive=False)
-    assert judge([rest], Setup((still,))).reasons == (rest,)
+    still = replace(WRONG_UNIT, kind="joint_at_rest", decisive=False)
+    assert judge([rest], set_up(still)).reasons == (rest,)
     late = Reason("doubtful", "The torque belongs to the position some samples later", "clocks", kind="delay")
-    (reason,) = judge([late], Setup((replace(Finding(), kind="time_shift"),))).reasons
+    (reason,) = judge([late], set_up(replace(WRONG_UNIT, kind="time_shift"))).reasons
     assert reason.kind == "setup"
 
 
