@@ -7,8 +7,8 @@ from typing import Annotated, Literal
 import typer
 
 from armident.identify.command_options import with_options
-from armident.identify.diagnosis.options import DiagnosisOptions
-from armident.identify.excitation.options import TrajectoryOptions
+from armident.identify.diagnosis.diagnosis_options import DiagnosisOptions
+from armident.identify.excitation.trajectory_options import TrajectoryOptions
 from armident.identify.identification.options import Options
 
 Json = Annotated[bool, typer.Option("--json", help="Print only the result document on stdout.")]
@@ -217,7 +217,7 @@ def trajectory(
     Example: armident trajectory --config configs/tx40.yaml --out excitation.yaml --known identification.json
     """
     from armident.identify.documents.files import write_atomically
-    from armident.identify.excitation.cli import trajectory_command
+    from armident.identify.excitation.trajectory_command import trajectory_command
     from armident.identify.report.trajectory import trajectory_report
 
     found = trajectory_command(options)

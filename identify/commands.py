@@ -8,7 +8,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from armident.configs import ConfigError, DataError
-from armident.identify.diagnosis.options import DiagnosisOptions
+from armident.identify.diagnosis.diagnosis_options import DiagnosisOptions
 from armident.identify.documents.files import load_document, to_json, write_atomically
 from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.identification.options import Options

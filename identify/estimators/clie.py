@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armident.identify.estimators.auxiliary_model import AuxiliaryModel
-from armident.identify.estimators.estimator import Estimator, Solved
 from armident.identify.estimators.output_error import output_error
+from armident.identify.estimators.problem import Estimator, Solved
 from armident.identify.regression.equations import Estimate, ExperimentEquations
 from armident.identify.regression.iterations import ITERATIONS
 

@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 from armident.configs import DataError
 from armident.identify.estimators.auxiliary_model import AuxiliaryModel
-from armident.identify.estimators.estimator import Estimator, Problem, Solved
 from armident.identify.estimators.output_error import output_error
+from armident.identify.estimators.problem import Estimator, Problem, Solved
 from armident.identify.regression.equations import Estimate, ExperimentEquations
 from armident.identify.regression.iterations import ITERATIONS
 

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armident.identify.estimators.auxiliary_model import AuxiliaryModel
-from armident.identify.estimators.estimator import Estimator, Solved
+from armident.identify.estimators.problem import Estimator, Solved
 from armident.identify.estimators.sensitivity import torque_sensitivities
 from armident.identify.regression.equations import (
     Estimate,

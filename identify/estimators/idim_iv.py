@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armident.identify.estimators.auxiliary_model import AuxiliaryModel
-from armident.identify.estimators.estimator import Estimator, Problem, Solved
+from armident.identify.estimators.problem import Estimator, Problem, Solved
 from armident.identify.regression.equations import (
     COVARIANCE_PASSES,
     Estimate,

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from armident.identify.estimators.estimator import Estimator
+from armident.identify.estimators.problem import Estimator
 from armident.identify.regression.ar_noise import WHITE
 from armident.identify.regression.equations import (
     COVARIANCE_PASSES,

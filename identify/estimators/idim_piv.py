@@ -6,9 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armident.identify.estimators.auxiliary_model import AuxiliaryModel
-from armident.identify.estimators.estimator import Estimator, Problem, Solved
 from armident.identify.estimators.grey_box import InverseController
 from armident.identify.estimators.idim_iv import idim_iv
+from armident.identify.estimators.problem import Estimator, Problem, Solved
 from armident.identify.estimators.reason import DIAGNOSE, Reason
 from armident.identify.regression.ar_noise import ArModel
 from armident.identify.regression.equations import (

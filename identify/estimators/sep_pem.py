@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from armident.identify.estimators.auxiliary_model import AuxiliaryModel
 from armident.identify.estimators.didim import solve_didim
-from armident.identify.estimators.estimator import Estimator, Problem, Solved
+from armident.identify.estimators.problem import Estimator, Problem, Solved
 from armident.identify.regression.equations import (
     COVARIANCE_PASSES,
     Estimate,

@@ -25,7 +25,6 @@ from armident.identify.effects.terms import arm_model
 from armident.identify.excitation.collision import ClosestApproach, CollisionModel
 from armident.identify.excitation.fourier_series import FourierSearch
 from armident.identify.excitation.objective import EffectObjective, effect_objective
-from armident.identify.excitation.options import Shape
 from armident.identify.excitation.point_to_point import (
     CUTOFF,
     SEARCH_RATE,
@@ -37,6 +36,7 @@ from armident.identify.excitation.point_to_point import (
     sample_trajectory,
     slow_share,
 )
+from armident.identify.excitation.trajectory_options import Shape
 from armident.identify.robot.arm import ArmModel
 from armident.identify.robot.chain import Floats
 from armident.identify.signals.decimate import design

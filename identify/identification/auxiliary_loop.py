@@ -14,10 +14,10 @@ from armident.identify.controller.nominal import known_controller, nominal_contr
 from armident.identify.controller.parametric import ControlLaw, identify_parametric
 from armident.identify.estimators.auxiliary_model import AuxiliaryModel
 from armident.identify.estimators.measured_instruments import MotionInstruments
-from armident.identify.estimators.registry import estimator
+from armident.identify.estimators.methods import estimator
 from armident.identify.experiment import Experiment
-from armident.identify.identification.criteria import IdentificationCriteria
 from armident.identify.identification.equations import PIV_CUTOFF, Prepared
+from armident.identify.identification.identification_criteria import IdentificationCriteria
 from armident.identify.identification.options import CONTROLLERS, Options
 from armident.identify.robot.arm import ArmModel
 from armident.identify.robot.controller import DiscreteController

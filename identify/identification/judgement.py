@@ -9,8 +9,8 @@ import numpy as np
 from scipy import linalg
 
 from armident.configs import DataError
+from armident.identify.estimators.methods import Method
 from armident.identify.estimators.reason import Reason
-from armident.identify.estimators.registry import Method
 from armident.identify.identification.checks.convergence import convergence, loop
 from armident.identify.identification.checks.delay import delay
 from armident.identify.identification.checks.error import error
@@ -19,7 +19,7 @@ from armident.identify.identification.checks.interval import interval
 from armident.identify.identification.checks.judged import Judged
 from armident.identify.identification.checks.physics import physics
 from armident.identify.identification.checks.residual import instruments, residual
-from armident.identify.identification.criteria import IdentificationCriteria
+from armident.identify.identification.identification_criteria import IdentificationCriteria
 from armident.identify.identification.moving_joints import MOVE
 from armident.identify.identification.solvers import is_singular
 from armident.identify.identification.support import Support

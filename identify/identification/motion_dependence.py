@@ -30,7 +30,7 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Dependence:
+class MotionDependence:
     """Dependence of the residuals of one joint on its motion.
 
     Parameters
@@ -51,7 +51,9 @@ class Dependence:
     deviation: float
 
 
-def motion_dependence(prepared: Prepared, blocks: Sequence[ExperimentEquations], theta: Array) -> list[Dependence]:
+def motion_dependence(
+    prepared: Prepared, blocks: Sequence[ExperimentEquations], theta: Array
+) -> list[MotionDependence]:
     """Return the dependence of the residuals of every joint on its own position and velocity.
 
     Parameters
@@ -73,7 +75,7 @@ def motion_dependence(prepared: Prepared, blocks: Sequence[ExperimentEquations],
         kept = [np.where(used[:, j], e[:, j], 0.0) for e, used in zip(errors, keep, strict=True)]
         q, qd = (signal[:, j] for signal in motion)
         for variable, bins in (("position", _position_bins(q, qd)), ("velocity", _velocity_bins(qd))):
-            found.append(Dependence(j, variable, *_explained(kept, bins)))
+            found.append(MotionDependence(j, variable, *_explained(kept, bins)))
     return found
 
 

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Literal, cast, get_args
 
 from armident.identify.command_options import documented, option
-from armident.identify.estimators.registry import METHODS, Method
+from armident.identify.estimators.methods import METHODS, Method
 from armident.identify.regression.orders import MAX_AR_ORDER
 from armident.identify.signals.choices import NVR_RULES, DerivativesName, NvrRule
 

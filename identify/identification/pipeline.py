@@ -14,13 +14,12 @@ from armident.identify.effects.terms import arm_model
 from armident.identify.estimators.diagnostics import diagnose_estimate
 from armident.identify.estimators.essential import essential_parameters
 from armident.identify.estimators.idim_ls import idim_ls
+from armident.identify.estimators.methods import estimator
 from armident.identify.estimators.reason import Reason
-from armident.identify.estimators.registry import estimator
 from armident.identify.experiment import Experiment, check_one_rate
 from armident.identify.identification.auxiliary_loop import ClosedLoop, closed_loop, velocity_error
 from armident.identify.identification.checks.interval import doubts_of_least_squares, interval_reason
 from armident.identify.identification.checks.judged import Judged
-from armident.identify.identification.criteria import IdentificationCriteria
 from armident.identify.identification.equations import (
     Prepared,
     aligned_torque,
@@ -29,21 +28,22 @@ from armident.identify.identification.equations import (
     published_equations,
     tested,
 )
-from armident.identify.identification.judgement import Notes, judgement, refusing_singular, require_finite
-from armident.identify.identification.moving_joints import MOVE, moving_joints, require_motion
-from armident.identify.identification.noise_decimation import decimation_from_noise
-from armident.identify.identification.options import CONTROLLERS, Options
-from armident.identify.identification.residual_statistics import residual_statistics
-from armident.identify.identification.result import (
+from armident.identify.identification.identification_criteria import IdentificationCriteria
+from armident.identify.identification.identification_result import (
     Array,
-    Identification,
+    IdentificationResult,
     LeastSquares,
     MethodResult,
     Statistics,
     make_result,
 )
+from armident.identify.identification.judgement import Notes, judgement, refusing_singular, require_finite
+from armident.identify.identification.moving_joints import MOVE, moving_joints, require_motion
+from armident.identify.identification.noise_decimation import decimation_from_noise
+from armident.identify.identification.options import CONTROLLERS, Options
+from armident.identify.identification.residual_statistics import residual_statistics
 from armident.identify.identification.sign_smoothing import unsaturated_joints, with_sign_smoothing
-from armident.identify.identification.solvers import Problem, Solution, decimation_of, solve
+from armident.identify.identification.solvers import IdentificationProblem, Solution, decimation_of, solve
 from armident.identify.identification.support import examine_support
 from armident.identify.identification.verdict import judge
 from armident.identify.regression.equations import Estimate, ExperimentEquations, residuals_of
@@ -73,7 +73,7 @@ def identify_experiment(
     options: Options | None = None,
     progress: Progress | None = None,
     setup: SetupCheck | None = None,
-) -> Identification:
+) -> IdentificationResult:
     """Identify the base parameters of a robot, and judge the result.
 
     The steps are those of the thesis: derivatives (5.1), IDIM-LS (2.3.2), controller (5.2), auxiliary closed loop,
@@ -122,7 +122,7 @@ def _identify(
     options: Options,
     clock: "_Clock",
     setup: SetupCheck | None,
-) -> Identification:
+) -> IdentificationResult:
     """Carry out the steps of the thesis in their order."""
     notes = Notes()
     criteria = IdentificationCriteria()
@@ -289,7 +289,7 @@ def _solve_in_closed_loop(
     )
 
     def in_loop(loop: ClosedLoop) -> Solution:
-        return solve(Problem(prepared, loop.auxiliary, loop.start, ls.decimation, options))
+        return solve(IdentificationProblem(prepared, loop.auxiliary, loop.start, ls.decimation, options))
 
     loop = closed_loop(prepared, options, ls.estimate.theta, decimation, bandwidth)
     clock.enter(options.method, 0.5)

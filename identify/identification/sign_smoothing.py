@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from armident.configs import RobotConfig
 from armident.identify.experiment import Experiment
-from armident.identify.identification.criteria import IdentificationCriteria
+from armident.identify.identification.identification_criteria import IdentificationCriteria
 from armident.identify.signals.bandpass import butterworth, central_difference
 from armident.identify.signals.bandwidth import position_noise
 from armident.identify.streamed import Streamed

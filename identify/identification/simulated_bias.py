@@ -15,8 +15,8 @@ from scipy import signal, stats
 
 from armident.identify.estimators.auxiliary_model import AuxiliaryModel
 from armident.identify.experiment import Experiment
-from armident.identify.identification.criteria import IdentificationCriteria
 from armident.identify.identification.equations import Prepared, aligned_torque
+from armident.identify.identification.identification_criteria import IdentificationCriteria
 from armident.identify.regression.ar_noise import ArModel
 from armident.identify.regression.equations import (
     Estimate,

@@ -9,11 +9,10 @@ from numpy.typing import NDArray
 
 from armident.identify.estimators.auxiliary_model import AuxiliaryModel
 from armident.identify.estimators.diagnostics import Diagnostics, diagnose_estimate
-from armident.identify.estimators.estimator import JOINT_TORQUE
+from armident.identify.estimators.methods import Method, estimator
+from armident.identify.estimators.problem import JOINT_TORQUE
 from armident.identify.estimators.reason import Reason
-from armident.identify.estimators.registry import Method, estimator
 from armident.identify.estimators.residual_tests import ljung_box
-from armident.identify.identification.criteria import IdentificationCriteria
 from armident.identify.identification.equations import (
     LS_CUTOFF,
     PIV_CUTOFF,
@@ -22,6 +21,7 @@ from armident.identify.identification.equations import (
     sufficient,
     tested,
 )
+from armident.identify.identification.identification_criteria import IdentificationCriteria
 from armident.identify.identification.options import Options
 from armident.identify.identification.simulated_bias import (
     DOMINANT,
@@ -106,7 +106,7 @@ def decimation_of(
 
 
 @dataclass(frozen=True)
-class Problem:
+class IdentificationProblem:
     """Input of every method: experiments with derivatives, the closed loop, and the first iterate.
 
     Parameters
@@ -172,12 +172,12 @@ class Problem:
         )
 
     @cached_property
-    def plain_problem(self) -> "Problem":
+    def plain_problem(self) -> "IdentificationProblem":
         """Problem with the decimation of the methods without a noise model."""
         return replace(self, auxiliary=replace(self.auxiliary.fresh(), decimation=self.plain))
 
     @cached_property
-    def in_band(self) -> "Problem":
+    def in_band(self) -> "IdentificationProblem":
         """Problem decimated to the band of the instruments where the equations have a wider one.
 
         At the recorded rate nearly all rows lie beyond the band of the instruments and carry no information.
@@ -209,7 +209,7 @@ class Solution:
     """
 
     estimate: Estimate
-    problem: Problem
+    problem: IdentificationProblem
     prefiltered: bool = False
     noise_of: str = JOINT_TORQUE
     reasons: tuple[Reason, ...] = ()
@@ -294,7 +294,7 @@ def is_singular(error: Exception) -> bool:
     return isinstance(error, np.linalg.LinAlgError) or NOT_FINITE in str(error)
 
 
-def solve(problem: Problem) -> Solution:
+def solve(problem: IdentificationProblem) -> Solution:
     """Solution of a problem by the method of its options, without the bias that instrumental variables have.
 
     Raises

@@ -7,9 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
-from armident.identify.identification.criteria import IdentificationCriteria
 from armident.identify.identification.equations import Prepared
-from armident.identify.identification.result import units
+from armident.identify.identification.identification_criteria import IdentificationCriteria
+from armident.identify.identification.identification_result import units
 from armident.identify.identification.verdict import listed
 from armident.identify.regression.ar_noise import ArModel
 from armident.identify.regression.equations import ExperimentEquations, filtered_regressor

@@ -72,7 +72,7 @@ class LinkBody:
 
 
 @dataclass(frozen=True)
-class JointFriction:
+class ExportedFriction:
     """Rotor inertia and friction of a joint, joint side.
 
     Parameters
@@ -183,7 +183,7 @@ class ExportedModel:
     consistent: ConsistentParameters
     frames: LinkFrames
     links: tuple[LinkBody, ...]
-    joints: tuple[JointFriction, ...]
+    joints: tuple[ExportedFriction, ...]
     couplings: tuple[JointCoupling, ...]
     effects: tuple[ExportedEffect, ...]
     source_urdf: SourceUrdf | None = None
@@ -345,12 +345,12 @@ def _refuse_negative_inertia(arm: ArmModel, theta: Floats, source: Path) -> None
         )
 
 
-def _joints(arm: ArmModel, theta: Floats, frames: LinkFrames) -> tuple[JointFriction, ...]:
+def _joints(arm: ArmModel, theta: Floats, frames: LinkFrames) -> tuple[ExportedFriction, ...]:
     """Return rotor inertias and friction of the joints, with their names in the file."""
     values = arm.values(theta)
     rows = np.stack([values.ia, values.fv, values.fc, values.off], axis=1).tolist()
     types = [joint.type for joint in arm.robot.joints]
-    return tuple(JointFriction(name, kind, *row) for name, kind, row in zip(frames.joints, types, rows, strict=True))
+    return tuple(ExportedFriction(name, kind, *row) for name, kind, row in zip(frames.joints, types, rows, strict=True))
 
 
 def _couplings(arm: ArmModel, theta: Floats) -> tuple[JointCoupling, ...]:

@@ -22,7 +22,7 @@ from armident.identify.estimators.idim_piv import idim_piv
 from armident.identify.estimators.sep_pem import sep_pem
 from armident.identify.identification.auxiliary_loop import RUNAWAY, initial_parameters
 from armident.identify.identification.equations import equations
-from armident.identify.identification.result import relative_errors
+from armident.identify.identification.identification_result import relative_torque_errors
 from armident.identify.regression.equations import Estimate, ExperimentEquations
 from armident.identify.regression.orders import MAX_AR_ORDER
 from armident.identify.robot.arm import ArmModel
@@ -275,7 +275,7 @@ class Laboratory:
         simulations = 0 if auxiliary is None else len(auxiliary.asked)
         if auxiliary is not None and method in SIMULATED:
             blocks = auxiliary.equations(blocks, estimate.theta)
-        return Run(estimate, relative_errors(blocks, estimate.theta)[0], seconds, simulations)
+        return Run(estimate, relative_torque_errors(blocks, estimate.theta)[0], seconds, simulations)
 
     def _iterate(
         self, method: Method, case: Case, blocks: Sequence[ExperimentEquations], auxiliary: AuxiliaryModel

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import signal
 
-from armident.identify.identification.result import relative_errors
+from armident.identify.identification.identification_result import relative_torque_errors
 from armident.identify.regression.ar_noise import ArModel
 from armident.identify.thesis.cached_estimates import PIV_CUTOFF_HZ, Case, Laboratory, Run
 from armident.identify.thesis.chapter5 import GOOD, POOR_IV
@@ -216,7 +216,7 @@ def inverse_error(lab: Laboratory, run: Run, case: Case) -> float:
     case
         Filters of the equations.
     """
-    return relative_errors(lab.equations(case), run.estimate.theta)[0]
+    return relative_torque_errors(lab.equations(case), run.estimate.theta)[0]
 
 
 def simulated_error(lab: Laboratory, run: Run, case: Case) -> float:
@@ -231,7 +231,7 @@ def simulated_error(lab: Laboratory, run: Run, case: Case) -> float:
     case
         Filters and auxiliary simulation.
     """
-    return relative_errors(lab.simulated(run, case), run.estimate.theta)[0]
+    return relative_torque_errors(lab.simulated(run, case), run.estimate.theta)[0]
 
 
 def simulated_variances(lab: Laboratory, run: Run, case: Case) -> list[float]:

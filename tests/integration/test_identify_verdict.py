@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 
 from armident.daq.cli import application
 from armident.daq.recording import Recording, write_recording
-from armident.identify.estimators.registry import METHODS, Method, estimator
+from armident.identify.estimators.methods import METHODS, Method, estimator
 from tests.fixtures.arms import FAST, recording
 
 pytestmark = pytest.mark.slow

@@ -19,7 +19,7 @@ from armident.daq.streaming import Keys, encode_block, encode_event, open_sessio
 from armident.daq.streaming.codec import end_content, start_content
 from armident.identify.documents.files import load_document
 from armident.identify.documents.identification import IdentificationDocument
-from armident.identify.identification.api import identify_recording
+from armident.identify.identification.identify_recording import identify_recording
 from armident.identify.monitoring import worker as module
 from armident.identify.monitoring.ledger import FILE, Ledger
 from armident.identify.monitoring.recorded import Captured

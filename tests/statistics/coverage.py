@@ -23,7 +23,7 @@ from scipy import stats
 
 from armident.configs import RobotConfig, Trajectory, load_robot, load_trajectory
 from armident.identify.effects.terms import arm_model
-from armident.identify.estimators.registry import METHODS, Method
+from armident.identify.estimators.methods import METHODS, Method
 from armident.identify.identification.from_recording import experiments_from_recording
 from armident.identify.identification.options import Options
 from armident.identify.identification.pipeline import identify_experiment

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy import signal
 
 from armident.configs import RobotConfig
-from armident.identify.estimators.registry import Method
+from armident.identify.estimators.methods import Method
 from armident.identify.experiment import Experiment
 from armident.identify.identification.from_recording import experiments_from_recording
 from armident.identify.identification.options import Options

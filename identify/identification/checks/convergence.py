@@ -1,10 +1,10 @@
 """Checks of the iterations and of the closed loop, simulated with their result."""
 
+from armident.identify.estimators.methods import estimator
 from armident.identify.estimators.reason import Level, Reason
-from armident.identify.estimators.registry import estimator
 from armident.identify.identification.auxiliary_loop import velocity_error
 from armident.identify.identification.checks.judged import Judged
-from armident.identify.identification.criteria import IdentificationCriteria
+from armident.identify.identification.identification_criteria import IdentificationCriteria
 
 
 def convergence(judged: Judged, criteria: IdentificationCriteria) -> list[Reason]:

@@ -4,7 +4,7 @@ import numpy as np
 
 from armident.identify.estimators.reason import Reason
 from armident.identify.identification.checks.judged import Judged
-from armident.identify.identification.criteria import IdentificationCriteria
+from armident.identify.identification.identification_criteria import IdentificationCriteria
 from armident.identify.identification.torque_delay import HELD
 from armident.identify.identification.verdict import listed
 

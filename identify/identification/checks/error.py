@@ -4,9 +4,9 @@ import numpy as np
 
 from armident.identify.estimators.reason import Level, Reason
 from armident.identify.identification.checks.judged import Judged
-from armident.identify.identification.criteria import IdentificationCriteria
+from armident.identify.identification.identification_criteria import IdentificationCriteria
+from armident.identify.identification.identification_result import relative_torque_errors
 from armident.identify.identification.moving_joints import MOVE
-from armident.identify.identification.result import relative_errors
 from armident.identify.identification.verdict import listed
 from armident.identify.regression.ar_noise import whiteness
 from armident.identify.regression.equations import residuals
@@ -21,7 +21,7 @@ def error(judged: Judged, criteria: IdentificationCriteria) -> list[Reason]:
     is mostly noise.
     """
     joints, blocks, theta = judged.prepared.model.robot.joints, judged.ls.blocks, judged.found.estimate.theta
-    errors, ls_errors = (relative_errors(blocks, at)[1] for at in (theta, judged.ls.estimate.theta))
+    errors, ls_errors = (relative_torque_errors(blocks, at)[1] for at in (theta, judged.ls.estimate.theta))
     step = MOVE if judged.unusable else CHECK
     rest = residuals(blocks, theta)
     limits = np.where(judged.support.moving, criteria.max_joint_error_pct, criteria.max_rest_error_pct)

@@ -9,7 +9,7 @@ from armident.configs import RobotConfig
 from armident.identify.estimators.reason import Level, Reason
 from armident.identify.experiment import Experiment
 from armident.identify.identification.checks.judged import Judged
-from armident.identify.identification.criteria import IdentificationCriteria
+from armident.identify.identification.identification_criteria import IdentificationCriteria
 from armident.identify.identification.moving_joints import FARTHEST, MOVE
 from armident.identify.identification.verdict import listed
 from armident.identify.robot.arm import ArmModel

@@ -4,8 +4,8 @@ from dataclasses import dataclass, field
 
 from armident.identify.estimators.reason import Reason
 from armident.identify.identification.equations import Prepared
+from armident.identify.identification.identification_result import LeastSquares, MethodResult, Statistics
 from armident.identify.identification.options import Options
-from armident.identify.identification.result import LeastSquares, MethodResult, Statistics
 from armident.identify.identification.solvers import Solution
 from armident.identify.identification.support import Support
 

@@ -8,8 +8,8 @@ from armident.configs import ArmidentError
 from armident.identify.estimators.reason import Reason
 from armident.identify.identification.checks.excitation import motion_postures, workspace_postures
 from armident.identify.identification.checks.judged import Judged
-from armident.identify.identification.criteria import IdentificationCriteria
-from armident.identify.identification.result import relative_errors, units
+from armident.identify.identification.identification_criteria import IdentificationCriteria
+from armident.identify.identification.identification_result import relative_torque_errors, units
 from armident.identify.identification.support import NON_NEGATIVE
 from armident.identify.identification.verdict import listed
 from armident.identify.robot.arm import ArmModel
@@ -60,7 +60,7 @@ def physics(judged: Judged, criteria: IdentificationCriteria) -> list[Reason]:
     if nearest is None:
         return [Reason("doubtful", message, CHECK_SIGNALS, kind="physics")]
     names = [joint.name for joint in model.robot.joints]
-    own, errors = relative_errors(blocks, theta), relative_errors(blocks, nearest.theta)
+    own, errors = relative_torque_errors(blocks, theta), relative_torque_errors(blocks, nearest.theta)
     wrong = (errors[1] > criteria.max_joint_error_pct) & (own[1] <= criteria.max_joint_error_pct)
     if wrong.any():
         left = [f"{errors[1][j]:.0f} % at {names[j]}" for j in np.flatnonzero(wrong)]

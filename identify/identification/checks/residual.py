@@ -1,9 +1,9 @@
 """Checks of the residuals, which must be noise, and of the instruments."""
 
+from armident.identify.estimators.methods import estimator
 from armident.identify.estimators.reason import Reason
-from armident.identify.estimators.registry import estimator
 from armident.identify.identification.checks.judged import Judged
-from armident.identify.identification.criteria import IdentificationCriteria
+from armident.identify.identification.identification_criteria import IdentificationCriteria
 from armident.identify.identification.motion_dependence import motion_dependence
 from armident.identify.identification.verdict import listed
 

@@ -5,7 +5,7 @@ from typing import Annotated
 import typer
 
 from armident.identify.command_options import with_options
-from armident.identify.monitoring.reidentify.options import ReidentifyOptions
+from armident.identify.monitoring.reidentify.reidentify_options import ReidentifyOptions
 
 
 @with_options

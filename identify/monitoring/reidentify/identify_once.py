@@ -12,7 +12,7 @@ from armident.configs import ArmidentError, DataError, RobotConfig
 from armident.daq.recording import Recording
 from armident.identify.documents.files import load_document, to_json
 from armident.identify.documents.identification import IdentificationDocument
-from armident.identify.identification.api import identify_recording
+from armident.identify.identification.identify_recording import identify_recording
 from armident.identify.identification.options import Options
 from armident.identify.monitoring.ledger import FILE, Ledger, LedgerError, LedgerUnusable, unique_owner
 from armident.identify.monitoring.recorded import captured_in, result_of

@@ -7,7 +7,7 @@ import pytest
 
 from armident.configs import load_robot
 from armident.identify.estimators.idim_piv import idim_piv
-from armident.identify.estimators.registry import Method
+from armident.identify.estimators.methods import Method
 from armident.identify.experiment import Experiment
 from armident.identify.identification import solvers as methods
 from armident.identify.identification.from_recording import experiments_from_recording

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from armident.configs import load_robot
 from armident.identify.effects.terms import arm_model
+from armident.identify.estimators.methods import Method
 from armident.identify.estimators.reason import Reason
-from armident.identify.estimators.registry import Method
 from armident.identify.experiment import Experiment
 from armident.identify.identification.equations import (
     EQUATIONS_PER_PARAMETER,

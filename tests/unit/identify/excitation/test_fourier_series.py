@@ -9,8 +9,8 @@ import pytest
 from armident.configs import ConfigError, RobotConfig, Trajectory, load_robot, load_trajectory
 from armident.configs.schema.trajectory import Fourier
 from armident.identify.effects.terms import arm_model
-from armident.identify.excitation.cli import TrajectoryOptions, trajectory_command
 from armident.identify.excitation.design import design_trajectory, predict_precision
+from armident.identify.excitation.trajectory_command import TrajectoryOptions, trajectory_command
 
 pytestmark = pytest.mark.slow
 

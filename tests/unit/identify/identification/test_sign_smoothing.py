@@ -8,7 +8,7 @@ from pydantic import ValidationError
 
 from armident.configs import RobotConfig, load_robot
 from armident.identify.effects.terms import arm_model
-from armident.identify.estimators.registry import Method
+from armident.identify.estimators.methods import Method
 from armident.identify.experiment import Experiment
 from armident.identify.identification.options import Options
 from armident.identify.identification.pipeline import identify_experiment

@@ -6,11 +6,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from armident.identify.estimators.registry import Method
-from armident.identify.identification.criteria import IdentificationCriteria
+from armident.identify.estimators.methods import Method
+from armident.identify.identification.identification_criteria import IdentificationCriteria
+from armident.identify.identification.identification_result import IdentificationResult
 from armident.identify.identification.options import Options
 from armident.identify.identification.pipeline import identify_experiment
-from armident.identify.identification.result import Identification
 from armident.identify.identification.simulated_bias import SIMULATION_ERROR, SimulatedBias, corrected
 from armident.identify.regression.ar_noise import ArModel
 from armident.identify.regression.equations import Estimate, ExperimentEquations
@@ -25,7 +25,7 @@ RUNS = 6
 
 
 @cache
-def noisy(seed: int, method: Method) -> Identification:
+def noisy(seed: int, method: Method) -> IdentificationResult:
     return identify_experiment(axis.recorded(seed, torque=1.0, position=ENCODER), axis.robot(), Options(method=method))
 
 

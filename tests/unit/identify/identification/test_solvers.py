@@ -10,8 +10,8 @@ import pytest
 from armident.configs import ConfigError
 from armident.identify.documents.files import to_json
 from armident.identify.effects.terms import arm_model
-from armident.identify.estimators.registry import METHODS, Method, estimator
-from armident.identify.identification.api import IdentificationOutcome, identify_recording
+from armident.identify.estimators.methods import METHODS, Method, estimator
+from armident.identify.identification.identify_recording import IdentificationOutcome, identify_recording
 from armident.identify.identification.options import Options, parse_decimation, parse_nvr
 from armident.identify.report.identification import identification_report
 from armident.virtual_robot.inertias import plant_parameters

@@ -15,22 +15,22 @@ from armident.identify.documents.files import from_json, to_json
 from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.effects.terms import arm_model
 from armident.identify.estimators.diagnostics import Diagnostics
+from armident.identify.estimators.methods import METHODS, Method
 from armident.identify.estimators.reason import Reason
-from armident.identify.estimators.registry import METHODS, Method
 from armident.identify.experiment import Experiment
 from armident.identify.identification.checks.convergence import convergence, loop
 from armident.identify.identification.checks.delay import delay
 from armident.identify.identification.checks.error import error
 from armident.identify.identification.checks.excitation import workspace_postures
 from armident.identify.identification.checks.residual import instruments, residual
-from armident.identify.identification.criteria import IdentificationCriteria
 from armident.identify.identification.equations import Prepared
 from armident.identify.identification.from_recording import experiments_from_recording
+from armident.identify.identification.identification_criteria import IdentificationCriteria
+from armident.identify.identification.identification_result import IdentificationResult
 from armident.identify.identification.motion_dependence import motion_dependence
 from armident.identify.identification.moving_joints import joint_ranges, moving_joints
 from armident.identify.identification.options import Options
 from armident.identify.identification.pipeline import identify_experiment
-from armident.identify.identification.result import Identification
 from armident.identify.identification.torque_delay import TorqueDelay
 from armident.identify.identification.verdict import judge
 from armident.identify.regression.equations import Estimate, ExperimentEquations
@@ -427,6 +427,6 @@ def test_an_endless_joint_has_its_recorded_range_as_workspace(arm: RobotConfig) 
 def test_no_result_with_an_error_above_its_torque_counts_as_converged(
     healthy: list[Experiment], arm: RobotConfig
 ) -> None:
-    found: Identification = identify_experiment(healthy, arm, LEAST_SQUARES)
+    found: IdentificationResult = identify_experiment(healthy, arm, LEAST_SQUARES)
     assert found.converged
     assert found.relative_error_pct < 100.0

@@ -9,7 +9,7 @@ import pytest
 
 from armident.configs import ArmidentError, DataError, config_path, load_session
 from armident.daq.recording import Recording, read_recording, write_recording
-from armident.identify.identification.api import identify_recording
+from armident.identify.identification.identify_recording import identify_recording
 from armident.identify.monitoring import history_schema
 from armident.identify.monitoring import ledger as ledger_module
 from armident.identify.monitoring.history import History

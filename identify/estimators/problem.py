@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armident.identify.estimators.auxiliary_model import AuxiliaryModel
+from armident.identify.estimators.methods import Method
 from armident.identify.estimators.reason import Reason
-from armident.identify.estimators.registry import Method
 from armident.identify.regression.equations import Estimate, ExperimentEquations
 
 Array = NDArray[np.float64]

@@ -17,7 +17,6 @@ from armident.identify.excitation.design import (
     with_objective,
 )
 from armident.identify.excitation.objective import EffectObjective
-from armident.identify.excitation.options import TrajectoryOptions
 from armident.identify.excitation.plot import check_name, draw
 from armident.identify.excitation.previous_estimate import PreviousEstimate, physical_estimate
 from armident.identify.excitation.safety import (
@@ -27,6 +26,7 @@ from armident.identify.excitation.safety import (
     checked_trajectory,
     safety_model,
 )
+from armident.identify.excitation.trajectory_options import TrajectoryOptions
 
 
 def trajectory_command(options: TrajectoryOptions) -> CheckedTrajectory:

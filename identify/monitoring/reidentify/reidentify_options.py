@@ -4,7 +4,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 
 from armident.identify.command_options import option
-from armident.identify.diagnosis.options import DiagnosisOptions
+from armident.identify.diagnosis.diagnosis_options import DiagnosisOptions
 
 _DIAGNOSIS = {one.name: one.metadata for one in fields(DiagnosisOptions)}
 

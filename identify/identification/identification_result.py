@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from armident.configs import RobotConfig
 from armident.identify.estimators.diagnostics import Diagnostics
-from armident.identify.identification.criteria import IdentificationCriteria
 from armident.identify.identification.held_out import held_out_errors
+from armident.identify.identification.identification_criteria import IdentificationCriteria
 from armident.identify.identification.options import Options
 from armident.identify.identification.residual_statistics import JointResidualStatistics
 from armident.identify.identification.torque_delay import TorqueDelay
@@ -47,7 +47,7 @@ class JointWhiteness:
 
 
 @dataclass(frozen=True)
-class Identification:
+class IdentificationResult:
     """The result of an identification; SI, joint side.
 
     Parameters
@@ -222,7 +222,7 @@ def make_result(
     judged: tuple[Verdict, IdentificationCriteria],
     warnings: Sequence[str],
     timing_s: dict[str, float],
-) -> Identification:
+) -> IdentificationResult:
     """Assemble the result; relative errors are those on the equations of IDIM-LS.
 
     Parameters
@@ -242,12 +242,12 @@ def make_result(
     """
     estimate, ls_blocks = found.estimate, ls.blocks
     joints = [joint.name for joint in model.robot.joints]
-    overall, by_joint = relative_errors(ls_blocks, estimate.theta)
+    overall, by_joint = relative_torque_errors(ls_blocks, estimate.theta)
     tests = [whiteness(series) for series in estimate.residuals]
     converged, stop_reason = estimate.converged, estimate.stop_reason
     if converged and not overall < WORTHLESS_PCT:
         converged, stop_reason = False, f"the parameters explain less than none: torque error {overall:.3g} %"
-    return Identification(
+    return IdentificationResult(
         verdict=judged[0],
         criteria=judged[1],
         method=options.method,
@@ -285,7 +285,7 @@ def make_result(
         warnings=tuple(dict.fromkeys(warnings)),
         options=options,
         idim_ls=(ls.estimate.theta, ls.estimate.std),
-        idim_ls_relative_error_pct=relative_errors(ls_blocks, ls.estimate.theta)[0],
+        idim_ls_relative_error_pct=relative_torque_errors(ls_blocks, ls.estimate.theta)[0],
         t=np.concatenate([b.t for b in ls_blocks]),
         tau_measured=np.concatenate([b.y for b in ls_blocks]),
         tau_predicted=np.concatenate([b.x @ estimate.theta for b in ls_blocks]),
@@ -296,7 +296,7 @@ def make_result(
     )
 
 
-def relative_errors(blocks: Sequence[ExperimentEquations], theta: Array) -> tuple[float, Array]:
+def relative_torque_errors(blocks: Sequence[ExperimentEquations], theta: Array) -> tuple[float, Array]:
     """``|y - X theta| / |y|`` in percent, overall and per joint (n,).
 
     Parameters

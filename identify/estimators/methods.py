@@ -5,7 +5,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Literal, get_args
 
 if TYPE_CHECKING:
-    from armident.identify.estimators.estimator import Estimator
+    from armident.identify.estimators.problem import Estimator
 
 Method = Literal["idim-piv", "idim-iv", "idim-ls", "didim", "clie", "cloe", "sep-pem"]
 METHODS: tuple[Method, ...] = get_args(Method)
