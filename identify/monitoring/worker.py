@@ -266,7 +266,7 @@ class Worker:
     def _enter(self, ledger: Ledger, entry: LedgerEntry, state: State, path: Path | None, message: str) -> bool:
         mine = self._until_possible("ledger", lambda: ledger.finish(entry.sha256, state, path, message))
         if not mine:
-            log.warning("%s: another worker took over after this one was held up; its result counts", entry.name)
+            log.warning("%s: lease expired: the result of the other worker is used", entry.name)
         return mine
 
     def _identify(self, entry: LedgerEntry) -> tuple[Path, str]:

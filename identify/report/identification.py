@@ -50,7 +50,7 @@ def identification_report(
         torques=torque_plots(result.t, result.tau_measured, result.tau_predicted, joints, _units(robot)),
         autocorrelation=_autocorrelation_figure(result.residual_autocorrelation, result.autocorrelation_bound, joints),
         controller=_controller_figure(document.controller),
-        beside={} if document.comparison is None else {p.name: p.value for p in document.comparison.parameters},
+        least_squares={} if document.comparison is None else {p.name: p.value for p in document.comparison.parameters},
         residuals=_residual_words(document),
         glossary=identification_entries(document),
     )

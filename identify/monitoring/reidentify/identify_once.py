@@ -215,8 +215,8 @@ def _identified(recording: Recording, robot: RobotConfig, options: Options, fold
         path, _ = write_identification(outcome, folder)
     except OSError as error:
         raise ArmidentError(
-            f"{error.filename or folder}: the result cannot be written: {error.strerror}; mend that, "
-            f"then a worker of the cell identifies the recording, or: armident identify {recording.path}"
+            f"{error.filename or folder}: the result cannot be written: {error.strerror}; fix this; "
+            f"a worker of the cell then identifies the recording, or run armident identify {recording.path}"
         ) from error
     return OnceIdentified(outcome.document, path, ours=True)
 
