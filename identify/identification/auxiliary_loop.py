@@ -28,7 +28,8 @@ from armident.identify.signals.differentiate import Derivatives, differentiate
 from armident.identify.streamed import kept, mapped
 
 RUNAWAY = 3.0
-"""Speed of a simulated joint, over the highest measured speed, beyond which the simulation has diverged."""
+"""Speed of a simulated joint, over the highest measured speed, beyond which the simulation has diverged: a stable loop
+oversteps its set points by less than their own speed, so that it stays below two."""
 
 NO_REFERENCE = (
     "There is no reference trajectory in the recording. Instruments: simulation of a stiff PD controller that "

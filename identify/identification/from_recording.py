@@ -11,6 +11,7 @@ from armident.configs import DataError, Joint, RobotConfig
 from armident.configs.schema.limits import ENDLESS
 from armident.daq.recording import Recording, Stream
 from armident.identify.experiment import Experiment
+from armident.identify.identification.identification_criteria import IdentificationCriteria
 from armident.identify.identification.set_points import between_set_points
 from armident.identify.streamed import OnDisk
 
@@ -18,8 +19,6 @@ MAX_MISSING_SHARE = 0.05
 """Largest share of missing samples of an experiment; with more, the rest is no longer the designed motion."""
 MIN_PIECE_S = 0.5
 """Shortest piece between two gaps, s: edge effects of the filters cover shorter ones."""
-STILL_SHARE = 1e-3
-"""Share of its position range below which a joint counts as not moving."""
 RATE_TOLERANCE = 0.01
 """Relative difference between the nominal rate and the receive times above which a note is added."""
 NO_REFERENCE = "no reference trajectory was recorded: identified without one"
@@ -374,7 +373,7 @@ def rest_notes(experiments: Sequence[Experiment], robot: RobotConfig) -> list[st
     return [
         f"{joint.name} does not move: its own parameters cannot be determined from this recording"
         for joint, width in zip(robot.joints, np.ptp(q, axis=0), strict=True)
-        if width < STILL_SHARE * _usual_range(joint)
+        if width < IdentificationCriteria.rest_limit_share * _usual_range(joint)
     ]
 
 

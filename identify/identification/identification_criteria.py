@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass
 
+from armident.identify.estimators.residual_tests import FALSE_ALARM_RATE
+
 
 @dataclass(frozen=True)
 class IdentificationCriteria:
@@ -82,7 +84,7 @@ class IdentificationCriteria:
     rest_limit_share: float = 1e-3
     rest_counts: float = 5.0
     rest_noise_std: float = 10.0
-    false_alarm_rate: float = 0.01
+    false_alarm_rate: float = FALSE_ALARM_RATE
     white_fraction: float = 0.15
     max_motion_share: float = 0.2
     min_motion_deviation: float = 4.0

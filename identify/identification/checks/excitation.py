@@ -14,8 +14,9 @@ from armident.identify.identification.moving_joints import FARTHEST, MOVE
 from armident.identify.identification.verdict import listed
 from armident.identify.robot.arm import ArmModel
 
-POSTURES = 100
-"""Postures of the motion, and of the workspace, at which inertia and gravity are examined."""
+EXAMINED_POSTURES = 100
+"""Postures of the motion, and of the workspace, at which inertia and gravity are examined: the standard error of a mean
+over 100 is a tenth of its spread between postures."""
 
 Array = NDArray[np.float64]
 
@@ -52,7 +53,7 @@ def excitation(judged: Judged, criteria: IdentificationCriteria) -> list[Reason]
     return [Reason(level, message, MOVE, kind="excitation")]
 
 
-def motion_postures(experiments: Sequence[Experiment], count: int = POSTURES) -> Array:
+def motion_postures(experiments: Sequence[Experiment], count: int = EXAMINED_POSTURES) -> Array:
     """Postures of the recordings, evenly taken, shape (about ``count``, n), rad or m.
 
     Parameters
@@ -66,7 +67,7 @@ def motion_postures(experiments: Sequence[Experiment], count: int = POSTURES) ->
     return np.concatenate([e.q[::every].copy() for e in experiments])
 
 
-def workspace_postures(robot: RobotConfig, recorded: Array, count: int = POSTURES) -> Array:
+def workspace_postures(robot: RobotConfig, recorded: Array, count: int = EXAMINED_POSTURES) -> Array:
     """Random postures between the position limits, shape (count, n), rad or m; the same in every call.
 
     Parameters
