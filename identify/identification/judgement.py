@@ -50,15 +50,7 @@ def judgement(judged: Judged, criteria: IdentificationCriteria) -> list[Reason]:
 def require_finite(estimate: Estimate) -> None:
     """Raise if an estimate or its covariance is not finite, or a variance is negative.
 
-    Parameters
-    ----------
-    estimate
-        Estimate of any method.
-
-    Raises
-    ------
-    LinAlgError
-        If so.
+    ``estimate``: estimate of any method. Raises LinAlgError if so.
     """
     finite = np.isfinite(estimate.theta).all() and np.isfinite(estimate.covariance).all()
     if not finite or (np.diag(estimate.covariance) < 0.0).any():
@@ -73,21 +65,8 @@ def refusing_singular(
 
     Floating-point warnings of such equations are suppressed: the verdict states the defect.
 
-    Parameters
-    ----------
-    method
-        Name of the method.
-    model
-        The arm.
-    support
-        Parameters that the motion supports.
-    criteria
-        Limits.
-
-    Raises
-    ------
-    DataError
-        If numpy finds a singular matrix, or scipy a number that is not finite (which it reports as ``ValueError``).
+    ``method``: name of the method; ``support``: parameters that the motion supports. Raises DataError if numpy finds a
+    singular matrix, or scipy a number that is not finite (which it reports as ``ValueError``).
     """
     try:
         with np.errstate(invalid="ignore", divide="ignore", over="ignore"), warnings.catch_warnings():

@@ -61,16 +61,9 @@ Array = NDArray[np.float64]
 class SimulatedBias:
     """Bias of an estimator and scatter by encoder noise, from simulated recordings.
 
-    Parameters
-    ----------
-    bias
-        Mean estimate of the simulated recordings less the parameters that made them, SI, (b,).
-    scatter
-        Standard deviations of these estimates, SI, (b,).
-    runs
-        Number of simulated recordings.
-    share
-        Share of the experiments that were simulated, 0 to 1: estimates from all scatter by its square root of that.
+    ``bias``: mean estimate of the simulated recordings less the parameters that made them, SI, (b,); ``scatter``:
+    standard deviations of these estimates, SI, (b,); ``share``: share of the experiments that were simulated, 0 to 1:
+    estimates from all scatter by its square root of that.
     """
 
     bias: Array
@@ -81,10 +74,7 @@ class SimulatedBias:
     def largest(self, estimate: Estimate) -> tuple[int, float]:
         """Parameter with the largest bias, and the bias in its standard deviations.
 
-        Parameters
-        ----------
-        estimate
-            Estimate whose standard deviations count.
+        ``estimate``: estimate whose standard deviations count.
         """
         share = np.abs(self.bias) / estimate.std
         k = int(np.argmax(share))
@@ -104,6 +94,9 @@ def simulated_bias(
 ) -> SimulatedBias | None:
     """Return the bias of an instrumental-variable estimate.
 
+    Returns ``None`` if the loop with this estimate cannot be simulated, or its recordings do not determine the
+    parameters.
+
     Parameters
     ----------
     prepared
@@ -122,11 +115,6 @@ def simulated_bias(
         Number of simulated recordings; ``None``: few where the bias is irrelevant, else many.
     share
         Share of the experiments of the estimate that are simulated, 0 to 1.
-
-    Returns
-    -------
-    SimulatedBias or None
-        ``None`` if the loop with this estimate cannot be simulated, or its recordings do not determine the parameters.
     """
     auxiliary, theta = auxiliary.fresh(), estimate.theta
     clean = auxiliary.simulate(theta)
@@ -161,14 +149,7 @@ def corrected(estimate: Estimate, found: SimulatedBias, blocks: Sequence[Experim
     more than its standard deviation, which assumes noise that is independent of the motion, it is widened to that
     scatter.
 
-    Parameters
-    ----------
-    estimate
-        Estimate with its noise models.
-    found
-        Its bias.
-    blocks
-        Equations of the estimate.
+    ``estimate``: estimate with its noise models.
     """
     theta = estimate.theta - found.bias
     ratio = np.sqrt(found.share) * found.scatter / estimate.std
@@ -229,14 +210,8 @@ def auxiliary_smoother(
 ) -> Callable[[Array], Derivatives]:
     """Smoother of the measured positions, for simulated ones.
 
-    Parameters
-    ----------
-    auxiliary
-        Closed loop; it has the bandpass where one was chosen.
-    derivatives
-        Name of the smoother.
-    nvr
-        Noise-variance ratios (n,) of the measured positions; ``None``: bandpass.
+    ``auxiliary``: closed loop; it has the bandpass where one was chosen. ``nvr``: noise-variance ratios (n,) of the
+    measured positions; ``None``: bandpass.
     """
     if nvr is None:
         measured = auxiliary.measured

@@ -70,8 +70,6 @@ def decimation_of(
     ----------
     method
         Name of the method; those with a noise model decimate only roughly.
-    dt
-        Sampling period, s.
     bandwidth_hz
         Closed-loop bandwidth, Hz.
     factor
@@ -109,18 +107,8 @@ def decimation_of(
 class IdentificationProblem:
     """Input of every method: experiments with derivatives, the closed loop, and the first iterate.
 
-    Parameters
-    ----------
-    prepared
-        Arm, experiments and derivatives.
-    auxiliary
-        The simulated closed loop with the decimation of the method.
-    start
-        First theta, shape (b,).
-    plain
-        Decimation of the methods without a noise model.
-    options
-        Options of the identification.
+    ``prepared``: arm, experiments and derivatives; ``auxiliary``: the simulated closed loop with the decimation of the
+    method; ``start``: first theta, shape (b,); ``plain``: decimation of the methods without a noise model.
     """
 
     prepared: Prepared
@@ -225,10 +213,7 @@ class Solution:
     def motions(self) -> Sequence[Derivatives]:
         """Simulated motion of the estimate along the recorded references, without the disturbances of the recordings.
 
-        Raises
-        ------
-        DataError
-            If neither the estimate nor any point between it and the last good one can be simulated.
+        Raises DataError if neither the estimate nor any point between it and the last good one can be simulated.
         """
         auxiliary = self.problem.auxiliary.fresh()
         return auxiliary.motions(self.estimate.theta) if self.runs is None else auxiliary.motions_of(self.runs)
@@ -286,22 +271,13 @@ class Solution:
 def is_singular(error: Exception) -> bool:
     """Return true for a singular matrix, and for scipy's ``ValueError`` about numbers that are not finite.
 
-    Parameters
-    ----------
-    error
-        Exception of numpy or scipy.
+    ``error``: exception of numpy or scipy.
     """
     return isinstance(error, np.linalg.LinAlgError) or NOT_FINITE in str(error)
 
 
 def solve(problem: IdentificationProblem) -> Solution:
-    """Solution of a problem by the method of its options, without the bias that instrumental variables have.
-
-    Raises
-    ------
-    DataError
-        If no auxiliary closed loop runs.
-    """
+    """Solution of a problem by the method of its options, without the bias that instrumental variables have."""
     used = estimator(problem.options.method)
     assert used.solve is not None, f"{used.name} solves no problem with a closed loop"
     found = used.solve(problem)
@@ -354,16 +330,7 @@ def _doubted(solution: Solution) -> Solution:
 def doubts_of_serial_correlation(method: str, names: Sequence[str], estimate: Estimate, std: Array) -> tuple[str, ...]:
     """Warning if the residuals of a joint are not white (Ljung and Box 1978) and intervals are too narrow for it.
 
-    Parameters
-    ----------
-    method
-        Name of the method.
-    names
-        Base parameters (b,).
-    estimate
-        Estimate whose covariance takes the residuals for white.
-    std
-        Standard deviations (b,) that allow for serial correlation, SI.
+    ``std`` (b,) are the standard deviations that allow for serial correlation, SI.
     """
     ratio = std / estimate.std
     worst = int(np.argmax(ratio))

@@ -38,15 +38,9 @@ Mask = NDArray[np.bool_]
 class Support:
     """Base parameters that a motion supports.
 
-    Parameters
-    ----------
-    moving
-        Joints that move (n,).
-    supported
-        Parameters that can be estimated together (b,). Each includes what the motion cannot separate from it.
-    theta, std
-        Least-squares estimate of these alone, from the joints that move, and its standard deviations; NaN elsewhere
-        (b,), SI.
+    ``moving``: joints that move (n,). ``supported``: parameters that can be estimated together (b,). Each includes what
+    the motion cannot separate from it. ``theta``, ``std``: least-squares estimate of these alone, from the joints that
+    move, and its standard deviations; NaN elsewhere (b,), SI.
     """
 
     moving: Mask
@@ -57,17 +51,7 @@ class Support:
     def determined(self, model: ArmModel, share: float) -> Mask:
         """Return the supported parameters that are precise, and not negative where nature forbids it.
 
-        Parameters
-        ----------
-        model
-            The arm.
-        share
-            Largest relative standard deviation.
-
-        Returns
-        -------
-        ndarray
-            Mask (b,).
+        ``share``: largest relative standard deviation. Returns the mask (b,).
         """
         possible = np.array([not name.startswith(NON_NEGATIVE) for name in model.base.names]) | (self.theta > 0)
         with np.errstate(invalid="ignore"):
@@ -76,12 +60,7 @@ class Support:
     def sentence(self, model: ArmModel, criteria: IdentificationCriteria) -> str:
         """List the parameters that the motion determines in words, with values if they are few.
 
-        Parameters
-        ----------
-        model
-            The arm.
-        criteria
-            Limits of the relative standard deviation and of the number of parameters that are listed.
+        ``criteria``: limits of the relative standard deviation and of the number of parameters that are listed.
         """
         found = np.flatnonzero(self.determined(model, criteria.max_relative_std))
         limit = f"within {100 * criteria.max_relative_std:.0f} %"
@@ -109,18 +88,9 @@ def examine_support(
     left out. Columns are taken in the order of pivoted QR. The subset is the largest leading one in which the standard
     deviation of every parameter changes the torque of its joints by less than ``max_relative_std`` of it.
 
-    Parameters
-    ----------
-    prepared
-        Arm, experiments and derivatives.
-    blocks, decimation
-        Equations of least squares, and their parallel filter.
-    moving
-        Joints that move (n,).
-    criteria
-        Limits.
-    noise
-        Residual variances of least squares, which weigh the equations; ``None``: the variances of the torques.
+    ``prepared``: arm, experiments and derivatives. ``blocks``, ``decimation``: equations of least squares, and their
+    parallel filter. ``moving``: joints that move (n,). ``noise``: residual variances of least squares, which weigh the
+    equations; ``None``: the variances of the torques.
     """
     model = prepared.model
     b, rows = model.base.b, 0

@@ -15,13 +15,8 @@ AT_REST = ("standstill", "joint_at_rest")
 class Verdict:
     """Judgement of a result.
 
-    Parameters
-    ----------
-    level
-        ``trustworthy``: no defect was found. ``doubtful``: usable within the limits that the reasons state.
-        ``unusable``: the parameters must not be used.
-    reasons
-        Defects, the most severe first; empty if trustworthy.
+    ``level``: ``trustworthy``: no defect was found. ``doubtful``: usable within the limits that the reasons state.
+    ``unusable``: the parameters must not be used. ``reasons``: defects, the most severe first; empty if trustworthy.
     """
 
     level: Level
@@ -36,13 +31,7 @@ class Verdict:
         return f"{self.level}: {self.reasons[0].message}" + (f" (and {more} more)" if more else "")
 
     def of_kind(self, kind: Kind) -> tuple[Reason, ...]:
-        """Return the reasons of one kind.
-
-        Parameters
-        ----------
-        kind
-            Property that was judged.
-        """
+        """Return the reasons of one kind. ``kind``: property that was judged."""
         return tuple(reason for reason in self.reasons if reason.kind == kind)
 
     def document(self) -> dict[str, Any]:
@@ -62,12 +51,7 @@ def judge(reasons: Sequence[Reason], setup: SetupCheck | None = None) -> Verdict
     The level is that of the most severe reason. Reasons are sorted by severity, those of the set-up first; each message
     occurs once.
 
-    Parameters
-    ----------
-    reasons
-        Defects found in data and result.
-    setup
-        Check of the set-up; ``None``: not made.
+    ``reasons``: defects found in data and result. ``setup``: check of the set-up; ``None``: not made.
     """
     every = _merged(reasons, setup)
     once = {reason.message: reason for reason in reversed(every)}
@@ -127,12 +111,7 @@ def _tried(setup: SetupCheck) -> str:
 def listed(names: Sequence[str], most: int = 12) -> str:
     """Return names as a list in words, cut after ``most``.
 
-    Parameters
-    ----------
-    names
-        Names, at least one.
-    most
-        Largest number of names.
+    ``names``: at least one; ``most``: largest number of names.
     """
     shown = list(names[:most])
     if len(names) > most:

@@ -54,15 +54,7 @@ def excitation(judged: Judged, criteria: IdentificationCriteria) -> list[Reason]
 
 
 def motion_postures(experiments: Sequence[Experiment], count: int = EXAMINED_POSTURES) -> Array:
-    """Postures of the recordings, evenly taken, shape (about ``count``, n), rad or m.
-
-    Parameters
-    ----------
-    experiments
-        Recordings.
-    count
-        Number of postures.
-    """
+    """Postures of the recordings, evenly taken, shape (about ``count``, n), rad or m."""
     every = max(1, sum(e.q.shape[0] for e in experiments) // count)
     return np.concatenate([e.q[::every].copy() for e in experiments])
 
@@ -70,14 +62,7 @@ def motion_postures(experiments: Sequence[Experiment], count: int = EXAMINED_POS
 def workspace_postures(robot: RobotConfig, recorded: Array, count: int = EXAMINED_POSTURES) -> Array:
     """Random postures between the position limits, shape (count, n), rad or m; the same in every call.
 
-    Parameters
-    ----------
-    robot
-        Configuration of the robot.
-    recorded
-        Recorded postures (N, n): their range replaces the limits of an endless joint.
-    count
-        Number of postures.
+    The range of the recorded postures (N, n) replaces the limits of an endless joint.
     """
     limits = np.array([joint.limits.position for joint in robot.joints], dtype=np.float64).T
     seen = np.stack([recorded.min(axis=0), recorded.max(axis=0)])
@@ -86,23 +71,10 @@ def workspace_postures(robot: RobotConfig, recorded: Array, count: int = EXAMINE
 
 
 def joint_uncertainty(model: ArmModel, theta: Array, covariance: Array, q: Array) -> tuple[Array, Array]:
-    """Uncertainty of inertia and gravity torque of each joint at given postures, without terms.
+    """Uncertainty of inertia and gravity torque (n,) of each joint at postures q (N, n), without terms.
 
-    Parameters
-    ----------
-    model
-        The arm.
-    theta, covariance
-        Base estimate (b,) and its covariance (b, b), SI.
-    q
-        Postures (N, n), rad or m.
-
-    Returns
-    -------
-    inertia : ndarray
-        Relative standard deviation of the diagonal of the mass matrix, median of the postures, (n,).
-    gravity : ndarray
-        Standard deviation of the gravity torque, mean of the postures, (n,), N m or N.
+    Relative standard deviation of the diagonal of the mass matrix, median of the postures; standard deviation of the
+    gravity torque, mean of the postures, N m or N.
     """
     rigid = model.base.b - model.e
     if not np.isfinite(covariance).all():

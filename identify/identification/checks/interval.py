@@ -29,16 +29,7 @@ def doubts_of_least_squares(
 ) -> tuple[str, ...]:
     """Warnings if derivatives and encoder noise bias IDIM-LS, or if serial correlation understates its intervals.
 
-    Parameters
-    ----------
-    prepared
-        Arm, experiments and derivatives.
-    options
-        Options of the identification.
-    ls
-        Estimate and its equations; those of a published fit are not examined.
-    bandwidth
-        Closed-loop bandwidth, Hz.
+    Equations of a published fit are not examined.
     """
     if ls.published:
         return ()

@@ -14,22 +14,8 @@ from armident.identify.identification.support import Support
 class Judged:
     """Parts of an identification that its verdict depends on.
 
-    Parameters
-    ----------
-    prepared
-        Arm, experiments and derivatives.
-    options
-        Options of the identification.
-    ls, found
-        IDIM-LS, in whose equations errors are measured, and the estimate of the method.
-    solution
-        Solution in the closed loop; ``None`` for IDIM-LS.
-    statistics
-        Tests of the estimate, and delay of the torques.
-    support
-        Joints that move, and parameters that the motion supports.
-    reasons
-        Defects that the checks before have found.
+    ``ls``: IDIM-LS, in whose equations errors are measured; ``found``: the estimate of the method; ``solution``:
+    ``None`` for IDIM-LS; ``reasons``: defects that the checks before have found.
     """
 
     prepared: Prepared

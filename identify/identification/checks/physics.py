@@ -77,16 +77,8 @@ def impossible_values(
 
     They are negative friction and rotor inertias, and a mass matrix that is not positive definite.
 
-    Parameters
-    ----------
-    model
-        The arm.
-    q
-        Postures (N, n) at which the mass matrix is computed, rad or m.
-    theta, covariance
-        Base estimate (b,) and its covariance (b, b), SI.
-    criteria
-        Limits.
+    ``q``: postures (N, n) at which the mass matrix is computed, rad or m; ``theta``, ``covariance``: base estimate (b,)
+    and its covariance (b, b), SI.
     """
     return [*_negative(model, theta, covariance, criteria), *_indefinite(model, q, theta, covariance, criteria)]
 
