@@ -49,7 +49,15 @@ class Problem(Protocol):
         """True if the noise is that of the positions, through the controller (6.28)."""
 
     def bias(self, estimate: Estimate, *, prefiltered: bool) -> Array | None:
-        """Bias (b,) of instrumental variables by derivatives and sampling alone; ``None``: no loop can be simulated."""
+        """Bias (b,) of instrumental variables by derivatives and sampling alone; ``None``: no loop can be simulated.
+
+        Parameters
+        ----------
+        estimate
+            The estimate whose recordings are simulated.
+        prefiltered
+            True if its noise models weigh the rows.
+        """
 
 
 @dataclass(frozen=True)
