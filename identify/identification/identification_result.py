@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from armident.configs import RobotConfig
 from armident.identify.estimators.diagnostics import Diagnostics
-from armident.identify.identification.criteria import IdentificationCriteria
 from armident.identify.identification.held_out import held_out_errors
+from armident.identify.identification.identification_criteria import IdentificationCriteria
 from armident.identify.identification.options import Options
 from armident.identify.identification.residual_statistics import JointResidualStatistics
 from armident.identify.identification.torque_delay import TorqueDelay
@@ -40,7 +40,7 @@ class JointWhiteness:
 
 
 @dataclass(frozen=True)
-class Identification:
+class IdentificationResult:
     """The result of an identification; SI, joint side.
 
     Parameters
@@ -197,7 +197,7 @@ def make_result(
     judged: tuple[Verdict, IdentificationCriteria],
     warnings: Sequence[str],
     timing_s: dict[str, float],
-) -> Identification:
+) -> IdentificationResult:
     """Assemble the result; relative errors are those on the equations of IDIM-LS.
 
     ``options``, ``model``: options and arm of the identification. ``found``, ``ls``: estimate of the method, and of
@@ -206,12 +206,12 @@ def make_result(
     """
     estimate, ls_blocks = found.estimate, ls.blocks
     joints = [joint.name for joint in model.robot.joints]
-    overall, by_joint = relative_errors(ls_blocks, estimate.theta)
+    overall, by_joint = relative_torque_errors(ls_blocks, estimate.theta)
     tests = [whiteness(series) for series in estimate.residuals]
     converged, stop_reason = estimate.converged, estimate.stop_reason
     if converged and not overall < WORTHLESS_PCT:
         converged, stop_reason = False, f"the parameters explain less than none: torque error {overall:.3g} %"
-    return Identification(
+    return IdentificationResult(
         verdict=judged[0],
         criteria=judged[1],
         method=options.method,
@@ -249,7 +249,7 @@ def make_result(
         warnings=tuple(dict.fromkeys(warnings)),
         options=options,
         idim_ls=(ls.estimate.theta, ls.estimate.std),
-        idim_ls_relative_error_pct=relative_errors(ls_blocks, ls.estimate.theta)[0],
+        idim_ls_relative_error_pct=relative_torque_errors(ls_blocks, ls.estimate.theta)[0],
         t=np.concatenate([b.t for b in ls_blocks]),
         tau_measured=np.concatenate([b.y for b in ls_blocks]),
         tau_predicted=np.concatenate([b.x @ estimate.theta for b in ls_blocks]),
@@ -260,8 +260,8 @@ def make_result(
     )
 
 
-def relative_errors(blocks: Sequence[ExperimentEquations], theta: Array) -> tuple[float, Array]:
-    """``|y - X theta| / |y|`` in percent, overall and per joint (n,). ``theta``: base parameters, shape (b,)."""
+def relative_torque_errors(blocks: Sequence[ExperimentEquations], theta: Array) -> tuple[float, Array]:
+    """``|y - X theta| / |y|`` in percent, overall and per joint (n,)."""
     errors = residuals(blocks, theta)
     miss = sum(np.sum(np.where(b.keep, e, 0.0) ** 2, axis=0) for e, b in zip(errors, blocks, strict=True))
     power = sum(np.sum(np.where(b.keep, b.y, 0.0) ** 2, axis=0) for b in blocks)

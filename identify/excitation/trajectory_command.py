@@ -1,6 +1,5 @@
 """Command ``armident trajectory``: design or check an exciting trajectory, plot it, predict its precision."""
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import yaml
@@ -13,7 +12,6 @@ from armident.identify.effects.terms import arm_model
 from armident.identify.excitation.design import (
     ASSUMED_NOISE,
     Design,
-    Shape,
     design_trajectory,
     predict_precision,
     with_objective,
@@ -28,53 +26,7 @@ from armident.identify.excitation.safety import (
     checked_trajectory,
     safety_model,
 )
-
-SHAPES: tuple[Shape, ...] = ("moves", "fourier")
-"""Values of ``--shape``."""
-
-
-@dataclass(frozen=True)
-class TrajectoryOptions:
-    """Options of ``armident trajectory``.
-
-    Parameters
-    ----------
-    config
-        Robot configuration.
-    out
-        Trajectory file to write; ``None`` with ``look_at``.
-    seed
-        Seed of the random search.
-    known
-        ``identification.json`` of the robot: parameters and noise.
-    evaluations
-        Number of candidates to try.
-    wanted, joint, against
-        Effect to make visible, its joint, and an effect to separate it from.
-    shape, harmonics
-        ``moves`` or ``fourier``, and the number of harmonics of the latter.
-    picture
-        File of the plot; ``None``: named after ``out`` or ``look_at``.
-    look_at
-        Existing trajectory to check instead of a design.
-    masses
-        Standard parameters that predict torques, without an identification.
-    """
-
-    config: Path
-    out: Path | None = None
-    duration: float = 7.5
-    seed: int = 0
-    known: Path | None = None
-    evaluations: int = 2000
-    wanted: str | None = None
-    joint: str | None = None
-    against: str | None = None
-    shape: str = "moves"
-    harmonics: int | None = None
-    picture: Path | None = None
-    look_at: Path | None = None
-    masses: Path | None = None
+from armident.identify.excitation.trajectory_options import TrajectoryOptions
 
 
 def trajectory_command(options: TrajectoryOptions) -> CheckedTrajectory:
@@ -85,7 +37,7 @@ def trajectory_command(options: TrajectoryOptions) -> CheckedTrajectory:
     DataError if ``known`` is of another robot or model, or is not physical.
     """
     robot, out, look_at = load_robot(options.config, "trajectory"), options.out, options.look_at
-    shape = _checked_shape(options)
+    _check_files(options)
     picture = options.picture
     if picture is None:
         picture = out.with_suffix(".png") if out is not None else Path(f"{Path(look_at or '').stem}.png")
@@ -101,7 +53,7 @@ def trajectory_command(options: TrajectoryOptions) -> CheckedTrajectory:
     if look_at is not None:
         design = _looked_at(robot, look_at, prior, aim, safety)
     else:
-        design = _designed(robot, options, shape, prior, aim, safety)
+        design = _designed(robot, options, prior, aim, safety)
     if out is not None:
         content = design.trajectory.model_dump(mode="json", by_alias=True, exclude_defaults=True)
         write_atomically(out, yaml.safe_dump(content, sort_keys=False))
@@ -122,7 +74,6 @@ def trajectory_command(options: TrajectoryOptions) -> CheckedTrajectory:
 def _designed(
     robot: RobotConfig,
     options: TrajectoryOptions,
-    shape: Shape,
     prior: PreviousEstimate | None,
     aim: EffectObjective | None,
     safety: SafetyModel,
@@ -137,23 +88,18 @@ def _designed(
             evaluations=options.evaluations,
             theta=safety.theta,
             aim=aim,
-            shape=shape,
+            shape=options.shape,
             harmonics=options.harmonics,
             collision=safety.collision,
             progress=lambda share: report("searching", share),
         )
 
 
-def _checked_shape(options: TrajectoryOptions) -> Shape:
-    """Return the shape; ConfigError if an option is wrong or two contradict each other."""
-    shape = next((each for each in SHAPES if each == options.shape), None)
-    if shape is None:
-        raise ConfigError(f"--shape {options.shape}: expected {' or '.join(SHAPES)}")
+def _check_files(options: TrajectoryOptions) -> None:
     if options.out is not None and options.out.suffix not in {".yaml", ".yml"}:
         raise ConfigError(f"--out {options.out}: expected a file name that ends in .yaml")
     if (options.out is None) == (options.look_at is None):
         raise ConfigError("give --out FILE for a new trajectory, or --look-at FILE for an existing one")
-    return shape
 
 
 def _looked_at(

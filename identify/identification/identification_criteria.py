@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass
 
+from armident.identify.estimators.residual_tests import FALSE_ALARM_RATE
+
 
 @dataclass(frozen=True)
 class IdentificationCriteria:
@@ -10,8 +12,8 @@ class IdentificationCriteria:
     Parameters
     ----------
     max_joint_error_pct
-        Largest error of a joint's torque that a model may leave, percent of the torque's norm. Above a third the rigid
-        model does not describe the joint (design page of the diagnosis, first principle).
+        Largest error of a joint's torque that a model may leave, percent of the torque's norm. A third is as much as
+        friction or a load of the usual size takes: more is no detail that the rigid model lacks, but a wrong signal.
     max_rest_error_pct
         The same for a joint at rest, percent: friction at rest has no model, but 100 % is the error of no model at all.
     sign_tolerance_std
@@ -47,15 +49,29 @@ class IdentificationCriteria:
     min_motion_deviation
         Deviation of that share from its mean under circular shifts, standard deviations of the shifts, from which on a
         dependence counts. 4: noise with a pole up to 0.9 per row reaches 3.7 in 540 tests.
+    max_bias_std
+        Bias by derivatives, encoder noise and sampling, standard deviations, above which an estimate is corrected.
+        0.5: an interval of two standard deviations with this bias covers 92.7 % instead of 95.4 %.
+    max_serial_std_ratio
+        Ratio of standard deviations with and without serial correlation above which intervals are doubtful where the
+        residuals are not white. 1.25: an interval of two standard deviations covers 89 %.
+    serial_level
+        Significance level of that test for white residuals. 1e-3: the parallel filter alone, whose cut-off is the
+        decimated Nyquist frequency, correlates neighbours by about 0.1, which 0.01 would reject.
     max_std_ratio
         Ratio of the standard deviations that allow for serial correlation to those of the method, above which the
         latter are too small. 1.5: an interval of two standard deviations covers 82 % instead of 95 %.
     max_velocity_error
-        Relative error of the simulated velocities above which the closed loop does not move like the robot.
+        Relative error of the simulated velocities above which the closed loop does not move like the robot. 0.3: the
+        instruments then keep a correlation of 0.95 with the motion (``sqrt(1 - 0.3^2)``).
+    min_smoothed_sign
+        Smoothed sign at the root mean square velocity of a joint below which a warning names it. 0.98: viscous friction
+        absorbs the 2 % of Coulomb friction that the smoothed sign lacks there, and is wrong by as much of its torque.
     max_delay_samples
-        Deviation of the torque delay from the expected half a sample that is tolerated, samples.
+        Deviation of the torque delay from the expected half a sample that is tolerated, samples. 1: a drive that
+        reports the torque of the sample before or after has less.
     max_listed
-        Largest number of parameters that a sentence lists by name.
+        Largest number of parameters that a sentence lists by name: two lines of text.
     """
 
     max_joint_error_pct: float = 100.0 / 3.0
@@ -68,11 +84,15 @@ class IdentificationCriteria:
     rest_limit_share: float = 1e-3
     rest_counts: float = 5.0
     rest_noise_std: float = 10.0
-    false_alarm_rate: float = 0.01
+    false_alarm_rate: float = FALSE_ALARM_RATE
     white_fraction: float = 0.15
     max_motion_share: float = 0.2
     min_motion_deviation: float = 4.0
+    max_bias_std: float = 0.5
+    max_serial_std_ratio: float = 1.25
+    serial_level: float = 1e-3
     max_std_ratio: float = 1.5
     max_velocity_error: float = 0.3
+    min_smoothed_sign: float = 0.98
     max_delay_samples: float = 1.0
     max_listed: int = 12

@@ -10,12 +10,12 @@ from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.experiment import Experiment
 from armident.identify.identification.document import identification_document
 from armident.identify.identification.from_recording import WHOLE, StretchRule, experiments_from_recording
+from armident.identify.identification.identification_result import IdentificationResult
 from armident.identify.identification.options import Options
 from armident.identify.identification.pipeline import identify_experiment
-from armident.identify.identification.result import Identification
 from armident.identify.identification.sign_smoothing import with_numbers
-from armident.identify.identification.verdict import SetupCheck
 from armident.identify.setup.check import check_setup
+from armident.identify.setup.result import SetupCheck
 from armident.identify.streamed import OnDisk, Streamed
 
 CHECKED_VALUES = 6_000_000
@@ -32,7 +32,7 @@ class IdentificationOutcome:
 
     recordings: tuple[Recording, ...]
     robot: RobotConfig
-    result: Identification
+    result: IdentificationResult
     document: IdentificationDocument
 
 

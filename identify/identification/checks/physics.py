@@ -1,20 +1,19 @@
-"""Physical possibility of an estimate: signs of friction and inertia, mass matrix, and the nearest possible arm."""
-
-from collections.abc import Sequence
+"""Check of physical possibility: signs of friction and inertia, mass matrix, and the nearest possible arm."""
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
 from armident.configs import ArmidentError
-from armident.identify.experiment import Experiment
-from armident.identify.identification.criteria import IdentificationCriteria
-from armident.identify.identification.excitation_check import NON_NEGATIVE, motion_postures, workspace_postures
-from armident.identify.identification.result import relative_errors, units
-from armident.identify.identification.verdict import Reason, listed
-from armident.identify.regression.equations import ExperimentEquations
+from armident.identify.estimators.reason import Reason
+from armident.identify.identification.checks.excitation import motion_postures, workspace_postures
+from armident.identify.identification.checks.judged import Judged
+from armident.identify.identification.identification_criteria import IdentificationCriteria
+from armident.identify.identification.identification_result import relative_torque_errors, units
+from armident.identify.identification.support import NON_NEGATIVE
+from armident.identify.identification.verdict import listed
 from armident.identify.robot.arm import ArmModel
-from armident.identify.robot.consistent import ConsistentParameters, nearest_base
+from armident.identify.robot.consistent import nearest_base
 
 Array = NDArray[np.float64]
 
@@ -24,25 +23,19 @@ USE_NEAREST = (
 )
 
 
-def physics_reasons(
-    model: ArmModel,
-    experiments: Sequence[Experiment],
-    blocks: Sequence[ExperimentEquations],
-    theta: Array,
-    covariance: Array,
-    criteria: IdentificationCriteria,
-    consistent: ConsistentParameters | None = None,
-) -> list[Reason]:
+def physics(judged: Judged, criteria: IdentificationCriteria) -> list[Reason]:
     """Return a reason if no physical arm has these parameters within their uncertainty.
 
     Small impossible values come from small model errors: then a possible arm explains the torques nearly as well, and
     the result is doubtful. Where the nearest possible arm leaves more than a third of a joint's torque, which the
     estimate explains, the signals themselves are wrong, and the result is unusable.
 
-    ``blocks``: equations in which the errors of the two arms are compared. ``theta``, ``covariance``: base estimate
-    (b,) and its covariance (b, b), SI. ``consistent``: nearest physically consistent parameters with their test, if
-    computed; otherwise the distance is tested with b degrees of freedom, more than there are, which is conservative.
+    Without the nearest physically consistent parameters, the distance is tested with b degrees of freedom, more than
+    there are, which is conservative.
     """
+    model, experiments, blocks = judged.prepared.model, judged.prepared.experiments, judged.ls.blocks
+    theta, covariance = judged.found.estimate.theta, judged.found.estimate.covariance
+    consistent = judged.statistics.physical
     if not (np.isfinite(theta).all() and np.isfinite(covariance).all()):
         return []
     seen = motion_postures(experiments)
@@ -67,7 +60,7 @@ def physics_reasons(
     if nearest is None:
         return [Reason("doubtful", message, CHECK_SIGNALS, kind="physics")]
     names = [joint.name for joint in model.robot.joints]
-    own, errors = relative_errors(blocks, theta), relative_errors(blocks, nearest.theta)
+    own, errors = relative_torque_errors(blocks, theta), relative_torque_errors(blocks, nearest.theta)
     wrong = (errors[1] > criteria.max_joint_error_pct) & (own[1] <= criteria.max_joint_error_pct)
     if wrong.any():
         left = [f"{errors[1][j]:.0f} % at {names[j]}" for j in np.flatnonzero(wrong)]
