@@ -30,7 +30,7 @@ from armident.identify.identification.residual_statistics import SPEED_QUANTILE
 from armident.identify.identification.result import relative_errors
 from armident.identify.identification.solvers import decimation_of
 from armident.identify.regression.equations import ExperimentEquations
-from armident.identify.saved_model import SavedModel
+from armident.identify.robot_model import RobotModel
 from armident.identify.setup.check import check_setup
 from armident.identify.setup.result import SetupCheck
 from armident.identify.signals.bandwidth import motion_bandwidth
@@ -77,7 +77,7 @@ class TorquePrediction:
 
 
 def predict_recording(
-    recording: Recording, model: SavedModel, progress: Callable[[str, float], None] | None = None
+    recording: Recording, model: RobotModel, progress: Callable[[str, float], None] | None = None
 ) -> TorquePrediction:
     """Predict the torques of a recording, filtered as in the identification of the model.
 
@@ -125,7 +125,7 @@ def predict_recording(
     )
 
 
-def _setup(experiments: Sequence[Experiment], model: SavedModel, notes: Notes) -> SetupCheck | None:
+def _setup(experiments: Sequence[Experiment], model: RobotModel, notes: Notes) -> SetupCheck | None:
     """Check the set-up of the recording; decisive findings become warnings."""
     try:
         found = check_setup(experiments, model.robot)
@@ -143,7 +143,7 @@ def _options(written: dict[str, Any]) -> Options:
 
 
 def _equations(
-    model: SavedModel, experiments: Sequence[Experiment], options: Options
+    model: RobotModel, experiments: Sequence[Experiment], options: Options
 ) -> tuple[Sequence[Derivatives], Sequence[ExperimentEquations]]:
     """Return the derivatives, and the equations after the filters of IDIM-LS as in an identification."""
     robot, arm = model.robot, model.arm
@@ -157,7 +157,7 @@ def _equations(
 
 
 def _document(
-    recording: Recording, model: SavedModel, blocks: Sequence[ExperimentEquations], warnings: Sequence[str]
+    recording: Recording, model: RobotModel, blocks: Sequence[ExperimentEquations], warnings: Sequence[str]
 ) -> PredictionDocument:
     names = [joint.name for joint in model.robot.joints]
     overall, by_joint = relative_errors(blocks, model.theta)
@@ -168,17 +168,17 @@ def _document(
     def named(values: Array) -> dict[str, float]:
         return {name: float(value) for name, value in zip(names, values, strict=True)}
 
-    used = reference(recording)
+    used, known = reference(recording), model.document
     return PredictionDocument(
         robot=model.robot.name,
         model=str(model.path),
-        method=model.document.method,
+        method=known.method,
         recording=used,
-        held_out=used.sha256 not in model.recording_hashes,
+        held_out=all(used.sha256 != own.sha256 for own in (known.recording, *(known.further_recordings or ()))),
         relative_error_pct=overall,
         relative_error_pct_by_joint=named(by_joint),
-        identification_error_pct=model.document.relative_error_pct,
-        identification_error_pct_by_joint=model.document.relative_error_pct_by_joint,
+        identification_error_pct=known.relative_error_pct,
+        identification_error_pct_by_joint=known.relative_error_pct_by_joint,
         error_rms=named(torque_rms * by_joint / 100),
         torque_rms=named(torque_rms),
         units={joint.name: "N m" if joint.type == "revolute" else "N" for joint in model.robot.joints},
@@ -194,7 +194,7 @@ def _rate(blocks: Sequence[ExperimentEquations]) -> float:
     return float(1.0 / (t[1] - t[0])) if t.size > 1 else 0.0
 
 
-def _beyond(signals: Sequence[Derivatives], model: SavedModel) -> list[str]:
+def _beyond(signals: Sequence[Derivatives], model: RobotModel) -> list[str]:
     """Return a warning for every joint that leaves the range over which the model was identified."""
     found = []
     q = np.concatenate([s.q for s in signals])

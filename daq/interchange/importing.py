@@ -2,13 +2,14 @@
 
 import hashlib
 import logging
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from armident.configs import ConfigError, DataError, RobotConfig
 from armident.daq.interchange.bag_files import bag_files, is_bag
@@ -106,7 +107,74 @@ def import_recording(
     source, rows = read_rows(
         path, robot, effort=effort, names=names, topic=topic, joints=joints, by_position=by_position
     )
+    facts = {"source": path.name, "source_sha256": _digest(path)}
+    if effort is not None:
+        facts |= {"effort": effort.name, "effort_sha256": _digest(effort)}
     rows = in_si(rows, robot, units or {})
+    return _checked(
+        source, rows, robot, facts, motor_side, rate_hz, polled=polled, resample_hz=resample_hz, time_unit=time_unit
+    )
+
+
+@np.errstate(over="ignore", invalid="ignore", divide="ignore")
+def recording_of_arrays(
+    t: ArrayLike,
+    position: ArrayLike,
+    torque: ArrayLike,
+    robot: RobotConfig,
+    reference: ArrayLike | None = None,
+    resample_hz: float | None = None,
+) -> Recording:
+    """Return arrays as a recording, after the checks of an import; see `Recording.from_arrays`."""
+    table = {"t": np.atleast_1d(np.asarray(t, np.float64)).ravel()}
+    for name, label, given in (("q", "position", position), ("tau", "torque", torque), ("qr", "reference", reference)):
+        if given is not None:
+            values = np.asarray(given, np.float64)
+            table[name] = values[:, None] if values.ndim == 1 else values
+            if table[name].shape != (table["t"].size, robot.n):
+                raise DataError(
+                    f"{label}: an array of shape {values.shape}; expected ({table['t'].size}, {robot.n}): one row for "
+                    f"each time and one column for each joint of {robot.name}"
+                )
+    _check_rates(None, False, resample_hz)
+    source = Source(Path("arrays"), table)
+    try:
+        rows = complete_rows(source, robot, {})
+        return _checked(source, rows, robot, {"source": "arrays"}, resample_hz=resample_hz)
+    except DataError as error:
+        raise type(error)(_as_arguments(str(error))) from error
+
+
+def _as_arguments(message: str) -> str:
+    """Return a message with the options of ``armident import`` as arguments of `Recording.from_arrays`."""
+    for option, argument in (
+        (r"--resample (\S+)", r"resample_hz=\1"),
+        (r"--rate (\S+)( if the samples are even)?", r"t = numpy.arange(len(t)) / \1\2"),
+        (r"--time-unit (m|u|n)s reads it so", r"t has to be in s"),
+        (r"give the sampling rate with --rate, and omit the times: --map time=-", "t has to be in s, at equal steps"),
+        (r" unless --motor-side", ""),
+        (r"--units \w+=\w+ if they are", "convert them if they are"),
+        (rf"--map demand={OMITTED} omits (it|the demand)", r"reference=None omits \1"),
+        (rf", or omit the demand with --map demand={OMITTED}", ", or leave the reference out"),
+    ):
+        message = re.sub(option, argument, message)
+    return message
+
+
+def _checked(
+    source: Source,
+    rows: Rows,
+    robot: RobotConfig,
+    facts: Mapping[str, str],
+    motor_side: bool = False,
+    rate_hz: float | None = None,
+    *,
+    polled: bool = False,
+    resample_hz: float | None = None,
+    time_unit: str | None = None,
+) -> Recording:
+    """Return the rows of a table as a recording, after checks of content, units and clock."""
+    path = source.path
     _refuse_immense(source, rows)
     side: Side = "motor" if motor_side else "joint"
     fields: dict[str, Field] = {
@@ -135,12 +203,8 @@ def import_recording(
         notes += fast_note(robot, made.values["position"], made.rate_hz)
     for note in notes:
         logging.getLogger(__name__).warning("%s: %s", path, note)
-    facts = {"source": path.name, "source_sha256": _digest(path), **made.facts}
-    if effort is not None:
-        facts |= {"effort": effort.name, "effort_sha256": _digest(effort)}
-    if notes:
-        facts[NOTES] = "; ".join(notes)
-    recording = _recording(robot, fields, made, known, facts)
+    remarks = {NOTES: "; ".join(notes)} if notes else {}
+    recording = _recording(robot, fields, made, known, {**facts, **made.facts, **remarks})
     if resample_hz is None or abs(made.rate_hz / resample_hz - 1.0) < 1e-9:
         return recording
     return at_rate(recording, resample_hz)

@@ -19,7 +19,7 @@ from armident.identify.robot.chain import Floats
 from armident.identify.robot.consistent import ConsistentParameters, nearest_consistent, pseudo_inertias
 from armident.identify.robot.known_bodies import nearest_to_known
 from armident.identify.robot_model import RobotModel
-from armident.identify.saved_model import SavedModel, load_model
+from armident.identify.saved_model import load_model
 
 IMPOSSIBLE = (
     "look for the effect with armident diagnose RECORDING and identify with the model it writes, "
@@ -197,8 +197,8 @@ class ExportedModel:
 
     @property
     def model(self) -> RobotModel:
-        """The model as ``import armident`` offers it; ``model.inverse_dynamics(exported.theta, q, qd, qdd)``."""
-        return RobotModel(self.robot)
+        """The model as ``import armident`` offers it, with the exported parameters."""
+        return RobotModel(self.robot, self.theta)
 
     @property
     def undetermined(self) -> dict[str, str]:
@@ -295,7 +295,7 @@ def load_exported_model(
     return model if source is None else model.in_frames_of(source)
 
 
-def exported_model(saved: SavedModel, *, nearest: bool = False) -> ExportedModel:
+def exported_model(saved: RobotModel, *, nearest: bool = False) -> ExportedModel:
     """Compute the physically consistent arm of an identification.
 
     Parameters

@@ -136,7 +136,7 @@ def test_a_model_gives_the_torques_of_its_regressor(result: armident.Identificat
     rng = np.random.default_rng(0)
     q, qd, qdd = rng.normal(size=(3, 50, 6))
     torque = model.regressor(q, qd, qdd) @ result.theta
-    assert np.allclose(model.inverse_dynamics(result.theta, q, qd, qdd), torque, rtol=1e-9, atol=1e-9)
+    assert np.allclose(model.inverse_dynamics(q, qd, qdd, theta=result.theta), torque, rtol=1e-9, atol=1e-9)
 
 
 def test_a_model_with_an_effect_needs_the_sampling_period() -> None:
@@ -148,18 +148,18 @@ def test_a_model_with_an_effect_needs_the_sampling_period() -> None:
     q = np.linspace(0.0, 0.2, 20)[:, None]
     theta = np.ones(len(model.names))
     with pytest.raises(ValueError, match="sampling period"):
-        model.inverse_dynamics(theta, q, q, q)
+        model.inverse_dynamics(q, q, q, theta=theta)
     torque = model.regressor(q, q, q, dt=1e-3) @ theta
-    assert np.allclose(model.inverse_dynamics(theta, q, q, q, dt=1e-3), torque, rtol=1e-9)
+    assert np.allclose(model.inverse_dynamics(q, q, q, theta=theta, dt=1e-3), torque, rtol=1e-9)
     with pytest.raises(armident.ConfigError, match="simulate"):
-        model.forward_dynamics(theta, q, q, q)
+        model.forward_dynamics(q, q, q, theta=theta)
 
 
 def test_the_closed_loop_follows_its_reference(result: armident.Identification) -> None:
-    run = armident.RobotModel("tx40").simulate(result.theta, "tx40_excitation", dt=1e-3)
+    run = armident.RobotModel("tx40").simulate("tx40_excitation", theta=result.theta, dt=1e-3)
     assert run.diverged_at is None
     reference = armident.design_trajectory("tx40", evaluations=0).trajectory.sample(1e-3)
-    again = armident.RobotModel("tx40").simulate(result.theta, reference, dt=1e-3)
+    again = armident.RobotModel("tx40").simulate(reference, theta=result.theta, dt=1e-3)
     assert np.abs(again.q - reference).max() < 0.1
 
 
