@@ -41,9 +41,7 @@ T = TypeVar("T", bound=BaseModel)
 log = logging.getLogger(__name__)
 
 
-def config_path(
-    name: str | Path, listed: tuple[str, ...] = ("robots", "cells"), of_folder: str = "robot.yaml"
-) -> Path:
+def config_path(name: str | Path, listed: tuple[str, ...] = ("robots", "cells"), of_folder: str = "robot.yaml") -> Path:
     """Path of a configuration file: the path as given, else a file that is shipped with armident.
 
     Parameters

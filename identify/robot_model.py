@@ -17,6 +17,9 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
+IN_MEMORY = Path("(in memory)")
+"""File of a model that comes from none, in messages."""
+
 
 class RobotModel:
     """The dynamic model of a robot: regressor, inverse and forward dynamics, closed loop.
@@ -56,11 +59,11 @@ class RobotModel:
         theta: ArrayLike | None = None,
         *,
         identification: IdentificationDocument | None = None,
-        path: Path | None = None,
+        path: Path = IN_MEMORY,
     ) -> None:
         self.robot = robot if isinstance(robot, RobotConfig) else load_robot(robot, "identify")
         self.robot.check_filled("identify")
-        self.path = Path("(in memory)") if path is None else path
+        self.path = path
         self._identification = identification
         if theta is None and identification is not None:
             theta = [p.value for p in identification.parameters]

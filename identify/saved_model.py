@@ -62,27 +62,17 @@ def model_of(
     *,
     default: RobotConfig | None = None,
 ) -> RobotModel:
-    """Return the model of an identification.
-
-    Parameters
-    ----------
-    document
-        The identification.
-    path
-        Its file, for messages.
-    robot, default
-        As for `load_model`.
-
-    Raises
-    ------
-    ConfigError
-        If there is no configuration.
-    DataError
-        If the document is judged unusable, or belongs to another configuration.
-    """
+    """Return the model of an identification that is not judged unusable; its file is for messages."""
     if document.verdict == "unusable":
         reason = document.reasons[0]
         raise DataError(f"{path}: the model is unusable: {reason.message}. Next: {reason.next_step}")
+    return RobotModel(used_configuration(document, path, robot, default), identification=document, path=path)
+
+
+def used_configuration(
+    document: IdentificationDocument, path: Path, robot: RobotConfig | None, default: RobotConfig | None = None
+) -> RobotConfig:
+    """Return the configuration of an identification, with its smoothing of the sign; refuse one of other parameters."""
     config = robot or configuration_of(document, path) or default
     if config is None:
         raise ConfigError(f"{path}: written by a former version, without the robot: add --config ROBOT")
@@ -100,7 +90,7 @@ def model_of(
         if set(smoothing) != {joint.name for joint in config.joints}:
             raise DataError(f"{path}: its joints are {', '.join(smoothing)}, other names than in the configuration")
         config = with_numbers(config, [smoothing[joint.name] for joint in config.joints])
-    return RobotModel(config, identification=document, path=path)
+    return config
 
 
 def _file(path: Path) -> Path:

@@ -126,7 +126,7 @@ def recording_of_arrays(
     resample_hz: float | None = None,
 ) -> Recording:
     """Return arrays as a recording, after the checks of an import; see `Recording.from_arrays`."""
-    table = {"t": np.atleast_1d(np.asarray(t, np.float64)).ravel()}
+    table: dict[str, NDArray[np.float64]] = {"t": np.asarray(t, np.float64).reshape(-1)}
     for name, label, given in (("q", "position", position), ("tau", "torque", torque), ("qr", "reference", reference)):
         if given is not None:
             values = np.asarray(given, np.float64)

@@ -3,55 +3,61 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from armident.identify.api.identification import Identification, document_of
+from armident.identify.api.identification import Identification, identified
+from armident.identify.api.result import Result
+from armident.identify.documents.comparison import ComparisonDocument
 from armident.identify.documents.identification import IdentificationDocument
-from armident.identify.monitoring.change_test import ParameterChangeTest
-from armident.identify.monitoring.change_test import compare as test_parameter_change
+from armident.identify.monitoring.comparison import compare_models
 from armident.identify.tables import Table
 
 
 @dataclass(frozen=True, repr=False)
-class ChangeTest:
-    """Test for a change of the parameters between two identifications of one robot.
+class ChangeTest(Result):
+    """Test for a change of the parameters between two identifications of one robot; true if they have changed.
 
     Parameters
     ----------
-    result
-        Differences, standard deviations and p-values of parameters and groups.
+    document
+        Everything that ``comparison.json`` holds: parameters, groups, residuals, warnings.
+    now
+        The later identification.
     """
 
-    result: ParameterChangeTest
+    document: ComparisonDocument
+    now: IdentificationDocument
+    file = "comparison.json"
 
     @property
     def changed(self) -> bool:
         """True if the parameters have changed, at the false-alarm rate asked for."""
-        return self.result.drifted
+        return self.document.verdict == "changed"
 
     @property
     def p_value(self) -> float:
         """Probability of so large a difference of all parameters together without a change."""
-        return self.result.p_joint
+        return self.document.p_value
 
     @property
     def parameters(self) -> Table:
         """Table of the parameters: value before and after, standard deviation of the difference, p-value (Holm)."""
-        result = self.result
-        rows = [
-            (p.name, float(before), p.value, float(std), float(p_value), p.unit)
-            for p, before, std, p_value in zip(
-                result.parameters, result.before, result.std, result.p_values, strict=True
-            )
-        ]
-        return Table(("name", "before", "after", "std_of_difference", "p_value", "unit"), rows, result.words)
+        columns = ("name", "joint", "before", "now", "std_of_difference", "p_value", "unit", "changed")
+        rows = [[getattr(p, column) for column in columns] for p in self.document.parameters]
+        return Table(columns, rows, self.document.sentence)
 
     def __bool__(self) -> bool:
         return self.changed
 
-    def __repr__(self) -> str:
-        return self.result.words
+    def _html(self) -> str:
+        from armident.identify.report.comparison import comparison_report
 
-    def _repr_html_(self) -> str:
-        return self.parameters._repr_html_()
+        return comparison_report(self.document, self.now)
+
+    def _summary(self) -> str:
+        return self.document.sentence
+
+    def _table(self) -> Table | None:
+        columns, changed = self.parameters.columns[:-1], [p for p in self.document.parameters if p.changed]
+        return Table(columns, [[getattr(p, column) for column in columns] for p in changed]) if changed else None
 
 
 def compare(
@@ -59,15 +65,18 @@ def compare(
     now: Identification | IdentificationDocument | str | Path,
     *,
     false_alarm_rate: float = 1e-4,
+    common: bool = False,
 ) -> ChangeTest:
     """Test if the parameters of a robot have changed since a baseline.
 
     Parameters
     ----------
     baseline, now
-        Two identifications of one robot with the same model, or the paths of their ``identification.json``.
+        Two identifications of one robot, or the paths of their ``identification.json``.
     false_alarm_rate
         Probability of the answer "changed" without a change.
+    common
+        True to compare the parameters that both have, if their models differ.
 
     Returns
     -------
@@ -87,4 +96,6 @@ def compare(
     >>> bool(armident.compare(first, second))
     False
     """
-    return ChangeTest(test_parameter_change(document_of(baseline), document_of(now), false_alarm_rate))
+    first, second = identified(baseline), identified(now)
+    document = compare_models(first, second, common=common, false_alarms=false_alarm_rate)
+    return ChangeTest(document, second[0])

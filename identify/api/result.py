@@ -3,13 +3,34 @@
 from abc import ABC, abstractmethod
 from html import escape
 from pathlib import Path
+from typing import Any, ClassVar
 
-from armident.identify.documents.files import write_atomically
+from pydantic import BaseModel
+
+from armident.identify.documents.files import to_json, write_atomically
 from armident.identify.tables import Table
 
 
 class Result(ABC):
-    """Result that prints itself, shows itself in a notebook and writes a report."""
+    """Result that prints itself, shows itself in a notebook, and writes its document and its report.
+
+    Parameters
+    ----------
+    document
+        Everything that the JSON file holds.
+    """
+
+    document: BaseModel
+    file: ClassVar[str]
+    """Name of the JSON file."""
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the document as JSON types."""
+        return self.document.model_dump(mode="json", by_alias=True)
+
+    def to_json(self) -> str:
+        """Return the document as JSON text, as the command line prints it with ``--json``."""
+        return to_json(self.document)
 
     def report(self, path: str | Path) -> Path:
         """Write the report, one HTML file that needs nothing else.
@@ -28,6 +49,23 @@ class Result(ABC):
         write_atomically(file, self._html())
         return file
 
+    def save(self, folder: str | Path) -> tuple[Path, ...]:
+        """Write the document and ``report.html``.
+
+        Parameters
+        ----------
+        folder
+            Folder of the files; made if it does not exist.
+
+        Returns
+        -------
+        tuple of Path
+            The document, the report, and further files if there are any.
+        """
+        document = Path(folder) / self.file
+        write_atomically(document, self.to_json())
+        return document, self.report(Path(folder) / "report.html")
+
     def __repr__(self) -> str:
         table = self._table()
         return self._summary() if table is None else f"{self._summary()}\n{table}"
@@ -44,6 +82,6 @@ class Result(ABC):
     def _summary(self) -> str:
         """Return one line of text."""
 
-    @abstractmethod
     def _table(self) -> Table | None:
         """Return the table below the line, if there is one."""
+        return None

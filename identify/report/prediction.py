@@ -1,31 +1,23 @@
 """HTML report of a prediction: held-out error, measured against predicted torques."""
 
-from armident.configs import RobotConfig
-from armident.identify.documents.identification import IdentificationDocument
-from armident.identify.prediction import TorquePrediction
+from typing import TYPE_CHECKING
+
 from armident.identify.report.glossary import identification_entries
 from armident.identify.report.identification import torque_plots
 from armident.identify.report.page import render
 
+if TYPE_CHECKING:
+    from armident.identify.api.prediction import TorquePrediction
 
-def prediction_report(prediction: TorquePrediction, robot: RobotConfig, identified: IdentificationDocument) -> str:
-    """Return the HTML page of a prediction, complete in one file.
 
-    Parameters
-    ----------
-    prediction
-        Torques and errors.
-    robot
-        Configuration of the model.
-    identified
-        Identification of the model, whose parameters the glossary explains.
-    """
-    document = prediction.document
+def prediction_report(prediction: "TorquePrediction") -> str:
+    """Return the HTML page of a prediction, complete in one file."""
+    document, model = prediction.document, prediction.model
     joints, units = list(document.units), list(document.units.values())
     return render(
         "prediction.html",
         document=document,
-        robot=robot,
+        robot=model.robot,
         torques=torque_plots(prediction.t, prediction.measured, prediction.predicted, joints, units),
-        glossary=identification_entries(identified),
+        glossary=identification_entries(model.document),
     )

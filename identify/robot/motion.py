@@ -258,7 +258,13 @@ class Motion:
         return self._still[links]
 
     def rate(self, values: Array) -> Array:
-        """Time derivative along the first axis by central differences, in units of ``values`` per s."""
+        """Return the time derivative along the first axis by central differences.
+
+        Parameters
+        ----------
+        values
+            Values (N, ...), in any unit; the derivative is in this unit per s.
+        """
         slope: Array = np.gradient(values, self.dt, axis=0)
         return slope
 
