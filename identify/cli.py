@@ -31,7 +31,7 @@ def identify(
     ] = "crc",
     noise_model: Annotated[str, typer.Option(help="Noise model of idim-piv: black-box or grey-box.")] = "black-box",
     max_ar_order: Annotated[int, typer.Option(min=0, help="Highest order of the noise models.")] = 60,
-    bandwidth: Annotated[
+    bandwidth_hz: Annotated[
         float | None, typer.Option(help="Closed-loop bandwidth, Hz. [default: as configured, or estimated]")
     ] = None,
     decimation: Annotated[
@@ -60,7 +60,7 @@ def identify(
         "controller": controller,
         "noise_model": noise_model,
         "max_ar_order": max_ar_order,
-        "bandwidth_hz": bandwidth,
+        "bandwidth_hz": bandwidth_hz,
         "decimation": decimation,
         "weighted": weighted,
         "physical": physical,

@@ -16,7 +16,7 @@ from tests.fixtures.arms import FAST, recording
 from tests.fixtures.diagnoses import diagnosis
 
 MOTION = "tx40_excitation"
-WORN = HiddenEffect(effect="asymmetric_viscous_friction", joint="joint_2", parameters={"ratio": 0.2})
+WORN = HiddenEffect(effect="asymmetric_viscous_friction", joint="joint_2", parameters={"fva": 0.2 * 5.5})
 
 RATES = [pytest.param(FAST, 1, id="1 kHz"), pytest.param(None, 3, id="5 kHz", marks=pytest.mark.proof)]
 """One repetition at 1 kHz, and three at the rate of the drives."""

@@ -167,7 +167,7 @@ def _on_joint_1(torque: Any, robot: RobotConfig) -> Any:
 @pytest.mark.slow
 @pytest.mark.parametrize("method", ["idim-ls", "idim-iv", "idim-piv", "didim"])
 def test_every_method_estimates_a_term_with_the_rest(robot: RobotConfig, method: Method) -> None:
-    worn = HiddenEffect(effect="asymmetric_viscous_friction", joint="joint_2", parameters={"ratio": 0.4})
+    worn = HiddenEffect(effect="asymmetric_viscous_friction", joint="joint_2", parameters={"fva": 0.4 * 5.5})
     data = recording("tx40", "tx40_excitation", 3, worn, period=FAST)
     known = with_effects(robot, Effect(effect="asymmetric_viscous_friction", joint="joint_2"))
     document = identify_recording(data, known, Options(method=method)).document
