@@ -61,8 +61,8 @@ class RobotModel:
         identification: IdentificationDocument | None = None,
         path: Path = IN_MEMORY,
     ) -> None:
-        self.robot = robot if isinstance(robot, RobotConfig) else load_robot(robot, "identify")
-        self.robot.check_filled("identify")
+        self.robot = robot if isinstance(robot, RobotConfig) else load_robot(robot)
+        self.robot.check_filled("identify", "" if isinstance(robot, RobotConfig) else str(robot))
         self.path = path
         self._identification = identification
         if theta is None and identification is not None:

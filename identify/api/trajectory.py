@@ -161,7 +161,7 @@ def design_trajectory(
     from armident.identify.excitation.previous_estimate import physical_estimate
     from armident.identify.excitation.safety import checked_trajectory, safety_model
 
-    config = robot_of(robot, ())
+    config = robot_of(robot, (), "trajectory")
     earlier = None if known is None else physical_estimate(identified(known)[0], config, "known")
     safety = safety_model(
         config,
