@@ -38,14 +38,9 @@ OFFSET_SHARE = 0.03
 class TorqueScale:
     """Typical loads of the joints, joint side.
 
-    Parameters
-    ----------
-    inertia
-        Diagonal of the mass matrix, rotors included, averaged over postures, kg m^2 or kg, shape (n,).
-    gravity
-        Root mean square torque of gravity over postures, N m or N, shape (n,).
-    torque
-        Typical torque of acceleration and gravity, N m or N, shape (n,).
+    ``inertia``: diagonal of the mass matrix, rotors included, averaged over postures, kg m^2 or kg, shape (n,);
+    ``gravity``: root mean square torque of gravity over postures, N m or N, shape (n,); ``torque``: typical torque of
+    acceleration and gravity, N m or N, shape (n,).
     """
 
     inertia: Floats
@@ -56,17 +51,8 @@ class TorqueScale:
 def draw_bodies(robot: RobotConfig, seed: int) -> dict[str, float]:
     """Draw the inertial parameters of all links.
 
-    Parameters
-    ----------
-    robot
-        Robot with limits of position, velocity and acceleration.
-    seed
-        Seed.
-
-    Returns
-    -------
-    dict
-        Parameters by name (``xx1`` ... ``m6``), SI.
+    ``robot``: robot with limits of position, velocity and acceleration. Returns parameters by name (``xx1`` ...
+    ``m6``), SI.
     """
     rng, n, ranges = np.random.default_rng([seed, 1]), robot.n, DEVELOPMENT
     mass = log_uniform(rng, ranges.mass) * np.cumprod(np.concatenate([[1.0], rng.uniform(*ranges.decay, n - 1)]))
@@ -87,12 +73,8 @@ def draw_bodies(robot: RobotConfig, seed: int) -> dict[str, float]:
 def needed_torque(robot: RobotConfig, standard: Mapping[str, float]) -> Floats:
     """Torque for gravity and a large acceleration, N m or N, shape (n,).
 
-    Parameters
-    ----------
-    robot
-        Robot with limits of position, velocity and acceleration.
-    standard
-        Inertial parameters of the links by name; others do not count.
+    ``robot``: robot with limits of position, velocity and acceleration. ``standard``: inertial parameters of the links
+    by name; others do not count.
     """
     load = torque_scale(robot, {name: value for name, value in standard.items() if not name.startswith("ia")})
     rise = np.array([min(j.limits.acceleration, RISE_PER_S * j.limits.velocity) for j in robot.joints])
@@ -119,17 +101,8 @@ def _standard(link: int, mass: float, com: Floats, second: Floats) -> dict[str, 
 def torque_scale(robot: RobotConfig, standard: Mapping[str, float]) -> TorqueScale:
     """Typical loads of the joints over postures within their limits.
 
-    Parameters
-    ----------
-    robot
-        Robot with limits of position and velocity.
-    standard
-        Inertial parameters by name, and rotor inertias where there are any.
-
-    Raises
-    ------
-    ConfigError
-        If a joint moves no inertia.
+    ``robot``: robot with limits of position and velocity; ``standard``: inertial parameters by name, and rotor inertias
+    where there are any. Raises ConfigError if a joint moves no inertia.
     """
     n = robot.n
     model = build_model(robot, standard)
@@ -156,14 +129,7 @@ def torque_scale(robot: RobotConfig, standard: Mapping[str, float]) -> TorqueSca
 def draw_rotors(robot: RobotConfig, standard: Mapping[str, float], seed: int) -> dict[str, float]:
     """Draw the rotor inertias, joint side; zero at joints without ``rotor_inertia``.
 
-    Parameters
-    ----------
-    robot
-        Robot with limits of position and velocity.
-    standard
-        Inertial parameters of the links by name.
-    seed
-        Seed.
+    ``robot``: robot with limits of position and velocity; ``standard``: inertial parameters of the links by name.
     """
     factors = log_uniform(np.random.default_rng([seed, 2]), DEVELOPMENT.rotor, robot.n)
     links = torque_scale(robot, standard).inertia
@@ -176,14 +142,7 @@ def draw_rotors(robot: RobotConfig, standard: Mapping[str, float], seed: int) ->
 def draw_friction(robot: RobotConfig, scale: TorqueScale, seed: int) -> dict[str, float]:
     """Draw viscous and Coulomb friction and offset of each joint, and the parameters of couplings.
 
-    Parameters
-    ----------
-    robot
-        The robot.
-    scale
-        Typical loads of its joints.
-    seed
-        Seed.
+    ``scale``: typical loads of its joints.
     """
     rng, n, ranges = np.random.default_rng([seed, 3]), robot.n, DEVELOPMENT
     speed = np.array([joint.limits.velocity for joint in robot.joints])

@@ -34,20 +34,9 @@ Json = dict[str, Any]
 def joint_scale(robot: RobotConfig, joint: int, q: tuple[float, ...]) -> dict[str, float]:
     """Return the properties of a joint of the healthy arm that expressions may use, SI, joint side.
 
-    Parameters
-    ----------
-    robot
-        The robot.
-    joint
-        Index of the joint, from 0.
-    q
-        Posture (n,) at which ``inertia`` is evaluated, rad or m.
-
-    Returns
-    -------
-    dict
-        ``fv``, ``fc``: viscous and Coulomb friction; ``ia``: rotor inertia; ``inertia``: diagonal element of the mass
-        matrix; ``speed``, ``torque``: limits; ``span``: width of the position range; ``ratio``: gear ratio.
+    ``joint``: index of the joint, from 0; ``q``: posture (n,) at which ``inertia`` is evaluated, rad or m. Result:
+    ``fv``, ``fc``: viscous and Coulomb friction; ``ia``: rotor inertia; ``inertia``: diagonal element of the mass
+    matrix; ``speed``, ``torque``: limits; ``span``: width of the position range; ``ratio``: gear ratio.
     """
     standard, limits = arm_parameters(robot).standard, robot.joints[joint].limits
     return {
@@ -65,26 +54,9 @@ def joint_scale(robot: RobotConfig, joint: int, q: tuple[float, ...]) -> dict[st
 def resolve_effect(entry: Json, robot: RobotConfig, trajectory: Trajectory) -> tuple[HiddenEffect, dict[str, float]]:
     """Evaluate the expressions of an effect.
 
-    Parameters
-    ----------
-    entry
-        Element of ``effects`` of a request.
-    robot
-        The robot.
-    trajectory
-        The trajectory; joint inertias are evaluated at its start.
-
-    Returns
-    -------
-    effect
-        The effect with numeric parameters.
-    truth
-        True values of the parameters that the diagnosis estimates, by name.
-
-    Raises
-    ------
-    ConfigError
-        If an expression has no value; the message names it.
+    ``entry``: element of ``effects`` of a request. ``trajectory``: the trajectory; joint inertias are evaluated at its
+    start. Returns ``effect``: the effect with numeric parameters; ``truth``: true values of the parameters that the
+    diagnosis estimates, by name. Raises ConfigError if an expression has no value; the message names it.
     """
     names = [joint.name for joint in robot.joints]
     place, joint = f"{entry['effect']} of {entry['joint']}", entry["joint"]
@@ -98,20 +70,8 @@ def resolve_effect(entry: Json, robot: RobotConfig, trajectory: Trajectory) -> t
 def simulate_request(request: Json) -> Json:
     """Simulate the recording of a request, write it, and return the answer.
 
-    Parameters
-    ----------
-    request
-        Request as described in the module's docstring.
-
-    Returns
-    -------
-    dict
-        Answer as described in the module's docstring.
-
-    Raises
-    ------
-    ConfigError
-        If the robot, the trajectory or an effect is not valid for the virtual arm.
+    ``request``: request as described in the module's docstring. Returns the answer as described in the module's
+    docstring. Raises ConfigError if the robot, the trajectory or an effect is not valid for the virtual arm.
     """
     begin = time.perf_counter()
     robot, once = load_robot(request["robot"]), load_trajectory(request["trajectory"])
@@ -137,10 +97,7 @@ def serve(handle: Callable[[Json], Json]) -> None:
 
     Other output of the process goes to standard error.
 
-    Parameters
-    ----------
-    handle
-        Returns the answer to a request. If it raises, the answer is ``{"error": "CLASS: MESSAGE"}``.
+    ``handle``: returns the answer to a request. If it raises, the answer is ``{"error": "CLASS: MESSAGE"}``.
     """
     answers = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())

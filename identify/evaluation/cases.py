@@ -70,10 +70,6 @@ class Case:
         Files of the robot configuration and of the trajectory.
     repeats
         Number of runs of the trajectory in the recording.
-    period
-        Sampling period, s.
-    seed
-        Seed of the noise.
     parts
         Simulated effects.
     baseline
@@ -129,11 +125,6 @@ def all_cases(suite: SuiteConfig) -> list[Case]:
 
     The cases of each row of the tables are spread evenly: a run that is stopped after a tenth of the cases has a tenth
     of each row. The order within a row follows from the keys and is the same in each run.
-
-    Parameters
-    ----------
-    suite
-        The suite.
     """
     cases = [*_clean(suite), *_effects(suite), *_pairs(suite), *_outside(suite)]
     rows: dict[tuple[str, str, str | None], list[Case]] = {}
@@ -152,21 +143,9 @@ def select_cases(
 ) -> list[Case]:
     """Return the cases that match all given conditions.
 
-    Parameters
-    ----------
-    cases
-        All cases.
-    quick
-        Only cases of the quick subset.
-    only
-        Names of effects, or ``clean``, ``clean_baseline``, ``pair``, ``outside`` for all cases of a kind.
-    levels
-        Strengths; healthy arms have none.
-
-    Raises
-    ------
-    ConfigError
-        If a name or a strength does not exist.
+    ``quick``: only cases of the quick subset. ``only``: names of effects, or ``clean``, ``clean_baseline``, ``pair``,
+    ``outside`` for all cases of a kind. ``levels``: strengths; healthy arms have none. Raises ConfigError if a name or
+    a strength does not exist.
     """
     cases = list(cases)
     known = {c.kind for c in cases} | {p.effect for c in cases for p in c.parts}
@@ -187,13 +166,7 @@ def select_cases(
 
 
 def healthy_twin(case: Case) -> Case:
-    """Return the case of the healthy arm with the same trajectory and noise and with the whole model.
-
-    Parameters
-    ----------
-    case
-        The case.
-    """
+    """Return the case of the healthy arm with the same trajectory and noise and with the whole model."""
     return Case("clean", None, case.robot, case.config, case.trajectory, case.repeats, case.period, case.seed)
 
 

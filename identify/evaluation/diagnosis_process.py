@@ -40,12 +40,7 @@ class DiagnosisProcess:
     after `TASKS_PER_PROCESS` tasks. It is also replaced after a task with which its memory exceeds ``memory_limit``. A
     pool of one worker confines the end of the worker to one case: a shared pool loses all running tasks with it.
 
-    Parameters
-    ----------
-    log
-        File to which the worker appends its output.
-    memory_limit
-        Resident memory, bytes.
+    ``log``: file to which the worker appends its output; ``memory_limit``: resident memory, bytes.
     """
 
     def __init__(self, log: Path, memory_limit: int = MEMORY_LIMIT) -> None:
@@ -62,19 +57,8 @@ class DiagnosisProcess:
     def run(self, function: Callable[[T], R], task: T, timeout: float) -> R:
         """Run ``function(task)`` in the worker and return the result.
 
-        Parameters
-        ----------
-        function
-            Function of a module.
-        task
-            Its argument.
-        timeout
-            Longest time to wait for the result, s.
-
-        Raises
-        ------
-        ArmidentError
-            If the function raises, the worker ends, or there is no result in time.
+        ``function``: function of a module; ``timeout``: longest time to wait for the result, s. Raises ArmidentError if
+        the function raises, the worker ends, or there is no result in time.
         """
         if self._pool is None:
             self.log.parent.mkdir(parents=True, exist_ok=True)

@@ -38,18 +38,8 @@ SHORTFALLS: tuple[tuple[str, Callable[[Scored], bool]], ...] = (
 def report(result: Tables, scored: Sequence[Scored], total: int, versions: Mapping[str, int], core_hours: float) -> str:
     """Return the report as one Markdown document.
 
-    Parameters
-    ----------
-    result
-        The tables.
-    scored
-        Cases with a result, and their scores.
-    total
-        Number of selected cases.
-    versions
-        Number of cases by version of the code.
-    core_hours
-        Computing time of all cases, h.
+    ``scored``: cases with a result, and their scores; ``total``: number of selected cases; ``versions``: number of
+    cases by version of the code; ``core_hours``: computing time of all cases, h.
     """
     code = ", ".join(f"{version} ({count} cases)" for version, count in versions.items())
     head = (
@@ -74,15 +64,8 @@ def report(result: Tables, scored: Sequence[Scored], total: int, versions: Mappi
 def shortfalls(scored: Sequence[Scored]) -> list[tuple[str, str, str]]:
     """List the cases with shortcomings, of healthy arms and of the strengths with targets.
 
-    Parameters
-    ----------
-    scored
-        Cases with a result, and their scores.
-
-    Returns
-    -------
-    list of tuple
-        Name of the case, shortcomings, and short form of the diagnosis.
+    ``scored``: cases with a result, and their scores. Returns the name of the case, shortcomings, and short form of the
+    diagnosis.
     """
     found = []
     for case, score in scored:

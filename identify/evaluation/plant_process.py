@@ -26,14 +26,8 @@ class PlantProcess:
     time, and after an answer with which its memory exceeds ``memory_limit``: the allocator returns little of the
     memory of arrays of many sizes, so that a process grows over hundreds of requests.
 
-    Parameters
-    ----------
-    log
-        File to which the process appends its standard error.
-    memory_limit
-        Resident memory, bytes.
-    module
-        Module of the server.
+    ``log``: file to which the process appends its standard error; ``memory_limit``: resident memory, bytes; ``module``:
+    module of the server.
     """
 
     def __init__(self, log: Path, memory_limit: int = MEMORY_LIMIT, module: str = SERVER) -> None:
@@ -49,17 +43,8 @@ class PlantProcess:
     def request(self, request: dict[str, Any], timeout: float) -> dict[str, Any]:
         """Send a request and return the answer.
 
-        Parameters
-        ----------
-        request
-            Request as described in `armident.virtual_robot.json_server`.
-        timeout
-            Longest time to wait for the answer, s.
-
-        Raises
-        ------
-        ArmidentError
-            If the simulation fails, the process ends, or there is no answer in time.
+        ``request``: request as described in `armident.virtual_robot.json_server`; ``timeout``: longest time to wait for
+        the answer, s. Raises ArmidentError if the simulation fails, the process ends, or there is no answer in time.
         """
         if self._process is None or not self._process.running:
             self.close()

@@ -33,8 +33,6 @@ class SuiteOptions:
 
     Parameters
     ----------
-    suite
-        Suite file.
     out
         Folder of results, logs and tables.
     quick
@@ -62,13 +60,7 @@ class SuiteOptions:
 
 
 def list_suite(options: SuiteOptions) -> None:
-    """Print key and name of each selected case.
-
-    Parameters
-    ----------
-    options
-        Options of the command.
-    """
+    """Print key and name of each selected case."""
     for case in select_cases(
         all_cases(load_suite(options.suite)), quick=options.quick, only=options.only, levels=options.levels
     ):
@@ -78,19 +70,8 @@ def list_suite(options: SuiteOptions) -> None:
 def run_suite(options: SuiteOptions, *, as_json: bool = False) -> Tables:
     """Run the selected cases without a result, and print, write and return the tables of all selected cases.
 
-    Parameters
-    ----------
-    options
-        Options of the command.
-    as_json
-        Print the summary as JSON instead of tables.
-
-    Raises
-    ------
-    ConfigError
-        If the suite file is not valid, or no case is selected.
-    ArmidentError
-        After the tables, if cases failed.
+    ``as_json``: print the summary as JSON instead of tables. Raises ConfigError if the suite file is not valid, or no
+    case is selected; ArmidentError: after the tables, if cases failed.
     """
     suite = load_suite(options.suite)
     cases = select_cases(all_cases(suite), quick=options.quick, only=options.only, levels=options.levels)
@@ -134,21 +115,8 @@ def _cause(case: Case, store: Store) -> str | None:
 def judged(cases: Sequence[Case], store: Store) -> tuple[list[Scored], list[Case], int]:
     """Score the results of cases.
 
-    Parameters
-    ----------
-    cases
-        The cases.
-    store
-        Their results.
-
-    Returns
-    -------
-    scored
-        Cases with a result, and their scores.
-    failed
-        Cases that failed, or whose healthy twin failed.
-    missing
-        Number of cases that have not been run.
+    Returns ``scored``: cases with a result, and their scores; ``failed``: cases that failed, or whose healthy twin
+    failed; ``missing``: number of cases that have not been run.
     """
     scored: list[Scored] = []
     failed: list[Case] = []
@@ -168,16 +136,7 @@ def judged(cases: Sequence[Case], store: Store) -> tuple[list[Scored], list[Case
 def summary(result: Tables, scored: Sequence[Scored], failed: Sequence[Case], total: int) -> dict[str, Any]:
     """Return the content of ``suite.json``: the tables and one entry per case.
 
-    Parameters
-    ----------
-    result
-        The tables.
-    scored
-        Cases with a result, and their scores.
-    failed
-        Cases that failed.
-    total
-        Number of selected cases.
+    ``scored``: cases with a result, and their scores; ``total``: number of selected cases.
     """
     run = len(scored) + len(failed)
     return {
@@ -191,29 +150,14 @@ def summary(result: Tables, scored: Sequence[Scored], failed: Sequence[Case], to
 
 
 def core_hours(results: Sequence[CaseResult]) -> float:
-    """Return the computing time of cases, h.
-
-    Parameters
-    ----------
-    results
-        Their results.
-    """
+    """Return the computing time of cases, h."""
     return float(sum(sum(result.seconds.values()) for result in results)) / 3600.0
 
 
 def write(out: Path, document: dict[str, Any], result: Tables, report_text: str) -> None:
     """Write the summary, the tables as CSV, and the report.
 
-    Parameters
-    ----------
-    out
-        Folder of the files.
-    document
-        Content of ``suite.json``.
-    result
-        The tables.
-    report_text
-        Content of ``suite.md``.
+    ``document``: content of ``suite.json``; ``report_text``: content of ``suite.md``.
     """
     out.mkdir(parents=True, exist_ok=True)
     text = io.StringIO()

@@ -74,14 +74,8 @@ class Score:
 def score(case: Case, result: CaseResult, healthy: CaseResult | None) -> Score:
     """Compare the diagnosis of a case with the simulated effects.
 
-    Parameters
-    ----------
-    case
-        The case.
-    result
-        Its result.
-    healthy
-        Result of its healthy twin, which has the torque error of the noise alone; ``None`` where nothing is simulated.
+    ``healthy``: result of its healthy twin, which has the torque error of the noise alone; ``None`` where nothing is
+    simulated.
     """
     document = result.diagnosis
     findings = [f for f in document.findings if f.effect != UNNAMED]
@@ -124,12 +118,7 @@ def score(case: Case, result: CaseResult, healthy: CaseResult | None) -> Score:
 def matches(part: InjectedEffect, named: Named) -> bool:
     """Return ``True`` if an entry of a document names a simulated effect at its joint; two joints in either order.
 
-    Parameters
-    ----------
-    part
-        The simulated effect.
-    named
-        A finding, an alternative, or an entry of ``not_visible`` or ``detection_limits``.
+    ``named``: a finding, an alternative, or an entry of ``not_visible`` or ``detection_limits``.
     """
     if named.effect not in part.names:
         return False
@@ -149,19 +138,8 @@ def closed_share(case: Case, document: DiagnosisDocument, healthy: DiagnosisDocu
     change by the findings is therefore the smaller of that at measured and that at simulated motion. The unit is N m or
     N: percentages depend on the torque, which an effect such as lost friction reduces.
 
-    Parameters
-    ----------
-    case
-        The case.
-    document
-        Its diagnosis.
-    healthy
-        Diagnosis of its healthy twin.
-
-    Returns
-    -------
-    float or None
-        ``None`` without an injected gap, or if the reported torques are scaled differently from the healthy arm's.
+    ``healthy``: diagnosis of its healthy twin. Returns ``None`` without an injected gap, or if the reported torques are
+    scaled differently from the healthy arm's.
     """
     if any(part.rescales for part in case.parts) and not case.baseline:
         return None
@@ -236,17 +214,7 @@ def _joints(case: Case, every: Iterable[str]) -> list[str]:
 def within(finding: Finding, truth: dict[str, float]) -> list[bool]:
     """Compare the parameters that finding and truth share.
 
-    Parameters
-    ----------
-    finding
-        The finding.
-    truth
-        True values by name.
-
-    Returns
-    -------
-    list of bool
-        ``True`` for each parameter within three standard deviations of the truth.
+    ``truth``: true values by name. Returns ``True`` for each parameter within three standard deviations of the truth.
     """
     deviations = finding.evidence.get("std", {})
     out = []

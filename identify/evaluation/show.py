@@ -27,10 +27,7 @@ LEAST_WIDTH = 120
 def progress(total: int) -> Iterator[OnResult]:
     """Show progress on stderr: a bar on a terminal, otherwise a line every 30 s; failures at once.
 
-    Parameters
-    ----------
-    total
-        Number of cases.
+    ``total``: number of cases.
     """
     lock, begin = threading.Lock(), time.monotonic()
     finished, shown = 0, begin
@@ -76,14 +73,7 @@ def progress(total: int) -> Iterator[OnResult]:
 def show(result: Tables, run: int, total: int) -> None:
     """Print the tables and the number of cases in them.
 
-    Parameters
-    ----------
-    result
-        The tables.
-    run
-        Number of cases with a result or an error.
-    total
-        Number of selected cases.
+    ``run``: number of cases with a result or an error; ``total``: number of selected cases.
     """
     console = Console()
     if not console.is_terminal:

@@ -77,13 +77,7 @@ class CaseResult(BaseModel):
 
     @property
     def diagnosis(self) -> DiagnosisDocument:
-        """The diagnosis document.
-
-        Raises
-        ------
-        DataError
-            If the case failed.
-        """
+        """The diagnosis document. Raises DataError if the case failed."""
         if self.document is None:
             raise DataError(f"{self.case}: no diagnosis: {self.error}")
         return self.document
@@ -96,10 +90,7 @@ class CaseResult(BaseModel):
 def code_version(packages: Mapping[str, Path] | None = None) -> str:
     """Return a hash of the code and the data files that determine the results.
 
-    Parameters
-    ----------
-    packages
-        Folder of each package by import name. Default: `DECIDING`, as imported.
+    ``packages``: folder of each package by import name. Default: `DECIDING`, as imported.
     """
     if packages is None:
         packages = {name: _folder(name) for name in DECIDING}
@@ -122,19 +113,9 @@ def _folder(package: str) -> Path:
 class Store:
     """File of results; it keeps the results of other versions of the code.
 
-    Parameters
-    ----------
-    path
-        The file; created with the first result.
-    version
-        `code_version` of the running code.
-    any_version
-        Use the results of other versions too.
-
-    Raises
-    ------
-    DataError
-        If a line is not a result. An incomplete last line is removed: an interrupted run leaves one.
+    ``path``: the file; created with the first result. ``version``: `code_version` of the running code. ``any_version``:
+    use the results of other versions too. Raises DataError if a line is not a result. An incomplete last line is
+    removed: an interrupted run leaves one.
     """
 
     def __init__(self, path: Path, version: str, *, any_version: bool = False) -> None:
@@ -154,25 +135,13 @@ class Store:
                 self._results[result.key] = result
 
     def get(self, key: str) -> CaseResult | None:
-        """Return the result of a case; ``None`` if it has none or failed.
-
-        Parameters
-        ----------
-        key
-            Key of the case.
-        """
+        """Return the result of a case; ``None`` if it has none or failed."""
         with self._lock:
             result = self._results.get(key)
         return None if result is None or result.error is not None else result
 
     def failure(self, key: str) -> CaseResult | None:
-        """Return the last failure of a case; ``None`` if it has a result or has not been run.
-
-        Parameters
-        ----------
-        key
-            Key of the case.
-        """
+        """Return the last failure of a case; ``None`` if it has a result or has not been run."""
         with self._lock:
             result = self._results.get(key)
         return result if result is not None and result.error is not None else None
@@ -180,10 +149,7 @@ class Store:
     def add(self, result: CaseResult) -> CaseResult:
         """Append a result to the file, and return it with the version of the code.
 
-        Parameters
-        ----------
-        result
-            The result; the file contains it when this function returns.
+        ``result``: the result; the file contains it when this function returns.
         """
         result = result.model_copy(update={"code": self.version})
         line = result.to_line()

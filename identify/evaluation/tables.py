@@ -25,8 +25,6 @@ class Row:
 
     Parameters
     ----------
-    label, level
-        Names of the effects, and their strength.
     n, failed
         Number of cases with a diagnosis, and of cases that failed.
     first, second
@@ -62,16 +60,9 @@ class Row:
 class Healthy:
     """Healthy arms of one kind.
 
-    Parameters
-    ----------
-    label
-        Kind and robot.
-    n, failed
-        Number of cases with a diagnosis, and of cases that failed.
-    alarms
-        Number of verdicts other than ``no_gap``.
-    low, high
-        Two-sided 95 % confidence limits of the false alarm rate, see `clopper_pearson`.
+    ``label``: kind and robot; ``n``, ``failed``: number of cases with a diagnosis, and of cases that failed;
+    ``alarms``: number of verdicts other than ``no_gap``; ``low``, ``high``: two-sided 95 % confidence limits of the
+    false alarm rate, see `clopper_pearson`.
     """
 
     label: str
@@ -88,8 +79,6 @@ class Outside:
 
     Parameters
     ----------
-    label, level
-        Name of the effect, and its strength.
     n, failed
         Number of cases with a diagnosis, and of cases that failed.
     unexplained
@@ -120,16 +109,8 @@ class Outside:
 class Aim:
     """One figure with a target.
 
-    Parameters
-    ----------
-    what
-        Description of the figure.
-    value
-        Reached value, a fraction of 1; ``None`` without cases.
-    aim
-        Target, a fraction of 1.
-    n
-        Number of cases or parameters.
+    ``what``: description of the figure. ``value``: reached value, a fraction of 1; ``None`` without cases. ``aim``:
+    target, a fraction of 1. ``n``: number of cases or parameters.
     """
 
     what: str
@@ -147,16 +128,8 @@ class Aim:
 class Tables:
     """All tables of a suite.
 
-    Parameters
-    ----------
-    effects, pairs
-        Single effects and pairs of effects, by strength.
-    healthy
-        Healthy arms.
-    outside
-        Effects outside the catalogue.
-    aims
-        Figures with targets.
+    ``effects``, ``pairs``: single effects and pairs of effects, by strength; ``healthy``: healthy arms; ``outside``:
+    effects outside the catalogue; ``aims``: figures with targets.
     """
 
     effects: tuple[Row, ...]
@@ -167,15 +140,7 @@ class Tables:
 
 
 def tables(scored: Sequence[Scored], failed: Sequence[Case]) -> Tables:
-    """Return the tables of a suite.
-
-    Parameters
-    ----------
-    scored
-        Cases with a result, and their scores.
-    failed
-        Cases that failed.
-    """
+    """Return the tables of a suite. ``scored``: cases with a result, and their scores."""
     singles = [s for s in scored if s[0].kind == "effect"]
     pairs = [s for s in scored if s[0].kind == "pair"]
     return Tables(
@@ -190,14 +155,7 @@ def tables(scored: Sequence[Scored], failed: Sequence[Case]) -> Tables:
 def clopper_pearson(k: int, n: int, level: float = 0.95) -> tuple[float, float]:
     """Return the two-sided confidence limits of a probability (Clopper and Pearson, Biometrika 26, 1934).
 
-    Parameters
-    ----------
-    k
-        Number of events.
-    n
-        Number of trials.
-    level
-        Confidence level.
+    ``k``: number of events; ``n``: number of trials.
     """
     interval = stats.binomtest(k, n).proportion_ci(level, "exact")
     return float(interval.low), float(interval.high)
@@ -287,13 +245,7 @@ def _outside(scored: Sequence[Scored], failed: Sequence[Case]) -> Iterable[Outsi
 
 
 def fate(score: Score) -> str:
-    """Return the column of `Outside` for an effect outside the catalogue.
-
-    Parameters
-    ----------
-    score
-        Score of the case.
-    """
+    """Return the column of `Outside` for an effect outside the catalogue. ``score``: score of the case."""
     if score.confidence >= LOW_CONFIDENCE:
         return "named"
     if score.confidence > 0:
@@ -348,25 +300,13 @@ def _mean(closed: Sequence[float]) -> float | None:
 
 
 def share(hits: Iterable[bool]) -> float | None:
-    """Return the fraction of ``True``; ``None`` without elements.
-
-    Parameters
-    ----------
-    hits
-        The elements.
-    """
+    """Return the fraction of ``True``; ``None`` without elements."""
     counted = list(hits)
     return sum(counted) / len(counted) if counted else None
 
 
 def percent(value: float | None) -> str:
-    """Return a share in percent as text.
-
-    Parameters
-    ----------
-    value
-        The share, a fraction of 1; ``None`` becomes ``-``.
-    """
+    """Return a share in percent as text. ``value``: the share, a fraction of 1; ``None`` becomes ``-``."""
     return "-" if value is None else f"{100 * value:.0f}"
 
 

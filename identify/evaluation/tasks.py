@@ -16,18 +16,9 @@ from armident.identify.documents.identification import IdentificationDocument
 class DiagnosisTask:
     """Recording to diagnose, without information about the simulated effects.
 
-    Parameters
-    ----------
-    recording
-        File of the recording.
-    robot
-        Name or file of the robot configuration.
-    leave_out
-        Part that is removed from the model, see `reduced_model`.
-    joints
-        Joints of which the part is removed.
-    baseline
-        Identification document of the healthy arm; ``None`` to diagnose without one.
+    ``robot``: name or file of the robot configuration. ``leave_out``: part that is removed from the model, see
+    `reduced_model`. ``joints``: joints of which the part is removed. ``baseline``: identification document of the
+    healthy arm; ``None`` to diagnose without one.
     """
 
     recording: Path
@@ -41,12 +32,7 @@ class DiagnosisTask:
 class ValidatedTask:
     """Recording to diagnose and recording to judge by, without information about the simulated effects.
 
-    Parameters
-    ----------
-    recording, validation
-        Files of the recordings.
-    robot
-        Name or file of the robot configuration.
+    ``robot``: name or file of the robot configuration.
     """
 
     recording: Path
@@ -74,19 +60,8 @@ class TimedDiagnosis:
 def reduced_model(robot: RobotConfig, leave_out: str | None, joints: tuple[str, ...]) -> RobotConfig:
     """Return the robot configuration without one part of its model.
 
-    Parameters
-    ----------
-    robot
-        The robot configuration.
-    leave_out
-        ``"rotor_inertia"``, ``"couplings"`` or ``None`` for the whole model.
-    joints
-        Names of the joints without rotor inertia.
-
-    Raises
-    ------
-    ConfigError
-        If ``leave_out`` is another name.
+    ``leave_out``: ``"rotor_inertia"``, ``"couplings"`` or ``None`` for the whole model; ``joints``: names of the joints
+    without rotor inertia. Raises ConfigError if ``leave_out`` is another name.
     """
     if leave_out is None:
         return robot
@@ -106,15 +81,8 @@ def reduced_model(robot: RobotConfig, leave_out: str | None, joints: tuple[str, 
 def diagnose_file(task: DiagnosisTask) -> TimedDiagnosis:
     """Diagnose a recording.
 
-    Parameters
-    ----------
-    task
-        Recording and model.
-
-    Raises
-    ------
-    ConfigError, DataError
-        If the model or the recording does not support a diagnosis.
+    ``task``: recording and model. Raises ConfigError or DataError if the model or the recording does not support a
+    diagnosis.
     """
     # Imported here: the process of the command line needs none of it.
     from armident.identify.diagnosis.diagnose import diagnose
@@ -132,15 +100,8 @@ def diagnose_file(task: DiagnosisTask) -> TimedDiagnosis:
 def diagnose_validated(task: ValidatedTask) -> TimedDiagnosis:
     """Diagnose a recording, judged by another one, as ``armident diagnose --validate`` does.
 
-    Parameters
-    ----------
-    task
-        Recordings and model.
-
-    Raises
-    ------
-    ConfigError, DataError
-        If the model or a recording does not support a diagnosis.
+    ``task``: recordings and model. Raises ConfigError or DataError if the model or a recording does not support a
+    diagnosis.
     """
     from armident.identify.api import diagnose
 
@@ -152,15 +113,8 @@ def diagnose_validated(task: ValidatedTask) -> TimedDiagnosis:
 def identify_file(task: IdentificationTask) -> None:
     """Identify a recording and write the identification document.
 
-    Parameters
-    ----------
-    task
-        Recording, robot and file of the document.
-
-    Raises
-    ------
-    ConfigError, DataError
-        If the robot or the recording does not support an identification.
+    ``task``: recording, robot and file of the document. Raises ConfigError or DataError if the robot or the recording
+    does not support an identification.
     """
     from armident.identify.identification.api import identify_recording
 

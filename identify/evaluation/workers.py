@@ -38,14 +38,7 @@ class CaseRunner:
 
     The error of a case is its result and does not end the run. A healthy twin that several cases need is run once.
 
-    Parameters
-    ----------
-    store
-        Results.
-    out
-        Folder of logs and baselines.
-    jobs
-        Number of workers.
+    ``out``: folder of logs and baselines.
     """
 
     def __init__(self, store: Store, out: Path, jobs: int) -> None:
@@ -61,14 +54,8 @@ class CaseRunner:
 
         Ctrl-C ends the running cases without a result; the next run repeats them.
 
-        Parameters
-        ----------
-        cases
-            The cases.
-        on_result
-            Called from a thread of a worker after each case.
-        until
-            `time.monotonic` after which no further case is started.
+        ``on_result``: called from a thread of a worker after each case; ``until``: `time.monotonic` after which no
+        further case is started.
         """
         queue: SimpleQueue[Case] = SimpleQueue()
         for case in cases:
@@ -196,12 +183,8 @@ class _Worker:
     def diagnose(self, case: Case, baseline: Path | None) -> TimedDiagnosis:
         """Diagnose the recording; the task contains nothing about the hidden effects.
 
-        Parameters
-        ----------
-        case
-            Case with robot and reduced model.
-        baseline
-            Identification document of the healthy arm, or ``None``.
+        ``case``: case with robot and reduced model; ``baseline``: identification document of the healthy arm, or
+        ``None``.
         """
         joints = [joint for part in case.parts for joint in (part.joint, part.other) if joint]
         task = DiagnosisTask(
@@ -210,15 +193,7 @@ class _Worker:
         return self.diagnosis.run(diagnose_file, task, TIMEOUT_S)
 
     def identify(self, case: Case, out: Path) -> None:
-        """Identify the recording and write the identification document.
-
-        Parameters
-        ----------
-        case
-            Case with the robot.
-        out
-            File of the identification document.
-        """
+        """Identify the recording and write the identification document. ``case``: case with the robot."""
         self.diagnosis.run(identify_file, IdentificationTask(self.recording, case.config, out), TIMEOUT_S)
 
     def kill(self) -> None:

@@ -28,16 +28,8 @@ def identification_report(
 ) -> str:
     """Return the HTML page of an identification, complete in one file.
 
-    Parameters
-    ----------
-    recordings
-        Recordings that were used; none if they are not at hand.
-    robot
-        Their robot.
-    result
-        Estimates and curves; ``None`` if only the document is left.
-    document
-        ``identification.json``.
+    ``recordings``: recordings that were used, none if they are not at hand; ``result``: estimates and curves, ``None``
+    if only the document is left.
     """
     joints = [joint.name for joint in robot.joints]
     return render(
@@ -89,16 +81,8 @@ def torque_plots(
 ) -> Markup:
     """Return plots of measured and predicted torque and their difference, one per joint, with common zoom.
 
-    Parameters
-    ----------
-    t
-        Instants (M,), s; a step back begins another experiment.
-    measured, predicted
-        Torques (M, n), N m or N.
-    joints, units
-        Name and unit of each joint.
-    before
-        Torques (M, n) of another model for comparison, the one as configured.
+    ``t``: instants (M,), s; a step back begins another experiment. ``measured``, ``predicted``: torques (M, n),
+    N m or N. ``before``: torques (M, n) of another model for comparison, the one as configured.
     """
     breaks = np.flatnonzero(np.diff(t) <= 0)
     measured = measured.copy()

@@ -30,6 +30,9 @@ def reproduce_command(
 ) -> None:
     """Carry out ``armident reproduce``.
 
+    Raises ConfigError if there is no such table, or the folder cannot be written; DataError if the measured recording
+    cannot be used.
+
     Parameters
     ----------
     tables
@@ -43,13 +46,6 @@ def reproduce_command(
         Fewer simulations, without the slow tables.
     as_json
         Print only the JSON document.
-
-    Raises
-    ------
-    ConfigError
-        If there is no such table, or the folder cannot be written.
-    DataError
-        If the measured recording cannot be used.
     """
     numbers = chosen_tables(tables, quick=quick)
     folder = out or FOLDER
@@ -73,17 +69,8 @@ def reproduce_command(
 def chosen_tables(tables: str | None, *, quick: bool) -> list[str]:
     """Return the chosen table numbers in the order of the thesis.
 
-    Parameters
-    ----------
-    tables
-        Numbers separated by commas; ``None``: all.
-    quick
-        Without the slow tables, if all are chosen.
-
-    Raises
-    ------
-    ConfigError
-        If there is no such table.
+    ``tables``: numbers separated by commas; ``None``: all. ``quick``: without the slow tables, if all are chosen.
+    Raises ConfigError if there is no such table.
     """
     if tables is None:
         return [number for number in TABLES if not (quick and number in SLOW)]
@@ -97,14 +84,8 @@ def chosen_tables(tables: str | None, *, quick: bool) -> list[str]:
 def make_bench(folder: Path, measured: Path | None = None, *, quick: bool = False) -> Bench:
     """Return the arms of the tables; recordings are made when they are needed, measured files are read at once.
 
-    Parameters
-    ----------
-    folder
-        Folder of the virtual recordings.
-    measured
-        Folder of measured data, or ``None``.
-    quick
-        Fewer simulations.
+    ``folder``: folder of the virtual recordings; ``measured``: folder of measured data, or ``None``; ``quick``: fewer
+    simulations.
     """
     real = None
     if measured is not None:
@@ -125,14 +106,7 @@ def reproduce(
 ) -> tuple[list[Table], list[Claim]]:
     """Return the tables of the given numbers, and the claims that depend only on them.
 
-    Parameters
-    ----------
-    bench
-        Arms with their cached estimates.
-    numbers
-        Table numbers.
-    report
-        Called with a stage and the share done.
+    ``bench``: arms with their cached estimates; ``report``: called with a stage and the share done.
     """
     found = []
     for k, number in enumerate(numbers):

@@ -108,14 +108,7 @@ VARIANTS: Mapping[str, Protocol] = {
 def inferred_rows(simulations: int, protocol: Protocol = INFERRED, seed: int = 0) -> list[Row]:
     """Return mean relative errors of the three methods of the table with a protocol.
 
-    Parameters
-    ----------
-    simulations
-        Number of noise realisations.
-    protocol
-        Conditions.
-    seed
-        Seed of the noise.
+    ``simulations``: number of noise realisations.
     """
     run = motion(protocol)
     random = np.random.default_rng(seed)

@@ -45,14 +45,7 @@ class TwoStages:
 def two_stages(lab: Laboratory, method: Literal["idim-iv", "didim"], case: Case) -> TwoStages | None:
     """Identify the controller of a case, then the arm; ``None`` if the second stage does not converge.
 
-    Parameters
-    ----------
-    lab
-        Arm with its cached estimates.
-    method
-        Method of the second stage.
-    case
-        Filters and auxiliary simulation, with the kind of controller.
+    ``lab``: arm with its cached estimates; ``case``: filters and auxiliary simulation, with the kind of controller.
     """
     identified, took = lab.first_stage(case)
     try:
@@ -96,12 +89,7 @@ def actual_structure(lab: Laboratory) -> Structure:
 def gain_error(lab: Laboratory, identified: IdentifiedController) -> float | None:
     """Return the largest relative error of position and velocity gains, percent; ``None`` for impulse responses.
 
-    Parameters
-    ----------
-    lab
-        Virtual arm, with the true gains.
-    identified
-        Identified controller of all motors.
+    ``lab``: virtual arm, with the true gains; ``identified``: identified controller of all motors.
     """
     recording = lab.recording(Case())
     errors = []

@@ -79,28 +79,13 @@ class Arm:
 def log_uniform(rng: Generator, limits: Range, size: int | None = None) -> Any:
     """Draw numbers whose logarithm is uniform.
 
-    Parameters
-    ----------
-    rng
-        Source of random numbers.
-    limits
-        Smallest and largest value.
-    size
-        Number of values; ``None`` for one number.
+    ``limits``: smallest and largest value. ``size``: number of values; ``None`` for one number.
     """
     return np.exp(rng.uniform(np.log(limits[0]), np.log(limits[1]), size))
 
 
 def random_arm(rng: Generator, ranges: Ranges) -> Arm:
-    """Draw an arm.
-
-    Parameters
-    ----------
-    rng
-        Source of random numbers.
-    ranges
-        Ranges of the half.
-    """
+    """Draw an arm. ``ranges``: ranges of the half."""
     n = int(rng.integers(ranges.joints[0], ranges.joints[1] + 1))
     prismatic = (rng.random(n) < ranges.prismatic).astype(np.int64)
     mdh = _geometry(rng, ranges, n)
@@ -158,17 +143,8 @@ def _bodies(rng: Generator, ranges: Ranges, n: int) -> tuple[Floats, Floats, Flo
 def random_body(rng: Generator, size: float, mass: float) -> tuple[Floats, Floats]:
     """Draw a body of positive second moments, so that it exists.
 
-    Parameters
-    ----------
-    rng
-        Source of random numbers.
-    size, mass
-        Length of the body, m, and its mass, kg.
-
-    Returns
-    -------
-    com, second
-        Centre of mass, m, shape (3,), and second moments about it, kg m^2, shape (3, 3).
+    ``size``, ``mass``: length of the body, m, and its mass, kg. Returns ``com``, ``second``: centre of mass, m, shape
+    (3,), and second moments about it, kg m^2, shape (3, 3).
     """
     com = rng.normal(size=3) * size * np.array([0.4, 0.15, 0.3])
     axes = np.linalg.qr(rng.normal(size=(3, 3)))[0]

@@ -17,10 +17,7 @@ from armident.virtual_robot.random_arms.disk import write_recordings
 def case_request(request: Json) -> Json:
     """Simulate a case, write its files, and return the answer.
 
-    Parameters
-    ----------
-    request
-        Request as described in the module's docstring.
+    ``request``: request as described in the module's docstring.
     """
     begin, out = time.perf_counter(), Path(request["out"])
     case = make_case(request["half"], int(request["index"]), with_twin=bool(request.get("twin")))

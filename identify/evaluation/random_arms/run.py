@@ -88,15 +88,7 @@ class RandomOptions:
 
 @dataclass(frozen=True)
 class RandomRun:
-    """Scores and tables of a run.
-
-    Parameters
-    ----------
-    scores
-        Scores by number of the case.
-    tables
-        Totals and rows.
-    """
+    """Scores and tables of a run. ``scores``: scores by number of the case; ``tables``: totals and rows."""
 
     scores: tuple[RandomScore, ...]
     tables: RandomTables
@@ -106,15 +98,7 @@ OnScore = Callable[[RandomScore], None]
 
 
 def run_cases(options: RandomOptions, on_score: OnScore = lambda score: None) -> RandomRun:
-    """Simulate and diagnose the cases of a half.
-
-    Parameters
-    ----------
-    options
-        Options of the command.
-    on_score
-        Called from a thread of a worker after each case.
-    """
+    """Simulate and diagnose the cases of a half. ``on_score``: called from a thread of a worker after each case."""
     queue: SimpleQueue[int] = SimpleQueue()
     for index in options.selected:
         queue.put(index)
@@ -201,12 +185,7 @@ class _Worker:
 def run_random_suite(options: RandomOptions, *, as_json: bool = False) -> RandomRun:
     """Run the suite, and print and write its results; of the reserve only totals and the table by effect.
 
-    Parameters
-    ----------
-    options
-        Options of the command.
-    as_json
-        Print the results as JSON instead of Markdown.
+    ``as_json``: print the results as JSON instead of Markdown.
     """
     count = len(options.selected)
     print(f"diagnose-suite: {count} random arms, {options.half} half, {options.jobs} at a time", file=sys.stderr)

@@ -20,18 +20,9 @@ RESCALING = ("gain_error",)
 class Truth:
     """Truth of a case, see `armident.virtual_robot.random_arms.cases.Truth`.
 
-    Parameters
-    ----------
-    name
-        Name of the case.
-    family, kind
-        Family, and kind of the hidden effect or mistake.
-    accepted
-        Names of findings that are right.
-    joints
-        Names of the joints at which a finding is right; empty for the whole arm.
-    visibility
-        Residual of the rigid model with the effect over that without.
+    ``family``, ``kind``: family, and kind of the hidden effect or mistake. ``accepted``: names of findings that are
+    right. ``joints``: names of the joints at which a finding is right; empty for the whole arm. ``visibility``:
+    residual of the rigid model with the effect over that without.
     """
 
     name: str
@@ -48,13 +39,7 @@ class Truth:
 
 
 def truth_from(document: Mapping[str, Any]) -> Truth:
-    """Truth of a case from its document.
-
-    Parameters
-    ----------
-    document
-        Content of ``NAME.truth.json``.
-    """
+    """Truth of a case from its document. ``document``: content of ``NAME.truth.json``."""
     return Truth(
         document["name"],
         cast(Family, document["family"]),
@@ -69,14 +54,8 @@ def truth_from(document: Mapping[str, Any]) -> Truth:
 class Claim:
     """A name that a diagnosis gives: a finding, or a mistake of the set-up.
 
-    Parameters
-    ----------
-    name
-        Name of the effect or mistake.
-    joints
-        Joints that the diagnosis gives; empty for the whole arm.
-    confidence
-        Confidence or probability, 0 to 1.
+    ``name``: name of the effect or mistake. ``joints``: joints that the diagnosis gives; empty for the whole arm.
+    ``confidence``: confidence or probability, 0 to 1.
     """
 
     name: str
@@ -93,8 +72,6 @@ class RandomScore:
 
     Parameters
     ----------
-    truth
-        The truth of the case.
     verdict
         Verdict of the diagnosis; empty after a failure.
     claims
@@ -131,13 +108,7 @@ class RandomScore:
 
 
 def claims_of(document: DiagnosisDocument) -> tuple[Claim, ...]:
-    """Names that a diagnosis gives, mistakes of the set-up before findings; unnamed terms are left out.
-
-    Parameters
-    ----------
-    document
-        The diagnosis.
-    """
+    """Names that a diagnosis gives, mistakes of the set-up before findings; unnamed terms are left out."""
     content = document.model_dump(mode="json")
     setup = content.get("setup") or {}
     mistakes = setup.get("findings", []) if isinstance(setup, Mapping) else setup
@@ -149,15 +120,7 @@ def claims_of(document: DiagnosisDocument) -> tuple[Claim, ...]:
 
 
 def is_right(truth: Truth, claim: Claim) -> bool:
-    """``True`` if a name is accepted, and its joint is one of the truth's.
-
-    Parameters
-    ----------
-    truth
-        The truth of the case.
-    claim
-        The name.
-    """
+    """``True`` if a name is accepted, and its joint is one of the truth's. ``truth``: the truth of the case."""
     at = not truth.joints or not claim.joints or bool(set(claim.joints) & set(truth.joints))
     return claim.name in truth.accepted and at
 
@@ -167,16 +130,7 @@ def score_case(
 ) -> RandomScore:
     """Compare a diagnosis with the truth.
 
-    Parameters
-    ----------
-    truth
-        The truth of the case.
-    document
-        The diagnosis.
-    twin
-        Diagnosis of the healthy twin; ``None`` without one.
-    seconds
-        Time of the diagnosis, s.
+    ``twin``: diagnosis of the healthy twin; ``None`` without one. ``seconds``: time of the diagnosis, s.
     """
     claims = claims_of(document)
     known = truth.family in ("effect", "setup")

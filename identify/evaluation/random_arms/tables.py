@@ -17,14 +17,7 @@ ORDER = ("healthy", "effect", "setup", "outside")
 class Total:
     """One aim of the suite.
 
-    Parameters
-    ----------
-    label
-        Description.
-    n, hits
-        Number of cases, and of those that reach it.
-    aim
-        Share aimed at, 0 to 1.
+    ``n``, ``hits``: number of cases, and of those that reach it; ``aim``: share aimed at, 0 to 1.
     """
 
     label: str
@@ -44,8 +37,6 @@ class KindRow:
 
     Parameters
     ----------
-    family, kind
-        Family and kind.
     n
         Cases that count: visible, and not failed.
     invisible
@@ -80,16 +71,8 @@ class KindRow:
 class RandomTables:
     """Totals and rows of a run.
 
-    Parameters
-    ----------
-    totals
-        Aims.
-    rows
-        Kinds.
-    cases, failed, worse
-        Number of cases, of failures, and of cases whose findings do not reduce the reported error.
-    seconds_median, seconds_p95, seconds_longest
-        Time of a diagnosis, s.
+    ``cases``, ``failed``, ``worse``: number of cases, of failures, and of cases whose findings do not reduce the
+    reported error; ``seconds_median``, ``seconds_p95``, ``seconds_longest``: time of a diagnosis, s.
     """
 
     totals: tuple[Total, ...]
@@ -103,13 +86,7 @@ class RandomTables:
 
 
 def is_correct(score: RandomScore) -> bool:
-    """``True`` if the answer is right for the family of the case.
-
-    Parameters
-    ----------
-    score
-        Score of the case.
-    """
+    """``True`` if the answer is right for the family of the case."""
     if score.truth.family == "healthy":
         return bool(score.clean)
     if score.truth.family == "outside":
@@ -118,13 +95,7 @@ def is_correct(score: RandomScore) -> bool:
 
 
 def random_tables(scores: Sequence[RandomScore]) -> RandomTables:
-    """Return totals and rows; a failed case counts as a wrong answer in the totals.
-
-    Parameters
-    ----------
-    scores
-        Scores of all cases.
-    """
+    """Return totals and rows; a failed case counts as a wrong answer in the totals."""
     times = [score.seconds for score in scores if not score.error] or [0.0]
     return RandomTables(
         _totals(scores),
@@ -175,15 +146,7 @@ def _rows(scores: Sequence[RandomScore]) -> Iterable[KindRow]:
 
 
 def markdown(tables: RandomTables, title: str) -> str:
-    """Return the totals and the table by effect as Markdown.
-
-    Parameters
-    ----------
-    tables
-        Totals and rows.
-    title
-        Title.
-    """
+    """Return the totals and the table by effect as Markdown. ``tables``: totals and rows."""
     lines = [
         f"# {title}",
         "",
@@ -219,14 +182,7 @@ def markdown(tables: RandomTables, title: str) -> str:
 def results_line(tables: RandomTables, half: str, commit: str, date: str) -> str:
     """Return a row of the table of runs in ``docs/results.md``.
 
-    Parameters
-    ----------
-    tables
-        Totals and rows.
-    half
-        Half of the suite.
-    commit, date
-        Commit and date of the run.
+    ``tables``: totals and rows; ``half``: half of the suite.
     """
     totals = " | ".join(f"{100.0 * t.hits / t.n:.1f} ({t.hits}/{t.n})" if t.n else "-" for t in tables.totals)
     times = f"{tables.seconds_median:.1f} / {tables.seconds_p95:.1f}"
