@@ -31,7 +31,17 @@ def recordings_of(recordings: Recorded | Sequence[Recorded]) -> tuple[Recording,
 
 
 def robot_of(robot: Robot | None, recordings: Sequence[Recording], command: str = "identify") -> RobotConfig:
-    """Return the configuration to use, with all values that a command needs; ``None``: that of the first recording."""
+    """Return the configuration to use, with all values that a command needs.
+
+    Parameters
+    ----------
+    robot
+        Configuration, or the path or shipped name of one; ``None``: the one inside the first recording.
+    recordings
+        Recordings, at least one if ``robot`` is ``None``.
+    command
+        Command whose values may not be blank.
+    """
     if isinstance(robot, str | Path):
         return load_robot(robot, command)
     config = recordings[0].robot if robot is None else robot
