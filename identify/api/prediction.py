@@ -128,7 +128,7 @@ class TorquePrediction(Result):
     def _html(self) -> str:
         from armident.identify.report.prediction import prediction_report
 
-        return prediction_report(self)
+        return prediction_report(self.document, self.model, self.t, self.measured, self.predicted)
 
     def _summary(self) -> str:
         return f"{self.document.robot}: {self.document.sentence}"

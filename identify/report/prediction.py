@@ -1,23 +1,28 @@
 """HTML report of a prediction: held-out error, measured against predicted torques."""
 
-from typing import TYPE_CHECKING
+import numpy as np
+from numpy.typing import NDArray
 
+from armident.identify.documents.prediction import PredictionDocument
 from armident.identify.report.glossary import identification_entries
 from armident.identify.report.identification import torque_plots
 from armident.identify.report.page import render
+from armident.identify.robot_model import RobotModel
 
-if TYPE_CHECKING:
-    from armident.identify.api.prediction import TorquePrediction
+Array = NDArray[np.float64]
 
 
-def prediction_report(prediction: "TorquePrediction") -> str:
-    """Return the HTML page of a prediction, complete in one file."""
-    document, model = prediction.document, prediction.model
-    joints, units = list(document.units), list(document.units.values())
+def prediction_report(
+    document: PredictionDocument, model: RobotModel, t: Array, measured: Array, predicted: Array
+) -> str:
+    """Return the HTML page of a prediction, complete in one file.
+
+    ``t``: instants (M,), s; ``measured``, ``predicted``: torques (M, n), N m or N.
+    """
     return render(
         "prediction.html",
         document=document,
         robot=model.robot,
-        torques=torque_plots(prediction.t, prediction.measured, prediction.predicted, joints, units),
+        torques=torque_plots(t, measured, predicted, list(document.units), list(document.units.values())),
         glossary=identification_entries(model.document),
     )
