@@ -14,7 +14,6 @@ from armident.identify.controller.nominal import known_controller, nominal_contr
 from armident.identify.controller.parametric import ControlLaw, identify_parametric
 from armident.identify.estimators.auxiliary_model import AuxiliaryModel
 from armident.identify.estimators.measured_instruments import MotionInstruments
-from armident.identify.experiment import Experiment
 from armident.identify.identification.equations import PIV_CUTOFF, Prepared
 from armident.identify.identification.options import CONTROLLERS, Options
 from armident.identify.identification.solvers import MEASURED
@@ -24,7 +23,8 @@ from armident.identify.robot.simulation import Simulation
 from armident.identify.signals.bandpass import butterworth
 from armident.identify.signals.decimate import Decimation
 from armident.identify.signals.differentiate import Derivatives, differentiate
-from armident.identify.streamed import kept, mapped
+from armident.identify.signals.experiments import Experiment
+from armident.identify.signals.streamed import kept, mapped
 
 RUNAWAY = 3.0
 """Speed of a simulated joint, over the highest measured speed, beyond which the simulation has diverged."""

@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from armident.configs import RobotConfig
-from armident.identify.experiment import Experiment
 from armident.identify.identification.criteria import IdentificationCriteria
 from armident.identify.identification.equations import Prepared
 from armident.identify.identification.moving_joints import FARTHEST, MOVE
@@ -21,7 +20,8 @@ from armident.identify.regression.qr import triangularize_parts
 from armident.identify.robot.arm import ArmModel
 from armident.identify.signals.decimate import Decimation
 from armident.identify.signals.differentiate import Derivatives
-from armident.identify.streamed import kept, mapped
+from armident.identify.signals.experiments import Experiment
+from armident.identify.signals.streamed import kept, mapped
 
 POSTURES = 100
 """Postures of the motion, and of the workspace, at which inertia and gravity are examined."""

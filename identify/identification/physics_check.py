@@ -7,7 +7,6 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from armident.configs import ArmidentError
-from armident.identify.experiment import Experiment
 from armident.identify.identification.criteria import IdentificationCriteria
 from armident.identify.identification.excitation_check import NON_NEGATIVE, motion_postures, workspace_postures
 from armident.identify.identification.result import relative_errors, units
@@ -15,6 +14,7 @@ from armident.identify.identification.verdict import Reason, listed
 from armident.identify.regression.equations import ExperimentEquations
 from armident.identify.robot.arm import ArmModel
 from armident.identify.robot.consistent import ConsistentParameters, nearest_base
+from armident.identify.signals.experiments import Experiment
 
 Array = NDArray[np.float64]
 

@@ -14,7 +14,6 @@ from armident.identify.effects.terms import arm_model
 from armident.identify.estimators.diagnostics import diagnose_estimate
 from armident.identify.estimators.essential import essential_parameters
 from armident.identify.estimators.idim_ls import idim_ls
-from armident.identify.experiment import Experiment, check_one_rate
 from armident.identify.identification.auxiliary_loop import RELEVANT, ClosedLoop, closed_loop, velocity_error
 from armident.identify.identification.criteria import IdentificationCriteria
 from armident.identify.identification.equations import (
@@ -50,7 +49,8 @@ from armident.identify.setup.result import with_torque_shift
 from armident.identify.signals.bandwidth import motion_bandwidth
 from armident.identify.signals.decimate import Decimation
 from armident.identify.signals.differentiate import Derivatives, differentiate, encoder_resolution
-from armident.identify.streamed import kept, mapped
+from armident.identify.signals.experiments import Experiment, check_one_rate
+from armident.identify.signals.streamed import kept, mapped
 
 TORQUE_PREDICTIONS = 2
 """Largest number of predictions of the torques on which terms depend."""

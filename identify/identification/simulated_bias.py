@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from scipy import signal, stats
 
 from armident.identify.estimators.auxiliary_model import AuxiliaryModel
-from armident.identify.experiment import Experiment
 from armident.identify.identification.equations import Prepared, aligned_torque
 from armident.identify.identification.options import DerivativesName
 from armident.identify.regression.ar_noise import ArModel
@@ -35,7 +34,8 @@ from armident.identify.signals.bandpass import central_difference
 from armident.identify.signals.bandwidth import position_noise
 from armident.identify.signals.decimate import Decimation
 from armident.identify.signals.differentiate import Derivatives, differentiate
-from armident.identify.streamed import kept, mapped
+from armident.identify.signals.experiments import Experiment
+from armident.identify.signals.streamed import kept, mapped
 
 RELEVANT_BIAS = 0.5
 """Bias in standard deviations above which an estimate is corrected: a 2-sigma interval with this bias holds the truth

@@ -46,7 +46,7 @@ from armident.identify.regression.iv import serial_covariance
 from armident.identify.robot.simulation import Simulation
 from armident.identify.signals.decimate import Decimation, design
 from armident.identify.signals.differentiate import Derivatives
-from armident.identify.streamed import chosen
+from armident.identify.signals.streamed import chosen
 
 CONTRADICTION = 5.0
 """Standard deviations by which IDIM-PIV may differ from IDIM-IV in any parameter before IDIM-IV replaces it."""

@@ -15,7 +15,7 @@ from armident.identify.robot.arm import ArmModel
 from armident.identify.robot.kernels import fill_regressor
 from armident.identify.signals.decimate import Decimation
 from armident.identify.signals.differentiate import Derivatives
-from armident.identify.streamed import mapped
+from armident.identify.signals.streamed import mapped
 
 MAX_AR_ORDER = 60
 """Highest order tried for the noise models."""

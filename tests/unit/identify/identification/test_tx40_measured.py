@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from armident.configs import load_robot
-from armident.identify.experiment import Experiment
 from armident.identify.identification.options import Method, Options
 from armident.identify.identification.pipeline import identify_experiment
 from armident.identify.identification.result import Identification
+from armident.identify.signals.experiments import Experiment
 from tests.tx40_reference import TABLE_B4, published_estimate
 
 pytestmark = pytest.mark.slow

@@ -13,7 +13,6 @@ from armident.identify.documents.files import from_json, to_json
 from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.effects.terms import arm_model
 from armident.identify.estimators.diagnostics import Diagnostics
-from armident.identify.experiment import Experiment
 from armident.identify.identification.criteria import IdentificationCriteria
 from armident.identify.identification.equations import Prepared
 from armident.identify.identification.excitation_check import workspace_postures
@@ -38,6 +37,7 @@ from armident.identify.regression.equations import Estimate, ExperimentEquations
 from armident.identify.setup.result import TorqueShift
 from armident.identify.signals.decimate import design
 from armident.identify.signals.differentiate import differentiate
+from armident.identify.signals.experiments import Experiment
 from armident.virtual_robot.offline import simulate_recording
 from tests.fixtures.arms import FAST, identified, recording, trajectory
 
