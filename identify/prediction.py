@@ -14,7 +14,7 @@ from armident.configs import DataError
 from armident.daq.recording import Recording
 from armident.identify.documents.base import reference, versions
 from armident.identify.documents.prediction import PredictionDocument
-from armident.identify.effects.recorded import put_right
+from armident.identify.effects.recorded import corrected_experiments
 from armident.identify.experiment import Experiment
 from armident.identify.identification.api import experiments_of
 from armident.identify.identification.equations import equations, least_rows, published_equations
@@ -104,7 +104,7 @@ def predict_recording(
     experiments, remarks = experiments_of([recording], robot, name_files=False)
     setup = _setup(experiments, model, notes)
     options = _options(model.document.options)
-    experiments = shifted_experiments(put_right(experiments, robot), robot, options, setup, notes)
+    experiments = shifted_experiments(corrected_experiments(experiments, robot), robot, options, setup, notes)
     show("torques", 0.5)
     with threadpool_limits(1):
         signals, blocks = _equations(model, experiments, options)

@@ -75,7 +75,7 @@ def _finding(final: ModelState, one: Selected, parameters: Mapping[str, float], 
         gap_after=float(report.best[joint]),
         evidence={
             "title": effect.title,
-            "description": effect.says,
+            "description": effect.description,
             "reference": effect.reference,
             "score": addition.gain,
             "p_value": report.p_value,
@@ -261,9 +261,9 @@ def undetectable(state: ModelState, hidden: frozenset[Key]) -> list[NotVisible]:
             elif (effect.key, place.joint, place.other) in hidden:
                 reason = "the motion does not excite it, or the model already contains it"
             if reason is not None:
-                joint = study.joints[place.joint]
-                entry = NotVisible(effect=effect.name, joint=joint, reason=reason, required_motion=effect.needs)
-                found.setdefault((effect.name, joint), entry)
+                name, joint, motion_text = effect.name, study.joints[place.joint], effect.required_motion
+                entry = NotVisible(effect=name, joint=joint, reason=reason, required_motion=motion_text)
+                found.setdefault((name, joint), entry)
     return list(found.values())
 
 

@@ -18,13 +18,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armident.identify.diagnosis.criteria import Criteria
-from armident.identify.diagnosis.free_functions import FINE, FreeFunction, Kind, free_functions, in_band
-from armident.identify.diagnosis.hints import hint_of, unit_of
+from armident.identify.diagnosis.free_functions import FINE, FreeFunction, free_functions, in_band
 from armident.identify.diagnosis.noise_beyond import noise_beyond
 from armident.identify.diagnosis.projection import JointResidual, Projection
 from armident.identify.diagnosis.regression import Fit
 from armident.identify.diagnosis.spectral_lines import Line, bandwidth_of_motion, lines_of_joints
 from armident.identify.diagnosis.stretch import Stretch
+from armident.identify.diagnosis.variables import Kind, hint_of, unit_of
 from armident.identify.regression.whitening import rows_of_joints
 from armident.identify.robot.motion import Motion
 from armident.identify.signals.periodogram import hann_window, periodogram

@@ -12,7 +12,7 @@ from armident.configs.schema.robot import Effect as Entry
 from armident.identify.diagnosis.regressor_cache import RegressorCache
 from armident.identify.diagnosis.stretch import KINDS, Stretch, at_rows, distances, moving_rows, rows_before
 from armident.identify.effects.drive import Correction
-from armident.identify.effects.recorded import of_recording, put_right
+from armident.identify.effects.recorded import corrected_experiments, of_recording
 from armident.identify.effects.registry import known
 from armident.identify.effects.terms import arm_model, terms_of
 from armident.identify.effects.wiring import Wiring
@@ -168,7 +168,7 @@ class Study:
     def _with_torques(self, sources: tuple[Sequence[Experiment], Sequence[Experiment]]) -> "Study":
         """The study with torques of the same motion that were recorded or corrected otherwise."""
         experiments = [*sources[0], *sources[1]]
-        torques = [self.thinning(_aligned(e)) for e in put_right(experiments, self.robot)]
+        torques = [self.thinning(_aligned(e)) for e in corrected_experiments(experiments, self.robot)]
 
         def of(s: Stretch) -> Stretch:
             torque = torques[s.experiment][s.span]
@@ -349,7 +349,7 @@ def build_study(
     DataError
         If rates differ, or the motion is too short or does not determine the parameters of the model.
     """
-    experiments = put_right([*training, *validation], robot)
+    experiments = corrected_experiments([*training, *validation], robot)
     check_one_rate(experiments)
     dt = experiments[0].dt
     experiments = _continued(experiments)
@@ -416,7 +416,7 @@ def log_volume(experiments: Sequence[Experiment], robot: RobotConfig, band: Call
     rng = np.random.default_rng(0)
     noise = [PERTURBATION * e.tau.std(axis=0) * rng.standard_normal(e.tau.shape) for e in experiments]
     disturbed = [replace(e, tau=e.tau + x) for e, x in zip(experiments, noise, strict=True)]
-    pairs = zip(put_right(disturbed, robot), put_right(experiments, robot), strict=True)
+    pairs = zip(corrected_experiments(disturbed, robot), corrected_experiments(experiments, robot), strict=True)
     after = [band(one.tau - other.tau) for one, other in pairs]
     before = [band(x) for x in noise]
     innovations = [[ar.variance for ar in ar_models(part, NOISE_ORDER)] for part in (after, before)]

@@ -6,7 +6,7 @@ import numpy as np
 
 from armident.identify.documents.comparison import LEVEL_95, ComparedParameter, ComparisonDocument
 from armident.identify.documents.identification import IdentificationDocument
-from armident.identify.report.glossary import identification_entries, in_words
+from armident.identify.report.glossary import base_entries, in_words
 from armident.identify.report.page import MODEL, MUTED, RESIDUAL, render
 from armident.identify.report.plots import Plot, Series, plots_html
 
@@ -26,7 +26,7 @@ def comparison_report(document: ComparisonDocument, glossary_of: IdentificationD
         document=document,
         plots={joint: plots_html([_plot(joint, parameters)]) for joint, parameters in document.by_joint.items()},
         level=LEVEL_95,
-        glossary=identification_entries(glossary_of),
+        glossary=base_entries(p.name for p in glossary_of.parameters),
     )
 
 
@@ -62,5 +62,5 @@ def _reading(p: ComparedParameter) -> str:
     """Return both values of a parameter with 95 % intervals, in words and with its unit."""
     words = in_words(p.name)
     values = (("before", p.before, p.before_std), ("now", p.now, p.now_std))
-    told = ", ".join(f"{when} {value:.4g} ± {LEVEL_95 * std:.2g}" for when, value, std in values)
-    return f"{p.name}{f' ({words})' if words else ''}: {told} {p.unit}"
+    values_in_words = ", ".join(f"{when} {value:.4g} ± {LEVEL_95 * std:.2g}" for when, value, std in values)
+    return f"{p.name}{f' ({words})' if words else ''}: {values_in_words} {p.unit}"

@@ -8,23 +8,15 @@ from numpy.typing import NDArray
 
 from armident.identify.diagnosis.diagnose import Diagnosis
 from armident.identify.diagnosis.lack_of_fit import Dependence
-from armident.identify.documents.diagnosis import DiagnosisDocument, Finding
-from armident.identify.report.glossary import diagnosis_entries, meaning_of
+from armident.identify.documents.diagnosis import VERDICTS, DiagnosisDocument, Finding
+from armident.identify.report.glossary import finding_entries, meaning_of
 from armident.identify.report.identification import torque_plots
 from armident.identify.report.page import BAND, INK, MEASURED, MODEL, MUTED, RESIDUAL, figure, render
 
 Array = NDArray[np.float64]
 
-VERDICTS = {
-    "no_gap": "The model explains the data; these recordings show no missing effect.",
-    "explained": "The model lacks effects, and the findings explain the gap.",
-    "partly_explained": "The model lacks effects; the findings explain a part of the gap.",
-    "unexplained": "The model lacks something that no effect of the catalogue explains.",
-}
 LEVELS = {"no_gap": "trustworthy", "explained": "doubtful", "partly_explained": "unusable", "unexplained": "unusable"}
 """Colours of the verdicts, by the levels of an identification."""
-CERTAIN, LIKELY = 0.95, 0.6
-"""Confidence from which a finding is called certain, and likely."""
 BINS, FILLED = 14, 5
 """Bins of a variable, and the fewest samples of one that is drawn."""
 SHOWN = 700
@@ -55,14 +47,14 @@ def diagnosis_report(diagnosis: Diagnosis, document: DiagnosisDocument) -> str:
         level=LEVELS[document.verdict],
         torques=torque_plots(diagnosis.t, diagnosis.measured, diagnosis.after, joints, units, before),
         detection_limits=_detection_limits(document),
-        glossary=diagnosis_entries(document),
+        glossary=finding_entries(document.findings),
         verdict=VERDICTS[document.verdict],
         findings=[
             {
                 "f": finding,
                 "title": finding.evidence.get("title", finding.effect.replace("_", " ")),
                 "where": finding.joint if finding.other is None else f"{finding.joint} and {finding.other}",
-                "sure": certainty(finding),
+                "probability": probability(finding),
                 "closed": closed_share(finding, document),
                 "rows": _rows(finding),
                 "picture": _finding_figure(diagnosis, joints.index(finding.joint), lacking, own),
@@ -89,20 +81,16 @@ def _detection_limits(document: DiagnosisDocument) -> list[dict[str, str]]:
     ]
 
 
-def certainty(finding: Finding) -> str:
-    """Return the confidence of a finding in words."""
-    rivals = finding.evidence.get("ambiguous_with", [])
-    if rivals:
-        return "ambiguous with " + ", ".join(name.replace("_", " ") for name in rivals)
-    if finding.confidence >= CERTAIN:
-        return "certain"
-    return "likely" if finding.confidence >= LIKELY else "uncertain: a similar effect, perhaps outside the catalogue"
+def probability(finding: Finding) -> str:
+    """Return the posterior probability of a finding, and the effects that explain the recordings nearly as well."""
+    percent = 100.0 * finding.confidence
+    number = "> 99.9 %" if percent > 99.9 else f"{percent:.1f} %"
+    rivals = ", ".join(name.replace("_", " ") for name in finding.evidence.get("ambiguous_with", []))
+    return f"{number}, ambiguous with {rivals}" if rivals else number
 
 
 def closed_share(finding: Finding, document: DiagnosisDocument) -> float | None:
     """Return the share of the joint's held-out gap above the noise floor that a finding closes, 0 to 1.
-
-    The gap after is that without derivative noise where this is smaller.
 
     Parameters
     ----------
@@ -116,8 +104,7 @@ def closed_share(finding: Finding, document: DiagnosisDocument) -> float | None:
     float or None
         ``None`` if there is no gap above the noise floor.
     """
-    noiseless = finding.evidence.get("gap_without_derivative_noise")
-    after = finding.gap_after if noiseless is None else min(finding.gap_after, noiseless)
+    after = finding.gap_after
     floor = min(document.noise_floor.by_joint[finding.joint], after)
     gap = finding.gap_before**2 - floor**2
     if gap <= 0:
@@ -256,7 +243,7 @@ def _unit(diagnosis: Diagnosis, joint: int) -> str:
 
 
 def _curve(axis: Any, d: Dependence, unit: str) -> None:
-    """Draw a residual dependence with its uncertainty; a spectrum or transients with the noise level."""
+    """Draw a residual dependence with its uncertainty; a spectrum with the noise level."""
     x, value, band = d.curve.x, d.curve.value, d.curve.band
     low, high = (np.zeros_like(band), band) if d.of_noise else (value - band, value + band)
     axis.fill_between(x, low, high, color=BAND, linewidth=0)
@@ -296,8 +283,8 @@ def _curve_figure(d: Dependence, unit: str) -> str:
     """Return a figure of an unexplained residual dependence, in the unit of the joint's torque."""
     with figure(1, 1, 2.3) as (_, axes, picture):
         _curve(axes[0, 0], d, unit)
-        over = {"motion": "frequency; shaded: noise", "transients": "time; shaded: noise"}
-        axes[0, 0].set_title(f"{d.joint}: unexplained residual, over {over.get(d.kind, d.varies_with)}")
+        over = "frequency; shaded: noise" if d.kind == "motion" else d.varies_with
+        axes[0, 0].set_title(f"{d.joint}: unexplained residual, over {over}")
         axes[0, 0].axhline(0, color=MUTED, linewidth=0.6)
     return picture[0]
 

@@ -3,7 +3,7 @@
 from armident.configs import RobotConfig
 from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.prediction import TorquePrediction
-from armident.identify.report.glossary import identification_entries
+from armident.identify.report.glossary import base_entries
 from armident.identify.report.identification import torque_plots
 from armident.identify.report.page import render
 
@@ -27,5 +27,5 @@ def prediction_report(prediction: TorquePrediction, robot: RobotConfig, identifi
         document=document,
         robot=robot,
         torques=torque_plots(prediction.t, prediction.measured, prediction.predicted, joints, units),
-        glossary=identification_entries(identified),
+        glossary=base_entries(p.name for p in identified.parameters),
     )

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from armident.configs import DataError, RobotConfig
-from armident.identify.effects.recorded import put_right
+from armident.identify.effects.recorded import corrected_experiments
 from armident.identify.experiment import Experiment, check_one_rate
 from armident.identify.setup import signals
 from armident.identify.setup.bench import Bench, make_bench
@@ -70,7 +70,7 @@ def check_setup(experiments: Sequence[Experiment], robot: RobotConfig) -> SetupC
     # The matrices are small: threads delay each other.
     with threadpool_limits(1):
         try:
-            return _check(put_right(experiments, robot), robot)
+            return _check(corrected_experiments(experiments, robot), robot)
         except np.linalg.LinAlgError as error:
             message = f"the set-up cannot be checked: the equations of the motion are singular ({error})"
             raise DataError(message) from error

@@ -169,8 +169,6 @@ def said(found: Diagnosis) -> list[str]:
         )
         gap_of_joint = f"{f.gap_before:.2f} -> {f.gap_after:.2f} %"
         lines.append(f"  {f.effect} of {where}, confidence {f.confidence:.2f}, {gap_of_joint}: {values}")
-    if document.considered:
-        lines.append("  considered: " + ", ".join(f"{f.effect} of {f.joint}" for f in document.considered))
     for u in document.unexplained:
         lines.append(f"  unexplained: {u.joint}, {100 * u.share_of_residual:.0f} % varies with {u.varies_with}")
     return lines

@@ -29,9 +29,9 @@ from armident.identify.effects.effect import Effect, Linear, Shape
 class TightSpot(Effect):
     name = "tight_spot"
     title = "a tight spot"
-    says = "something pushes back near one position"
+    description = "something pushes back near one position"
     reference = "the machine's log book"
-    needs = "motion across the spot"
+    required_motion = "motion across the spot"
     linear = (Linear("height", ("N m", "N")),)
     shapes = (Shape("position", ("rad", "m")),)
 

@@ -12,14 +12,15 @@ from scipy.signal import lfilter
 from armident.configs import load_robot
 from armident.configs.schema.scenario import HiddenEffect
 from armident.identify.diagnosis.criteria import Criteria
-from armident.identify.diagnosis.free_functions import free_functions, hats
-from armident.identify.diagnosis.hints import HINTS, hint_of
+from armident.identify.diagnosis.free_functions import free_functions
 from armident.identify.diagnosis.lack_of_fit import MOST_DEVIATIONS, Dependence, LackOfFit, limited
 from armident.identify.diagnosis.noise_beyond import noise_beyond
 from armident.identify.diagnosis.regression import Fit, fit
 from armident.identify.diagnosis.spectral_lines import strongest_line
 from armident.identify.diagnosis.stretch import Stretch
 from armident.identify.diagnosis.study import Study, build_study
+from armident.identify.diagnosis.variables import VARIABLES, hint_of
+from armident.identify.effects.tables import hats
 from armident.identify.identification.from_recording import experiments_from_recording
 from armident.identify.regression.equations import applied
 from tests.fixtures.arms import FAST, recording
@@ -130,7 +131,7 @@ def test_every_set_of_functions_has_its_own_key_and_a_hint() -> None:
     motions = [study.motion(s, "simulated", fit(study).theta) for s in study.train]
     every = list(free_functions(study, motions, 0))
     assert len({(f.kind, f.other, f.knots) for f in every}) == len(every)
-    assert {f.kind for f in every} | {"frequency", "motion", "transients"} == set(HINTS)
+    assert {f.kind for f in every} | {"frequency", "motion"} == set(VARIABLES)
     text = hint_of("torque of another joint", "joint_3", "joint_2", "1 N m")
     assert text.startswith("The torque of joint_3 follows that of joint_2: look for")
 
