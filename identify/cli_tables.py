@@ -96,7 +96,7 @@ def warn(lines: list[str]) -> None:
 
 
 def setup_table(result: SetupCheck) -> None:
-    """Print the findings of a set-up check, one below the other, and its hypotheses where a joint is not understood."""
+    """Print the findings of a set-up check, one below the other, and its hypotheses where the model does not explain a joint."""
     before = ", ".join(f"{error:.1f}" for error in result.relative_error_pct)
     after = ", ".join(f"{error:.1f}" for error in result.corrected_error_pct)
     if not result.findings:
@@ -111,7 +111,7 @@ def setup_table(result: SetupCheck) -> None:
         print(f"torque error of the rigid model by joint: {before} %{corrected}{' %' if corrected else ''}")
     if result.joints_not_understood:
         names = ", ".join(result.joints_not_understood)
-        print(f"not understood: the rigid model leaves more than a third of the torque of {names}")
+        print(f"not explained: the rigid model leaves more than a third of the torque of {names}")
         print(f"  tried: {'; '.join(result.tried)}")
 
 

@@ -82,7 +82,7 @@ def check_command(paths: Sequence[Path], config: Path | None, *, as_json: bool) 
     Returns
     -------
     int
-        Exit code: `UNUSABLE` with a decisive finding or a joint that is not understood, otherwise 0.
+        Exit code: `UNUSABLE` with a decisive finding or a joint that the rigid model does not explain, otherwise 0.
 
     Raises
     ------

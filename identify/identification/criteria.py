@@ -11,7 +11,7 @@ class IdentificationCriteria:
     ----------
     max_joint_error_pct
         Largest error of a joint's torque that a model may leave, percent of the torque's norm. Above a third the rigid
-        model does not describe the joint (design page of the diagnosis, first principle).
+        model does not describe the joint.
     max_rest_error_pct
         The same for a joint at rest, percent: friction at rest has no model, but 100 % is the error of no model at all.
     sign_tolerance_std

@@ -24,7 +24,7 @@ from scipy.io import loadmat
 from armident.configs import RobotConfig, load_robot
 from armident.configs.loading import parse
 from armident.daq.interchange.importing import import_recording
-from armident.identify.diagnosis.diagnose import Diagnosis, diagnose
+from armident.identify.diagnosis.diagnose import DiagnosisResult, run_diagnosis
 from armident.identify.experiment import Experiment
 from armident.identify.identification.from_recording import experiments_from_recording
 from tests.conftest import REPOSITORY
@@ -34,7 +34,7 @@ STANDSTILL_S = 7.5
 TX40_DT = 2e-4
 
 MOST_CPU_S = 60.0
-"""Most CPU time of a diagnosis, s: design page of the diagnosis, principle 9."""
+"""Most CPU time of a diagnosis, s."""
 MOST_MEMORY_GB = 2.0
 """Most memory of a diagnosis, GB: the same."""
 CERTAIN = 0.9
@@ -65,9 +65,9 @@ class Measured:
     training: tuple[Experiment, ...]
     validation: tuple[Experiment, ...] = ()
 
-    def diagnosed(self) -> Diagnosis:
+    def diagnosed(self) -> DiagnosisResult:
         """With the defaults."""
-        return diagnose(self.training, self.validation, self.robot)
+        return run_diagnosis(self.training, self.validation, self.robot)
 
 
 def emps(data: Path, name: str) -> Experiment:
@@ -153,7 +153,7 @@ MACHINES: dict[str, tuple[str, Callable[[Path], Measured]]] = {
 """Title, and how it is loaded."""
 
 
-def said(found: Diagnosis) -> list[str]:
+def said(found: DiagnosisResult) -> list[str]:
     """Lines that tell a diagnosis."""
     document = found.document
     gap = document.gap.validation
@@ -208,7 +208,7 @@ class Row:
     lines: tuple[str, ...]
 
 
-def flags_of(found: Diagnosis, cpu_s: float, memory_gb: float) -> tuple[str, ...]:
+def flags_of(found: DiagnosisResult, cpu_s: float, memory_gb: float) -> tuple[str, ...]:
     """Limits that a diagnosis exceeds.
 
     Parameters
