@@ -96,7 +96,7 @@ def warn(lines: list[str]) -> None:
 
 
 def setup_table(result: SetupCheck) -> None:
-    """Print the findings of a set-up check, one below the other, and its hypotheses where the model does not explain a joint."""
+    """Print the findings of a set-up check, and its hypotheses where the rigid model does not explain a joint."""
     before = ", ".join(f"{error:.1f}" for error in result.relative_error_pct)
     after = ", ".join(f"{error:.1f}" for error in result.corrected_error_pct)
     if not result.findings:

@@ -14,7 +14,7 @@ from armident.configs import DataError
 from armident.daq.recording import Recording
 from armident.identify.documents.base import reference, versions
 from armident.identify.documents.prediction import PredictionDocument
-from armident.identify.effects.recorded import corrected_experiments
+from armident.identify.effects.recording_corrections import corrected_experiments
 from armident.identify.experiment import Experiment
 from armident.identify.identification.api import experiments_of
 from armident.identify.identification.equations import equations, least_rows, published_equations

@@ -2,6 +2,7 @@
 
 import importlib.metadata
 from collections.abc import Iterable
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -9,11 +10,13 @@ import click
 import typer
 from sphinx.application import Sphinx
 
+from armident.configs.schema.base import split_docstring
 from armident.configs.schema.robot import RobotConfig
 from armident.configs.schema.scenario import Scenario
 from armident.configs.schema.session import SessionConfig
 from armident.configs.schema.trajectory import Trajectory
 from armident.daq.cli import GROUP, application
+from armident.identify.diagnosis.criteria import Criteria
 from armident.identify.documents.diagnosis import DiagnosisDocument
 from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.effects.registry import own_effects
@@ -88,6 +91,10 @@ def files_page() -> str:
             f"### {heading}: {name}\n\n{part['description']}\n\n{table(part)}"
             for name, part in sorted(schema.get("$defs", {}).items())
         ]
+    descriptions = split_docstring(Criteria.__doc__ or "")[1]
+    rows = [f"| `{f.name}` | {f.default:.4g} | {descriptions[f.name]} |" for f in fields(Criteria)]
+    rows = ["| threshold | value | meaning, with source or reckoning |", "| --- | --- | --- |", *rows]
+    sections.append("## Criteria of a diagnosis\n\n" + "\n".join(rows).replace("``", "`"))
     return "\n\n".join(sections) + "\n"
 
 
@@ -114,12 +121,12 @@ def glossary_page() -> str:
     return "\n\n".join(parts) + "\n"
 
 
-def listed(entries: Iterable[glossary.Entry]) -> str:
+def listed(entries: Iterable[glossary.GlossaryEntry]) -> str:
     """Return a Markdown list of entries."""
     return "\n".join(f"- **{entry.name}**: {entry.text}" for entry in entries)
 
 
-def parameter_table(entries: Iterable[glossary.Entry]) -> str:
+def parameter_table(entries: Iterable[glossary.GlossaryEntry]) -> str:
     """Return the Markdown table of parameters."""
     rows = [f"| `{entry.name}` | {entry.unit.replace(' | ', ', ')} | {entry.text} |" for entry in entries]
     return "\n".join(["| parameter | unit | meaning |", "| --- | --- | --- |", *rows])

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from armident.identify.diagnosis.study import Study
 from armident.identify.diagnosis.variables import VARIABLES, Kind
-from armident.identify.effects.tables import hats
+from armident.identify.effects.free_shapes import hats
 from armident.identify.robot.motion import Motion
 
 Array = NDArray[np.float64]

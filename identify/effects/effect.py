@@ -138,7 +138,7 @@ class Effect(ABC):
     required_motion
         Motion or data that make the effect visible, in words.
     excitation
-        Keywords of the motion that excites the effect, see `armident.identify.diagnosis.experiment`.
+        Keywords of the motion that excites the effect, see `armident.identify.diagnosis.next_experiment`.
     scope
         See `Scope`.
     linear

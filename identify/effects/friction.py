@@ -20,8 +20,8 @@ from armident.identify.effects.effect import (
     TorqueDependent,
     Trials,
 )
+from armident.identify.effects.free_shapes import TOP_SPEED, FreeShape, OverPosition, hats, table, values
 from armident.identify.effects.rotor import ROTOR, rotors
-from armident.identify.effects.tables import TOP_SPEED, FreeShape, OverPosition, hats, table, values
 from armident.identify.robot.compiled import compiled
 from armident.identify.robot.motion import Motion
 

@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armident.identify.effects.effect import TORQUE, Effect, Linear, Place, TorqueDependent
-from armident.identify.effects.numbers import ParameterChange
-from armident.identify.effects.tables import OverPosition, table, values
+from armident.identify.effects.free_shapes import OverPosition, table, values
+from armident.identify.effects.parameter_change import ParameterChange
 from armident.identify.robot.chain import INERTIAL
 from armident.identify.robot.motion import Motion
 

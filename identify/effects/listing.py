@@ -17,7 +17,7 @@ ALWAYS: tuple[tuple[str, str, str], ...] = (
 """Terms with a key of their own in the robot configuration: name, parameters, condition."""
 
 
-def described(effect: Effect) -> dict[str, Any]:
+def effect_json(effect: Effect) -> dict[str, Any]:
     """Return the entry of ``armident effects --json`` of an effect."""
     return {
         "name": effect.name,
@@ -62,7 +62,7 @@ def effects_command(name: str | None, *, as_json: bool) -> None:
     """
     chosen = list(catalogue().values()) if name is None else [known(name)]
     if as_json:
-        sys.stdout.write(json.dumps([described(effect) for effect in chosen], indent=1) + "\n")
+        sys.stdout.write(json.dumps([effect_json(effect) for effect in chosen], indent=1) + "\n")
         return
     if name is not None:
         _one(chosen[0])

@@ -5,7 +5,7 @@ from importlib.metadata import entry_points
 
 from armident.configs import ConfigError
 from armident.configs.schema.robot import Effect as Entry
-from armident.identify.effects import drive, friction, link, numbers, transmission, unnamed, wiring
+from armident.identify.effects import drive, friction, link, parameter_change, transmission, unnamed, wiring
 from armident.identify.effects.effect import Effect
 
 ENTRY_POINTS = "armident.effects"
@@ -17,7 +17,7 @@ REQUIRED = ("name", "title", "description", "reference", "required_motion", "lin
 
 def own_effects() -> list[Effect]:
     """Return the effects of this package."""
-    modules = (friction, link, transmission, drive, numbers, wiring, unnamed)
+    modules = (friction, link, transmission, drive, parameter_change, wiring, unnamed)
     return [effect() for module in modules for effect in module.EFFECTS]
 
 

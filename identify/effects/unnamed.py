@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armident.identify.effects.effect import POSITION, TORQUE, VELOCITY, Linear, Place, Shape, TorqueDependent, Trials
-from armident.identify.effects.tables import TOP_SPEED, FreeShape, ends, hats, table, values
+from armident.identify.effects.free_shapes import TOP_SPEED, FreeShape, ends, hats, table, values
 from armident.identify.robot.motion import Motion
 
 Array = NDArray[np.float64]

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from armident.configs import DataError, RobotConfig
-from armident.identify.effects.recorded import corrected_experiments
+from armident.identify.effects.recording_corrections import corrected_experiments
 from armident.identify.effects.terms import arm_model
 from armident.identify.estimators.diagnostics import diagnose_estimate
 from armident.identify.estimators.essential import essential_parameters

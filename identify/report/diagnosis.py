@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from armident.identify.diagnosis.diagnose import Diagnosis
-from armident.identify.diagnosis.lack_of_fit import Dependence
+from armident.identify.diagnosis.diagnose import DiagnosisResult
+from armident.identify.diagnosis.lack_of_fit import ResidualDependence
 from armident.identify.documents.diagnosis import VERDICTS, DiagnosisDocument, Finding
-from armident.identify.report.glossary import finding_entries, meaning_of
+from armident.identify.report.glossary import finding_entries, parameter_meaning
 from armident.identify.report.identification import torque_plots
 from armident.identify.report.page import BAND, INK, MEASURED, MODEL, MUTED, RESIDUAL, figure, render
 
@@ -25,7 +25,7 @@ FOLLOWS = 0.6
 """Share of the power of a finding's torque that its means over a variable must have to be drawn over it."""
 
 
-def diagnosis_report(diagnosis: Diagnosis, document: DiagnosisDocument) -> str:
+def diagnosis_report(diagnosis: DiagnosisResult, document: DiagnosisDocument) -> str:
     """Return the HTML page of a diagnosis, complete in one file.
 
     Parameters
@@ -55,7 +55,7 @@ def diagnosis_report(diagnosis: Diagnosis, document: DiagnosisDocument) -> str:
                 "title": finding.evidence.get("title", finding.effect.replace("_", " ")),
                 "where": finding.joint if finding.other is None else f"{finding.joint} and {finding.other}",
                 "probability": probability(finding),
-                "closed": closed_share(finding, document),
+                "closed": closed_gap_share(finding, document),
                 "rows": _rows(finding),
                 "picture": _finding_figure(diagnosis, joints.index(finding.joint), lacking, own),
             }
@@ -89,7 +89,7 @@ def probability(finding: Finding) -> str:
     return f"{number}, ambiguous with {rivals}" if rivals else number
 
 
-def closed_share(finding: Finding, document: DiagnosisDocument) -> float | None:
+def closed_gap_share(finding: Finding, document: DiagnosisDocument) -> float | None:
     """Return the share of the joint's held-out gap above the noise floor that a finding closes, 0 to 1.
 
     Parameters
@@ -116,7 +116,7 @@ def _rows(finding: Finding) -> list[tuple[str, float, float | None, str, str]]:
     """Return the parameters with standard deviation, unit and meaning."""
     std, units = finding.evidence.get("std", {}), finding.evidence.get("units", {})
     return [
-        (name, value, std.get(name), units.get(name, ""), meaning_of(name, finding))
+        (name, value, std.get(name), units.get(name, ""), parameter_meaning(name, finding))
         for name, value in finding.parameters.items()
     ]
 
@@ -140,7 +140,7 @@ def _gap_figure(document: DiagnosisDocument) -> str:
     return picture[0]
 
 
-def _finding_figure(diagnosis: Diagnosis, joint: int, lacking: Array | None, own: Array | None) -> str:
+def _finding_figure(diagnosis: DiagnosisResult, joint: int, lacking: Array | None, own: Array | None) -> str:
     """Return a figure of the joint's held-out residual without and with a finding, over time and over its variable.
 
     Parameters
@@ -189,7 +189,7 @@ def telling_stretch(added: Array) -> slice:
     return slice(begin, begin + SHOWN)
 
 
-def followed_variable(diagnosis: Diagnosis, joint: int, added: Array) -> tuple[str, str, Array]:
+def followed_variable(diagnosis: DiagnosisResult, joint: int, added: Array) -> tuple[str, str, Array]:
     """Return the variable that a finding is drawn over: name, unit, values (M,).
 
     Speed, position or time, the first whose means have the share `FOLLOWS` of its power; otherwise its own torque.
@@ -238,11 +238,11 @@ def _over_cause(axis: Any, rest: Array, added: Array, cause: tuple[str, str, Arr
     axis.legend(frameon=False, fontsize=8.5, loc="best")
 
 
-def _unit(diagnosis: Diagnosis, joint: int) -> str:
+def _unit(diagnosis: DiagnosisResult, joint: int) -> str:
     return "N m" if diagnosis.robot.joints[joint].type == "revolute" else "N"
 
 
-def _curve(axis: Any, d: Dependence, unit: str) -> None:
+def _curve(axis: Any, d: ResidualDependence, unit: str) -> None:
     """Draw a residual dependence with its uncertainty; a spectrum with the noise level."""
     x, value, band = d.curve.x, d.curve.value, d.curve.band
     low, high = (np.zeros_like(band), band) if d.of_noise else (value - band, value + band)
@@ -253,7 +253,7 @@ def _curve(axis: Any, d: Dependence, unit: str) -> None:
     axis.set_ylabel(f"{unit}/√Hz" if d.kind == "motion" else unit)
 
 
-def _map_figure(diagnosis: Diagnosis, joints: Sequence[str]) -> str | None:
+def _map_figure(diagnosis: DiagnosisResult, joints: Sequence[str]) -> str | None:
     """Return a figure of the share of each joint's residual that each variable predicts, unexplained ones marked."""
     kinds = list(dict.fromkeys(d.kind for d in diagnosis.where))
     if not kinds:
@@ -279,7 +279,7 @@ def _map_figure(diagnosis: Diagnosis, joints: Sequence[str]) -> str | None:
     return picture[0]
 
 
-def _curve_figure(d: Dependence, unit: str) -> str:
+def _curve_figure(d: ResidualDependence, unit: str) -> str:
     """Return a figure of an unexplained residual dependence, in the unit of the joint's torque."""
     with figure(1, 1, 2.3) as (_, axes, picture):
         _curve(axes[0, 0], d, unit)

@@ -14,7 +14,7 @@ from armident.identify.effects.registry import catalogue
 
 
 @dataclass(frozen=True)
-class Entry:
+class GlossaryEntry:
     """One entry of the glossary.
 
     Parameters
@@ -37,100 +37,105 @@ class Entry:
         return " | ".join(dict.fromkeys(unit for unit in self.units if unit))
 
 
+def _entries(texts: dict[str, str]) -> tuple[GlossaryEntry, ...]:
+    return tuple(GlossaryEntry(name, text) for name, text in texts.items())
+
+
 INERTIA, MOMENT = ("kg m^2", "kg m^2"), ("kg m", "kg m")
 
-RIGID: tuple[Entry, ...] = (
-    Entry("xx", "Moment of inertia of the link about the x axis of its frame, at the origin of that frame.", INERTIA),
-    Entry("yy", "Moment of inertia of the link about the y axis of its frame.", INERTIA),
-    Entry("zz", "Moment of inertia of the link about the z axis of its frame, which is the joint axis.", INERTIA),
-    Entry("xy", "Product of inertia xy of the link.", INERTIA),
-    Entry("xz", "Product of inertia xz of the link.", INERTIA),
-    Entry("yz", "Product of inertia yz of the link.", INERTIA),
-    Entry("mx", "First moment of mass of the link along x: mass times the x coordinate of its centre.", MOMENT),
-    Entry("my", "First moment of mass of the link along y.", MOMENT),
-    Entry("mz", "First moment of mass of the link along z.", MOMENT),
-    Entry("m", "Mass of the link; of a prismatic axis the moved mass with the rotor.", ("kg", "kg")),
-    Entry("ia", "Inertia of the motor's rotor, on the joint side: motor inertia times the squared gear ratio.",
-          ("kg m^2", "kg")),
-    Entry("fv", "Viscous friction: torque per joint velocity.", ("N m s/rad", "N s/m")),
-    Entry("fc", "Coulomb friction: level of the dry friction torque, with the sign of the velocity.", ("N m", "N")),
-    Entry("off", "Constant torque offset: current sensor, asymmetric friction.", ("N m", "N")),
-)  # fmt: skip
+RIGID = tuple(GlossaryEntry(*each) for each in (
+    ("xx", "Moment of inertia of the link about the x axis of its frame, at the origin of that frame.", INERTIA),
+    ("yy", "Moment of inertia of the link about the y axis of its frame.", INERTIA),
+    ("zz", "Moment of inertia of the link about the z axis of its frame, which is the joint axis.", INERTIA),
+    ("xy", "Product of inertia xy of the link.", INERTIA),
+    ("xz", "Product of inertia xz of the link.", INERTIA),
+    ("yz", "Product of inertia yz of the link.", INERTIA),
+    ("mx", "First moment of mass of the link along x: mass times the x coordinate of its centre.", MOMENT),
+    ("my", "First moment of mass of the link along y.", MOMENT),
+    ("mz", "First moment of mass of the link along z.", MOMENT),
+    ("m", "Mass of the link; of a prismatic axis the moved mass with the rotor.", ("kg", "kg")),
+    ("ia", "Inertia of the motor's rotor, on the joint side: motor inertia times the squared gear ratio.",
+     ("kg m^2", "kg")),
+    ("fv", "Viscous friction: torque per joint velocity.", ("N m s/rad", "N s/m")),
+    ("fc", "Coulomb friction: level of the dry friction torque, with the sign of the velocity.", ("N m", "N")),
+    ("off", "Constant torque offset: current sensor, asymmetric friction.", ("N m", "N")),
+))  # fmt: skip
 """Standard parameters of a link and its joint (thesis equations 2.6, 2.12 and 2.13); the joint number follows."""
 
-CONVENTIONS: tuple[Entry, ...] = (
-    Entry("joint number", "The digits at the end of a name: `fv2` is of joint 2, `fcc45` of the joints 4 and 5."),
-    Entry("suffix r", "Base parameter that groups others: `zz1r` contains `zz1` and parameters of links 2 and up. The "
-          "formula is in the report; `r` stands for regrouped (thesis section A.3, table B.3)."),
-    Entry("suffix _2", "Second instance of an effect at the same joint, for example another harmonic."),
-    Entry("coupling name", "Letters and digits after `ia`, `fv` or `fc` that are not a joint number: `iam6` is the "
-          "inertia of the coupling `m6` in the robot configuration (thesis equation B.1)."),
-    Entry("joint side", "All torques, inertias and friction parameters refer to the joint: motor torque times the gear "
-          "ratio, motor inertia times its square. Torques are in N m, of prismatic joints forces in N."),
-    Entry("link frame", "Frame of modified Denavit-Hartenberg parameters: z along the joint axis. Lengths in formulas, "
-          "for example `d3` and `r4`, are those parameters."),
-)  # fmt: skip
+CONVENTIONS = _entries({
+    "joint number": "The digits at the end of a name: `fv2` is of joint 2, `fcc45` of the joints 4 and 5.",
+    "suffix r": "Base parameter that groups others: `zz1r` contains `zz1` and parameters of links 2 and up. The "
+        "formula is in the report; `r` stands for regrouped (thesis section A.3, table B.3).",
+    "suffix _2": "Second instance of an effect at the same joint, for example another harmonic.",
+    "coupling name": "Letters and digits after `ia`, `fv` or `fc` that are not a joint number: `iam6` is the "
+        "inertia of the coupling `m6` in the robot configuration (thesis equation B.1).",
+    "joint side": "All torques, inertias and friction parameters refer to the joint: motor torque times the gear "
+        "ratio, motor inertia times its square. Torques are in N m, of prismatic joints forces in N.",
+    "link frame": "Frame of modified Denavit-Hartenberg parameters: z along the joint axis. Lengths in formulas, "
+        "for example `d3` and `r4`, are those parameters.",
+})  # fmt: skip
 """Rules by which parameter names are formed."""
 
-TERMS: tuple[Entry, ...] = (
-    Entry("trustworthy", "Verdict of an identification: no check found a defect."),
-    Entry("doubtful", "Verdict of an identification: the parameters can be used within the limits that the reasons "
-          "state."),
-    Entry("unusable", "Verdict of an identification: the parameters must not be used. `armident identify` ends with "
-          "exit code 3."),
-    Entry("nearest possible arm", "Physically consistent parameters closest to an estimate, in units of its "
-          "covariance. If they explain the torques too, impossible values come from small model errors."),
-    Entry("determined", "Parameter whose standard deviation is at most a third of its value, in a fit of those that "
-          "the motion supports together."),
-    Entry("base parameters", "Smallest set of parameters that determines the torques; combinations of the standard "
-          "ones (thesis section A.3)."),
-    Entry("residual", "Measured minus predicted torque."),
-    Entry("NVR", "Noise-variance ratio of the position smoother: small values smooth more (thesis section 5.1.2)."),
-    Entry("IRWSM", "Integrated-random-walk smoother: derivatives of measured positions by fixed-interval smoothing "
-          "(thesis section 5.1.2)."),
-    Entry("IDIM-LS", "Least squares on the inverse dynamic model, the reference method."),
-    Entry("IDIM-IV", "Instrumental variables: the regressor of a simulation serves as instrument, so that noise in the "
-          "measured positions causes no bias."),
-    Entry("IDIM-PIV", "IDIM-IV with a prefilter by the noise model; the default method (thesis chapter 6)."),
-    Entry("DIDIM, CLIE, CLOE, SEP-PEM", "Methods that minimise an error of the closed loop: of simulated torques, of "
-          "inputs, of outputs, or of predictions."),
-    Entry("instruments", "Signals that follow the motion but not the measurement noise. Weak instruments follow a "
-          "parameter's column of the regressor too little to determine it."),
-    Entry("Durbin, Wu, Hausman", "Test that compares least squares and instrumental variables: a difference beyond "
-          "chance means that least squares is biased by noise."),
-    Entry("Ljung-Box", "Probability of such an autocorrelation in white noise."),
-    Entry("Breusch-Pagan", "Probability of such a variation of the residual's variance under constant variance."),
-    Entry("physically consistent", "Parameters that belong to real masses: every link has a positive mass and a "
-          "positive-definite inertia with triangle inequality."),
-    Entry("samples lost", "Samples of a recording that did not arrive. They are recorded as missing, never filled."),
-    Entry("held-out data", "Data that are not used for fitting: `--validate`, or the last part of the recordings. "
-          "Effects must reduce the error there."),
-    Entry("ambiguous", "Alternatives whose likelihood is within a factor of twenty of the finding's. The next "
-          "experiment separates them."),
-    Entry("p-value", "Probability that a model without the effect shows at least this evidence by chance."),
-    Entry("false-alarm rate", "Probability that a diagnosis of a complete model finds anything; option "
-          "`--false-alarms`, shared between all tests."),
-    Entry("baseline", "Earlier identification of the same arm whose parameters are tested for change."),
-)  # fmt: skip
+TERMS = _entries({
+    "trustworthy": "Verdict of an identification: no check found a defect.",
+    "doubtful": "Verdict of an identification: the parameters can be used within the limits that the reasons "
+        "state.",
+    "unusable": "Verdict of an identification: the parameters must not be used. `armident identify` ends with "
+        "exit code 3.",
+    "nearest possible arm": "Physically consistent parameters closest to an estimate, in units of its "
+        "covariance. If they explain the torques too, impossible values come from small model errors.",
+    "determined": "Parameter whose standard deviation is at most a third of its value, in a fit of those that "
+        "the motion supports together.",
+    "base parameters": "Smallest set of parameters that determines the torques; combinations of the standard "
+        "ones (thesis section A.3).",
+    "residual": "Measured minus predicted torque.",
+    "NVR": "Noise-variance ratio of the position smoother: small values smooth more (thesis section 5.1.2).",
+    "IRWSM": "Integrated-random-walk smoother: derivatives of measured positions by fixed-interval smoothing "
+        "(thesis section 5.1.2).",
+    "IDIM-LS": "Least squares on the inverse dynamic model, the reference method.",
+    "IDIM-IV": "Instrumental variables: the regressor of a simulation serves as instrument, so that noise in the "
+        "measured positions causes no bias.",
+    "IDIM-PIV": "IDIM-IV with a prefilter by the noise model; the default method (thesis chapter 6).",
+    "DIDIM, CLIE, CLOE, SEP-PEM": "Methods that minimise an error of the closed loop: of simulated torques, of "
+        "inputs, of outputs, or of predictions.",
+    "instruments": "Signals that follow the motion but not the measurement noise. Weak instruments follow a "
+        "parameter's column of the regressor too little to determine it.",
+    "Durbin, Wu, Hausman": "Test that compares least squares and instrumental variables: a difference beyond "
+        "chance means that least squares is biased by noise.",
+    "Ljung-Box": "Probability of such an autocorrelation in white noise.",
+    "Breusch-Pagan": "Probability of such a variation of the residual's variance under constant variance.",
+    "physically consistent": "Parameters that belong to real masses: every link has a positive mass and a "
+        "positive-definite inertia with triangle inequality.",
+    "samples lost": "Samples of a recording that did not arrive. They are recorded as missing, never filled.",
+    "held-out data": "Data that are not used for fitting: `--validate`, or the last part of the recordings. "
+        "Effects must reduce the error there.",
+    "ambiguous": "Alternatives whose likelihood is within a factor of twenty of the finding's. The next "
+        "experiment separates them.",
+    "p-value": "Probability that a model without the effect shows at least this evidence by chance.",
+    "false-alarm rate": "Probability that a diagnosis of a complete model finds anything; option "
+        "`--false-alarms`, shared between all tests.",
+    "baseline": "Earlier identification of the same arm whose parameters are tested for change.",
+})  # fmt: skip
 """Methods, tests and words of the reports that are no keys of a document."""
 
 EVERYDAY = {
     "after", "all", "before", "by_joint", "configuration", "converged", "effect", "evidence", "findings", "formula",
     "hint", "information", "iterations", "joint", "kind", "lags", "law", "level", "limits", "message", "method",
     "model", "name", "options", "other", "parameters", "path", "reason", "reasons", "recording", "recordings", "rms",
-    "robot", "samples", "schema", "sha256", "train", "unit", "units", "validation", "value", "verdict", "versions", "warnings",
+    "robot", "samples", "schema", "sha256", "train", "unit", "units", "validation", "value", "verdict", "versions",
+    "warnings",
 }  # fmt: skip
 """Keys of documents that need no explanation."""
 
 _NAME = re.compile(r"([a-z_]+?)(m?\d+)(r?)((?:_\d+)?)$")
 
 
-def effect_entries(effect: Effect) -> list[Entry]:
+def effect_entries(effect: Effect) -> list[GlossaryEntry]:
     """Return the entries of all parameters of an effect: linear, nonlinear, settings."""
-    return [Entry(p.name, p.meaning or effect.description, p.unit) for p in effect.parameters_of_entry]
+    return [GlossaryEntry(p.name, p.meaning or effect.description, p.unit) for p in effect.parameters_of_entry]
 
 
-def base_entry(name: str) -> Entry | None:
+def base_entry(name: str) -> GlossaryEntry | None:
     """Return the entry of the kind of a base parameter, for example of ``zz`` for ``zz1r``; ``None`` if unknown.
 
     Parameters
@@ -179,7 +184,7 @@ def in_words(name: str) -> str:
     return f"{phrase}, grouped" if match[3] else phrase
 
 
-def meaning_of(name: str, finding: Finding) -> str:
+def parameter_meaning(name: str, finding: Finding) -> str:
     """Return the meaning of a parameter of a finding, as a sentence; empty if unknown.
 
     Parameters
@@ -195,16 +200,16 @@ def meaning_of(name: str, finding: Finding) -> str:
     return entries[0].text if entries else in_words(name)
 
 
-def base_entries(names: Iterable[str]) -> list[Entry]:
+def base_entries(names: Iterable[str]) -> list[GlossaryEntry]:
     """Return the entries that explain a list of base parameters, each once, in the order of the glossary."""
     found = {entry.name: entry for entry in map(base_entry, names) if entry is not None}
     order = [entry.name for entry in RIGID]
     return sorted(found.values(), key=lambda e: order.index(e.name) if e.name in order else len(order))
 
 
-def finding_entries(findings: Iterable[Finding]) -> list[Entry]:
+def finding_entries(findings: Iterable[Finding]) -> list[GlossaryEntry]:
     """Return the entries of the parameters of findings, each once."""
-    found: dict[str, Entry] = {}
+    found: dict[str, GlossaryEntry] = {}
     effects = catalogue()
     for finding in findings:
         key = f"{finding.effect}/{finding.law}" if finding.law else finding.effect
@@ -212,47 +217,47 @@ def finding_entries(findings: Iterable[Finding]) -> list[Entry]:
             for entry in effect_entries(effects[key]):
                 if entry.name in finding.parameters:
                     name = f"{entry.name} ({finding.effect.replace('_', ' ')})"
-                    found.setdefault(name, Entry(name, entry.text, entry.units))
+                    found.setdefault(name, GlossaryEntry(name, entry.text, entry.units))
         else:
             found |= {entry.name: entry for entry in base_entries(finding.parameters)}
     return list(found.values())
 
 
-def document_entries(kind: type[Document]) -> list[Entry]:
+def document_entries(kind: type[Document]) -> list[GlossaryEntry]:
     """Return the keys of a document and of its parts in words, with their descriptions in the schema."""
     schema = kind.model_json_schema(by_alias=True)
-    found: dict[str, Entry] = {}
+    found: dict[str, GlossaryEntry] = {}
     for part in (schema, *schema.get("$defs", {}).values()):
         for key, field in part["properties"].items():
             if key not in EVERYDAY:
                 name = re.sub(r"_(pct|hz|samples|s)\b", "", key).replace("_", " ").replace("std", "standard deviation")
-                found.setdefault(name, Entry(name, field["description"].replace("``", "`")))
+                found.setdefault(name, GlossaryEntry(name, field["description"].replace("``", "`")))
     return list(found.values())
 
 
-def verdict_entries() -> list[Entry]:
+def verdict_entries() -> list[GlossaryEntry]:
     """Return the verdicts of a diagnosis."""
-    return [Entry(name.replace("_", " "), f"Verdict of a diagnosis: {text}") for name, text in VERDICTS.items()]
+    return [GlossaryEntry(name.replace("_", " "), f"Verdict of a diagnosis: {text}") for name, text in VERDICTS.items()]
 
 
-def variable_entries() -> list[Entry]:
+def variable_entries() -> list[GlossaryEntry]:
     """Return the variables that an unexplained residual may depend on: values of ``varies_with``."""
-    return [Entry(name, variable.meaning) for name, variable in VARIABLES.items()]
+    return [GlossaryEntry(name, variable.meaning) for name, variable in VARIABLES.items()]
 
 
 @cache
-def all_terms() -> tuple[Entry, ...]:
+def all_terms() -> tuple[GlossaryEntry, ...]:
     """Return all terms of reports: methods and tests, keys of documents, verdicts."""
     keys = (document_entries(kind) for kind in (IdentificationDocument, DiagnosisDocument))
     every = (entry for part in (TERMS, verdict_entries(), *keys) for entry in part)
     return tuple({entry.name: entry for entry in every}.values())
 
 
-def mentioned(page: str) -> list[Entry]:
+def mentioned(page: str) -> list[GlossaryEntry]:
     """Return the terms that a page mentions."""
     text = re.sub(r'src="data:[^"]*"|<script.*?</script>', "", page, flags=re.DOTALL)
 
-    def stands(entry: Entry) -> bool:
+    def stands(entry: GlossaryEntry) -> bool:
         # The name of several methods has commas, and that of a test the names of its authors.
         return any(re.search(rf"\b{re.escape(word)}", text, re.IGNORECASE) for word in entry.name.split(", "))
 

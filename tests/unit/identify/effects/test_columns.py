@@ -12,7 +12,7 @@ from armident.configs.schema.robot import Effect as Entry
 from armident.configs.schema.robot import Limits
 from armident.identify.effects.effect import Place
 from armident.identify.effects.friction import dahl
-from armident.identify.effects.recorded import corrected_experiments
+from armident.identify.effects.recording_corrections import corrected_experiments
 from armident.identify.effects.registry import catalogue
 from armident.identify.effects.rotor import rotors
 from armident.identify.effects.terms import arm_model

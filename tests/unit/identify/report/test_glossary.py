@@ -18,7 +18,9 @@ def test_every_parameter_of_every_effect_is_explained_by_its_class() -> None:
     for effect in catalogue().values():
         for parameter in effect.parameters_of_entry:
             assert parameter.meaning.endswith("."), f"{effect.key}: {parameter.name}"
-            assert glossary.Entry(parameter.name, parameter.meaning, parameter.unit) in glossary.effect_entries(effect)
+            assert glossary.GlossaryEntry(parameter.name, parameter.meaning, parameter.unit) in glossary.effect_entries(
+                effect
+            )
 
 
 def test_a_parameter_without_a_meaning_is_explained_by_its_effect() -> None:
