@@ -17,10 +17,10 @@ WITH_VCAN := $(PY) -m armident.drivers.vcan -n 2 --
 PARALLEL := -n auto --dist worksteal
 LINT := $(PY) -m ruff check $(SOURCES) && $(PY) -m ruff format --check $(SOURCES) && $(PY) -m mypy && $(VENV)/bin/lint-imports
 
-.PHONY: help install demo check test proof off-bus on-bus coverage lint vcan suite docs bench lock clean
+.PHONY: help install demo check test proof off-bus on-bus coverage lint vcan suite reproduce docs bench lock clean
 
 help: ## what there is to do
-	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "make %-8s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "make %-9s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 
 $(PY):
 	@if [ -z "$(PYTHON)" ]; then
@@ -92,7 +92,10 @@ vcan: install ## fetch what the vcan guest needs, where this kernel has no Socke
 	@$(PY) -m armident.drivers.vcan --setup
 
 suite: install ## hide effects in virtual arms and count what is found (SUITE="--quick" passes options), two hours
-	@$(VENV)/bin/armident diagnose-suite $(SUITE)
+	@$(PY) -m tests.evaluation $(SUITE)
+
+reproduce: install ## the tables of the thesis beside ours (REPRODUCE="--quick" passes options)
+	@$(PY) -m tests.reproduction $(REPRODUCE)
 
 docs: install ## the documentation as a site, .cache/site/index.html
 	@$(PY) -m sphinx -q -W --keep-going -b html docs .cache/site
@@ -107,4 +110,4 @@ lock: install ## write requirements.lock anew from the ranges in pyproject.toml
 		--no-annotate -q -o requirements.lock pyproject.toml
 
 clean: ## remove what make and the tools created
-	@rm -rf $(VENV) .cache .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache *.egg-info build dist out demo suite
+	@rm -rf $(VENV) .cache .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache *.egg-info build dist out demo suite reproduction

@@ -13,7 +13,6 @@ from armident.configs.errors import ConfigError
 from armident.configs.schema.robot import RobotConfig
 from armident.configs.schema.scenario import Scenario
 from armident.configs.schema.session import RENAMED, DriveNode, SessionConfig
-from armident.configs.schema.suite import SuiteConfig
 from armident.configs.schema.trajectory import Trajectory
 from armident.configs.suspected_units import suspected_units
 from armident.configs.urdf import UrdfGeometry, geometry_from_urdf, urdf_file
@@ -26,11 +25,10 @@ KINDS: dict[str, type[BaseModel]] = {
     "robot": RobotConfig,
     "session": SessionConfig,
     "trajectory": Trajectory,
-    "suite": SuiteConfig,
     "scenario": Scenario,
 }
 """Kinds of files by the word in their ``schema`` key."""
-SHIPPED = ("robots", "cells", "trajectories", "scenarios", "suites", "eds", "zenoh")
+SHIPPED = ("robots", "cells", "trajectories", "scenarios", "eds", "zenoh")
 """Folders of shipped files, in the order of the search for a bare name."""
 _LONGEST = 80
 """Maximum number of characters of a file that a message quotes."""
@@ -302,22 +300,6 @@ def _with_known_joints(session: SessionConfig, robot: RobotConfig, path: Path) -
                 f"({', '.join(sorted(joints.values()))})"
             )
     return tuple(d.model_copy(update={"joint": joints[d.joint.lower()]}) for d in session.drives)
-
-
-def load_suite(name: str | Path) -> SuiteConfig:
-    """Load the cases of a diagnosis suite.
-
-    Parameters
-    ----------
-    name
-        A path, or the name of a shipped file (see `config_path`).
-
-    Raises
-    ------
-    ConfigError
-        If the file is missing or wrong; names file, key and expected value.
-    """
-    return _load(config_path(name), SuiteConfig)
 
 
 def load_scenario(name: str | Path) -> Scenario:

@@ -56,12 +56,8 @@ def application(
 ) -> typer.Typer:
     """Return the command line with the command that is called, or with all if none is (help, completion).
 
-    Parameters
-    ----------
-    words
-        Arguments of the command line.
-    entry_points
-        The registered commands; default: those of the installed packages.
+    ``words``: arguments of the command line. ``entry_points``: the registered commands; default: those of the installed
+    packages.
     """
     app = typer.Typer(
         no_args_is_help=True,

@@ -33,14 +33,8 @@ _CELL = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
 class Step:
     """One part of an installation.
 
-    Parameters
-    ----------
-    name
-        Result of the step, for example ``folder /etc/armident``.
-    is_done
-        Returns whether the result is there already.
-    apply
-        Makes the result.
+    ``name``: result of the step, for example ``folder /etc/armident``; ``is_done``: returns whether the result is there
+    already; ``apply``: makes the result.
     """
 
     name: str
@@ -52,12 +46,8 @@ class Step:
 class System:
     """The system on which a service is installed.
 
-    Parameters
-    ----------
-    root
-        Root folder: ``/``, or the folder of a system image.
-    executable
-        The command ``armident`` as the units start it.
+    ``root``: root folder: ``/``, or the folder of a system image; ``executable``: the command ``armident`` as the units
+    start it.
     """
 
     root: Path
@@ -104,17 +94,7 @@ class System:
     def run(self, *words: str, timeout_s: float = 60.0) -> None:
         """Run a command of the package ``passwd`` or of systemd.
 
-        Parameters
-        ----------
-        *words
-            The command.
-        timeout_s
-            Longest time for it, s.
-
-        Raises
-        ------
-        ArmidentError
-            If it is missing or fails.
+        ``timeout_s``: longest time for it, s. Raises ArmidentError if it is missing or fails.
         """
         prefix = () if self.is_running else ("--prefix", str(self.root))
         command = (words[0], *prefix, *words[1:]) if words[0] != "systemctl" else words
@@ -132,12 +112,7 @@ class System:
 def steps(system: System, cell: str) -> Iterator[Step]:
     """Return the steps of the installation of a cell, in their order: its parts, and a reload of systemd.
 
-    Parameters
-    ----------
-    system
-        The system.
-    cell
-        Name of the cell: its session configuration is ``/etc/armident/CELL.yaml``.
+    ``cell``: name of the cell: its session configuration is ``/etc/armident/CELL.yaml``.
     """
     found = list(parts(system, cell))
     changed = not all(step.is_done() for step in found if step.name.startswith("unit "))
@@ -149,12 +124,7 @@ def steps(system: System, cell: str) -> Iterator[Step]:
 def parts(system: System, cell: str) -> Iterator[Step]:
     """Return the parts of the installation of a cell, in their order.
 
-    Parameters
-    ----------
-    system
-        The system.
-    cell
-        Name of the cell: its session configuration is ``/etc/armident/CELL.yaml``.
+    ``cell``: name of the cell: its session configuration is ``/etc/armident/CELL.yaml``.
     """
     yield Step(
         f"system group {ACCOUNT}",
@@ -242,28 +212,14 @@ def _unit(system: System, file: Path) -> Step:
 
 
 def shipped_text(name: str) -> str:
-    """Return the text of a shipped unit.
-
-    Parameters
-    ----------
-    name
-        Name of its file.
-    """
+    """Return the text of a shipped unit. ``name``: name of its file."""
     return (CONFIGS / "systemd" / name).read_text(encoding="utf-8")
 
 
 def named_cell(cell: str) -> str:
     """Return the name of a cell, after a check that a unit and a folder can have it.
 
-    Parameters
-    ----------
-    cell
-        The name.
-
-    Raises
-    ------
-    ConfigError
-        If it cannot be the name of a unit.
+    Raises ConfigError if it cannot be the name of a unit.
     """
     if _CELL.fullmatch(cell) is None:
         raise ConfigError(f"{cell!r}: expected letters, digits, '_', '-' and '.' as the name of a cell, at most 64")
@@ -273,10 +229,7 @@ def named_cell(cell: str) -> str:
 def installed_executable() -> Path:
     """Return the command ``armident`` of the running environment, as a unit can start it.
 
-    Raises
-    ------
-    ConfigError
-        If the units would not see it, or may not run it.
+    Raises ConfigError if the units would not see it, or may not run it.
     """
     beside = Path(sys.executable).with_name("armident")
     remedy = (
@@ -300,23 +253,10 @@ def install(cell: str, root: Path = Path("/"), executable: Path | None = None, d
 
     Parts that are there are left alone, so that a second run does nothing. No unit is enabled or started.
 
-    Parameters
-    ----------
-    cell
-        Name of the cell.
-    root
-        Root folder of the system; another than ``/`` is that of a system image.
-    executable
-        The command ``armident`` as the units start it; default: that of this environment, in an image
-        ``/opt/armident/bin/armident``.
-    dry_run
-        Change nothing.
-
-    Raises
-    ------
-    ConfigError
-        If the name of the cell cannot be that of a unit, without the rights of root, or if there is a unit of other
-        origin.
+    ``root``: root folder of the system; another than ``/`` is that of a system image. ``executable``: the command
+    ``armident`` as the units start it; default: that of this environment, in an image ``/opt/armident/bin/armident``.
+    ``dry_run``: change nothing. Raises ConfigError if the name of the cell cannot be that of a unit, without the rights
+    of root, or if there is a unit of other origin.
     """
     named_cell(cell)
     root = root.resolve()
@@ -338,17 +278,7 @@ def install(cell: str, root: Path = Path("/"), executable: Path | None = None, d
 def carry_out(open_steps: Sequence[Step], *, dry_run: bool) -> list[str]:
     """Carry out steps, and return one line for each.
 
-    Parameters
-    ----------
-    open_steps
-        The steps.
-    dry_run
-        Change nothing.
-
-    Raises
-    ------
-    ArmidentError
-        If a step fails.
+    ``dry_run``: change nothing. Raises ArmidentError if a step fails.
     """
     lines = []
     for step in open_steps:

@@ -34,19 +34,9 @@ LONGEST_STOP_S = 240.0
 def status(cell: str, root: Path = Path("/"), executable: Path | None = None) -> tuple[list[str], bool]:
     """Return the lines on the state of the services of a cell, and ``True`` if all parts are installed.
 
-    Parameters
-    ----------
-    cell
-        Name of the cell.
-    root
-        Root folder of the system.
-    executable
-        The command ``armident`` as the units start it; default as for `armident.daq.service.install`.
-
-    Raises
-    ------
-    ConfigError
-        If the name of the cell cannot be that of a unit, or a file may be read by root only.
+    ``root``: root folder of the system. ``executable``: the command ``armident`` as the units start it; default as for
+    `armident.daq.service.install`. Raises ConfigError if the name of the cell cannot be that of a unit, or a file may
+    be read by root only.
     """
     root = root.resolve()
     system = System(root, executable or (installed_executable() if root == Path("/") else Path(SHIPPED_EXECUTABLE)))
@@ -77,19 +67,8 @@ def uninstall(cell: str, root: Path = Path("/"), dry_run: bool = False) -> list[
     Its units are stopped and disabled. The unit files, which all cells share, go with the last cell. Recordings,
     results, configurations and the user that owns them are kept.
 
-    Parameters
-    ----------
-    cell
-        Name of the cell.
-    root
-        Root folder of the system; another than ``/`` is that of a system image.
-    dry_run
-        Change nothing.
-
-    Raises
-    ------
-    ConfigError
-        If the name of the cell cannot be that of a unit, or without the rights of root.
+    ``root``: root folder of the system; another than ``/`` is that of a system image. ``dry_run``: change nothing.
+    Raises ConfigError if the name of the cell cannot be that of a unit, or without the rights of root.
     """
     root = root.resolve()
     system = System(root, Path(SHIPPED_EXECUTABLE))

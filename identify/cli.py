@@ -1,8 +1,7 @@
-"""Commands of this package: identification, checks, diagnosis, use of models, history, trajectories, suite."""
+"""Commands of this package: identification, checks, diagnosis, use of models, history, trajectories."""
 
-import os
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import typer
 
@@ -323,78 +322,3 @@ def trajectory(
     write_atomically(page, trajectory_report(found))
     print(f"report: {page}")
     found.refuse_excess()
-
-
-def reproduce(
-    tables: Annotated[str | None, typer.Option(help="Table numbers, for example 5.2,6.7. [default: all]")] = None,
-    measured: Annotated[Path | None, typer.Option(help="Folder of the measured data of TX40 and EMPS.")] = None,
-    out: Annotated[Path, typer.Option("--out", help="Folder for the results and recordings.")] = Path("reproduction"),
-    quick: Annotated[bool, typer.Option("--quick", help="Skip tables 4.1 to 4.3 and run fewer simulations.")] = False,
-    json: Json = False,
-) -> None:
-    """Compute the tables of the thesis beside the published values, and check its claims.
-
-    Example: armident reproduce --tables 5.2,6.7
-    """
-    from armident.identify.thesis.command import reproduce_command
-
-    reproduce_command(tables, measured, out, quick, as_json=json)
-
-
-def diagnose_suite(
-    suite: Annotated[Path, typer.Option("--suite", help="Suite file: effects, joints and strengths.")] = Path(
-        "suite.yaml"
-    ),
-    out: Annotated[
-        Path, typer.Option("--out", help="Folder of results and tables; a stopped run continues there.")
-    ] = Path("suite"),
-    quick: Annotated[bool, typer.Option("--quick", help="One arm, place, strength and run of each effect.")] = False,
-    only: Annotated[
-        str, typer.Option("--only", help="Effects by name, or clean, clean_baseline, pair, outside: A,B,...")
-    ] = "",
-    strength: Annotated[str, typer.Option("--strength", help="detectable, typical, obvious: A,B,...")] = "",
-    jobs: Annotated[int | None, typer.Option("--jobs", help="Cases at a time. [default: processors]", min=1)] = None,
-    minutes: Annotated[
-        float | None,
-        typer.Option("--minutes", help="Start no case after this time, min; call again to continue.", min=0),
-    ] = None,
-    any_version: Annotated[
-        bool, typer.Option("--any-version", help="Use results of other versions of the code.")
-    ] = False,
-    list_cases: Annotated[bool, typer.Option("--list", help="Print the cases and end.")] = False,
-    arms: Annotated[
-        Literal["virtual", "random"], typer.Option("--arms", help="The two virtual robots, or arms drawn at random.")
-    ] = "virtual",
-    half: Annotated[
-        Literal["development", "reserve"],
-        typer.Option("--half", help="Half of the random arms; of the reserve only totals are shown and kept."),
-    ] = "development",
-    cases: Annotated[
-        int | None, typer.Option("--cases", help="Number of random arms. [default: 88, reserve 176]", min=1)
-    ] = None,
-    json: Json = False,
-) -> None:
-    """Hide effects in virtual arms, diagnose them, and print the detection rate of each effect.
-
-    Results are kept case by case: a stopped run continues.
-
-    Example: armident diagnose-suite --quick --out suite
-
-    Random arms: armident diagnose-suite --arms random --half development --out DIR
-    """
-    if arms == "random":
-        from armident.identify.evaluation.random_arms.run import RandomOptions, run_random_suite
-
-        random_options = RandomOptions(half, out, cases, jobs or len(os.sched_getaffinity(0)), minutes=minutes)
-        run_random_suite(random_options, as_json=json)
-        return
-    from armident.identify.evaluation.run import SuiteOptions, list_suite, run_suite
-
-    def words(text: str) -> tuple[str, ...]:
-        return tuple(word.strip() for word in text.split(",") if word.strip())
-
-    options = SuiteOptions(suite, out, quick, words(only), words(strength), jobs, minutes, any_version)
-    if list_cases:
-        list_suite(options)
-    else:
-        run_suite(options, as_json=json)

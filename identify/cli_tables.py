@@ -51,15 +51,7 @@ def progress(what: str) -> Iterator[Report]:
 
     The first run on a machine also prints that it compiles kernels.
 
-    Parameters
-    ----------
-    what
-        Command and its argument, the beginning of each line.
-
-    Yields
-    ------
-    callable
-        Takes a stage and the share done, 0 to 1.
+    ``what``: command and its argument, the beginning of each line. The result takes a stage and the share done, 0 to 1.
     """
     begin = time.monotonic()
     with event.install_listener("numba:compile", _Compilation(what)), _stages(what, begin) as report:
@@ -118,14 +110,8 @@ def setup_table(result: SetupCheck) -> None:
 def design_table(robot: RobotConfig, theta: NDArray[np.float64] | None, std: NDArray[np.float64]) -> None:
     """Print base parameters, if known, and their predicted standard deviations.
 
-    Parameters
-    ----------
-    robot
-        For the names of the parameters.
-    theta
-        Base parameters (b,), or ``None``.
-    std
-        Predicted standard deviations (b,).
+    ``robot``: for the names of the parameters; ``theta``: base parameters (b,), or ``None``; ``std``: predicted
+    standard deviations (b,).
     """
     table = Table(title=f"{robot.name}: predicted precision, base parameters", title_justify="left")
     names = arm_model(robot).base.names
@@ -241,12 +227,7 @@ def diagnosis_table(document: DiagnosisDocument) -> None:
 def time_left(elapsed_s: float, share: float) -> str:
     """Return the time left at a constant rate, in words.
 
-    Parameters
-    ----------
-    elapsed_s
-        Time since the beginning, s.
-    share
-        Share done, above 0 to 1.
+    ``elapsed_s``: time since the beginning, s; ``share``: share done, above 0 to 1.
     """
     seconds = round(elapsed_s * (1.0 - share) / share)
     return f"{seconds} s" if seconds < 120 else f"{seconds // 60} min"

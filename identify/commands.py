@@ -25,28 +25,11 @@ def identify_command(
 ) -> int:
     """Carry out ``armident identify``.
 
-    Parameters
-    ----------
-    path
-        Recording.
-    config
-        Robot configuration; ``None``: that of the recording.
-    chosen
-        Options of `armident.identify.api.identify` as the user wrote them.
-    out
-        Folder of the results; ``None``: beside the recording.
-    as_json
-        Print the document on stdout instead of a table.
-
-    Returns
-    -------
-    int
-        Exit code: `UNUSABLE` if the verdict says so, otherwise 0.
-
-    Raises
-    ------
-    ConfigError, DataError
-        If an option or a file is wrong, or the recording cannot be identified.
+    ``config``: robot configuration; ``None``: that of the recording. ``chosen``: options of
+    `armident.identify.api.identify` as the user wrote them. ``out``: folder of the results; ``None``: beside the
+    recording. ``as_json``: print the document on stdout instead of a table. Returns the exit code: `UNUSABLE` if the
+    verdict says so, otherwise 0. Raises ConfigError or DataError if an option or a file is wrong, or the recording
+    cannot be identified.
     """
     from armident.identify.api import identify
     from armident.identify.cli_tables import identification_table, progress, verdict_lines, warn
@@ -70,24 +53,9 @@ def identify_command(
 def check_command(paths: Sequence[Path], config: Path | None, *, as_json: bool) -> int:
     """Carry out ``armident check``.
 
-    Parameters
-    ----------
-    paths
-        Recordings.
-    config
-        Robot configuration; ``None``: that of the first recording.
-    as_json
-        Print the result as JSON on stdout instead of a table.
-
-    Returns
-    -------
-    int
-        Exit code: `UNUSABLE` with a decisive finding or a joint that the rigid model does not explain, otherwise 0.
-
-    Raises
-    ------
-    ConfigError, DataError
-        If a file is wrong, or the recordings cannot be checked.
+    ``config``: robot configuration; ``None``: that of the first recording. ``as_json``: print the result as JSON on
+    stdout instead of a table. Returns the exit code: `UNUSABLE` with a decisive finding or a joint that is not
+    understood, otherwise 0. Raises ConfigError or DataError if a file is wrong, or the recordings cannot be checked.
     """
     from armident.identify.api import check
     from armident.identify.cli_tables import progress, setup_table
@@ -118,6 +86,9 @@ def diagnose_command(
 ) -> int:
     """Carry out ``armident diagnose``.
 
+    Returns the exit code: 0 if the verdict is ``no_gap``, otherwise `FOUND`. Raises ConfigError or DataError if an
+    option or a file is wrong, or the recordings cannot support a diagnosis.
+
     Parameters
     ----------
     paths
@@ -135,16 +106,6 @@ def diagnose_command(
         Folder of the results; ``None``: beside the first recording.
     as_json
         Print the document on stdout instead of a table.
-
-    Returns
-    -------
-    int
-        Exit code: 0 if the verdict is ``no_gap``, otherwise `FOUND`.
-
-    Raises
-    ------
-    ConfigError, DataError
-        If an option or a file is wrong, or the recordings cannot support a diagnosis.
     """
     from armident.identify.api import diagnose
     from armident.identify.cli_tables import diagnosis_table, progress, warn
@@ -168,28 +129,11 @@ def diagnose_command(
 def predict_command(paths: Sequence[Path], model: Path, config: Path | None, out: Path | None, *, as_json: bool) -> int:
     """Carry out ``armident predict``.
 
-    Parameters
-    ----------
-    paths
-        Recordings.
-    model
-        Result with the identified parameters.
-    config
-        Robot configuration; ``None``: that of the model.
-    out
-        Folder of the results, of several recordings with a folder for each; ``None``: beside each recording.
-    as_json
-        Print the document on stdout instead of a table.
-
-    Returns
-    -------
-    int
-        Exit code: `FOUND` if the model explains the torques of a recording no better than none, otherwise 0.
-
-    Raises
-    ------
-    ConfigError, DataError
-        If a file is wrong, the model is unusable, or a recording cannot be used.
+    ``model``: result with the identified parameters. ``config``: robot configuration; ``None``: that of the model.
+    ``out``: folder of the results, of several recordings with a folder for each; ``None``: beside each recording.
+    ``as_json``: print the document on stdout instead of a table. Returns the exit code: `FOUND` if the model explains
+    the torques of a recording no better than none, otherwise 0. Raises ConfigError or DataError if a file is wrong, the
+    model is unusable, or a recording cannot be used.
     """
     from armident.configs import load_robot
     from armident.daq.recording import read_recording
@@ -253,6 +197,9 @@ def compare_command(
 ) -> int:
     """Carry out ``armident compare``.
 
+    Returns the exit code: `FOUND` if the parameters differ significantly, otherwise 0. Raises ConfigError or DataError
+    if a file is wrong, or the two cannot be compared.
+
     Parameters
     ----------
     baseline, now
@@ -265,16 +212,6 @@ def compare_command(
         Compare only the parameters that both have.
     as_json
         Print the document on stdout instead of a table.
-
-    Returns
-    -------
-    int
-        Exit code: `FOUND` if the parameters differ significantly, otherwise 0.
-
-    Raises
-    ------
-    ConfigError, DataError
-        If a file is wrong, or the two cannot be compared.
     """
     from armident.identify.cli_tables import warn
     from armident.identify.monitoring.comparison import compare_models, comparison_table

@@ -84,19 +84,8 @@ def predict_recording(
     Positions are differentiated, and torques aligned, by the steps of `armident.identify`, so that the recording of the
     identification has the error that its document states.
 
-    Parameters
-    ----------
-    recording
-        The recording, of the same robot.
-    model
-        The model.
-    progress
-        Called with the name of a stage and the share done, 0 to 1.
-
-    Raises
-    ------
-    DataError
-        If the recording is of another robot, or too short.
+    ``recording``: of the same robot; ``progress``: called with the name of a stage and the share done, 0 to 1. Raises
+    DataError if the recording is of another robot, or too short.
     """
     show = progress or (lambda stage, share: None)
     robot, notes = model.robot, Notes()

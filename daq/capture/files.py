@@ -32,23 +32,8 @@ def open_series(
 
     With a trigger it keeps the last seconds in memory, and writes a file at each event.
 
-    Parameters
-    ----------
-    session, robot
-        Configuration that the files hold.
-    streams
-        The captured streams.
-    directory
-        Directory of the files.
-    name
-        Name of the first file, without suffix.
-    metadata
-        Metadata of every file.
-
-    Raises
-    ------
-    ConfigError
-        If the first file cannot be created.
+    ``session``, ``robot``: configuration that the files hold; ``name``: name of the first file, without suffix. Raises
+    ConfigError if the first file cannot be created.
     """
     options = session.recording
     layouts = [stream.layout for stream in streams]
@@ -111,14 +96,7 @@ def next_time(directory: Path, robot: str, now: datetime.datetime) -> datetime.d
 
     After a step of the clock back, names would otherwise collide or come before those of earlier recordings.
 
-    Parameters
-    ----------
-    directory
-        Directory of the recordings.
-    robot
-        Name of the robot.
-    now
-        Time of the clock (UTC).
+    ``now``: time of the clock (UTC).
     """
     newest = max((made for _, made in recordings_of(directory, robot)), default=None)
     if newest is None or now - newest >= _STAMP_STEP:
@@ -136,14 +114,7 @@ def next_time(directory: Path, robot: str, now: datetime.datetime) -> datetime.d
 class RecordingRetention:
     """Deletes old recordings of a robot during a capture; use it in a ``with`` block.
 
-    Parameters
-    ----------
-    options
-        ``keep_days`` and ``min_free_gb``; may be exchanged at any time.
-    directory
-        Directory of the recordings.
-    robot
-        Name of the robot.
+    ``options``: ``keep_days`` and ``min_free_gb``; may be exchanged at any time.
     """
 
     def __init__(self, options: RecordingOptions, directory: Path, robot: str) -> None:

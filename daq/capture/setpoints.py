@@ -34,17 +34,8 @@ class StandstillDetector:
     An arm is at standstill if no joint exceeds 0.2 % of its velocity limit, averaged over any 10 ms of the last 50 ms.
     The turning point of an oscillation is thus no standstill. Two encoder counts are no motion.
 
-    Parameters
-    ----------
-    session
-        Gives the SYNC period.
-    robot
-        Gives transmission, scales and limits.
-
-    Raises
-    ------
-    ConfigError
-        If a drive has no ``counts_per_unit``.
+    ``session``: gives the SYNC period; ``robot``: gives transmission, scales and limits. Raises ConfigError if a drive
+    has no ``counts_per_unit``.
     """
 
     def __init__(self, session: SessionConfig, robot: RobotConfig) -> None:
@@ -59,12 +50,7 @@ class StandstillDetector:
     def update(self, sync: int, counts: NDArray[np.integer]) -> bool:
         """Take positions and return True if the arm stands still; ``False`` during the first 50 ms.
 
-        Parameters
-        ----------
-        sync
-            Number of the SYNC of the positions.
-        counts
-            Motor positions (n,), counts.
+        ``counts``: motor positions (n,), counts.
         """
         now = self._per_count @ counts
         if self._last is None:
@@ -81,12 +67,7 @@ class StandstillDetector:
 class SetpointSchedule:
     """Set points of a capture.
 
-    Parameters
-    ----------
-    plan
-        The set points.
-    first, last
-        Rows of the start and of the end of the experiment.
+    ``plan``: the set points; ``first``, ``last``: rows of the start and of the end of the experiment.
     """
 
     plan: SetpointPlan
@@ -98,10 +79,7 @@ class SetpointSchedule:
 
         The demand reaches a row one interpolation period (60C2h) after the row has become the target.
 
-        Parameters
-        ----------
-        played_from
-            Number of the SYNC at which row 0 becomes the target.
+        ``played_from``: number of the SYNC at which row 0 becomes the target.
         """
         every = self.plan.every
         return played_from + (self.first + 1) * every, played_from + (self.last + 1) * every
@@ -112,16 +90,8 @@ def plan_setpoints(
 ) -> SetpointSchedule:
     """Return the set points of a trajectory, with an approach from the actual position and rest at both ends.
 
-    Parameters
-    ----------
-    session
-        Session with ``setpoints``.
-    robot
-        The robot.
-    trajectory
-        Trajectory within the robot's limits.
-    actual_counts
-        Motor positions (6064h), (n,), counts.
+    ``session``: session with ``setpoints``; ``trajectory``: trajectory within the robot's limits; ``actual_counts``:
+    motor positions (6064h), (n,), counts.
     """
     assert session.setpoints is not None
     options = session.setpoints
@@ -147,14 +117,8 @@ def approach(
 ) -> NDArray[np.float64]:
     """Return the joint positions (N, n) of a smooth move within `APPROACH_SHARE` of the limits.
 
-    Parameters
-    ----------
-    actual, start
-        Joint positions (n,) at both ends, rad or m.
-    robot
-        Gives the limits.
-    period
-        Time between two rows, s.
+    ``actual``, ``start``: joint positions (n,) at both ends, rad or m; ``robot``: gives the limits; ``period``: time
+    between two rows, s.
     """
     distance = np.abs(start - actual)
     velocity = np.array([joint.limits.velocity for joint in robot.joints]) * APPROACH_SHARE

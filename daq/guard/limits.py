@@ -30,16 +30,8 @@ Floats = NDArray[np.float64]
 class Limits:
     """Limits of the joints.
 
-    Parameters
-    ----------
-    low, high
-        Range of position (n,), rad or m.
-    velocity
-        Largest speed (n,), rad/s or m/s.
-    torque
-        Largest effort (n,), N m or N.
-    following
-        Largest distance between demand and position (n,), rad or m.
+    ``low``, ``high``: range of position (n,), rad or m; ``velocity``: largest speed (n,), rad/s or m/s; ``torque``:
+    largest effort (n,), N m or N; ``following``: largest distance between demand and position (n,), rad or m.
     """
 
     low: Floats
@@ -52,17 +44,8 @@ class Limits:
 def limits_of(robot: RobotConfig, following_s: float = FOLLOWING_S) -> Limits:
     """Return the limits of a robot.
 
-    Parameters
-    ----------
-    robot
-        Robot whose joints have limits.
-    following_s
-        Largest following error, as the time of motion at the velocity limit, s.
-
-    Raises
-    ------
-    ConfigError
-        If the robot lacks a limit.
+    ``robot``: robot whose joints have limits; ``following_s``: largest following error, as the time of motion at the
+    velocity limit, s. Raises ConfigError if the robot lacks a limit.
     """
     robot.check_movable()
     limits = [joint.limits for joint in robot.joints]

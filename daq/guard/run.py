@@ -44,12 +44,7 @@ def stop_frames(session: SessionConfig, robot: RobotConfig) -> list[Frames]:
     The RPDOs of the controlwords come first, since they act at once; SDO requests follow for drives that map no
     controlword.
 
-    Parameters
-    ----------
-    session
-        Session with ``setpoints``.
-    robot
-        The robot.
+    ``session``: session with ``setpoints``.
     """
     assert session.setpoints is not None
     word = int(Control.QUICK_STOP).to_bytes(2, "little")
@@ -72,16 +67,7 @@ def stop_frames(session: SessionConfig, robot: RobotConfig) -> list[Frames]:
 class Guard:
     """Monitors the buses of one session and stops the drives.
 
-    Parameters
-    ----------
-    buses
-        The buses, with filters for the identifiers of the monitor.
-    monitor
-        Checks their frames.
-    stops
-        Frames that stop the drives of each bus.
-    period
-        SYNC period, s.
+    ``buses``: with filters for the identifiers of the monitor; ``monitor``: checks their frames.
     """
 
     def __init__(
@@ -109,10 +95,7 @@ class Guard:
     def run(self) -> Alarm | None:
         """Monitor until an alarm, `stop` or `leave`; return the alarm, after which the drives are stopped.
 
-        Raises
-        ------
-        BusDown
-            If a bus went down while the arm did not move.
+        Raises BusDown if a bus went down while the arm did not move.
         """
         while not self._over:
             alarm, received = None, 0
@@ -153,19 +136,9 @@ def guard(config: str, following_s: float = FOLLOWING_S) -> None:
 
     An alarm, SIGINT and SIGTERM stop the drives. SIGUSR1 ends the guard after the motion, without a quick stop.
 
-    Parameters
-    ----------
-    config
-        Session configuration.
-    following_s
-        Largest following error, as the time of motion at the velocity limit, s.
-
-    Raises
-    ------
-    ConfigError
-        If the session has no set points, or a bus does not exist.
-    ArmidentError
-        If the guard stopped the drives on an alarm; the message gives the reason.
+    ``config``: session configuration; ``following_s``: largest following error, as the time of motion at the velocity
+    limit, s. Raises ConfigError if the session has no set points, or a bus does not exist. Raises ArmidentError if the
+    guard stopped the drives on an alarm; the message gives the reason.
     """
     session = load_session(config)
     robot = load_robot(session.robot)

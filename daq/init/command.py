@@ -27,8 +27,6 @@ class InitOptions:
 
     Parameters
     ----------
-    out
-        Folder of the files.
     urdf, robot, dh, axes
         Source of the geometry: a URDF, a robot of the library, a table of Denavit-Hartenberg parameters, or only the
         number of joints.
@@ -75,17 +73,8 @@ class InitOptions:
 def run_init(options: InitOptions) -> str:
     """Write ``robot.yaml`` and ``session.yaml``, and return the summary for the user.
 
-    Parameters
-    ----------
-    options
-        Options of the command.
-
-    Raises
-    ------
-    ConfigError
-        If no source is given, a source is wrong, or a file exists already.
-    DataError
-        If the recording cannot be imported, or is of another arm.
+    Raises ConfigError if no source is given, a source is wrong, or a file exists already; DataError if the recording
+    cannot be imported, or is of another arm.
     """
     robot_file, session_file = options.out / "robot.yaml", options.out / "session.yaml"
     taken = [str(file) for file in (robot_file, session_file) if file.exists()]
@@ -156,14 +145,7 @@ def _sources(geometry: Geometry, facts: RecordedFacts | None) -> str:
 def summary(robot_file: Path, session_file: Path, geometry: Geometry, facts: RecordedFacts | None) -> str:
     """Return what was written, found and assumed, all blanks, and the next commands.
 
-    Parameters
-    ----------
-    robot_file, session_file
-        The files.
-    geometry
-        Source of the geometry.
-    facts
-        Facts of the recording; ``None``: there is none.
+    ``geometry``: source of the geometry. ``facts``: facts of the recording; ``None``: there is none.
     """
     robot, session = load_robot(robot_file, ""), load_session(session_file, "")
     joints = ", ".join(joint.name for joint in robot.joints)

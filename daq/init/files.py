@@ -18,16 +18,8 @@ SYNC_US = (100, 1_000_000)
 class CellFacts:
     """Facts of a cell with CANopen drives; what is ``None`` is left blank.
 
-    Parameters
-    ----------
-    cell
-        Name of the cell.
-    channel, bitrate
-        CAN interface and bit rate; a bit rate of 0 is that of a virtual bus.
-    node_ids
-        CANopen node of each joint, base to tip.
-    eds
-        Electronic data sheet of the drives.
+    ``channel``, ``bitrate``: CAN interface and bit rate; a bit rate of 0 is that of a virtual bus. ``node_ids``:
+    CANopen node of each joint, base to tip. ``eds``: electronic data sheet of the drives.
     """
 
     cell: str
@@ -48,8 +40,6 @@ def robot_content(
 
     Parameters
     ----------
-    geometry
-        The arm.
     facts
         Facts of a recording; ``None``: there is none.
     signal
@@ -137,16 +127,7 @@ def _moved(facts: RecordedFacts, kind: str, k: int) -> str:
 def session_content(robot: RobotConfig, signal: str, facts: RecordedFacts | None, cell: CellFacts) -> dict[str, Any]:
     """Return the content of ``session.yaml``.
 
-    Parameters
-    ----------
-    robot
-        The arm.
-    signal
-        Kind of effort that the drives report.
-    facts
-        Facts of a recording; ``None``: there is none.
-    cell
-        Facts of the cell.
+    ``signal``: kind of effort that the drives report. ``facts``: facts of a recording; ``None``: there is none.
     """
     hinted: set[str] = set()
     ids = cell.node_ids

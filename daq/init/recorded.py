@@ -36,8 +36,6 @@ class RecordedFacts:
 
     Parameters
     ----------
-    path
-        The file.
     rate_hz
         Sampling rate, 1/s.
     duration_s
@@ -77,19 +75,9 @@ def examine(path: Path, robot: RobotConfig, stated: Mapping[str, Any]) -> Record
     Units of positions, torques and times, and times that jitter, are recognized, and the options of `armident import`
     that correct them are returned.
 
-    Parameters
-    ----------
-    path
-        A file that `armident import` reads, or a recording.
-    robot
-        The robot that was measured, with the limits that are known.
-    stated
-        Options of `import_recording` that the user has stated.
-
-    Raises
-    ------
-    ConfigError, DataError
-        If the file cannot be imported.
+    ``path``: a file that `armident import` reads, or a recording; ``robot``: the robot that was measured, with the
+    limits that are known; ``stated``: options of `import_recording` that the user has stated. Raises ConfigError or
+    DataError if the file cannot be imported.
     """
     if is_recording(path):
         return _facts(path, read_recording(path), robot, {})
@@ -212,15 +200,7 @@ def _as_options(options: Mapping[str, Any]) -> dict[str, str]:
 
 
 def moved(facts: RecordedFacts, robot: RobotConfig) -> NDArray[np.bool_]:
-    """Mask (n,) of the joints that moved: over 1 % of the widest range of joints of their type.
-
-    Parameters
-    ----------
-    facts
-        Facts of the recording.
-    robot
-        The robot, for the types of its joints.
-    """
+    """Mask (n,) of the joints that moved: over 1 % of the widest range of joints of their type."""
     ranges = facts.position[:, 1] - facts.position[:, 0]
     revolute = np.array([joint.type == "revolute" for joint in robot.joints])
     widest = np.array([ranges[revolute == one].max() for one in revolute])

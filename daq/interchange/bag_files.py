@@ -52,14 +52,7 @@ _DAMAGED = (sqlite3.Error, UnicodeDecodeError)
 class BagMessage(NamedTuple):
     """Message of a bag.
 
-    Parameters
-    ----------
-    topic
-        Topic.
-    logged_ns
-        Time at which it was recorded, ns UTC.
-    data
-        Content in CDR, uncompressed.
+    ``logged_ns``: time at which it was recorded, ns UTC; ``data``: content in CDR, uncompressed.
     """
 
     topic: str
@@ -68,28 +61,16 @@ class BagMessage(NamedTuple):
 
 
 def is_bag(path: Path) -> bool:
-    """Return True if a path has the name of a bag file, one of ROS 1 included, or is a folder.
-
-    Parameters
-    ----------
-    path
-        The file or folder.
-    """
+    """Return True if a path has the name of a bag file, one of ROS 1 included, or is a folder."""
     return path.name.lower().endswith((*SUFFIXES, ROS_1)) or path.is_dir()
 
 
 def bag_files(path: Path) -> tuple[list[Path], list[str]]:
     """Return the files of a bag in the order of recording, and the names of those that its metadata lists in vain.
 
-    Parameters
-    ----------
-    path
-        A file, or a folder with ``metadata.yaml``; without it, the folder's bag files in the order of their numbers.
-
-    Raises
-    ------
-    ConfigError
-        If there is no such file or folder, or the folder has no bag file, those of several bags, or bags of ROS 1.
+    ``path``: a file, or a folder with ``metadata.yaml``; without it, the folder's bag files in the order of their
+    numbers. Raises ConfigError if there is no such file or folder, or the folder has no bag file, those of several
+    bags, or bags of ROS 1.
     """
     if not path.is_dir():
         if not path.is_file():
@@ -137,12 +118,9 @@ def _of_ros_1(file: Path) -> str:
 class BagReader:
     """Iterates over the messages of one type in a bag, in the order of its files.
 
-    Parameters
-    ----------
-    path
-        File or folder of the bag.
-    message_type
-        Type of the messages, such as ``sensor_msgs/msg/JointState``.
+    ``message_type``: type of the messages, such as ``sensor_msgs/msg/JointState``. Raises ConfigError if there is no
+    such bag, or it cannot be read. The iteration raises it. Raises DataError if no file is a bag file. The iteration
+    raises it.
 
     Attributes
     ----------
@@ -150,13 +128,6 @@ class BagReader:
         Type by topic, of all topics so far.
     losses
         Descriptions of what is missing or damaged, after the iteration.
-
-    Raises
-    ------
-    ConfigError
-        If there is no such bag, or it cannot be read. The iteration raises it.
-    DataError
-        If no file is a bag file. The iteration raises it.
     """
 
     def __init__(self, path: Path, message_type: str) -> None:

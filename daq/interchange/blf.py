@@ -38,17 +38,7 @@ _LARGEST_CONTAINER = 256 * 2**20
 def read_blf(path: Path, into: FrameCollector) -> None:
     """Add the frames of a BLF log, and a note for everything that is damaged or cut off.
 
-    Parameters
-    ----------
-    path
-        The log.
-    into
-        Takes the frames.
-
-    Raises
-    ------
-    DataError
-        If it is not a BLF file.
+    ``into``: takes the frames. Raises DataError if it is not a BLF file.
     """
     with path.open("rb") as file:
         head = file.read(_HEADER.size)

@@ -37,22 +37,10 @@ NOTES = "source_remarks"
 def recording_from_log(path: Path, session: SessionConfig, robot: RobotConfig) -> Recording:
     """Return the recording of a log: its frames, matched by the mapping of a session.
 
-    Parameters
-    ----------
-    path
-        Log of one bus, or of several that have the names of the session's buses.
-    session, robot
-        Mapping of the TPDOs, and scales of their objects.
-
-    Lines and blocks that are damaged are left out, counted and named in warnings and in the metadata.
-
-    Raises
-    ------
-    ConfigError
-        If there is no such file, it lacks a bus of the session, or the session's buses carry CAN FD.
-    DataError
-        If it cannot be read as such a log, holds no SYNC, its SYNC period differs from that of the session, or a drive
-        sends no TPDO of the length that the session maps.
+    ``path``: log of one bus, or of several that have the names of the session's buses; ``session``, ``robot``: mapping
+    of the TPDOs, and scales of their objects. Raises ConfigError if there is no such file, it lacks a bus of the
+    session, or the session's buses carry CAN FD; DataError if it cannot be read as such a log, holds no SYNC, its SYNC
+    period differs from that of the session, or a drive sends no TPDO of the length that the session maps.
     """
     _check_classic(session, str(path))
     streams = captured_streams(session, robot)
@@ -169,19 +157,9 @@ def write_log(recording: Recording, path: Path) -> None:
     A recording has the time of every SYNC; its answers follow at intervals of 20 us. SYNCs that were not received or
     not answered by all drives are not in the log, which its SYNC counter shows.
 
-    Parameters
-    ----------
-    recording
-        A recording that comes from a bus.
-    path
-        The file; its suffix selects the format.
-
-    Raises
-    ------
-    ConfigError
-        If the file cannot be written, or the session's buses carry CAN FD.
-    DataError
-        If the recording does not come from a bus.
+    ``recording``: a recording that comes from a bus. ``path``: the file; its suffix selects the format. Raises
+    ConfigError if the file cannot be written, or the session's buses carry CAN FD; DataError if the recording does not
+    come from a bus.
     """
     session = recording.session
     if session is None:

@@ -27,18 +27,9 @@ Floats = NDArray[np.float64]
 class EvenSamples:
     """Samples on an even clock, with gaps.
 
-    Parameters
-    ----------
-    numbers
-        Number of each sample, from 0, strictly increasing, (M,).
-    values
-        Quantities, (M, n) each.
-    holes
-        Number of holes.
-    left_out
-        Rows of pieces too short to resample.
-    steps_s
-        Quantiles 0.01, 0.5 and 0.99 of the steps of the times, s.
+    ``numbers``: number of each sample, from 0, strictly increasing, (M,); ``values``: quantities, (M, n) each;
+    ``left_out``: rows of pieces too short to resample; ``steps_s``: quantiles 0.01, 0.5 and 0.99 of the steps of the
+    times, s.
     """
 
     numbers: NDArray[np.int64]
@@ -49,32 +40,16 @@ class EvenSamples:
 
 
 def usual_rate(times: Floats) -> float:
-    """Return the rate of the usual step, 1/s.
-
-    Parameters
-    ----------
-    times
-        Times (N,), s, strictly increasing.
-    """
+    """Return the rate of the usual step, 1/s. ``times`` (N,), s, strictly increasing."""
     return 1.0 / float(np.median(np.diff(times)))
 
 
 def onto_even_times(times: Floats, raw: Mapping[str, Floats], rate_hz: float) -> EvenSamples:
     """Return samples at even times: positions by cubic splines, efforts linearly; nothing across holes.
 
-    Parameters
-    ----------
-    times
-        Times (N,), s, strictly increasing.
-    raw
-        Quantities (N, n); ``position`` and ``demand`` are smooth, others are not.
-    rate_hz
-        Rate of the even clock, 1/s, not much below that of the rows.
-
-    Raises
-    ------
-    DataError
-        If there are too few rows, or too many holes.
+    ``times`` (N,), s, strictly increasing. ``raw``: quantities (N, n); ``position`` and ``demand`` are smooth, others
+    are not. ``rate_hz``: rate of the even clock, 1/s, not much below that of the rows. Raises DataError if there are
+    too few rows, or too many holes.
     """
     from scipy.interpolate import CubicSpline
 

@@ -18,12 +18,7 @@ def columns(recording: Recording) -> dict[str, NDArray[np.float64]]:
     """Return time ``t`` (s), joint positions ``q1..``, torques ``tau1..`` and references ``qr1..``, (N,) each.
 
     References are given where recorded, linear between set points, as drives interpolate (CiA 402, 60C0h = 0). Rows
-    outside the recorded set points are NaN.
-
-    Raises
-    ------
-    DataError
-        If the recording has no samples.
+    outside the recorded set points are NaN. Raises DataError if the recording has no samples.
     """
     robot, samples = recording.robot, recording.samples
     if samples.sync.size == 0:
@@ -55,19 +50,10 @@ def columns(recording: Recording) -> dict[str, NDArray[np.float64]]:
 def export_recording(recording: Recording, path: Path) -> None:
     """Write a recording in the format of the suffix; the file appears when it is complete.
 
-    Parameters
-    ----------
-    recording
-        The recording.
-    path
-        The file: `columns` as .csv, .npz, .mat, .parquet or .mcap (ROS 2), or a log of the bus (`bus_log.SUFFIXES`).
-
-    Raises
-    ------
-    ConfigError
-        If the format is unknown, needs a package that is not installed, or the file cannot be written.
-    DataError
-        If the recording has no samples, or a bus log is requested of one that does not come from a bus.
+    ``path``: the file: `columns` as .csv, .npz, .mat, .parquet or .mcap (ROS 2), or a log of the bus
+    (`bus_log.SUFFIXES`). Raises ConfigError if the format is unknown, needs a package that is not installed, or the
+    file cannot be written; DataError if the recording has no samples, or a bus log is requested of one that does not
+    come from a bus.
     """
     if path.suffix.lower() in LOG_SUFFIXES:
         write_log(recording, path)

@@ -50,6 +50,10 @@ def import_recording(
 ) -> Recording:
     """Return measured motion and effort as a recording, after checks of content, units and clock.
 
+    Raises ConfigError if a file or option is wrong; DataError if the content is wrong: missing columns, wrong number of
+    axes, too many damaged rows, times that jitter or contradict the rate, values far outside the limits, or a demand
+    that no joint followed.
+
     Parameters
     ----------
     path
@@ -85,14 +89,6 @@ def import_recording(
         Take joints of other names in the order of the file.
     units
         Units of quantities that are not in SI units (`armident.daq.interchange.stated_units.CHOICES`).
-
-    Raises
-    ------
-    ConfigError
-        If a file or option is wrong.
-    DataError
-        If the content is wrong: missing columns, wrong number of axes, too many damaged rows, times that jitter or
-        contradict the rate, values far outside the limits, or a demand that no joint followed.
     """
     if is_recording(path):
         if effort is not None or motor_side or names or polled or time_unit or topic or joints or by_position or units:
@@ -158,17 +154,8 @@ def read_rows(
 ) -> tuple[Source, Rows]:
     """Return a table, and its complete rows in the units of the file.
 
-    Parameters
-    ----------
-    path, robot, effort, names, topic, joints, by_position
-        As for `import_recording`.
-
-    Raises
-    ------
-    ConfigError
-        If a file or option is wrong.
-    DataError
-        If columns are missing, or too many rows are damaged.
+    ``path``, ``robot``, ``effort``, ``names``, ``topic``, ``joints``, ``by_position``: as for `import_recording`.
+    Raises ConfigError if a file or option is wrong; DataError if columns are missing, or too many rows are damaged.
     """
     chosen = dict(names or {})
     unknown = sorted(chosen.keys() - NAMES.keys())

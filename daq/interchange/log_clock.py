@@ -25,14 +25,8 @@ _HOLE_PERIODS = 10
 def clock_steps(numbers: NDArray[np.int64], t_ns: NDArray[np.int64], session: SessionConfig) -> list[str]:
     """Return a sentence if the times of SYNCs step where their numbers do not.
 
-    Parameters
-    ----------
-    numbers
-        Numbers of the SYNCs, (N,), increasing.
-    t_ns
-        Their times, ns, (N,).
-    session
-        The session, with SYNC period and counter.
+    ``numbers``: numbers of the SYNCs, (N,), increasing; ``t_ns``: their times, ns, (N,); ``session``: with SYNC period
+    and counter.
     """
     period = session.sync.period_us * 1000
     late = np.diff(t_ns) - np.diff(numbers) * period
@@ -52,19 +46,8 @@ def clock_steps(numbers: NDArray[np.int64], t_ns: NDArray[np.int64], session: Se
 def check_sync_period(path: Path, frames: Frames, session: SessionConfig) -> None:
     """Refuse a log whose SYNCs come at another period than that of the session.
 
-    Parameters
-    ----------
-    path
-        The log, for messages.
-    frames
-        Its frames of one bus, (N,).
-    session
-        The session, with SYNC period and counter.
-
-    Raises
-    ------
-    DataError
-        If both periods differ; the message states both.
+    ``path``: the log, for messages; ``frames``: its frames of one bus, (N,); ``session``: with SYNC period and counter.
+    Raises DataError if both periods differ; the message states both.
     """
     syncs = frames[frames["can_id"] == COB_SYNC]
     found = sync_period_ns(syncs["t_ns"], _steps(syncs, session.sync.counter))
@@ -83,12 +66,8 @@ def check_sync_period(path: Path, frames: Frames, session: SessionConfig) -> Non
 def sync_period_ns(t_ns: NDArray[np.int64], steps: NDArray[np.int64] | None) -> tuple[float, float] | None:
     """Return the mean SYNC period and its uncertainty, ns; ``None`` if there are too few SYNCs.
 
-    Parameters
-    ----------
-    t_ns
-        Times of the SYNCs, (N,), ns.
-    steps
-        Number of periods from each SYNC to the next by its counter, (N - 1,); ``None``: one each.
+    ``t_ns``: times of the SYNCs, (N,), ns. ``steps``: number of periods from each SYNC to the next by its counter,
+    (N - 1,); ``None``: one each.
     """
     if t_ns.size < _FEWEST:
         return None

@@ -26,17 +26,8 @@ _LONGEST_LINE = 4096
 def read_log(path: Path) -> LogFrames:
     """Return the frames of a bus log.
 
-    Parameters
-    ----------
-    path
-        The log; its suffix tells the format.
-
-    Raises
-    ------
-    ConfigError
-        If there is no such file, or it cannot be opened.
-    DataError
-        If it is not such a log, or holds no frames.
+    ``path``: the log; its suffix tells the format. Raises ConfigError if there is no such file, or it cannot be opened;
+    DataError if it is not such a log, or holds no frames.
     """
     if not is_file(path):
         raise ConfigError(f"{path}: no such file")

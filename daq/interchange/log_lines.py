@@ -84,13 +84,7 @@ class CandumpLines:
         self.added_up: bool | None = None
 
     def parse(self, line: str) -> FrameLine | Line:
-        """Return the frame of a line, or the kind of the line.
-
-        Parameters
-        ----------
-        line
-            The line, without spaces at its ends.
-        """
+        """Return the frame of a line, or the kind of the line. ``line``: without spaces at its ends."""
         if not line or line[0] in "#;/":
             return Line.COMMENT
         if found := _LOG_LINE.match(line):
@@ -163,10 +157,7 @@ def _month(word: str) -> int | None:
 def asc_date_ns(text: str) -> int | None:
     """Return the time of a date line of an ASC log in ns, in the zone of this computer; ``None`` if it is not known.
 
-    Parameters
-    ----------
-    text
-        The line, in the language of the computer that wrote it.
+    ``text``: the line, in the language of the computer that wrote it.
     """
     clock = _ASC_CLOCK.search(text)
     if clock is None:
@@ -202,13 +193,7 @@ class AscLines:
         self._trigger = False
 
     def parse(self, line: str) -> FrameLine | Line:
-        """Return the frame of a line, or the kind of the line.
-
-        Parameters
-        ----------
-        line
-            The line, without spaces at its ends.
-        """
+        """Return the frame of a line, or the kind of the line. ``line``: without spaces at its ends."""
         found = _ASC_EVENT.match(line)
         if found is None:
             return self._heading(line)
@@ -312,13 +297,7 @@ class TrcLines:
         self._columns: list[str] = []
 
     def parse(self, line: str) -> FrameLine | Line:
-        """Return the frame of a line, or the kind of the line.
-
-        Parameters
-        ----------
-        line
-            The line, without spaces at its ends.
-        """
+        """Return the frame of a line, or the kind of the line. ``line``: without spaces at its ends."""
         if not line:
             return Line.COMMENT
         if line.startswith(";"):

@@ -32,19 +32,8 @@ def at_rate(recording: Recording, rate_hz: float) -> Recording:
     Gaps, marks and pieces between gaps keep their times. So does the time from a position to the torque that belongs
     to it, as in a capture of the same drives at the new rate; in sampling periods it is another number.
 
-    Parameters
-    ----------
-    recording
-        The recording.
-    rate_hz
-        New sampling rate, 1/s.
-
-    Raises
-    ------
-    ConfigError
-        If the rate is not a number greater than 0.
-    DataError
-        If the recording has no samples, or a value that is not finite.
+    ``rate_hz``: new sampling rate, 1/s. Raises ConfigError if the rate is not a number greater than 0; DataError if the
+    recording has no samples, or a value that is not finite.
     """
     if not (np.isfinite(rate_hz) and rate_hz > 0):
         raise ConfigError(f"--rate: expected a sampling rate greater than 0 Hz, found {rate_hz:g}")
@@ -115,14 +104,8 @@ def _values(quantity: str, raw: NDArray[Any], at: Floats, ratio: float) -> NDArr
 def low_passed(values: Floats, at: Floats, share: float) -> Floats:
     """Return a signal after a low-pass filter of linear phase, at any instants (M, n).
 
-    Parameters
-    ----------
-    values
-        Samples (N, n); beyond the ends they continue by point reflection.
-    at
-        Instants (M,), in samples.
-    share
-        Frequency from which on the signal is attenuated, in shares of the Nyquist frequency, at most 1.
+    ``values``: samples (N, n); beyond the ends they continue by point reflection. ``at``: instants (M,), in samples.
+    ``share``: frequency from which on the signal is attenuated, in shares of the Nyquist frequency, at most 1.
     """
     stop, begin = 0.5 * share, 0.5 * share * PASS_SHARE
     cutoff = (stop + begin) / 2

@@ -33,14 +33,8 @@ Ints = NDArray[np.int64]
 class EvenClockSamples:
     """Samples on an even clock.
 
-    Parameters
-    ----------
-    values
-        Quantities, (M, n) each.
-    repeated
-        Number of repeated rows that were dropped.
-    interpolated
-        Number of missed samples that were interpolated.
+    ``values``: quantities, (M, n) each; ``repeated``: number of repeated rows that were dropped; ``interpolated``:
+    number of missed samples that were interpolated.
     """
 
     values: dict[str, Floats]
@@ -54,15 +48,8 @@ def onto_even_clock(raw: Mapping[str, Floats]) -> EvenClockSamples:
     Repeated rows are dropped and missed samples interpolated: positions by a cubic spline, efforts linearly. During
     standstill every row counts as one sample.
 
-    Parameters
-    ----------
-    raw
-        Quantities (N, n) as read; ``position`` is one of them.
-
-    Raises
-    ------
-    DataError
-        If the rows do not fit an even clock, or there are too few.
+    ``raw``: quantities (N, n) as read; ``position`` is one of them. Raises DataError if the rows do not fit an even
+    clock, or there are too few.
     """
     rows = np.concatenate(list(raw.values()), axis=1)
     changed = np.append(True, np.any(rows[1:] != rows[:-1], axis=1))

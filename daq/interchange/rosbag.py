@@ -35,14 +35,8 @@ SIMULATED_S = 1e8
 class JointStates:
     """Joint states of a robot.
 
-    Parameters
-    ----------
-    t_ns
-        Times, ns, (N,), increasing.
-    q, tau
-        Positions and efforts, SI units, (N, n), in the robot's order.
-    remarks
-        Sentences on what was assumed, passed over or is missing, for the user.
+    ``t_ns``: times, ns, (N,), increasing; ``q``, ``tau``: positions and efforts, SI units, (N, n), in the robot's
+    order; ``remarks``: sentences on what was assumed, passed over or is missing, for the user.
     """
 
     t_ns: NDArray[np.int64]
@@ -63,7 +57,9 @@ def read_joint_states(
 
     Joints are found by their names in every message (`armident.daq.interchange.joint_names`). Other joints are passed
     over. Messages of one stamp with parts of the robot's joints are one sample. Times are the stamps, or the times of
-    recording if no stamp is set. What is damaged is left out, with a remark.
+    recording if no stamp is set. What is damaged is left out, with a remark. Raises ConfigError if there is no such
+    bag; DataError if it is no bag, has no joint states, those of several robots, no joint of a name, or contradictory
+    times.
 
     Parameters
     ----------
@@ -77,13 +73,6 @@ def read_joint_states(
         Names in the bag of the robot's joints, in the robot's order; ``None``: those of the robot.
     by_position
         True to take joints of other names in the order of the messages.
-
-    Raises
-    ------
-    ConfigError
-        If there is no such bag.
-    DataError
-        If it is no bag, has no joint states, those of several robots, no joint of a name, or contradictory times.
     """
     reader = BagReader(path, MESSAGE_TYPE)
     found: dict[str, TopicMessages] = {}
@@ -282,16 +271,8 @@ def write_joint_states(
 ) -> None:
     """Write positions and efforts as joint states.
 
-    Parameters
-    ----------
-    path
-        The rosbag2 file.
-    joints
-        Names of the n joints.
-    t_ns
-        Times, ns UTC, (N,).
-    columns
-        Positions ``q1..qn`` and efforts ``tau1..taun``, (N,) each; either may be absent.
+    ``path``: the rosbag2 file. ``joints``: names of the n joints. ``t_ns``: times, ns UTC, (N,). ``columns``: positions
+    ``q1..qn`` and efforts ``tau1..taun``, (N,) each; either may be absent.
     """
     q, tau = (
         np.stack([columns[f"{base}{j + 1}"] for j in range(len(joints))], axis=1) if f"{base}1" in columns else None

@@ -19,18 +19,9 @@ JITTER = 0.01
 def sample_numbers(t_ns: NDArray[np.int64], rate_hz: float | None = None) -> tuple[NDArray[np.int64], float]:
     """Return the number of each sample, from 0, and the sampling rate, 1/s.
 
-    Parameters
-    ----------
-    t_ns
-        Times of the samples, ns, increasing, (N,).
-    rate_hz
-        Sampling rate, 1/s, for times that jitter; ``None``: that of the times.
-
-    Raises
-    ------
-    DataError
-        If there is one sample only, if the times contradict the rate, or if they are too uneven to count the samples
-        that are missing between them.
+    ``t_ns``: times of the samples, ns, increasing, (N,). ``rate_hz``: sampling rate, 1/s, for times that jitter;
+    ``None``: that of the times. Raises DataError if there is one sample only, if the times contradict the rate, or if
+    they are too uneven to count the samples that are missing between them.
     """
     steps_ns = np.diff(t_ns)
     steps = steps_ns / 1e9
@@ -63,13 +54,7 @@ def sample_numbers(t_ns: NDArray[np.int64], rate_hz: float | None = None) -> tup
 
 
 def gaps_and_counters(streams: Mapping[str, Stream]) -> tuple[tuple[Gap, ...], dict[str, int]]:
-    """Return the gaps between the sample numbers of streams, and the counters of a recording.
-
-    Parameters
-    ----------
-    streams
-        Streams by name.
-    """
+    """Return the gaps between the sample numbers of streams, and the counters of a recording."""
     gaps: list[Gap] = []
     counters: dict[str, int] = {}
     for name, stream in streams.items():

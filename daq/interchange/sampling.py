@@ -29,20 +29,9 @@ Floats = NDArray[np.float64]
 class Sampled:
     """Samples with their numbers.
 
-    Parameters
-    ----------
-    rate_hz
-        Sampling rate, 1/s.
-    numbers
-        Number of each sample, strictly increasing, (M,).
-    values
-        Quantities, (M, n) each.
-    resampled
-        The values were interpolated.
-    facts
-        Facts on the resampling, for the metadata of the recording.
-    notes
-        Sentences on what was assumed or done.
+    ``numbers``: number of each sample, strictly increasing, (M,); ``values``: quantities, (M, n) each; ``resampled``:
+    the values were interpolated; ``facts``: facts on the resampling, for the metadata of the recording; ``notes``:
+    sentences on what was assumed or done.
     """
 
     rate_hz: float
@@ -65,27 +54,10 @@ def sampled(
 ) -> Sampled:
     """Return the rows of a table as samples of one clock.
 
-    Parameters
-    ----------
-    source
-        The table, for messages.
-    rows
-        Its complete rows.
-    robot
-        The robot, for its velocity limits.
-    rate_hz
-        Rate that the user states, 1/s.
-    polled
-        The rows were polled from a controller of this rate.
-    resample_hz
-        Resample to this rate, 1/s.
-    time_unit
-        Unit of the times that the user states.
-
-    Raises
-    ------
-    DataError
-        If times, rate and motion contradict each other, or there is neither a time nor a rate.
+    ``source``: the table, for messages; ``rows``: its complete rows; ``robot``: for its velocity limits; ``rate_hz``:
+    rate that the user states, 1/s; ``polled``: the rows were polled from a controller of this rate; ``resample_hz``:
+    resample to this rate, 1/s; ``time_unit``: unit of the times that the user states. Raises DataError if times, rate
+    and motion contradict each other, or there is neither a time nor a rate.
     """
     everything = np.concatenate([values for name, values in rows.values.items() if name != "demand"], axis=1)
     repeated = repeated_share(everything) if len(everything) > 1 else 0.0

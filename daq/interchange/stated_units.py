@@ -35,19 +35,9 @@ Floats = NDArray[np.float64]
 def in_si(rows: Rows, robot: RobotConfig, units: Mapping[str, str]) -> Rows:
     """Rows in SI units.
 
-    Parameters
-    ----------
-    rows
-        Rows of a table in the units of the file.
-    robot
-        The robot, for the types of its joints: ``deg`` is that of revolute joints, ``mm`` that of prismatic ones.
-    units
-        Unit of a quantity (`CHOICES`); quantities that are left out are in SI units.
-
-    Raises
-    ------
-    ConfigError
-        If a quantity has no such unit.
+    ``rows``: rows of a table in the units of the file. ``robot``: for the types of its joints: ``deg`` is that of
+    revolute joints, ``mm`` that of prismatic ones. ``units``: unit of a quantity (`CHOICES`); quantities that are left
+    out are in SI units. Raises ConfigError if a quantity has no such unit.
     """
     values = dict(rows.values)
     notes = list(rows.notes)
@@ -83,12 +73,8 @@ def _factors(robot: RobotConfig, unit: str) -> Floats:
 def suspected(rows: Rows, robot: RobotConfig) -> dict[str, str]:
     """Units by magnitude: those in which values beyond the limits of the joints are within them.
 
-    Parameters
-    ----------
-    rows
-        Rows in the units of the file.
-    robot
-        The robot with its limits; joints without limits do not tell a unit.
+    ``rows``: rows in the units of the file. ``robot``: the robot with its limits; joints without limits do not tell a
+    unit.
     """
     found: dict[str, str] = {}
     limits = np.array([max(abs(end) for end in joint.limits.position) for joint in robot.joints])

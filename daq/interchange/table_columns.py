@@ -46,16 +46,8 @@ Table = Mapping[str, NDArray[np.float64]]
 class Columns:
     """Values of one quantity.
 
-    Parameters
-    ----------
-    values
-        Values (N, n).
-    labels
-        Name of each column in the file.
-    notes
-        Sentences on what was assumed.
-    joints
-        Name of the joint of each column; empty if the columns are numbered.
+    ``values`` (N, n). ``labels``: name of each column in the file. ``notes``: sentences on what was assumed.
+    ``joints``: name of the joint of each column; empty if the columns are numbered.
     """
 
     values: NDArray[np.float64]
@@ -71,17 +63,8 @@ def without_units(
 
     Units that are not known are kept, for `armident.daq.interchange.column_units.check_unit`.
 
-    Parameters
-    ----------
-    table
-        Columns by name, such as ``q1 [deg]`` or ``time_ms``.
-    units
-        A unit for each column, from a line of units; may be empty.
-
-    Raises
-    ------
-    DataError
-        If two names are equal without their units.
+    ``table``: columns by name, such as ``q1 [deg]`` or ``time_ms``. ``units``: a unit for each column, from a line of
+    units; may be empty. Raises DataError if two names are equal without their units.
     """
     made: dict[str, NDArray[np.float64]] = {}
     stated: dict[str, str] = {}
@@ -107,12 +90,7 @@ def without_units(
 def find_time(table: Table, name: str | None = None) -> tuple[str, NDArray[np.float64]] | None:
     """Return name and values (N,) of the column of times, or ``None``.
 
-    Parameters
-    ----------
-    table
-        Columns by name.
-    name
-        Name that the user has given.
+    ``table``: columns by name; ``name``: name that the user has given.
     """
     if name is not None and name not in table:
         raise DataError(f"no array named {name!r}; found {listed(list(table))}")
@@ -138,23 +116,10 @@ def find_columns(
 ) -> Columns | None:
     """Return the columns of a quantity in the robot's order, or ``None`` if there are none.
 
-    Parameters
-    ----------
-    table
-        Columns (N,), or arrays (N, n), by name.
-    quantity
-        A key of `NAMES`.
-    robot
-        The robot, for number and names of its joints.
-    name
-        Name that the user has given for this quantity.
-    by_position, joints
-        Choice of the joints by the user (`armident.daq.interchange.joint_names`).
-
-    Raises
-    ------
-    DataError
-        If joints are missing, or there are too many.
+    ``table``: columns (N,), or arrays (N, n), by name; ``quantity``: a key of `NAMES`; ``robot``: for number and names
+    of its joints; ``name``: name that the user has given for this quantity; ``by_position``, ``joints``: choice of the
+    joints by the user (`armident.daq.interchange.joint_names`). Raises DataError if joints are missing, or there are
+    too many.
     """
     for base in (name,) if name is not None else NAMES[quantity]:
         found = _numbered(table, base, robot.n)
@@ -170,10 +135,7 @@ def find_columns(
 def unused_demand(table: Table) -> str:
     """Return a sentence on columns that name a demand, for a table in which no demand was found; empty without any.
 
-    Parameters
-    ----------
-    table
-        Columns by name.
+    ``table``: columns by name.
     """
     named = [name for name in table if without_demand(name) is not None]
     if not named:

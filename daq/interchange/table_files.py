@@ -25,20 +25,9 @@ _LATER_MAT = b"MATLAB 7.3"
 class Source:
     """Named arrays of a file.
 
-    Parameters
-    ----------
-    path
-        The file.
-    table
-        Arrays by name, (N,) or (N, n).
-    lines
-        Line number of each row in a text file, (N,); ``None`` for other formats.
-    units
-        Units that the file states, by name of the array.
-    notes
-        Sentences on what was left out or assumed.
-    t_ns
-        Stamps of the messages of a bag, ns, (N,).
+    ``table``: arrays by name, (N,) or (N, n). ``lines``: line number of each row in a text file, (N,); ``None`` for
+    other formats. ``units``: units that the file states, by name of the array. ``notes``: sentences on what was left
+    out or assumed. ``t_ns``: stamps of the messages of a bag, ns, (N,).
     """
 
     path: Path
@@ -51,12 +40,7 @@ class Source:
     def place(self, row: int, name: str) -> str:
         """Return the position of a value in the file, for messages.
 
-        Parameters
-        ----------
-        row
-            Row, from 0.
-        name
-            Name of the column.
+        ``row``: row, from 0; ``name``: name of the column.
         """
         where = f"row {row}" if self.lines is None else f"line {self.lines[row]}"
         return f"{self.path}: {where}, column {name}"
@@ -65,17 +49,8 @@ class Source:
 def read_table(path: Path) -> Source:
     """Return the arrays of a table, in SI units where the names of columns tell another unit.
 
-    Parameters
-    ----------
-    path
-        File or folder; its suffix tells the format.
-
-    Raises
-    ------
-    ConfigError
-        If there is no such file, or its format is unknown.
-    DataError
-        If it cannot be read.
+    ``path``: file or folder; its suffix tells the format. Raises ConfigError if there is no such file, or its format is
+    unknown; DataError if it cannot be read.
     """
     files = data_files(path)
     if not files and not is_file(path):
@@ -97,19 +72,9 @@ def read_table(path: Path) -> Source:
 def read_pair(path: Path, effort: Path, robot: RobotConfig) -> Source:
     """Return two tables with free or no headers as one; effort is torque or the drive's own signal.
 
-    Parameters
-    ----------
-    path, effort
-        Text files of positions and efforts, with one column per joint, or a single column sample by sample.
-    robot
-        The robot, for the number of its joints.
-
-    Raises
-    ------
-    ConfigError
-        If there is no such file.
-    DataError
-        If the numbers of columns or rows differ.
+    ``path``, ``effort``: text files of positions and efforts, with one column per joint, or a single column sample by
+    sample; ``robot``: for the number of its joints. Raises ConfigError if there is no such file; DataError if the
+    numbers of columns or rows differ.
     """
     columns: Table = {}
     notes: list[str] = []

@@ -52,13 +52,7 @@ class Rows:
     notes: tuple[str, ...] = ()
 
     def taken(self, chosen: NDArray[np.int64] | NDArray[np.bool_]) -> "Rows":
-        """Return some of the rows.
-
-        Parameters
-        ----------
-        chosen
-            Indices, or one truth value for each row.
-        """
+        """Return some of the rows. ``chosen``: indices, or one truth value for each row."""
         times = None if self.times is None else self.times[chosen]
         values = {name: array[chosen] for name, array in self.values.items()}
         return replace(self, values=values, row=self.row[chosen], times=times)
@@ -77,21 +71,9 @@ def complete_rows(
     Rows without any of them belong to something else and are passed over. Rows of one time are joined, where one has
     what the other lacks. Others are left out and named.
 
-    Parameters
-    ----------
-    source
-        The table.
-    robot
-        The robot, for its joints.
-    names
-        Names of the file by quantity; ``-`` leaves one out.
-    by_position, joints
-        Choice of the joints by the user.
-
-    Raises
-    ------
-    DataError
-        If a quantity is missing, or too many rows are incomplete.
+    ``robot``: for its joints. ``names``: names of the file by quantity; ``-`` leaves one out. ``by_position``,
+    ``joints``: choice of the joints by the user. Raises DataError if a quantity is missing, or too many rows are
+    incomplete.
     """
     try:
         found: dict[Quantity, Columns] = {}

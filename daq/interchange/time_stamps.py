@@ -48,14 +48,7 @@ class JitterError(DataError):
 class Clock:
     """Clock of the samples.
 
-    Parameters
-    ----------
-    rate_hz
-        Sampling rate, 1/s.
-    numbers
-        Number of each sample, from 0, strictly increasing, (N,).
-    notes
-        Sentences on what was assumed.
+    ``numbers``: number of each sample, from 0, strictly increasing, (N,); ``notes``: sentences on what was assumed.
     """
 
     rate_hz: float
@@ -71,25 +64,9 @@ def in_seconds(
     The unit is that of the option, of the name of the column, or seconds. Seconds are refused if only another unit
     gives a rate and velocities that an arm can have.
 
-    Parameters
-    ----------
-    times
-        Times (N,).
-    q
-        Positions (N, n), for the velocities.
-    robot
-        The robot, for its velocity limits.
-    named
-        Unit in the name of the column; empty if there is none.
-    stated
-        Unit of the option ``--time-unit``.
-
-    Raises
-    ------
-    ConfigError
-        If the stated unit is none.
-    DataError
-        If units contradict each other, or the unit contradicts rate and motion.
+    ``times`` (N,). ``q``: positions (N, n), for the velocities. ``robot``: for its velocity limits. ``named``: unit in
+    the name of the column; empty if there is none. ``stated``: unit of the option ``--time-unit``. Raises ConfigError
+    if the stated unit is none; DataError if units contradict each other, or the unit contradicts rate and motion.
     """
     if stated is not None and stated not in UNITS:
         raise ConfigError(f"--time-unit: expected one of {', '.join(UNITS)}, found {stated}")
@@ -138,10 +115,7 @@ def _velocity_share(times: Floats, q: Floats, robot: RobotConfig) -> float:
 def repeated_share(values: Floats) -> float:
     """Return the share of rows that repeat the row before, among those of a motion.
 
-    Parameters
-    ----------
-    values
-        All quantities, (N, columns).
+    ``values``: all quantities, (N, columns).
     """
     same = np.all(values[1:] == values[:-1], axis=1)
     # Standstill repeats rows too, in long runs; polling repeats one or two.
@@ -153,21 +127,9 @@ def repeated_share(values: Floats) -> float:
 def clock_of(times: Floats, rate_hz: float | None, repeated: float = 0.0) -> Clock:
     """Return the clock of samples by their times; missing samples are missing numbers.
 
-    Parameters
-    ----------
-    times
-        Times (N,), s, not decreasing.
-    rate_hz
-        Rate that the user states; ``None``: that of the times.
-    repeated
-        Share of rows that repeat the row before.
-
-    Raises
-    ------
-    DataError
-        If there is a single sample, or the times contradict the rate.
-    JitterError
-        If the steps are too uneven to tell how many samples are missing.
+    ``times`` (N,), s, not decreasing. ``rate_hz``: rate that the user states; ``None``: that of the times.
+    ``repeated``: share of rows that repeat the row before. Raises DataError if there is a single sample, or the times
+    contradict the rate; JitterError if the steps are too uneven to tell how many samples are missing.
     """
     steps = np.diff(times)
     if steps.size == 0:

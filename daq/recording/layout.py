@@ -371,10 +371,7 @@ _PYTHON_TYPES = re.compile(r"\bobject\b|literal for|could not convert|argument")
 def short_reason(error: Exception) -> str:
     """Return the reason of an error in damaged JSON, on one line.
 
-    Parameters
-    ----------
-    error
-        Error of the JSON reader, or of a missing or wrong entry.
+    ``error``: error of the JSON reader, or of a missing or wrong entry.
     """
     if isinstance(error, RecursionError):
         return "nested too deeply"

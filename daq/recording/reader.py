@@ -103,10 +103,7 @@ def _is_listed(file: BinaryIO) -> bool:
 def recovered_words(metadata: dict[str, dict[str, str]]) -> list[str]:
     """Return a description of the parts that a recovered file lacks; empty if it was not recovered.
 
-    Parameters
-    ----------
-    metadata
-        Entries of the file's metadata records, by name.
+    ``metadata``: entries of the file's metadata records, by name.
     """
     entries = metadata.get(RECOVERED) or metadata.get(RECOVERED_OLD) or {}
     return [entries["missing"]] if "missing" in entries else []
@@ -126,10 +123,7 @@ class _Content:
     def rows_of(self, channel: int) -> Rows:
         """Return the rows of a channel with a layout; channels of one stream share them.
 
-        Raises
-        ------
-        DataError
-            If another channel of the same stream has another layout.
+        Raises DataError if another channel of the same stream has another layout.
         """
         layout = self.scan.layouts[channel]
         if layout.name not in self.rows:

@@ -13,12 +13,8 @@ _FEWEST = 4096
 class Rows:
     """Rows of one stream read so far.
 
-    Parameters
-    ----------
-    layout
-        Layout of the stream's messages.
-    expected
-        Expected number of rows, for which memory is reserved; 0 if unknown.
+    ``layout``: layout of the stream's messages. ``expected``: expected number of rows, for which memory is reserved; 0
+    if unknown.
     """
 
     def __init__(self, layout: StreamLayout, expected: int = 0) -> None:
@@ -34,10 +30,7 @@ class Rows:
     def append(self, records: NDArray[Any]) -> None:
         """Add message records of the stream, (N,) in the dtype of the layout.
 
-        Raises
-        ------
-        DataError
-            If a record does not have the layout of the stream's channel.
+        Raises DataError if a record does not have the layout of the stream's channel.
         """
         end = self.size + len(records)
         if end > self._sync.size:

@@ -14,16 +14,9 @@ from armident.daq.recording import mcap_records as mcap
 class Summary:
     """The summary of a file that grows chunk by chunk.
 
-    Parameters
-    ----------
-    schemas, channels
-        Bytes of their records, as in the file.
-    chunks, metadata
-        Index records of the chunks and metadata.
-    messages
-        Number of messages by channel.
-    span_ns
-        Earliest and latest log time of all messages, ns; ``None`` if there are none.
+    ``schemas``, ``channels``: bytes of their records, as in the file. ``chunks``, ``metadata``: index records of the
+    chunks and metadata. ``messages``: number of messages by channel. ``span_ns``: earliest and latest log time of all
+    messages, ns; ``None`` if there are none.
     """
 
     schemas: list[bytes] = field(default_factory=list)
@@ -34,15 +27,7 @@ class Summary:
     span_ns: tuple[int, int] | None = None
 
     def add_chunk(self, index: ChunkIndex, messages: Mapping[int, int]) -> None:
-        """Add a chunk.
-
-        Parameters
-        ----------
-        index
-            Index record of the chunk.
-        messages
-            Number of its messages by channel.
-        """
+        """Add a chunk. ``index``: index record of the chunk; ``messages``: number of its messages by channel."""
         self.chunks.append(index)
         for channel, count in messages.items():
             self.messages[channel] = self.messages.get(channel, 0) + count

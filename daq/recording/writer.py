@@ -414,12 +414,7 @@ def checksum_record(data: bytes, start: int = 0) -> Metadata:
 
     Chunks have checksums of their own, other records have none.
 
-    Parameters
-    ----------
-    data
-        The bytes.
-    start
-        CRC-32 that the checksum continues.
+    ``start``: CRC-32 that the checksum continues.
     """
     return Metadata(CHECK, {"bytes": str(len(data)), "crc32": str(zlib.crc32(data, start))})
 

@@ -33,19 +33,9 @@ def endpoints(session: SessionConfig) -> dict[Role, str]:
 def configuration(session: SessionConfig, role: Role, *, any_port: bool = False) -> zenoh.Config:
     """Return the Zenoh configuration of a role: the session's file, or peers on the loopback interface.
 
-    Parameters
-    ----------
-    session
-        Configuration of the cell.
-    role
-        ``capture`` or ``worker`` (listen), or ``observer``.
-    any_port
-        Listen on a free loopback port in place of that of the role, which other peers learn from those they know.
-
-    Raises
-    ------
-    ConfigError
-        If the configuration file is not one of Zenoh's.
+    ``role``: ``capture`` or ``worker`` (listen), or ``observer``; ``any_port``: listen on a free loopback port in place
+    of that of the role, which other peers learn from those they know. Raises ConfigError if the configuration file is
+    not one of Zenoh's.
     """
     options = session.zenoh
     if options.config is not None:
@@ -84,19 +74,9 @@ def configuration(session: SessionConfig, role: Role, *, any_port: bool = False)
 def open_session(session: SessionConfig, role: Role, *, any_port: bool = False) -> zenoh.Session:
     """Open a Zenoh session; capture and worker may start in any order and restart.
 
-    Parameters
-    ----------
-    session
-        Configuration of the cell.
-    role
-        ``capture`` and ``worker`` listen, one each per cell; an ``observer`` only connects to both.
-    any_port
-        Listen on a free loopback port in place of that of the role: for a second worker.
-
-    Raises
-    ------
-    ConfigError
-        If Zenoh refuses the configuration or cannot listen (another process of that role runs).
+    ``role``: ``capture`` and ``worker`` listen, one each per cell; an ``observer`` only connects to both. ``any_port``:
+    listen on a free loopback port in place of that of the role: for a second worker. Raises ConfigError if Zenoh
+    refuses the configuration or cannot listen (another process of that role runs).
     """
     config = configuration(session, role, any_port=any_port)
     try:
@@ -112,15 +92,7 @@ def open_session(session: SessionConfig, role: Role, *, any_port: bool = False) 
 def unreadable_files(config: zenoh.Config) -> list[str]:
     """Files named in a Zenoh configuration that cannot be opened: certificates, private keys, lists of users.
 
-    Parameters
-    ----------
-    config
-        Zenoh configuration.
-
-    Returns
-    -------
-    list
-        Key and path of each file, with the reason.
+    Returns the key and path of each file, with the reason.
     """
     found: list[str] = []
     for section in ("transport/link/tls", "transport/auth/usrpwd", "transport/auth/pubkey"):

@@ -23,12 +23,7 @@ RANK_TOLERANCE = 1e-7
 class Change:
     """Candidate change of the plant.
 
-    Parameters
-    ----------
-    effect, place
-        Effect and its place.
-    directions
-        Change of the known parameters (k,) per unit of the parameters of the effect, shape (k, m).
+    ``directions``: change of the known parameters (k,) per unit of the parameters of the effect, shape (k, m).
     """
 
     effect: Effect
@@ -78,16 +73,8 @@ class BaselineComparison:
     def solved(self, changes: Sequence[Change]) -> tuple[Array, Array, Array, float, int]:
         """Parameters of changes by generalised least squares.
 
-        Parameters
-        ----------
-        changes
-            Changes of the plant.
-
-        Returns
-        -------
-        tuple
-            Parameters (of `absorbed` first), covariance, mask of the parameters that are estimable one by one, the
-            remaining chi-square and its degrees of freedom.
+        ``changes``: changes of the plant. Returns parameters (of `absorbed` first), covariance, mask of the parameters
+        that are estimable one by one, the remaining chi-square and its degrees of freedom.
         """
         stack = np.column_stack([self.absorbed, *(c.directions for c in changes)])
         target = self.whitened(self.difference)
@@ -126,17 +113,8 @@ class BaselineComparison:
 def with_baseline(fit: IvFit, baseline: IdentificationDocument) -> BaselineComparison:
     """Comparison of a fit with a baseline.
 
-    Parameters
-    ----------
-    fit
-        Fit of the present recording.
-    baseline
-        Document of an earlier identification.
-
-    Raises
-    ------
-    DataError
-        If the baseline is of another model, or its covariance has another size.
+    ``fit``: fit of the present recording; ``baseline``: document of an earlier identification. Raises DataError if the
+    baseline is of another model, or its covariance has another size.
     """
     names = fit.study.model.base.names
     rigid = names[: len(names) - fit.study.model.e]

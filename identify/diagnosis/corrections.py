@@ -34,14 +34,8 @@ def screened_correction(
     therefore no evidence of an effect. It gives the second value, for effects that are so large that the predicted
     torque is far from the true one.
 
-    Parameters
-    ----------
-    fit
-        Fit of the model without the effect.
-    candidate
-        Effect on a recorded torque, and its motor.
-    column_cache
-        Cache of the columns of the same fit.
+    ``fit``: fit of the model without the effect; ``candidate``: effect on a recorded torque, and its motor;
+    ``column_cache``: cache of the columns of the same fit.
     """
     study, effect, motor = fit.study, candidate.effect, candidate.place.joint
     assert isinstance(effect, Correction)

@@ -23,12 +23,7 @@ def detection_limits(state: ModelState, step: SelectionStep | None) -> list[Dete
     log-likelihood reaches the threshold of the selection with the probability `Criteria.detection_power`, and the error
     of the joint falls by the share that a finding requires.
 
-    Parameters
-    ----------
-    state
-        Model with all findings.
-    step
-        Comparison of all effects in that model; ``None`` if it was not made.
+    ``state``: model with all findings. ``step``: comparison of all effects in that model; ``None`` if it was not made.
     """
     column_cache = ColumnCache(state.study, state.fit.theta)
     shapes = {} if step is None else {a.candidate.key: a.shapes for a in reversed(step.ranked)}

@@ -33,18 +33,9 @@ POINTS = 121
 class FreeFunction:
     """Set of basis functions of one variable, for the residual of one joint (thesis 7.3.2).
 
-    Parameters
-    ----------
-    joint
-        Number of the joint of the residual.
-    kind
-        Kind of the variable.
-    other
-        Joint or motor to which the variable belongs, if it is another one.
-    knots
-        Knots of the hat functions, increasing; for an angle the wave numbers; for the time the time constant, s.
-    low, high
-        Range of the curve.
+    ``other``: joint or motor to which the variable belongs, if it is another one. ``knots``: knots of the hat
+    functions, increasing; for an angle the wave numbers; for the time the time constant, s. ``low``, ``high``: range of
+    the curve.
     """
 
     joint: int
@@ -69,25 +60,14 @@ class FreeFunction:
         return self.kind.removesuffix(" of another joint"), at, side, self.knots
 
     def variable(self, motion: Motion) -> Array:
-        """Values of the variable, (N,).
-
-        Parameters
-        ----------
-        motion
-            Motion of the arm, N samples.
-        """
+        """Values of the variable, (N,). ``motion``: motion of the arm, N samples."""
         signal: Array = getattr(motion, VARIABLES[self.kind].signal)
         return signal if signal.ndim == 1 else signal[:, self.joint if self.other is None else self.other]
 
     def basis(self, x: Array, side: Array) -> Array:
         """Basis functions, (N, k).
 
-        Parameters
-        ----------
-        x
-            Values of the variable, (N,).
-        side
-            Smoothed sign of the velocity of the joint, (N,).
+        ``x``: values of the variable, (N,); ``side``: smoothed sign of the velocity of the joint, (N,).
         """
         if self.kind == "velocity":
             speed = hats(np.abs(x), self.knots)
@@ -103,13 +83,7 @@ class FreeFunction:
         return functions * side[:, None] if self.directed else functions
 
     def columns(self, motion: Motion) -> Array:
-        """Basis functions along a motion, without its lead, (N, k).
-
-        Parameters
-        ----------
-        motion
-            Motion of the arm.
-        """
+        """Basis functions along a motion, without its lead, (N, k). ``motion``: motion of the arm."""
         return self.basis(self.variable(motion), motion.sign[:, self.joint])[motion.lead :]
 
     def on_grid(self) -> tuple[Array, Array, list[Array]]:
@@ -126,14 +100,7 @@ class FreeFunction:
 def free_functions(study: Study, motions: Sequence[Motion], joint: int) -> Iterator[FreeFunction]:
     """All sets of functions for the residual of one joint.
 
-    Parameters
-    ----------
-    study
-        Data with the robot.
-    motions
-        The training stretches at simulated signals.
-    joint
-        Number of the joint.
+    ``study``: data with the robot; ``motions``: the training stretches at simulated signals.
     """
     top = max(float(np.abs(m.qd[:, joint]).max()) for m in motions)
     if top > 0:
@@ -188,14 +155,8 @@ def _of_angle(study: Study, joint: int, motor: int, motions: Sequence[Motion]) -
 def in_band(study: Study, motion: Motion, functions: Sequence[FreeFunction]) -> dict[tuple[object, ...], Array]:
     """Basis functions along a motion in the band of the comparison, (M, k) of every key.
 
-    Parameters
-    ----------
-    study
-        Data with the filter.
-    motion
-        Motion of the arm, at the working rate.
-    functions
-        Sets of functions of all joints.
+    ``study``: data with the filter; ``motion``: motion of the arm, at the working rate; ``functions``: sets of
+    functions of all joints.
     """
     unique = {f.key: f for f in functions}
     made = [f.columns(motion) for f in unique.values()]

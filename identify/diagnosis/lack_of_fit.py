@@ -50,14 +50,8 @@ class Fitted(Protocol):
 class Curve:
     """A shape with its uncertainty.
 
-    Parameters
-    ----------
-    x
-        Values of the variable, (G,).
-    value
-        Missing torque of the model there, N m or N, (G,).
-    band
-        Two standard deviations, (G,).
+    ``x``: values of the variable, (G,); ``value``: missing torque of the model there, N m or N, (G,); ``band``: two
+    standard deviations, (G,).
     """
 
     x: Array
@@ -71,12 +65,8 @@ class ResidualDependence:
 
     Parameters
     ----------
-    joint
-        Its name.
     kind, other
         Variable; the joint or motor to which it belongs, if it is another one.
-    unit
-        Unit of the variable.
     share
         Share of the power of the joint's held-out residual that the dependence, fitted on the training data, predicts.
         For a frequency: share of the residual at the working rate.
@@ -122,10 +112,7 @@ class ResidualDependence:
 def dependences(state: Fitted) -> tuple[ResidualDependence, ...]:
     """Significant dependences of the residual, at most one for each joint and variable, largest share first.
 
-    Parameters
-    ----------
-    state
-        Fitted model.
+    ``state``: fitted model.
     """
     return LackOfFit(state.fit).dependences
 
@@ -135,23 +122,14 @@ def unexplained(state: Fitted) -> tuple[ResidualDependence, ...]:
 
     A variable that is merely correlated with a stronger one (speed with torque, for example) is not listed again.
 
-    Parameters
-    ----------
-    state
-        Fitted model.
+    ``state``: fitted model.
     """
     return LackOfFit(state.fit).unexplained
 
 
 @dataclass(frozen=True, eq=False)
 class LackOfFit:
-    """All tests of the residual of one fit.
-
-    Parameters
-    ----------
-    fit
-        Fit of the model.
-    """
+    """All tests of the residual of one fit. ``fit``: fit of the model."""
 
     fit: IvFit
 
@@ -379,14 +357,7 @@ def limited(residual: Array, joints: Sequence[slice], deviations: float) -> Arra
     About a reversal the sign of a measured velocity is uncertain, and with it the whole dry friction. A few samples
     there would outweigh all others.
 
-    Parameters
-    ----------
-    residual
-        Whitened residuals of all joints, (R,).
-    joints
-        Rows of each joint.
-    deviations
-        Largest size, robust standard deviations.
+    ``residual``: whitened residuals of all joints, (R,); ``joints``: rows of each joint.
     """
     found = residual.copy()
     for rows in joints:

@@ -18,14 +18,7 @@ REFINEMENTS = 12
 def screened(fit: IvFit, candidate: Candidate, column_cache: ColumnCache) -> tuple[float, Shapes] | None:
     """Best score statistic of a candidate on its grid, by the training data, and the nonlinear parameters there.
 
-    Parameters
-    ----------
-    fit
-        Fit of the model.
-    candidate
-        Candidate with its grid.
-    column_cache
-        Cache of the columns of the same fit.
+    ``fit``: fit of the model; ``column_cache``: cache of the columns of the same fit.
     """
     if not candidate.grid:
         return None
@@ -42,21 +35,9 @@ def screened(fit: IvFit, candidate: Candidate, column_cache: ColumnCache) -> tup
 def score_statistics(fit: IvFit, columns: Sequence[tuple[int, Array]], count: int, sign: int = 0) -> Array:
     """Power of the training residual along groups of instruments orthogonal to the model's own, (G,).
 
-    Parameters
-    ----------
-    fit
-        Fit of the model.
-    columns
-        Whitened instruments (R, G k) of each joint on which they act, with its number, group after group.
-    count
-        Number of groups, G.
-    sign
-        +1 or -1: sign of the parameter of a group of one, which physics determines; 0: none.
-
-    Returns
-    -------
-    ndarray
-        Zero where the parameter would have the wrong sign. Not a number where the model contains a group.
+    ``columns``: whitened instruments (R, G k) of each joint on which they act, with its number, group after group.
+    ``sign``: +1 or -1: sign of the parameter of a group of one, which physics determines; 0: none. Returns zero where
+    the parameter would have the wrong sign. Not a number where the model contains a group.
     """
     if not columns:
         return np.full(count, np.nan)
@@ -78,14 +59,8 @@ def score_statistics(fit: IvFit, columns: Sequence[tuple[int, Array]], count: in
 def score_statistic(fit: IvFit, columns: Sequence[tuple[int, Array]], sign: int = 0) -> float | None:
     """Score statistic of one group of instruments; ``None`` if the model contains it.
 
-    Parameters
-    ----------
-    fit
-        Fit of the model.
-    columns
-        Whitened instruments (R, k) of each joint on which they act, with its number.
-    sign
-        See `score_statistics`.
+    ``columns``: whitened instruments (R, k) of each joint on which they act, with its number; ``sign``: see
+    `score_statistics`.
     """
     found = float(score_statistics(fit, columns, 1, sign)[0])
     return None if np.isnan(found) else found
@@ -96,16 +71,7 @@ def contained(fit: IvFit, candidate: Candidate, column_cache: ColumnCache, shape
 
     None if these are all: an effect keeps one parameter, which is then zero.
 
-    Parameters
-    ----------
-    fit
-        Fit of the model.
-    candidate
-        The candidate.
-    column_cache
-        Cache of the columns of the same fit.
-    shapes
-        Nonlinear parameters of the candidate.
+    ``column_cache``: cache of the columns of the same fit; ``shapes``: nonlinear parameters of the candidate.
     """
     columns = column_cache.grid(candidate.effect, candidate.place, (shapes,), fit.noise, keep=False)
     size = np.sqrt(np.sum([np.einsum("ij,ij->j", own, own) for _, own in columns], axis=0))
@@ -123,12 +89,7 @@ def contained(fit: IvFit, candidate: Candidate, column_cache: ColumnCache, shape
 def orthogonal_directions(fit: IvFit, instruments: Array) -> tuple[Array, Array, Array] | None:
     """Orthonormal directions (R, r) of instruments orthogonal to the model's, and their map (k, r) with scales (k,).
 
-    Parameters
-    ----------
-    fit
-        Fit of the model.
-    instruments
-        Whitened instruments, (R, k).
+    ``instruments``: whitened instruments, (R, k).
     """
     scale = np.linalg.norm(instruments, axis=0)
     if np.any(scale == 0) or not np.isfinite(scale).all():
@@ -146,16 +107,8 @@ def orthogonal_directions(fit: IvFit, instruments: Array) -> tuple[Array, Array,
 def refined(fit: IvFit, candidate: Candidate, column_cache: ColumnCache, best: tuple[float, Shapes]) -> Shapes:
     """Nonlinear parameters between those of the grid, one continuous parameter after the other, on a logarithmic scale.
 
-    Parameters
-    ----------
-    fit
-        Fit of the model.
-    candidate
-        Candidate with its grid.
-    column_cache
-        Cache of the columns of the same fit.
-    best
-        Score statistic and nonlinear parameters of the grid, the start.
+    ``fit``: fit of the model; ``column_cache``: cache of the columns of the same fit; ``best``: score statistic and
+    nonlinear parameters of the grid, the start.
     """
     found = best
     for k, free in enumerate(candidate.effect.refinable(fit.study.robot, candidate.place)):
@@ -184,11 +137,6 @@ def refined(fit: IvFit, candidate: Candidate, column_cache: ColumnCache, best: t
 def replaced(shapes: Shapes, k: int, value: float) -> Shapes:
     """Nonlinear parameters with another value of the k-th.
 
-    Parameters
-    ----------
-    shapes
-        Pairs of name and value.
-    k, value
-        Number of the parameter, and its new value.
+    ``shapes``: pairs of name and value; ``k``, ``value``: number of the parameter, and its new value.
     """
     return (*shapes[:k], (shapes[k][0], value), *shapes[k + 1 :])

@@ -58,10 +58,7 @@ class SetupStage:
     def as_configured(self, gap: Gap) -> Gap:
         """Gap of the model in the set-up as configured, from that in the corrected one.
 
-        Parameters
-        ----------
-        gap
-            Relative errors of the model in the corrected set-up.
+        ``gap``: relative errors of the model in the corrected set-up.
         """
         if not self.findings:
             return gap
@@ -79,22 +76,15 @@ class SetupStage:
     def doubtful(self, gap: Gap) -> list[Unexplained]:
         """Entries of the joints that the model with the effects found does not explain, either.
 
-        Parameters
-        ----------
-        gap
-            Held-out errors of the model with the effects found.
+        ``gap``: held-out errors of the model with the effects found.
         """
         return [entry for entry in self.unexplained if gap.by_joint[entry.joint] > self.criteria.set_up_doubtful_pct]
 
     def left(self, unexplained: Sequence[Unexplained], gap: Gap) -> list[Unexplained]:
         """Joints that the rigid model does not explain, then the dependences at the others.
 
-        Parameters
-        ----------
-        unexplained
-            Remaining dependences of the residual.
-        gap
-            Held-out errors of the model with the effects found.
+        ``unexplained``: remaining dependences of the residual; ``gap``: held-out errors of the model with the effects
+        found.
         """
         doubtful = self.doubtful(gap)
         joints = {entry.joint for entry in doubtful}
@@ -106,19 +96,8 @@ def set_up(
 ) -> SetupStage:
     """Check the set-up and correct its mistakes.
 
-    Parameters
-    ----------
-    training, validation
-        Experiments of a diagnosis.
-    robot
-        The configuration.
-    criteria
-        Thresholds.
-
-    Raises
-    ------
-    DataError
-        If nothing moves, or the recordings do not fit together.
+    ``training``, ``validation``: experiments of a diagnosis. Raises DataError if nothing moves, or the recordings do
+    not fit together.
     """
     check = check_setup([*training, *validation], robot)
     shift = check.torque_shift

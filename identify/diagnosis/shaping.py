@@ -31,16 +31,8 @@ def shapes_of_both_signals(
 
     Simulated signals are those of a loop without the effect, and measured ones contain noise that it amplifies.
 
-    Parameters
-    ----------
-    fit
-        Fit of the model.
-    candidate
-        Candidate with its grid.
-    column_cache
-        Cache of the columns of the same fit.
-    shapes
-        Nonlinear parameters by simulated signals.
+    ``fit``: fit of the model; ``candidate``: candidate with its grid; ``column_cache``: cache of the columns of the
+    same fit; ``shapes``: nonlinear parameters by simulated signals.
     """
     found = instrumented_shapes(fit, candidate, column_cache, shapes)
     return (shapes,) if found == shapes else (found, shapes)
@@ -52,16 +44,8 @@ def instrumented_shapes(fit: IvFit, candidate: Candidate, column_cache: ColumnCa
     Those of effects that depend on the motion alone stay. That motion is simulated well, and measured velocities are
     least accurate around standstill, where friction changes most.
 
-    Parameters
-    ----------
-    fit
-        Fit of the model.
-    candidate
-        Candidate with its grid.
-    column_cache
-        Cache of the columns of the same fit.
-    shapes
-        Start: the best values at simulated signals.
+    ``fit``: fit of the model; ``column_cache``: cache of the columns of the same fit; ``shapes``: start: the best
+    values at simulated signals.
     """
     found = shapes
     if not candidate.effect.depends_on_torque:

@@ -23,12 +23,8 @@ Starts = tuple[float, ...]
 class Incumbent:
     """A finding with which other effects compete.
 
-    Parameters
-    ----------
-    gain
-        Its gain of log-likelihood beside the other findings, nats.
-    joints
-        Joints on whose torques it acts, (n,). An effect that acts on none of them cannot take its place.
+    ``gain``: its gain of log-likelihood beside the other findings, nats. ``joints``: joints on whose torques it acts,
+    (n,). An effect that acts on none of them cannot take its place.
     """
 
     gain: float
@@ -39,15 +35,8 @@ class Incumbent:
 class Shortlist:
     """Candidates of a step that are tested in their own closed loops.
 
-    Parameters
-    ----------
-    chosen
-        The candidates, each with its nonlinear parameters, or with the values from which its correction of recorded
-        torques starts.
-    tests
-        Number of all candidates.
-    hidden
-        Candidates that the motion does not show.
+    ``chosen``: the candidates, each with its nonlinear parameters, or with the values from which its correction of
+    recorded torques starts; ``hidden``: candidates that the motion does not show.
     """
 
     chosen: list[tuple[Candidate, Shapes, Starts]]
@@ -58,12 +47,8 @@ class Shortlist:
 def shortlist(state: ModelState, incumbent: Incumbent | None) -> Shortlist:
     """Return the candidates with the highest statistics less their numbers of parameters.
 
-    Parameters
-    ----------
-    state
-        Model without them.
-    incumbent
-        Finding that the model is without, if only effects that could take its place are compared.
+    ``state``: model without them; ``contested``: finding that the model is without, if only effects that could take its
+    place are compared.
     """
     criteria, column_cache = state.study.criteria, ColumnCache(state.study, state.fit.theta)
     noise = state.fit.renoised(state.weights)

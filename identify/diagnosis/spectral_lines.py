@@ -32,8 +32,6 @@ class SpectralLine:
 
     Parameters
     ----------
-    frequency
-        Frequency, Hz.
     p_train, p_held
         Probability of such a line in the training residual at any frequency, and in the held-out one at this frequency,
         without a line.
@@ -64,14 +62,7 @@ class SpectralLine:
 def working_rate_residuals(study: Study, stretches: Sequence[MotionStretch], theta: Array) -> list[Array]:
     """Torques less those of the model at the working rate, (N, n) each, N m or N.
 
-    Parameters
-    ----------
-    study
-        Data with the model.
-    stretches
-        Stretches of the study.
-    theta
-        Parameters of the model, (b,).
+    ``stretches``: stretches of the study; ``theta``: parameters of the model, (b,).
     """
     return [s.torque - study.torques(s, "measured", theta) for s in stretches]
 
@@ -79,10 +70,7 @@ def working_rate_residuals(study: Study, stretches: Sequence[MotionStretch], the
 def bandwidth_of_motion(study: Study) -> float:
     """Bandwidth of the motion, Hz; below it the repeatable part of the residual has lines, too.
 
-    Parameters
-    ----------
-    study
-        Data with the filter of the comparison.
+    ``study``: data with the filter of the comparison.
     """
     return 0.5 / (study.dt * study.decimation.factor * study.criteria.band)
 
@@ -90,12 +78,7 @@ def bandwidth_of_motion(study: Study) -> float:
 def lines_of_joints(study: Study, theta: Array) -> Iterator[tuple[int, SpectralLine]]:
     """Strongest line of each joint above the frequencies of the motion that the references do not contain.
 
-    Parameters
-    ----------
-    study
-        Data with the model.
-    theta
-        Parameters of the model, (b,).
+    ``theta``: parameters of the model, (b,).
     """
     train, held = (working_rate_residuals(study, part, theta) for part in (study.train, study.held))
     lowest = bandwidth_of_motion(study)
@@ -111,14 +94,7 @@ def strongest_line(train: Sequence[Array], held: Sequence[Array], dt: float, low
     Without a line, the power at a frequency over that of its surroundings has an F-distribution. Its phase may differ
     from one stretch to the next.
 
-    Parameters
-    ----------
-    train, held
-        Residuals, (N,) each.
-    dt
-        Sampling period, s.
-    lowest
-        Lowest frequency of the search, Hz.
+    ``train``, ``held``: residuals, (N,) each; ``lowest``: lowest frequency of the search, Hz.
     """
     spectra = [_Spectrum.of(e, dt) for e in train]
     size = max(s.power.size for s in spectra)
@@ -153,12 +129,7 @@ def of_references(study: Study, frequency: float) -> bool:
     Set points have a rate of their own, and the arm follows them. The motion modulates the line, so its width is a
     share of the bandwidth of the motion.
 
-    Parameters
-    ----------
-    study
-        Data with the references.
-    frequency
-        Frequency of the line, Hz.
+    ``study``: data with the references.
     """
     wide = study.criteria.modulated_line * bandwidth_of_motion(study)
     for reference in study.auxiliary.references:
@@ -188,15 +159,7 @@ class _Spectrum:
 
     @classmethod
     def of(cls, e: Array, dt: float) -> "_Spectrum":
-        """Return the spectrum of a series with a Hann window.
-
-        Parameters
-        ----------
-        e
-            Series, (N,).
-        dt
-            Sampling period, s.
-        """
+        """Return the spectrum of a series with a Hann window. ``e``: series, (N,)."""
         window = hann_window(e.size)
         windowed = window * (e - e.mean())
         power = periodogram(windowed, PADDING)
@@ -207,12 +170,6 @@ class _Spectrum:
         return cls(f, power, background, 2.0 / float(window.sum()) ** 2, windowed, dt)
 
     def at(self, frequency: float) -> tuple[float, float]:
-        """Return power and background at any frequency.
-
-        Parameters
-        ----------
-        frequency
-            Frequency, Hz.
-        """
+        """Return power and background at any frequency."""
         turning = np.exp(-2j * np.pi * frequency * self.dt * np.arange(self.windowed.size))
         return float(np.abs(self.windowed @ turning) ** 2), float(np.interp(frequency, self.f, self.background))

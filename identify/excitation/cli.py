@@ -43,8 +43,6 @@ class TrajectoryOptions:
         Robot configuration.
     out
         Trajectory file to write; ``None`` with ``look_at``.
-    duration
-        Length, s.
     seed
         Seed of the random search.
     known
@@ -82,22 +80,9 @@ class TrajectoryOptions:
 def trajectory_command(options: TrajectoryOptions) -> CheckedTrajectory:
     """Carry out ``armident trajectory`` but for its report.
 
-    Parameters
-    ----------
-    options
-        As given by the user.
-
-    Returns
-    -------
-    CheckedTrajectory
-        A trajectory to check may exceed limits of torque, if masses are known, and of distance.
-
-    Raises
-    ------
-    ConfigError
-        If an option is wrong, no trajectory keeps all limits, or a trajectory to check exceeds the limits of motion.
-    DataError
-        If ``known`` is of another robot or model, or is not physical.
+    Result: a trajectory to check may exceed limits of torque, if masses are known, and of distance. Raises ConfigError
+    if an option is wrong, no trajectory keeps all limits, or a trajectory to check exceeds the limits of motion;
+    DataError if ``known`` is of another robot or model, or is not physical.
     """
     robot, out, look_at = load_robot(options.config, "trajectory"), options.out, options.look_at
     shape = _checked_shape(options)

@@ -26,16 +26,8 @@ CHECKED_VALUES = 6_000_000
 class IdentificationOutcome:
     """An identification with all data of its report.
 
-    Parameters
-    ----------
-    recordings
-        Identified recordings.
-    robot
-        Configuration of the robot, with the smoothing of the sign that was used.
-    result
-        The estimate with its curves.
-    document
-        Contents of ``identification.json``.
+    ``recordings``: identified recordings; ``robot``: configuration of the robot, with the smoothing of the sign that
+    was used; ``result``: the estimate with its curves; ``document``: contents of ``identification.json``.
     """
 
     recordings: tuple[Recording, ...]
@@ -54,6 +46,9 @@ def identify_recording(
 ) -> IdentificationOutcome:
     """Identification of recordings, read from files or assembled from the stream.
 
+    Raises ConfigError if the configuration cannot support the request; DataError if the data cannot support the
+    request.
+
     Parameters
     ----------
     recordings
@@ -68,13 +63,6 @@ def identify_recording(
         Check of the set-up, whose findings enter the verdict; ``None``: none.
     stretches
         Size from which recordings are identified in stretches; ``None``: the default.
-
-    Raises
-    ------
-    ConfigError
-        If the configuration cannot support the request.
-    DataError
-        If the data cannot support the request.
     """
     recordings = (recordings,) if isinstance(recordings, Recording) else tuple(recordings)
     robot = robot or recordings[0].robot
@@ -108,23 +96,9 @@ def experiments_of(
 ) -> tuple[Sequence[Experiment], list[str]]:
     """Return the experiments of recordings, one recording after the other, and remarks on them.
 
-    Parameters
-    ----------
-    recordings
-        The recordings.
-    robot
-        Configuration to convert them with.
-    name_files
-        True to begin each remark with the name of its file.
-    stretches
-        Size from which recordings are cut into stretches; all together count.
-
-    Raises
-    ------
-    ConfigError
-        If a recording is of another robot.
-    DataError
-        If a recording holds no experiment that can be used.
+    ``robot``: configuration to convert them with. ``name_files``: True to begin each remark with the name of its file.
+    ``stretches``: size from which recordings are cut into stretches; all together count. Raises ConfigError if a
+    recording is of another robot; DataError if a recording holds no experiment that can be used.
     """
     found: list[Sequence[Experiment]] = []
     notes: list[str] = []

@@ -46,17 +46,9 @@ Array = NDArray[np.float64]
 class ClosedLoop(NamedTuple):
     """The closed loop that an estimator simulates.
 
-    Parameters
-    ----------
-    auxiliary
-        The auxiliary model.
-    start
-        Parameters with which it runs, shape (b,): the first iterate.
-    controller
-        Description of the controller, as in the result document: its kind, parameters, and the relative error of the
-        simulated velocities in percent.
-    warnings
-        Reasons why a preferred controller was not used.
+    ``start``: parameters with which it runs, shape (b,): the first iterate; ``controller``: description of the
+    controller, as in the result document: its kind, parameters, and the relative error of the simulated velocities in
+    percent; ``warnings``: reasons why a preferred controller was not used.
     """
 
     auxiliary: AuxiliaryModel
@@ -78,25 +70,10 @@ def closed_loop(
     Controllers are tried in order of preference: the identified or known one, then a stiff PD controller. Each is
     simulated with the IDIM-LS estimate, then with the initial parameters of the configuration.
 
-    Parameters
-    ----------
-    prepared
-        The arm, the experiments and the derivatives of their positions.
-    options
-        Method and controller.
-    ls
-        IDIM-LS estimate, shape (b,).
-    decimation
-        Parallel filter of the method.
-    bandwidth
-        Closed-loop bandwidth, Hz.
-    excluded
-        Kind of controller that is not tried.
-
-    Raises
-    ------
-    DataError
-        If every simulation diverges and the method has no measured regressor.
+    ``prepared``: the arm, the experiments and the derivatives of their positions; ``options``: method and controller;
+    ``ls``: IDIM-LS estimate, shape (b,); ``decimation``: parallel filter of the method; ``excluded``: kind of
+    controller that is not tried. Raises DataError if every simulation diverges and the method has no measured
+    regressor.
     """
     model, experiments, signals = prepared.model, prepared.experiments, prepared.signals
     dt = experiments[0].dt
@@ -164,10 +141,7 @@ def _bandpassed(options: Options, bandwidth: float, dt: float) -> Callable[[Arra
 def velocity_error(runs: Sequence[Simulation], signals: Sequence[Derivatives]) -> float:
     """Norm of the difference of simulated and smoothed velocities over that of the smoothed ones.
 
-    Parameters
-    ----------
-    runs, signals
-        Simulated and smoothed motion of every experiment.
+    ``runs``, ``signals``: simulated and smoothed motion of every experiment.
     """
     differences = [float(np.linalg.norm(run.qd - s.qd)) for run, s in zip(runs, signals, strict=True)]
     return float(np.linalg.norm(differences) / np.linalg.norm([np.linalg.norm(s.qd) for s in signals]))
@@ -245,15 +219,7 @@ def _description(response: JointResponse) -> dict[str, Any]:
 def initial_parameters(model: ArmModel) -> Array:
     """Base parameters (b,) of the configuration's ``initial_parameters`` (standard names), the rest zero.
 
-    Parameters
-    ----------
-    model
-        The arm.
-
-    Raises
-    ------
-    ConfigError
-        If a name is not a standard parameter of the robot.
+    Raises ConfigError if a name is not a standard parameter of the robot.
     """
     standard = np.zeros(len(model.names))
     for name, value in model.robot.initial_parameters.items():

@@ -44,15 +44,9 @@ Mask = NDArray[np.bool_]
 class Support:
     """Base parameters that a motion supports.
 
-    Parameters
-    ----------
-    moving
-        Joints that move (n,).
-    supported
-        Parameters that can be estimated together (b,). Each includes what the motion cannot separate from it.
-    theta, std
-        Least-squares estimate of these alone, from the joints that move, and its standard deviations; NaN elsewhere
-        (b,), SI.
+    ``moving``: joints that move (n,). ``supported``: parameters that can be estimated together (b,). Each includes what
+    the motion cannot separate from it. ``theta``, ``std``: least-squares estimate of these alone, from the joints that
+    move, and its standard deviations; NaN elsewhere (b,), SI.
     """
 
     moving: Mask
@@ -63,17 +57,7 @@ class Support:
     def determined(self, model: ArmModel, share: float) -> Mask:
         """Return the supported parameters that are precise, and not negative where nature forbids it.
 
-        Parameters
-        ----------
-        model
-            The arm.
-        share
-            Largest relative standard deviation.
-
-        Returns
-        -------
-        ndarray
-            Mask (b,).
+        ``share``: largest relative standard deviation. Returns the mask (b,).
         """
         possible = np.array([not name.startswith(NON_NEGATIVE) for name in model.base.names]) | (self.theta > 0)
         with np.errstate(invalid="ignore"):
@@ -82,12 +66,7 @@ class Support:
     def sentence(self, model: ArmModel, criteria: IdentificationCriteria) -> str:
         """List the parameters that the motion determines in words, with values if they are few.
 
-        Parameters
-        ----------
-        model
-            The arm.
-        criteria
-            Limits of the relative standard deviation and of the number of parameters that are listed.
+        ``criteria``: limits of the relative standard deviation and of the number of parameters that are listed.
         """
         found = np.flatnonzero(self.determined(model, criteria.max_relative_std))
         limit = f"within {100 * criteria.max_relative_std:.0f} %"
@@ -115,18 +94,9 @@ def examine_support(
     left out. Columns are taken in the order of pivoted QR. The subset is the largest leading one in which the standard
     deviation of every parameter changes the torque of its joints by less than ``max_relative_std`` of it.
 
-    Parameters
-    ----------
-    prepared
-        Arm, experiments and derivatives.
-    blocks, decimation
-        Equations of least squares, and their parallel filter.
-    moving
-        Joints that move (n,).
-    criteria
-        Limits.
-    noise
-        Residual variances of least squares, which weigh the equations; ``None``: the variances of the torques.
+    ``prepared``: arm, experiments and derivatives. ``blocks``, ``decimation``: equations of least squares, and their
+    parallel filter. ``moving``: joints that move (n,). ``noise``: residual variances of least squares, which weigh the
+    equations; ``None``: the variances of the torques.
     """
     model = prepared.model
     b, rows = model.base.b, 0
@@ -176,18 +146,8 @@ def excitation_reasons(
 ) -> list[Reason]:
     """Return a reason if the motion leaves inertia or gravity of a joint undetermined, or a joint at rest.
 
-    Parameters
-    ----------
-    model
-        The arm.
-    experiments
-        Recordings.
-    support
-        Parameters that the motion supports.
-    theta, covariance
-        Base estimate (b,) and its covariance (b, b), SI.
-    criteria
-        Limits.
+    ``support``: parameters that the motion supports; ``theta``, ``covariance``: base estimate (b,) and its covariance
+    (b, b), SI.
     """
     names = [joint.name for joint in model.robot.joints]
     q = motion_postures(experiments)
@@ -218,15 +178,7 @@ def excitation_reasons(
 
 
 def motion_postures(experiments: Sequence[Experiment], count: int = POSTURES) -> Array:
-    """Postures of the recordings, evenly taken, shape (about ``count``, n), rad or m.
-
-    Parameters
-    ----------
-    experiments
-        Recordings.
-    count
-        Number of postures.
-    """
+    """Postures of the recordings, evenly taken, shape (about ``count``, n), rad or m."""
     every = max(1, sum(e.q.shape[0] for e in experiments) // count)
     return np.concatenate([e.q[::every].copy() for e in experiments])
 
@@ -234,14 +186,7 @@ def motion_postures(experiments: Sequence[Experiment], count: int = POSTURES) ->
 def workspace_postures(robot: RobotConfig, recorded: Array, count: int = POSTURES) -> Array:
     """Random postures between the position limits, shape (count, n), rad or m; the same in every call.
 
-    Parameters
-    ----------
-    robot
-        Configuration of the robot.
-    recorded
-        Recorded postures (N, n): their range replaces the limits of an endless joint.
-    count
-        Number of postures.
+    ``recorded``: recorded postures (N, n): their range replaces the limits of an endless joint.
     """
     limits = np.array([joint.limits.position for joint in robot.joints], dtype=np.float64).T
     seen = np.stack([recorded.min(axis=0), recorded.max(axis=0)])
@@ -252,21 +197,9 @@ def workspace_postures(robot: RobotConfig, recorded: Array, count: int = POSTURE
 def joint_uncertainty(model: ArmModel, theta: Array, covariance: Array, q: Array) -> tuple[Array, Array]:
     """Uncertainty of inertia and gravity torque of each joint at given postures, without terms.
 
-    Parameters
-    ----------
-    model
-        The arm.
-    theta, covariance
-        Base estimate (b,) and its covariance (b, b), SI.
-    q
-        Postures (N, n), rad or m.
-
-    Returns
-    -------
-    inertia : ndarray
-        Relative standard deviation of the diagonal of the mass matrix, median of the postures, (n,).
-    gravity : ndarray
-        Standard deviation of the gravity torque, mean of the postures, (n,), N m or N.
+    ``theta``, ``covariance``: base estimate (b,) and its covariance (b, b), SI; ``q``: postures (N, n), rad or m.
+    Returns ``inertia``: relative standard deviation of the diagonal of the mass matrix, median of the postures, (n,);
+    ``gravity``: standard deviation of the gravity torque, mean of the postures, (n,), N m or N.
     """
     rigid = model.base.b - model.e
     if not np.isfinite(covariance).all():

@@ -23,17 +23,8 @@ def held_out_errors(blocks: Sequence[ExperimentEquations], theta: Array) -> tupl
 
     Parts are stretches of time, so that the correlation of the noise reaches over their ends only.
 
-    Parameters
-    ----------
-    blocks
-        Equations of every experiment.
-    theta
-        Base parameters (b,), SI; their residuals are the weights of the least squares.
-
-    Returns
-    -------
-    tuple of float and ndarray, or None
-        ``None`` if the rest of the recordings does not determine all parameters.
+    ``theta``: base parameters (b,), SI; their residuals are the weights of the least squares. Returns ``None`` if the
+    rest of the recordings does not determine all parameters.
     """
     # Blocks of a long recording are on disk: one at a time is in memory.
     n = len(blocks[0].y[0])

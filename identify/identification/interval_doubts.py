@@ -27,16 +27,8 @@ def doubts_of_least_squares(
 ) -> tuple[str, ...]:
     """Warnings if derivatives and encoder noise bias IDIM-LS, or if serial correlation understates its intervals.
 
-    Parameters
-    ----------
-    prepared
-        Arm, experiments and derivatives.
-    options
-        Options of the identification.
-    ls
-        Estimate and its equations; those of a published fit are not examined.
-    bandwidth
-        Closed-loop bandwidth, Hz.
+    ``prepared``: arm, experiments and derivatives. ``ls``: estimate and its equations; those of a published fit are not
+    examined. ``bandwidth``: closed-loop bandwidth, Hz.
     """
     if ls.published:
         return ()
@@ -62,16 +54,8 @@ def doubts_of_least_squares(
 def doubts_of_serial_correlation(method: str, names: Sequence[str], estimate: Estimate, std: Array) -> tuple[str, ...]:
     """Warning if the residuals of a joint are not white (Ljung and Box 1978) and intervals are too narrow for it.
 
-    Parameters
-    ----------
-    method
-        Name of the method.
-    names
-        Base parameters (b,).
-    estimate
-        Estimate whose covariance takes the residuals for white.
-    std
-        Standard deviations (b,) that allow for serial correlation, SI.
+    ``names``: base parameters (b,); ``estimate``: estimate whose covariance takes the residuals for white; ``std``:
+    standard deviations (b,) that allow for serial correlation, SI.
     """
     ratio = std / estimate.std
     worst = int(np.argmax(ratio))

@@ -49,8 +49,6 @@ class Judged:
     ----------
     prepared
         Arm, experiments and derivatives.
-    options
-        Options of the identification.
     ls, found
         IDIM-LS, in whose equations errors are measured, and the estimate of the method.
     solution
@@ -73,15 +71,7 @@ class Judged:
 def require_finite(estimate: Estimate) -> None:
     """Raise if an estimate or its covariance is not finite, or a variance is negative.
 
-    Parameters
-    ----------
-    estimate
-        Estimate of any method.
-
-    Raises
-    ------
-    LinAlgError
-        If so.
+    ``estimate``: estimate of any method. Raises LinAlgError if so.
     """
     finite = np.isfinite(estimate.theta).all() and np.isfinite(estimate.covariance).all()
     if not finite or (np.diag(estimate.covariance) < 0.0).any():
@@ -96,21 +86,8 @@ def refusing_singular(
 
     Floating-point warnings of such equations are suppressed: the verdict states the defect.
 
-    Parameters
-    ----------
-    method
-        Name of the method.
-    model
-        The arm.
-    support
-        Parameters that the motion supports.
-    criteria
-        Limits.
-
-    Raises
-    ------
-    DataError
-        If numpy finds a singular matrix, or scipy a number that is not finite (which it reports as ``ValueError``).
+    ``method``: name of the method; ``support``: parameters that the motion supports. Raises DataError if numpy finds a
+    singular matrix, or scipy a number that is not finite (which it reports as ``ValueError``).
     """
     try:
         with np.errstate(invalid="ignore", divide="ignore", over="ignore"), warnings.catch_warnings():
@@ -130,12 +107,7 @@ def judgement(judged: Judged, criteria: IdentificationCriteria) -> list[Reason]:
 
     Tests of residuals and instruments have no meaning for an unusable result; they are left out.
 
-    Parameters
-    ----------
-    judged
-        Parts of the identification.
-    criteria
-        Limits.
+    ``judged``: parts of the identification.
     """
     prepared, estimate = judged.prepared, judged.found.estimate
     model, experiments, method = prepared.model, prepared.experiments, judged.options.method

@@ -33,16 +33,9 @@ Array = NDArray[np.float64]
 class Dependence:
     """Dependence of the residuals of one joint on its motion.
 
-    Parameters
-    ----------
-    joint
-        Index of the joint.
-    variable
-        ``position`` (and direction) or ``velocity``.
-    share
-        Share of the power of the residuals that the averages explain beyond chance, 0 to 1.
-    deviation
-        Difference of that share from its mean under shifts, in standard deviations of the shifts.
+    ``joint``: index of the joint; ``variable``: ``position`` (and direction) or ``velocity``; ``share``: share of the
+    power of the residuals that the averages explain beyond chance, 0 to 1; ``deviation``: difference of that share from
+    its mean under shifts, in standard deviations of the shifts.
     """
 
     joint: int
@@ -54,14 +47,7 @@ class Dependence:
 def motion_dependence(prepared: Prepared, blocks: Sequence[ExperimentEquations], theta: Array) -> list[Dependence]:
     """Return the dependence of the residuals of every joint on its own position and velocity.
 
-    Parameters
-    ----------
-    prepared
-        Experiments with the derivatives of their positions.
-    blocks
-        Equations of the residuals.
-    theta
-        Base parameters (b,), SI.
+    ``prepared``: experiments with the derivatives of their positions; ``theta``: base parameters (b,), SI.
     """
     dt = prepared.experiments[0].dt
     errors = residuals(blocks, theta)

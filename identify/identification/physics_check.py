@@ -39,21 +39,9 @@ def physics_reasons(
     the result is doubtful. Where the nearest possible arm leaves more than a third of a joint's torque, which the
     estimate explains, the signals themselves are wrong, and the result is unusable.
 
-    Parameters
-    ----------
-    model
-        The arm.
-    experiments
-        Recordings.
-    blocks
-        Equations in which the errors of the two arms are compared.
-    theta, covariance
-        Base estimate (b,) and its covariance (b, b), SI.
-    criteria
-        Limits.
-    consistent
-        Nearest physically consistent parameters with their test, if computed; otherwise the distance is tested with b
-        degrees of freedom, more than there are, which is conservative.
+    ``blocks``: equations in which the errors of the two arms are compared. ``theta``, ``covariance``: base estimate
+    (b,) and its covariance (b, b), SI. ``consistent``: nearest physically consistent parameters with their test, if
+    computed; otherwise the distance is tested with b degrees of freedom, more than there are, which is conservative.
     """
     if not (np.isfinite(theta).all() and np.isfinite(covariance).all()):
         return []
@@ -96,16 +84,8 @@ def impossible_values(
 
     They are negative friction and rotor inertias, and a mass matrix that is not positive definite.
 
-    Parameters
-    ----------
-    model
-        The arm.
-    q
-        Postures (N, n) at which the mass matrix is computed, rad or m.
-    theta, covariance
-        Base estimate (b,) and its covariance (b, b), SI.
-    criteria
-        Limits.
+    ``q``: postures (N, n) at which the mass matrix is computed, rad or m; ``theta``, ``covariance``: base estimate (b,)
+    and its covariance (b, b), SI.
     """
     return [*_negative(model, theta, covariance, criteria), *_indefinite(model, q, theta, covariance, criteria)]
 

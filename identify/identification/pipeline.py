@@ -77,25 +77,11 @@ def identify_experiment(
     IDIM-IV (2.3.3) or IDIM-PIV (6.2.2). IDIM-LS is always computed: it starts the iterations and is reported beside
     their result.
 
-    Parameters
-    ----------
-    experiments
-        One or more recordings of the same robot at one sampling rate.
-    robot
-        Its configuration.
-    options
-        Options; ``None``: the defaults.
-    progress
-        Called with a stage and the share done, 0 to 1.
-    setup
-        Check of the set-up of these recordings, which enters the verdict; ``None``: not made.
-
-    Raises
-    ------
-    ConfigError
-        If ``controller='known'`` and the configuration has none.
-    DataError
-        If the data cannot support the request: too short, not finite, motion that leaves parameters undetermined.
+    ``experiments``: one or more recordings of the same robot at one sampling rate. ``options``: options; ``None``: the
+    defaults. ``progress``: called with a stage and the share done, 0 to 1. ``setup``: check of the set-up of these
+    recordings, which enters the verdict; ``None``: not made. Raises ConfigError if ``controller='known'`` and the
+    configuration has none; DataError if the data cannot support the request: too short, not finite, motion that leaves
+    parameters undetermined.
     """
     if isinstance(experiments, Experiment):
         experiments = [experiments]
@@ -234,10 +220,7 @@ def _least_squares(
 def has_published_filters(robot: RobotConfig, options: Options) -> bool:
     """Return True if IDIM-LS uses the filters of a published fit, which takes the torque as recorded.
 
-    Parameters
-    ----------
-    robot, options
-        Configuration, which may have such filters, and options of the identification.
+    ``robot``, ``options``: configuration, which may have such filters, and options of the identification.
     """
     return options.derivatives is None and options.decimation is None and robot.preprocessing is not None
 
@@ -247,16 +230,8 @@ def shifted_experiments(
 ) -> Sequence[Experiment]:
     """Return the experiments with the common shift of the torques that the check of the set-up found.
 
-    Parameters
-    ----------
-    experiments
-        Experiments of one robot.
-    robot, options
-        Its configuration, and options of the identification.
-    setup
-        Check of the set-up; ``None``: not made.
-    notes
-        Receives a remark on the shift.
+    ``experiments``: experiments of one robot. ``robot``, ``options``: its configuration, and options of the
+    identification. ``setup``: check of the set-up; ``None``: not made. ``notes``: receives a remark on the shift.
     """
     shift = None if setup is None else setup.torque_shift
     if shift is None or not shift.applied or (options.method == "idim-ls" and has_published_filters(robot, options)):
@@ -399,14 +374,8 @@ def smoothed_derivatives(
 ) -> Sequence[Derivatives]:
     """Smoothed positions of every experiment and their derivatives (5.1).
 
-    Parameters
-    ----------
-    experiments
-        Experiments of one robot.
-    robot, options
-        Its configuration, and options of the identification.
-    bandwidth
-        Closed-loop bandwidth, Hz.
+    ``experiments``: experiments of one robot; ``robot``, ``options``: its configuration, and options of the
+    identification; ``bandwidth``: closed-loop bandwidth, Hz.
     """
     resolution = encoder_resolution(robot) if options.nvr == "tracking-error" else None
 
@@ -429,15 +398,7 @@ class _Clock:
     _begin: float = field(default_factory=time.perf_counter)
 
     def enter(self, stage: str, share: float) -> None:
-        """End the current stage and begin the next one.
-
-        Parameters
-        ----------
-        stage
-            Name of the next stage.
-        share
-            Share of the identification that is done, 0 to 1.
-        """
+        """End the current stage and begin the next one. ``share``: share of the identification that is done, 0 to 1."""
         self._close()
         self._stage, self._since = stage, time.perf_counter()
         self.report(stage, share)

@@ -52,8 +52,6 @@ class JointResidualStatistics:
 
     Parameters
     ----------
-    joint
-        Name of the joint.
     position_range
         Smallest and largest position, rad or m: first and last knot.
     velocity_limit
@@ -85,14 +83,8 @@ def residual_statistics(
 ) -> tuple[JointResidualStatistics, ...]:
     """Return the statistics of the residuals of every joint.
 
-    Parameters
-    ----------
-    prepared
-        Experiments with the derivatives of their positions.
-    blocks
-        Equations of the estimate.
-    estimate
-        Estimate, whose noise models weigh the residuals; a model is fitted where it has none.
+    ``prepared``: experiments with the derivatives of their positions. ``blocks``: equations of the estimate.
+    ``estimate``: whose noise models weigh the residuals; a model is fitted where it has none.
     """
     noise: Sequence[ArModel] = estimate.noise
     if not any(ar.order for ar in noise):
@@ -130,14 +122,8 @@ def residual_statistics(
 def motion_functions(q: Array, qd: Array, limits: tuple[float, float], fastest: float) -> Array:
     """Return the free functions of the motion of a joint at every instant, shape (M, k).
 
-    Parameters
-    ----------
-    q, qd
-        Position and velocity (M,), rad and rad/s, or m and m/s.
-    limits
-        First and last knot of position.
-    fastest
-        Last knot of velocity; the first is its negative.
+    ``q``, ``qd``: position and velocity (M,), rad and rad/s, or m and m/s. ``limits``: first and last knot of position.
+    ``fastest``: last knot of velocity; the first is its negative.
     """
     place = _hats(q, np.linspace(*limits, POSITION_KNOTS))
     direction = qd / np.hypot(qd, max(DIRECTION * fastest, 1e-300))
@@ -157,12 +143,7 @@ def band_powers(series: Sequence[Array], noise: ArModel) -> tuple[Array, Array]:
     Ordinates of a periodogram are independent chi-square variables with two degrees of freedom each, scaled by the
     spectrum. Satterthwaite's approximation with the spectrum of the noise model gives those of their sum.
 
-    Parameters
-    ----------
-    series
-        Residuals of one joint, one array (M,) per experiment.
-    noise
-        Noise model of the joint.
+    ``series``: residuals of one joint, one array (M,) per experiment; ``noise``: noise model of the joint.
     """
     bands = len(BANDS) - 1
     power, sums, squares = np.zeros(bands), np.zeros(bands), np.zeros(bands)

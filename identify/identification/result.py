@@ -31,14 +31,7 @@ WORTHLESS_PCT = 100.0
 class JointWhiteness:
     """Residual autocorrelation of one joint.
 
-    Parameters
-    ----------
-    joint
-        Name of the joint.
-    lags
-        Number of lags.
-    fraction_outside_2sigma
-        Share of the lags outside the 2-sigma band, about 0.05 if white.
+    ``fraction_outside_2sigma``: share of the lags outside the 2-sigma band, about 0.05 if white.
     """
 
     joint: str
@@ -56,8 +49,6 @@ class Identification:
         Judgement of the result with its reasons.
     criteria
         Limits of the verdict.
-    method
-        Name of the method.
     names, units, formulas, theta, std, covariance, essential
         Base parameters (b,) in SI units, the formulas of regrouped ones, their standard deviations (b,), their
         covariance (b, b), and the mask (b,) of the essential ones.
@@ -88,8 +79,6 @@ class Identification:
         Duration of every stage, s.
     warnings
         Lines for the user.
-    options
-        Options of the identification.
     idim_ls, idim_ls_relative_error_pct
         Theta and standard deviations of IDIM-LS on the same data, for comparison, and its relative error, percent.
     held_out
@@ -143,16 +132,8 @@ class Identification:
 class LeastSquares:
     """The IDIM-LS estimate and its equations.
 
-    Parameters
-    ----------
-    estimate, blocks
-        Estimate, and the equations of every experiment.
-    decimation
-        Parallel filter of the methods without a noise model.
-    factor
-        Decimation factor chosen by the user or from the noise; ``None``: from the bandwidth.
-    published
-        True for the filters of a published fit.
+    ``decimation``: parallel filter of the methods without a noise model. ``factor``: decimation factor chosen by the
+    user or from the noise; ``None``: from the bandwidth. ``published``: True for the filters of a published fit.
     """
 
     estimate: Estimate
@@ -166,14 +147,8 @@ class LeastSquares:
 class MethodResult:
     """The estimate of the chosen method.
 
-    Parameters
-    ----------
-    estimate, blocks
-        Estimate, and the equations of every experiment.
-    controller
-        Description of the controller of the auxiliary model; its kind is ``none`` for IDIM-LS.
-    noise_of
-        Quantity to which noise models and residuals belong.
+    ``controller``: description of the controller of the auxiliary model; its kind is ``none`` for IDIM-LS.
+    ``noise_of``: quantity to which noise models and residuals belong.
     """
 
     estimate: Estimate
@@ -225,20 +200,9 @@ def make_result(
 ) -> Identification:
     """Assemble the result; relative errors are those on the equations of IDIM-LS.
 
-    Parameters
-    ----------
-    options, model
-        Options and arm of the identification.
-    found, ls
-        Estimate of the method, and of IDIM-LS for comparison.
-    statistics
-        Tests of the estimate of the method.
-    judged
-        Verdict, and its limits.
-    warnings
-        Lines for the user; each is kept once.
-    timing_s
-        Duration of every stage, s.
+    ``options``, ``model``: options and arm of the identification. ``found``, ``ls``: estimate of the method, and of
+    IDIM-LS for comparison. ``statistics``: tests of the estimate of the method. ``judged``: verdict, and its limits.
+    ``warnings``: lines for the user; each is kept once. ``timing_s``: duration of every stage, s.
     """
     estimate, ls_blocks = found.estimate, ls.blocks
     joints = [joint.name for joint in model.robot.joints]
@@ -297,15 +261,7 @@ def make_result(
 
 
 def relative_errors(blocks: Sequence[ExperimentEquations], theta: Array) -> tuple[float, Array]:
-    """``|y - X theta| / |y|`` in percent, overall and per joint (n,).
-
-    Parameters
-    ----------
-    blocks
-        Equations of every experiment.
-    theta
-        Base parameters, shape (b,).
-    """
+    """``|y - X theta| / |y|`` in percent, overall and per joint (n,). ``theta``: base parameters, shape (b,)."""
     errors = residuals(blocks, theta)
     miss = sum(np.sum(np.where(b.keep, e, 0.0) ** 2, axis=0) for e, b in zip(errors, blocks, strict=True))
     power = sum(np.sum(np.where(b.keep, b.y, 0.0) ** 2, axis=0) for b in blocks)
@@ -313,13 +269,7 @@ def relative_errors(blocks: Sequence[ExperimentEquations], theta: Array) -> tupl
 
 
 def units(model: ArmModel) -> tuple[str, ...]:
-    """SI units of the base parameters, those of the terms at the end, shape (b,).
-
-    Parameters
-    ----------
-    model
-        The arm.
-    """
+    """SI units of the base parameters, those of the terms at the end, shape (b,)."""
     rigid = [unit(name, model.robot) for name in model.base.names[: model.base.b - model.e]]
     return (*rigid, *(one for term in model.terms for one in term.units))
 
@@ -331,12 +281,7 @@ UNITS = {"ia": ("kg m^2", "kg"), "fv": ("N m s/rad", "N s/m"), "fc": ("N m", "N"
 def unit(name: str, robot: RobotConfig) -> str:
     """SI unit of a base parameter, joint side.
 
-    Parameters
-    ----------
-    name
-        Base parameter.
-    robot
-        Its robot; joints are revolute or prismatic.
+    ``name``: base parameter. ``robot``: its robot; joints are revolute or prismatic.
     """
     kind = name[:2]
     if kind in ("mx", "my", "mz"):

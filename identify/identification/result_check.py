@@ -44,8 +44,6 @@ def error_reasons(
 
     Parameters
     ----------
-    robot
-        Configuration of the robot.
     blocks
         Equations to which the errors belong.
     theta
@@ -54,8 +52,6 @@ def error_reasons(
         Relative error of each joint (n,), percent.
     moving
         Joints that move (n,).
-    criteria
-        Limits.
     step
         Next step where the rest is not noise and least squares does no better.
     ls_errors
@@ -88,15 +84,7 @@ def error_reasons(
 
 
 def convergence_reasons(method: Method, estimate: Estimate) -> list[Reason]:
-    """Return a reason if the iterations did not converge.
-
-    Parameters
-    ----------
-    method
-        Name of the method.
-    estimate
-        Its estimate.
-    """
+    """Return a reason if the iterations did not converge. ``method``: name of the method."""
     if estimate.converged:
         return []
     message = f"{method} did not converge: {estimate.stop_reason}"
@@ -110,16 +98,8 @@ def loop_reasons(
 ) -> list[Reason]:
     """Return a reason if the closed loop, simulated with the estimate, diverges or does not move like the robot.
 
-    Parameters
-    ----------
-    method
-        Name of the method.
-    diverges
-        True if no closed loop runs with the estimate.
-    velocity_error
-        Relative error of the simulated velocities; ``None`` without a simulation.
-    criteria
-        Limits.
+    ``method``: name of the method. ``diverges``: True if no closed loop runs with the estimate. ``velocity_error``:
+    relative error of the simulated velocities; ``None`` without a simulation.
     """
     level: Level = "unusable" if method in SIMULATED else "doubtful"
     if diverges:
@@ -146,20 +126,9 @@ def residual_reasons(
 
     A variance that depends on speed or torque is reported by the tests, but is no defect: it biases nothing.
 
-    Parameters
-    ----------
-    method
-        Name of the method.
-    diagnostics
-        Tests of the estimate.
-    judged
-        Joints whose residuals are judged; those with a worse defect are not.
-    criteria
-        Limits.
-    known
-        Reasons of the estimator, which may already contain the statement.
-    dependences
-        Dependence of the residuals on the motion.
+    ``method``: name of the method. ``diagnostics``: tests of the estimate. ``judged``: joints whose residuals are
+    judged; those with a worse defect are not. ``known``: reasons of the estimator, which may already contain the
+    statement. ``dependences``: dependence of the residuals on the motion.
     """
     coloured = [j for j in diagnostics.joints if j.joint in judged and not j.white]
     parts, step = [], DIAGNOSE
@@ -198,14 +167,7 @@ def residual_reasons(
 def instrument_reasons(diagnostics: Diagnostics, parameters: int, criteria: IdentificationCriteria) -> list[Reason]:
     """Return a reason if instruments are weak.
 
-    Parameters
-    ----------
-    diagnostics
-        Tests of the estimate.
-    parameters
-        Number of base parameters.
-    criteria
-        Limits.
+    ``diagnostics``: tests of the estimate; ``parameters``: number of base parameters.
     """
     weak = diagnostics.weak_instruments
     if not weak:
@@ -218,14 +180,7 @@ def instrument_reasons(diagnostics: Diagnostics, parameters: int, criteria: Iden
 def delay_reasons(delay: TorqueDelay | None, robot: RobotConfig, criteria: IdentificationCriteria) -> list[Reason]:
     """Return a reason if torques are recorded more than a sample away from their expected position.
 
-    Parameters
-    ----------
-    delay
-        Estimated delays; ``None``: not estimated.
-    robot
-        Configuration of the robot.
-    criteria
-        Limits.
+    ``delay``: estimated delays; ``None``: not estimated.
     """
     if delay is None:
         return []

@@ -49,14 +49,8 @@ Array = NDArray[np.float64]
 class Speeds:
     """Velocities of each joint in the recordings, rad/s or m/s, shape (n,) each.
 
-    Parameters
-    ----------
-    top
-        99 % quantile of the absolute velocity.
-    rms
-        Root mean square velocity.
-    noise
-        Standard deviation of the velocity that the noise of the encoder causes after the same filter.
+    ``top``: 99 % quantile of the absolute velocity; ``rms``: root mean square velocity; ``noise``: standard deviation
+    of the velocity that the noise of the encoder causes after the same filter.
     """
 
     top: Array
@@ -65,15 +59,7 @@ class Speeds:
 
 
 def recorded_speeds(experiments: Sequence[Experiment], bandwidth_hz: float) -> Speeds:
-    """Velocities of each joint, after a zero-phase low-pass at the closed-loop bandwidth.
-
-    Parameters
-    ----------
-    experiments
-        Recordings.
-    bandwidth_hz
-        Closed-loop bandwidth, Hz.
-    """
+    """Velocities of each joint, after a zero-phase low-pass at the closed-loop bandwidth."""
     speeds, noise, power, samples = [], [], np.zeros(experiments[0].q.shape[1]), 0
     for e in experiments:
         cutoff = min(bandwidth_hz, LARGEST_CUTOFF / e.dt)
@@ -94,14 +80,8 @@ def with_sign_smoothing(robot: RobotConfig, experiments: Sequence[Experiment], b
     The width ``1/g`` is ``1 / SATURATION`` of the joint's top speed. It is not below the noise of the measured
     velocity: the sign of a narrower one would be that of the noise. A joint without any motion keeps the nominal value.
 
-    Parameters
-    ----------
-    robot
-        Configuration; it is returned as it is where it gives the smoothing.
-    experiments
-        Recordings, corrected for wiring errors.
-    bandwidth_hz
-        Closed-loop bandwidth, Hz.
+    ``robot``: configuration; it is returned as it is where it gives the smoothing. ``experiments``: recordings,
+    corrected for wiring errors. ``bandwidth_hz``: closed-loop bandwidth, Hz.
     """
     if robot.friction.sign_smoothing is not None:
         return robot
@@ -118,12 +98,7 @@ def with_sign_smoothing(robot: RobotConfig, experiments: Sequence[Experiment], b
 def with_numbers(robot: RobotConfig, smoothing: Sequence[float] | Array) -> RobotConfig:
     """Return the configuration with numbers for ``friction.sign_smoothing`` where it gives none.
 
-    Parameters
-    ----------
-    robot
-        Configuration; it is returned as it is where it gives the smoothing.
-    smoothing
-        ``g`` of each joint, s/rad or s/m, (n,).
+    ``smoothing``: ``g`` of each joint, s/rad or s/m, (n,).
     """
     if robot.friction.sign_smoothing is not None:
         return robot
@@ -136,16 +111,8 @@ def unsaturated_joints(
 ) -> list[str]:
     """Warnings for joints that move so slowly that the smoothing of the sign biases their friction.
 
-    Parameters
-    ----------
-    given
-        Configuration of the user.
-    robot
-        Configuration with numbers, from `with_sign_smoothing`.
-    experiments
-        Recordings.
-    bandwidth_hz
-        Closed-loop bandwidth, Hz.
+    ``given``: configuration of the user; ``robot``: configuration with numbers, from `with_sign_smoothing`;
+    ``bandwidth_hz``: closed-loop bandwidth, Hz.
     """
     speeds = recorded_speeds(experiments, bandwidth_hz)
     reached = 2 / np.pi * np.arctan(robot.sign_smoothing * speeds.rms)

@@ -64,16 +64,9 @@ Array = NDArray[np.float64]
 class SimulatedBias:
     """Bias of an estimator and scatter by encoder noise, from simulated recordings.
 
-    Parameters
-    ----------
-    bias
-        Mean estimate of the simulated recordings less the parameters that made them, SI, (b,).
-    scatter
-        Standard deviations of these estimates, SI, (b,).
-    runs
-        Number of simulated recordings.
-    share
-        Share of the experiments that were simulated, 0 to 1: estimates from all scatter by its square root of that.
+    ``bias``: mean estimate of the simulated recordings less the parameters that made them, SI, (b,); ``scatter``:
+    standard deviations of these estimates, SI, (b,); ``share``: share of the experiments that were simulated, 0 to 1:
+    estimates from all scatter by its square root of that.
     """
 
     bias: Array
@@ -84,10 +77,7 @@ class SimulatedBias:
     def largest(self, estimate: Estimate) -> tuple[int, float]:
         """Parameter with the largest bias, and the bias in its standard deviations.
 
-        Parameters
-        ----------
-        estimate
-            Estimate whose standard deviations count.
+        ``estimate``: estimate whose standard deviations count.
         """
         share = np.abs(self.bias) / estimate.std
         k = int(np.argmax(share))
@@ -107,6 +97,9 @@ def simulated_bias(
 ) -> SimulatedBias | None:
     """Return the bias of an instrumental-variable estimate.
 
+    Returns ``None`` if the loop with this estimate cannot be simulated, or its recordings do not determine the
+    parameters.
+
     Parameters
     ----------
     prepared
@@ -125,11 +118,6 @@ def simulated_bias(
         Number of simulated recordings; ``None``: few where the bias is irrelevant, else many.
     share
         Share of the experiments of the estimate that are simulated, 0 to 1.
-
-    Returns
-    -------
-    SimulatedBias or None
-        ``None`` if the loop with this estimate cannot be simulated, or its recordings do not determine the parameters.
     """
     auxiliary, theta = auxiliary.fresh(), estimate.theta
     clean = auxiliary.simulate(theta)
@@ -164,14 +152,7 @@ def corrected(estimate: Estimate, found: SimulatedBias, blocks: Sequence[Experim
     more than its standard deviation, which assumes noise that is independent of the motion, it is widened to that
     scatter.
 
-    Parameters
-    ----------
-    estimate
-        Estimate with its noise models.
-    found
-        Its bias.
-    blocks
-        Equations of the estimate.
+    ``estimate``: estimate with its noise models.
     """
     theta = estimate.theta - found.bias
     ratio = np.sqrt(found.share) * found.scatter / estimate.std
@@ -232,14 +213,8 @@ def auxiliary_smoother(
 ) -> Callable[[Array], Derivatives]:
     """Smoother of the measured positions, for simulated ones.
 
-    Parameters
-    ----------
-    auxiliary
-        Closed loop; it has the bandpass where one was chosen.
-    derivatives
-        Name of the smoother.
-    nvr
-        Noise-variance ratios (n,) of the measured positions; ``None``: bandpass.
+    ``auxiliary``: closed loop; it has the bandpass where one was chosen. ``nvr``: noise-variance ratios (n,) of the
+    measured positions; ``None``: bandpass.
     """
     if nvr is None:
         measured = auxiliary.measured

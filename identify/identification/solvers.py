@@ -84,8 +84,6 @@ def decimation_of(
     ----------
     method
         Name of the method; those with a noise model decimate only roughly.
-    dt
-        Sampling period, s.
     bandwidth_hz
         Closed-loop bandwidth, Hz.
     factor
@@ -123,18 +121,8 @@ def decimation_of(
 class Problem:
     """Input of every method: experiments with derivatives, the closed loop, and the first iterate.
 
-    Parameters
-    ----------
-    prepared
-        Arm, experiments and derivatives.
-    auxiliary
-        The simulated closed loop with the decimation of the method.
-    start
-        First theta, shape (b,).
-    plain
-        Decimation of the methods without a noise model.
-    options
-        Options of the identification.
+    ``prepared``: arm, experiments and derivatives; ``auxiliary``: the simulated closed loop with the decimation of the
+    method; ``start``: first theta, shape (b,); ``plain``: decimation of the methods without a noise model.
     """
 
     prepared: Prepared
@@ -202,10 +190,7 @@ class Solution:
     def motions(self) -> Sequence[Derivatives]:
         """Simulated motion of the estimate along the recorded references, without the disturbances of the recordings.
 
-        Raises
-        ------
-        DataError
-            If neither the estimate nor any point between it and the last good one can be simulated.
+        Raises DataError if neither the estimate nor any point between it and the last good one can be simulated.
         """
         auxiliary = self.problem.auxiliary.fresh()
         return auxiliary.motions(self.estimate.theta) if self.runs is None else auxiliary.motions_of(self.runs)
@@ -263,22 +248,13 @@ class Solution:
 def is_singular(error: Exception) -> bool:
     """Return true for a singular matrix, and for scipy's ``ValueError`` about numbers that are not finite.
 
-    Parameters
-    ----------
-    error
-        Exception of numpy or scipy.
+    ``error``: exception of numpy or scipy.
     """
     return isinstance(error, np.linalg.LinAlgError) or NOT_FINITE in str(error)
 
 
 def solve(problem: Problem) -> Solution:
-    """Solution of a problem by the method of its options.
-
-    Raises
-    ------
-    DataError
-        If no auxiliary closed loop runs.
-    """
+    """Solution of a problem by the method of its options. Raises DataError if no auxiliary closed loop runs."""
     return _SOLVERS[problem.options.method](problem)
 
 

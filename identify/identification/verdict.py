@@ -21,18 +21,9 @@ Kind = Literal[
 class Reason:
     """One defect of a result.
 
-    Parameters
-    ----------
-    level
-        Level of the verdict that the defect causes.
-    message
-        The defect in one sentence, with figures.
-    next_step
-        Action that removes it.
-    joint
-        Joint concerned; ``None``: several, or none in particular.
-    kind
-        Property that was judged.
+    ``level``: level of the verdict that the defect causes. ``message``: the defect in one sentence, with figures.
+    ``next_step``: action that removes it. ``joint``: joint concerned; ``None``: several, or none in particular.
+    ``kind``: property that was judged.
     """
 
     level: Level
@@ -46,13 +37,8 @@ class Reason:
 class Verdict:
     """Judgement of a result.
 
-    Parameters
-    ----------
-    level
-        ``trustworthy``: no defect was found. ``doubtful``: usable within the limits that the reasons state.
-        ``unusable``: the parameters must not be used.
-    reasons
-        Defects, the most severe first; empty if trustworthy.
+    ``level``: ``trustworthy``: no defect was found. ``doubtful``: usable within the limits that the reasons state.
+    ``unusable``: the parameters must not be used. ``reasons``: defects, the most severe first; empty if trustworthy.
     """
 
     level: Level
@@ -67,13 +53,7 @@ class Verdict:
         return f"{self.level}: {self.reasons[0].message}" + (f" (and {more} more)" if more else "")
 
     def of_kind(self, kind: Kind) -> tuple[Reason, ...]:
-        """Return the reasons of one kind.
-
-        Parameters
-        ----------
-        kind
-            Property that was judged.
-        """
+        """Return the reasons of one kind. ``kind``: property that was judged."""
         return tuple(reason for reason in self.reasons if reason.kind == kind)
 
     def document(self) -> dict[str, Any]:
@@ -141,12 +121,7 @@ def judge(reasons: Sequence[Reason], setup: SetupCheck | None = None) -> Verdict
     The level is that of the most severe reason. Reasons are sorted by severity, those of the set-up first; each message
     occurs once.
 
-    Parameters
-    ----------
-    reasons
-        Defects found in data and result.
-    setup
-        Check of the set-up; ``None``: not made.
+    ``reasons``: defects found in data and result. ``setup``: check of the set-up; ``None``: not made.
     """
     every = _merged(reasons, setup)
     once = {reason.message: reason for reason in reversed(every)}
@@ -206,12 +181,7 @@ def _tried(setup: SetupCheck) -> str:
 def listed(names: Sequence[str], most: int = 12) -> str:
     """Return names as a list in words, cut after ``most``.
 
-    Parameters
-    ----------
-    names
-        Names, at least one.
-    most
-        Largest number of names.
+    ``names``: at least one; ``most``: largest number of names.
     """
     shown = list(names[:most])
     if len(names) > most:

@@ -21,13 +21,6 @@ def write_csv(model: ExportedModel, path: Path) -> tuple[list[Path], LimitationS
 
     ``identifiable`` is ``alone``, ``group`` or ``no``; ``std`` is empty where the recordings do not determine the
     parameter alone.
-
-    Parameters
-    ----------
-    model
-        The model.
-    path
-        File to write.
     """
     found = model.consistent
     rigid = len(found.names) - model.arm.e

@@ -21,22 +21,7 @@ HOLDS = ("viscous friction", "Coulomb friction")
 
 
 def write_urdf(model: ExportedModel, out: Path) -> tuple[list[Path], LimitationSheet]:
-    """Write a URDF.
-
-    Parameters
-    ----------
-    model
-        The model.
-    out
-        The file.
-
-    Returns
-    -------
-    files : list of Path
-        The file.
-    sheet : LimitationSheet
-        Limits of the format.
-    """
+    """Write a URDF. Returns ``files``: the file; ``sheet``: limits of the format."""
     model, parts = with_rigid_effects(model)
     if model.source_urdf is None:
         root, remarks = _new(model), ["there are no meshes"]

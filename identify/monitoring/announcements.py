@@ -17,12 +17,7 @@ class Announcements:
     end of the transaction leaves an entry that counts as not announced. Other workers have heard the announcement,
     and enter it.
 
-    Parameters
-    ----------
-    keys
-        Keys of the robot.
-    link
-        Zenoh session of the worker.
+    ``keys``: keys of the robot; ``link``: Zenoh session of the worker.
     """
 
     def __init__(self, keys: Keys, link: WorkerLink) -> None:
@@ -33,19 +28,9 @@ class Announcements:
     def make(self, ledger: Ledger, sha256: str) -> bytes | None:
         """Announce the result or the failure of a recording, and return the document that was announced.
 
-        Parameters
-        ----------
-        ledger
-            Ledger of the worker, which has a claim on the recording.
-        sha256
-            The recording.
-
-        Raises
-        ------
-        LinkDown
-            If the session is missing, too new, or fails.
-        LedgerError
-            If the ledger cannot be written; the announcement is not repeated when this is called again.
+        ``ledger``: ledger of the worker, which has a claim on the recording. Raises LinkDown if the session is missing,
+        too new, or fails. Raises LedgerError if the ledger cannot be written; the announcement is not repeated when
+        this is called again.
         """
         entry = ledger.entry(sha256)
         if entry is None or entry.announced or entry.state == "waiting":
@@ -69,15 +54,8 @@ class Announcements:
     def enter_heard(self, ledger: Ledger) -> None:
         """Enter the announcements that other workers have made, but not entered.
 
-        Parameters
-        ----------
-        ledger
-            Ledger that the workers share.
-
-        Raises
-        ------
-        LedgerError
-            If the ledger cannot be read or written; what was heard is kept for the next call.
+        ``ledger``: ledger that the workers share. Raises LedgerError if the ledger cannot be read or written; what was
+        heard is kept for the next call.
         """
         self._heard |= self._link.receiver.take_heard()
         if not self._heard:

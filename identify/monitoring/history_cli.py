@@ -29,6 +29,9 @@ def history_command(
 ) -> int:
     """Carry out ``armident history``: add documents, compare runs with the first one, plot parameters.
 
+    Returns the exit code: 0, or `DRIFTED`. Raises ConfigError if the database, robot, cell, a parameter or the plot is
+    wrong; DataError if a document is wrong, or the runs are of different models.
+
     Parameters
     ----------
     documents
@@ -45,18 +48,6 @@ def history_command(
         Probability of a false alarm per run.
     as_json
         Print JSON instead of a table.
-
-    Returns
-    -------
-    int
-        Exit code: 0, or `DRIFTED`.
-
-    Raises
-    ------
-    ConfigError
-        If the database, robot, cell, a parameter or the plot is wrong.
-    DataError
-        If a document is wrong, or the runs are of different models.
     """
     loaded = [(load_document(path, IdentificationDocument), path) for path in documents]
     history = History(database)

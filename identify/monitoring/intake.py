@@ -17,16 +17,9 @@ log = logging.getLogger(__name__)
 class Intake:
     """Enters recordings that have ended in the ledger, each once.
 
-    Parameters
-    ----------
-    cell, robot
-        Names of the cell and of its robot.
-    folder_of
-        Gives the folder of the result of a recording by its name.
-    buffer, lock
-        Streams of the captures under way, and the lock that protects them.
-    refused
-        Takes a stream that cannot be used: name of the capture, message and exit code.
+    ``folder_of``: gives the folder of the result of a recording by its name; ``buffer``, ``lock``: streams of the
+    captures under way, and the lock that protects them; ``refused``: takes a stream that cannot be used: name of the
+    capture, message and exit code.
     """
 
     def __init__(
@@ -47,12 +40,7 @@ class Intake:
     def take_stream(self, ledger: Ledger, assembly: Assembly) -> None:
         """Enter the files of a capture that has ended; without them the stream itself.
 
-        Parameters
-        ----------
-        ledger
-            Ledger of the worker.
-        assembly
-            Events and blocks of the capture.
+        ``ledger``: ledger of the worker; ``assembly``: events and blocks of the capture.
         """
         found = captured_as(assembly.files)
         if any(not captured.finished for captured in found):
@@ -85,16 +73,8 @@ class Intake:
     ) -> None:
         """Enter finished recordings of this cell that the ledger does not know.
 
-        Parameters
-        ----------
-        ledger
-            Ledger of the worker.
-        found
-            The recordings.
-        streamed
-            Hash of the stream of these files, if it was received.
-        announced
-            True for files that were announced on the keys of this cell.
+        ``ledger``: ledger of the worker; ``streamed``: hash of the stream of these files, if it was received;
+        ``announced``: True for files that were announced on the keys of this cell.
         """
         for captured in found:
             try:

@@ -17,12 +17,7 @@ _REASONS = {
 def sqlite_reason(error: sqlite3.Error, busy_s: float) -> str:
     """Return one line that says why a file cannot be used.
 
-    Parameters
-    ----------
-    error
-        Error of SQLite.
-    busy_s
-        Time for which a locked file was waited for, s.
+    ``busy_s``: time for which a locked file was waited for, s.
     """
     text = " ".join(str(error).split())
     found = next((reason for part, reason in _REASONS.items() if part in text), "{text}")

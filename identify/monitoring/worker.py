@@ -52,21 +52,9 @@ class Worker:
     It finds recordings by the events on Zenoh and in the folders of the cell. A ledger in the folder of the results
     says which have a result: a worker that was absent or killed continues there, and several workers share the work.
 
-    Parameters
-    ----------
-    session
-        Configuration of the cell.
-    robot
-        Configuration of its robot.
-    out
-        Folder of the results; each recording has a subfolder. The ledger is there.
-    progress
-        Called every second with the state, as long as the work advances; resets a watchdog.
-
-    Raises
-    ------
-    ConfigError
-        If Zenoh's configuration is wrong.
+    ``out``: folder of the results; each recording has a subfolder. The ledger is there. ``progress``: called every
+    second with the state, as long as the work advances; resets a watchdog. Raises ConfigError if Zenoh's configuration
+    is wrong.
     """
 
     def __init__(
@@ -310,24 +298,8 @@ def _exit_code(state: State, message: str | None) -> int:
 def run_worker(config: Path, *, once: bool, out: Path | None) -> int:
     """Carry out ``armident worker`` until SIGTERM or SIGINT.
 
-    Parameters
-    ----------
-    config
-        Session configuration.
-    once
-        End after one recording with its exit code.
-    out
-        Folder of the results; ``None``: the recording directory of the session.
-
-    Returns
-    -------
-    int
-        Exit code.
-
-    Raises
-    ------
-    ConfigError
-        If the configuration is wrong.
+    ``config``: session configuration. ``once``: end after one recording with its exit code. ``out``: folder of the
+    results; ``None``: the recording directory of the session. Returns the exit code.
     """
     session = load_session(config, "identify")
     robot = load_robot(session.robot, "identify")

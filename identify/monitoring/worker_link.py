@@ -27,23 +27,9 @@ class WorkerLink:
     The first worker of a cell listens on the port of its role. Others listen on a free port, and one of them takes the
     port of the role when it is free again. Without a session the worker continues with the files.
 
-    Parameters
-    ----------
-    session
-        Configuration of the cell.
-    keys
-        Keys of its robot.
-    on_event, on_block
-        Take an encoded message (``None`` if it is larger than the limit) and its size, bytes.
-    limits
-        Largest event and block that are passed on, bytes.
-    answer
-        Returns the last result, or ``None``.
-
-    Raises
-    ------
-    ConfigError
-        If Zenoh's configuration is wrong.
+    ``keys``: keys of its robot; ``on_event``, ``on_block``: take an encoded message (``None`` if it is larger than the
+    limit) and its size, bytes; ``limits``: largest event and block that are passed on, bytes; ``answer``: returns the
+    last result, or ``None``. Raises ConfigError if Zenoh's configuration is wrong.
     """
 
     def __init__(
@@ -95,15 +81,7 @@ class WorkerLink:
     def announce(self, *messages: tuple[str, bytes]) -> None:
         """Publish a result or a failure; it has left the process when this returns.
 
-        Parameters
-        ----------
-        messages
-            Key expressions and contents.
-
-        Raises
-        ------
-        LinkDown
-            If there is no session, it is too new, or it fails.
+        ``messages``: key expressions and contents. Raises LinkDown if there is no session, it is too new, or it fails.
         """
         with self._lock:
             if self._announcer is None or not self.can_announce:
@@ -114,15 +92,7 @@ class WorkerLink:
                 raise LinkDown("zenoh: the session failed") from error
 
     def status(self, state: str, **more: Any) -> None:
-        """Publish the state of the worker if there is a session.
-
-        Parameters
-        ----------
-        state
-            Name of the state.
-        more
-            Further entries.
-        """
+        """Publish the state of the worker if there is a session. ``more``: further entries."""
         content = status("worker", state, **more)
         with self._lock:
             if self._session is None:

@@ -14,12 +14,7 @@ from armident.identify.report.plots import Plot, Series, plots_html
 def comparison_report(document: ComparisonDocument, glossary_of: IdentificationDocument) -> str:
     """Return the HTML page of a comparison, complete in one file.
 
-    Parameters
-    ----------
-    document
-        The comparison.
-    glossary_of
-        The later identification, whose parameters the glossary explains.
+    ``glossary_of``: the later identification, whose parameters the glossary explains.
     """
     return render(
         "comparison.html",

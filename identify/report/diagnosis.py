@@ -28,12 +28,7 @@ FOLLOWS = 0.6
 def diagnosis_report(diagnosis: DiagnosisResult, document: DiagnosisDocument) -> str:
     """Return the HTML page of a diagnosis, complete in one file.
 
-    Parameters
-    ----------
-    diagnosis
-        Curves and configuration with the findings.
-    document
-        ``diagnosis.json``.
+    ``diagnosis``: curves and configuration with the findings; ``document``: ``diagnosis.json``.
     """
     joints = [joint.name for joint in diagnosis.robot.joints]
     hidden: dict[str, list[str]] = {}
@@ -92,17 +87,8 @@ def probability(finding: Finding) -> str:
 def closed_gap_share(finding: Finding, document: DiagnosisDocument) -> float | None:
     """Return the share of the joint's held-out gap above the noise floor that a finding closes, 0 to 1.
 
-    Parameters
-    ----------
-    finding
-        A finding.
-    document
-        Its document, for the noise floor.
-
-    Returns
-    -------
-    float or None
-        ``None`` if there is no gap above the noise floor.
+    The gap after is that without derivative noise where this is smaller. Returns ``None`` if there is no gap above the
+    noise floor.
     """
     after = finding.gap_after
     floor = min(document.noise_floor.by_joint[finding.joint], after)
@@ -143,17 +129,9 @@ def _gap_figure(document: DiagnosisDocument) -> str:
 def _finding_figure(diagnosis: DiagnosisResult, joint: int, lacking: Array | None, own: Array | None) -> str:
     """Return a figure of the joint's held-out residual without and with a finding, over time and over its variable.
 
-    Parameters
-    ----------
-    diagnosis
-        Curves.
-    joint
-        Index of the joint.
-    lacking
-        Torques (M, n) of the model without the finding; ``None`` compares the model as configured with that of all
-        findings.
-    own
-        Torques (M, n) of the finding itself, which depend on its variable alone; ``None`` if it is no term.
+    ``joint``: index of the joint. ``lacking``: torques (M, n) of the model without the finding; ``None`` compares the
+    model as configured with that of all findings. ``own``: torques (M, n) of the finding itself, which depend on its
+    variable alone; ``None`` if it is no term.
     """
     name, unit = diagnosis.robot.joints[joint].name, _unit(diagnosis, joint)
     seen = [d for d in diagnosis.where if d.joint == name]
@@ -194,14 +172,7 @@ def followed_variable(diagnosis: DiagnosisResult, joint: int, added: Array) -> t
 
     Speed, position or time, the first whose means have the share `FOLLOWS` of its power; otherwise its own torque.
 
-    Parameters
-    ----------
-    diagnosis
-        Curves.
-    joint
-        Index of the joint.
-    added
-        Torque (M,) of the finding, N m or N.
+    ``joint``: index of the joint; ``added``: torque (M,) of the finding, N m or N.
     """
     way = "m" if diagnosis.robot.joints[joint].type == "prismatic" else "rad"
     for name, unit, x in (

@@ -28,16 +28,7 @@ def identification_report(
 ) -> str:
     """Return the HTML page of an identification, complete in one file.
 
-    Parameters
-    ----------
-    recordings
-        Recordings that were used.
-    robot
-        Their robot.
-    result
-        Estimates and curves.
-    document
-        ``identification.json``.
+    ``recordings``: recordings that were used; ``result``: estimates and curves; ``document``: ``identification.json``.
     """
     joints = [joint.name for joint in robot.joints]
     return render(
@@ -88,16 +79,8 @@ def torque_plots(
 ) -> Markup:
     """Return plots of measured and predicted torque and their difference, one per joint, with common zoom.
 
-    Parameters
-    ----------
-    t
-        Instants (M,), s; a step back begins another experiment.
-    measured, predicted
-        Torques (M, n), N m or N.
-    joints, units
-        Name and unit of each joint.
-    before
-        Torques (M, n) of another model for comparison, the one as configured.
+    ``t``: instants (M,), s; a step back begins another experiment. ``measured``, ``predicted``: torques (M, n),
+    N m or N. ``before``: torques (M, n) of another model for comparison, the one as configured.
     """
     breaks = np.flatnonzero(np.diff(t) <= 0)
     measured = measured.copy()

@@ -25,13 +25,7 @@ MOTION_EVERY, DISTANCE_EVERY = 5, 20
 
 
 def trajectory_report(found: CheckedTrajectory) -> str:
-    """Return the HTML page of a trajectory, complete in one file.
-
-    Parameters
-    ----------
-    found
-        The trajectory and its checks.
-    """
+    """Return the HTML page of a trajectory, complete in one file."""
     robot, design = found.robot, found.design
     names = arm_model(robot).base.names
     torque = None

@@ -61,12 +61,14 @@ def differentiate(
 ) -> Derivatives:
     """Differentiate measured positions twice.
 
+    Raises DataError if a series is too short or not finite, or ``nvr`` is neither positive nor a rule. ``bandpass``: if
+    the bandwidth is missing. ``tracking-error``: if the reference or the resolution is missing, or a joint has no
+    tracking error.
+
     Parameters
     ----------
     q
         Measured positions, shape (N, n), rad or m.
-    dt
-        Sampling period, s.
     derivatives
         ``irwsm``: IRWSM 1, the level-slope smoother applied twice; ``irwsm2``: IRWSM 2, three states at once;
         ``bandpass``: zero-phase Butterworth of order 4 at five times ``bandwidth_hz``, then central differences.
@@ -90,13 +92,6 @@ def differentiate(
 
     The second pass of IRWSM 1 uses the ratio of the first pass: the noise after the first pass is not white, so that
     its ratio cannot be estimated. Only ``likelihood`` estimates a ratio for each pass, as the thesis does.
-
-    Raises
-    ------
-    DataError
-        If a series is too short or not finite, or ``nvr`` is neither positive nor a rule. ``bandpass``: if the
-        bandwidth is missing. ``tracking-error``: if the reference or the resolution is missing, or a joint has no
-        tracking error.
     """
     if derivatives == "bandpass":
         if bandwidth_hz is None:
@@ -123,19 +118,10 @@ def tracking_error_nvr(
 ) -> NDArray[np.float64]:
     """Noise-variance ratios approximated from the tracking error (thesis 5.25 to 5.27), shape (n,).
 
-    Parameters
-    ----------
-    error
-        Tracking error ``q_ref - q``, shape (N, n), rad or m.
-    order
-        2: variance of its difference (5.26, IRWSM 1); 3: of its second difference (5.27, IRWSM 2).
-    resolution
-        Encoder resolution: joint displacement per count, scalar or (n,), rad or m.
-
-    Raises
-    ------
-    DataError
-        If a resolution is not positive, or a joint has no tracking error.
+    ``error``: tracking error ``q_ref - q``, shape (N, n), rad or m. ``order``: 2: variance of its difference
+    (5.26, IRWSM 1); 3: of its second difference (5.27, IRWSM 2). ``resolution``: encoder resolution: joint displacement
+    per count, scalar or (n,), rad or m. Raises DataError if a resolution is not positive, or a joint has no tracking
+    error.
     """
     step = np.broadcast_to(np.asarray(resolution, dtype=np.float64), (error.shape[1],))
     if not (step > 0).all():
@@ -153,12 +139,8 @@ def tracking_error_nvr(
 def encoder_resolution(robot: RobotConfig) -> NDArray[np.float64]:
     """Joint displacement per count of the motor encoders, shape (n,), rad or m.
 
-    If several motors move a joint, their resolutions add as the square root of the sum of squares.
-
-    Raises
-    ------
-    DataError
-        If the configuration of a drive has no encoder resolution.
+    If several motors move a joint, their resolutions add as the square root of the sum of squares. Raises DataError if
+    the configuration of a drive has no encoder resolution.
     """
     steps = []
     for joint in robot.joints:

@@ -63,17 +63,7 @@ def _exported(suffix: str) -> Callable[[], list[bytes]]:
 def check_consistent(recording: Recording, folder: Path) -> None:
     """Refuse a recording that cannot be written and read, or has not one row of numbers for every sample.
 
-    Parameters
-    ----------
-    recording
-        What was imported.
-    folder
-        Takes the file.
-
-    Raises
-    ------
-    MisreadError
-        If it is inconsistent.
+    ``recording``: what was imported; ``folder``: takes the file. Raises MisreadError if it is inconsistent.
     """
     for stream in recording.streams.values():
         for name, values in stream.raw.items():

@@ -49,16 +49,9 @@ ROOT = Path(__file__).resolve().parents[2]
 class Runs:
     """Estimates of R runs and the truth.
 
-    Parameters
-    ----------
-    names, truth
-        Base parameters and their true values (b,).
-    seeds
-        Shape (R,).
-    theta, covariance
-        Shapes (R, b) and (R, b, b).
-    converged, stepped_back
-        Shape (R,): whether the iterations ended, and whether IDIM-PIV handed over to IDIM-IV.
+    ``names``, ``truth``: base parameters and their true values (b,); ``seeds``: shape (R,); ``theta``, ``covariance``:
+    shapes (R, b) and (R, b, b); ``converged``, ``stepped_back``: shape (R,): whether the iterations ended, and whether
+    IDIM-PIV handed over to IDIM-IV.
     """
 
     names: tuple[str, ...]
@@ -173,14 +166,8 @@ def campaign(
 ) -> Runs:
     """Run every seed that is not stored yet and gather all of them.
 
-    Parameters
-    ----------
-    folder
-        Cache; the runs go into a subfolder named after :func:`fingerprint`.
-    noise
-        Scale of the plant's noise; 1 is that of table B.4's standard deviations.
-    jobs
-        Processes at once.
+    ``folder``: cache; the runs go into a subfolder named after :func:`fingerprint`. ``noise``: scale of the plant's
+    noise; 1 is that of table B.4's standard deviations. ``jobs``: processes at once.
     """
     folder = folder / fingerprint(method, noise)
     folder.mkdir(parents=True, exist_ok=True)

@@ -11,19 +11,8 @@ from armident.virtual_robot.effects.spec import Hidden, ParameterSpec
 def hidden_effects(scenario: Scenario | None, robot: RobotConfig, where: str = "scenario") -> tuple[Hidden, ...]:
     """Validate the effects of a scenario.
 
-    Parameters
-    ----------
-    scenario
-        The scenario; ``None``: no effects.
-    robot
-        The robot.
-    where
-        Name of the scenario in messages.
-
-    Raises
-    ------
-    ConfigError
-        If an entry is invalid; names the entry and the expected value.
+    ``scenario``: the scenario; ``None``: no effects. Raises ConfigError if an entry is invalid; names the entry and the
+    expected value.
     """
     out: list[Hidden] = []
     for k, entry in enumerate(() if scenario is None else scenario.effects):

@@ -85,20 +85,8 @@ class RowMatcher:
     def add(self, block: SampleBlock) -> bool:
         """Take over a block; rows that are complete are handed over.
 
-        Parameters
-        ----------
-        block
-            A block of any stream.
-
-        Returns
-        -------
-        bool
-            True if the block begins another capture: its SYNC numbers begin anew at a later time.
-
-        Raises
-        ------
-        DataError
-            If the block has other joints than the robot, or lacks position or torque.
+        ``block``: a block of any stream. Returns True if the block begins another capture: its SYNC numbers begin anew
+        at a later time. Raises DataError if the block has other joints than the robot, or lacks position or torque.
         """
         layout = block.layout
         names = tuple(joint.name for joint in self._robot.joints)

@@ -31,12 +31,7 @@ def change_lines(drift: ParameterChangeTest, robot: RobotConfig) -> list[str]:
 
     A single line if only all parameters together have changed; none without a change.
 
-    Parameters
-    ----------
-    drift
-        The comparison.
-    robot
-        Names of the joints.
+    ``robot``: names of the joints.
     """
     lines = [_line(drift, name, robot) + f", p = {_p_text(_p_value(drift, name))}" for name in drift.changed]
     for group in drift.changed_groups:
@@ -94,12 +89,7 @@ def finding_lines(diagnosis: DiagnosisDocument) -> list[str]:
 def place_of(name: str, robot: RobotConfig) -> str:
     """Return the joint, or the two joints of a coupling, of a base parameter.
 
-    Parameters
-    ----------
-    name
-        Base parameter.
-    robot
-        Names of joints and couplings.
+    ``name``: base parameter; ``robot``: names of joints and couplings.
     """
     for coupling in robot.couplings:
         if name in {kind + coupling.name for kind in _SHARED}:

@@ -17,7 +17,6 @@ from armident.configs import (
     load_robot,
     load_scenario,
     load_session,
-    load_suite,
     load_trajectory,
 )
 from armident.configs.loading import HERE, parse
@@ -33,7 +32,6 @@ def robot_with(**changes: object) -> str:
 KINDS: dict[str, Callable[[Path], object]] = {
     "robots": load_robot,
     "cells": load_session,
-    "suites": load_suite,
     "trajectories": load_trajectory,
     "scenarios": load_scenario,
 }
@@ -65,7 +63,6 @@ def test_a_shipped_configuration_is_found_by_its_short_names(
         ("cells", "tx40_cell.yaml"),
         ("trajectories", "tx40_excitation.yaml"),
         ("scenarios", "tx40_worn_joint2.yaml"),
-        ("suites", "suite.yaml"),
         ("eds", "cia402_servo.eds"),
         ("zenoh", "peer.json5"),
     ],
@@ -290,7 +287,7 @@ def test_a_trajectory_beyond_a_limit_is_refused_with_joint_and_value() -> None:
     [
         (load_session, "tx40.yaml", "this is a robot file (armident/robot/1); a session file is wanted"),
         (load_robot, "tx40_cell.yaml", "this is a session file (armident/session/1); a robot file is wanted"),
-        (load_suite, "trajectories/tx40_1.yaml", "this is a trajectory file"),
+        (load_scenario, "trajectories/tx40_1.yaml", "this is a trajectory file"),
     ],
 )
 def test_a_file_of_another_kind_is_named_for_what_it_is(
