@@ -30,7 +30,7 @@ CONVERGED = 0.1
 
 @dataclass(frozen=True, eq=False)
 class ModelState:
-    """Model of one step of the selection. ``study``: data with the model and the motion of its closed loop."""
+    """Model of one step of the selection: its fit to the data, with the motion of its closed loop."""
 
     fit: IvFit
 

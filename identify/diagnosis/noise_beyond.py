@@ -87,15 +87,7 @@ def _taken(noise: ArModel, span: Sequence[Array], highest: int) -> Array:
 
 
 def noise_beyond_shapes(fit: IvFit, column_cache: ColumnCache) -> list[ArModel]:
-    """Noise models of the residual without smooth functions of each joint's own motion.
-
-    Parameters
-    ----------
-    fit
-        Fit of the model.
-    column_cache
-        Cache of the columns of the same fit.
-    """
+    """Noise models of the residual of a fit without smooth functions of each joint's own motion."""
     errors = fit.errors(fit.theta, held=False)
     columns = [
         _smooth_functions(column_cache, column_cache.motion(s, "measured"), sum(e.shape[0] for e in errors))

@@ -23,8 +23,7 @@ class RegressorCache:
     def get(self, key: Hashable, made: Callable[[], Arrays]) -> Arrays:
         """Return the arrays of a key; computed where the cache does not have them.
 
-        ``key``: all that the arrays depend on, with the identity of the signals. ``signals``: the signals. The cache
-        keeps them: their identity is theirs only while they exist.
+        ``key``: all that the arrays depend on, among them the signals, which are equal only to themselves.
         """
         kept = self._kept.pop(key, None)
         if kept is None:

@@ -148,7 +148,7 @@ class StepwiseSelection:
     def step(self, state: ModelState, incumbent: Incumbent | None = None) -> SelectionStep:
         """Compare all candidates in a model.
 
-        ``state``: model without them; ``contested``: finding that the model is without, if only effects that could take
+        ``state``: model without them; ``incumbent``: finding that the model is without, if only effects that could take
         its place are compared: those that act on a joint on which it acts, and do not promise much less.
         """
         key = _key(state.robot)

@@ -47,7 +47,7 @@ class Shortlist:
 def shortlist(state: ModelState, incumbent: Incumbent | None) -> Shortlist:
     """Return the candidates with the highest statistics less their numbers of parameters.
 
-    ``state``: model without them; ``contested``: finding that the model is without, if only effects that could take its
+    ``state``: model without them; ``incumbent``: finding that the model is without, if only effects that could take its
     place are compared.
     """
     criteria, column_cache = state.study.criteria, ColumnCache(state.study, state.fit.theta)

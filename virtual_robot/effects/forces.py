@@ -95,15 +95,7 @@ def effect_torque(code, p, q, qd, motor, other, load, t, smoothing):  # type: ig
 
 
 def waves(h: Hidden, joint: Joint) -> float:
-    """Angular wave number (1/rad or 1/m) of an effect that is periodic in the joint position.
-
-    Parameters
-    ----------
-    h
-        Hidden effect with the parameter ``per_turn``.
-    joint
-        Its joint.
-    """
+    """Angular wave number (1/rad or 1/m) of an effect that is periodic in the joint position."""
     if joint.type == "revolute":
         return h.value_or("per_turn", 1.0)
     low, high = joint.limits.position

@@ -20,20 +20,9 @@ Target = Literal["force", "bristle", "gear", "body", "drive", "report"]
 class ParameterSpec:
     """Parameter of an effect, joint side.
 
-    Parameters
-    ----------
-    unit
-        Unit at a revolute joint; at a prismatic joint N for N m, and m for rad.
-    meaning
-        Description.
-    default
-        ``None``: required; ``AUTO``: derived from the robot as described in ``meaning``.
-    low, high
-        Range of values.
-    above
-        ``True`` if ``low`` itself is excluded.
-    only
-        Type of joint that has the parameter; ``None``: both.
+    ``unit``: at a revolute joint; at a prismatic one N for N m, m for rad. ``default``: ``None``: required; ``AUTO``:
+    derived from the robot as ``meaning`` describes. ``above``: True if ``low`` itself is excluded. ``only``: type of
+    joint that has the parameter; ``None``: both.
     """
 
     unit: str
@@ -49,25 +38,11 @@ class ParameterSpec:
 class EffectSpec:
     """Effect that can be hidden in the virtual arm.
 
-    Parameters
-    ----------
-    target
-        Target of the effect.
-    meaning
-        Description.
-    parameters
-        Parameters by name.
-    other
-        ``required``, ``optional`` or ``none``: second joint of the effect.
-    first_joint
-        ``True`` if the effect concerns the base and is given at the first joint.
-    group
-        ``catalogue``: ``armident diagnose`` can find it by name; ``outside``: it must report it as unexplained;
-        ``parameters``: it changes parameters and not the structure, so that a new identification leaves no error.
-    repeatable
-        ``True`` if one joint may have it several times, such as harmonics.
-    row
-        Of a force: its parameters for `effect_torque` from the effect, the robot, and fv and fc of the joint.
+    ``other``: second joint of the effect. ``first_joint``: True if it concerns the base and is given at the first joint.
+    ``group``: ``armident diagnose`` finds a member of the catalogue by name and must report one outside it as
+    unexplained; a change of parameters leaves no error after a new identification. ``repeatable``: True if one joint may
+    have it several times. ``row``: parameters of a force for `effect_torque`, from the entry, the robot, and fv and fc
+    of the joint.
     """
 
     target: Target
@@ -97,20 +72,9 @@ PITCH = ParameterSpec("m", "travel of a prismatic joint per turn of its motor", 
 
 @dataclass(frozen=True)
 class Hidden:
-    """Validated hidden effect.
+    """Validated hidden effect of a joint, and of another one if ``other`` is not -1.
 
-    Parameters
-    ----------
-    effect
-        Name of the effect.
-    joint, other
-        Numbers of its joints; ``other`` is -1 if there is none.
-    values
-        Parameters including defaults; ``AUTO`` (NaN): derived from the robot.
-    where
-        Name of the entry in messages.
-    spec
-        Its specification.
+    ``values``: all parameters; ``AUTO`` (NaN): derived from the robot. ``where``: name of the entry in messages.
     """
 
     effect: str
@@ -129,14 +93,6 @@ class Hidden:
         return self.values[name]
 
     def value_or(self, name: str, otherwise: float) -> float:
-        """Value of a parameter, or a default derived from the robot.
-
-        Parameters
-        ----------
-        name
-            Name of the parameter.
-        otherwise
-            Value if the parameter is ``AUTO``.
-        """
+        """Return the value of a parameter; if it is ``AUTO``, ``otherwise``."""
         value = self.values[name]
         return otherwise if math.isnan(value) else value
