@@ -102,12 +102,7 @@ class DriveGainError(Correction):
     required_motion = "several joints that carry the same link; for a single axis a baseline"
     excitation = ("load", "accelerations")
     linear = (
-        Linear(
-            "gain_error",
-            UNITLESS,
-            "Relative error of the reported torque: 0.1 means 10 % too much.",
-            bounds=(-0.6, 1.5),
-        ),
+        Linear("gain_error", UNITLESS, "Relative error of the reported torque: 0.1: 10 % more.", bounds=(-0.6, 1.5)),
     )
     scales_torque = True
     change_title = "torque constant changed since the baseline"
@@ -214,14 +209,7 @@ class ActuatorBandwidth(TimeDelay):
         "delay of the reported position has the same effect"
     )
     reference = "Leonhard 2001, Control of Electrical Drives, chapter 7"
-    linear = (
-        Linear(
-            "lag",
-            ("s", "s"),
-            "Time constant of the first-order lag of the actual torque behind the reported one.",
-            sign=1,
-        ),
-    )
+    linear = (Linear("lag", ("s", "s"), "Time constant of the lag of the torque behind the report.", sign=1),)
 
     def shaft_column(self, torque: Array, motion: Motion, motor: int) -> Array:
         """Return the rate of the torque."""

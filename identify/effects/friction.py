@@ -55,22 +55,11 @@ class CoulombTransition(Effect):
     required_motion = "reversals"
     excitation = ("reversals",)
     linear = (
-        Linear(
-            "fct",
-            TORQUE,
-            "Part of the Coulomb friction that reverses gradually: `fct tanh((qd + lead qdd) / velocity)` in place of "
-            "the smoothed sign.",
-            sign=1,
-        ),
+        Linear("fct", TORQUE, "Coulomb friction that reverses as `fct tanh((qd + lead qdd) / velocity)`.", sign=1),
     )
     shapes = (
         Shape("velocity", VELOCITY, "Velocity over which the dry friction reverses."),
-        Shape(
-            "lead",
-            ("s", "s"),
-            "Time by which the dry friction reverses before the differentiated velocity.",
-            default=0.0,
-        ),
+        Shape("lead", ("s", "s"), "Time by which it reverses before the differentiated velocity.", default=0.0),
     )
 
     def columns(self, motion: Motion, place: Place, shapes: Mapping[str, float]) -> Array:
@@ -101,9 +90,7 @@ class AsymmetricViscousFriction(Effect):
     description = "viscous friction is higher in one direction than in the other: a worn or one-sidedly loaded gear"
     reference = "Janot, Gautier, Brunot 2019, Data set and reference models of EMPS"
     required_motion = "both directions of motion at several speeds"
-    linear = (
-        Linear("fva", VISCOUS, "Half the difference of the viscous friction between positive and negative velocity."),
-    )
+    linear = (Linear("fva", VISCOUS, "Half the difference of the viscous friction between both directions."),)
 
     def columns(self, motion: Motion, place: Place, shapes: Mapping[str, float]) -> Array:
         """Return ``qd sign(qd)``."""
@@ -122,12 +109,8 @@ class AsymmetricCoulombFriction(Effect):
     reference = "Armstrong-Helouvry, Dupont, Canudas de Wit 1994, Automatica 30(7)"
     required_motion = "both directions of motion, and standstill: while moving it looks like a constant offset"
     excitation = ("reversals", "standstill")
-    linear = (
-        Linear("fca", TORQUE, "Half the difference of the Coulomb friction between positive and negative velocity."),
-    )
-    shapes = (
-        Shape("velocity", VELOCITY, "Velocity scale over which the difference builds up; 0: at once.", default=0.0),
-    )
+    linear = (Linear("fca", TORQUE, "Half the difference of the Coulomb friction between both directions."),)
+    shapes = (Shape("velocity", VELOCITY, "Velocity over which the difference builds up; 0: at once.", default=0.0),)
 
     def columns(self, motion: Motion, place: Place, shapes: Mapping[str, float]) -> Array:
         """Return ``sign(qd)^2``, with the smoothing of the model if the velocity is zero."""
@@ -154,15 +137,11 @@ class StribeckBell(Effect):
     required_motion = "slow motion in both directions"
     excitation = ("slow", "reversals")
     linear: tuple[Linear, ...] = (
-        Linear(
-            "fst", TORQUE, "Additional friction torque at low speed: `fst exp(-(qd / velocity)^2) sign(qd)`.", sign=1
-        ),
+        Linear("fst", TORQUE, "Additional friction at low speed: `fst exp(-(qd / velocity)^2) sign(qd)`.", sign=1),
     )
     shapes: tuple[Shape, ...] = (
         Shape("velocity", VELOCITY, "Stribeck velocity, at which the additional friction has decreased to 37 %."),
-        Shape(
-            "displacement", POSITION, "Characteristic displacement of the bristle (Dahl); 0: no bristle.", default=0.0
-        ),
+        Shape("displacement", POSITION, "Displacement of the bristle (Dahl); 0: no bristle.", default=0.0),
     )
 
     def columns(self, motion: Motion, place: Place, shapes: Mapping[str, float]) -> Array:
@@ -186,13 +165,7 @@ class StribeckFriction(StribeckBell):
 
     linear = (
         *StribeckBell.linear,
-        Linear(
-            "fsb",
-            TORQUE,
-            "Part of the Coulomb friction that follows the bristle instead of the smoothed sign of the velocity.",
-            requires="displacement",
-            absorbs="fc",
-        ),
+        Linear("fsb", TORQUE, "Coulomb friction on the bristle.", requires="displacement", absorbs="fc"),
     )
 
     def columns(self, motion: Motion, place: Place, shapes: Mapping[str, float]) -> Array:
@@ -211,9 +184,7 @@ class StribeckFrictionExponential(StribeckBell):
 
     law = "exponential"
     reference = "Bo, Pavelescu 1982, Wear 82(3), with exponent 1"
-    linear = (
-        Linear("fst", TORQUE, "Additional friction torque at low speed: `fst exp(-|qd| / velocity) sign(qd)`.", sign=1),
-    )
+    linear = (Linear("fst", TORQUE, "Additional friction: `fst exp(-|qd| / velocity) sign(qd)`.", sign=1),)
     shapes = (Shape("velocity", VELOCITY, "Velocity at which the additional friction has decreased to 37 %."),)
 
     def columns(self, motion: Motion, place: Place, shapes: Mapping[str, float]) -> Array:
@@ -234,11 +205,7 @@ class StribeckFrictionTable(FreeShape, StribeckBell):
 
     reference = "Bittencourt, Gunnarsson 2012, J. Dyn. Sys. Meas. Control 134(5), measured curves"
     linear = tuple(
-        Linear(
-            f"fst{k}",
-            TORQUE,
-            f"Additional friction torque at {share:.0%} of the speed `top`; between the speeds it is linear.",
-        )
+        Linear(f"fst{k}", TORQUE, f"Additional friction at {share:.0%} of the speed `top`; linear in between.")
         for k, share in enumerate(KNOTS[:-2])
     )
     shapes = TOP_SPEED
@@ -319,14 +286,7 @@ class PreslidingFriction(Effect):
     reference = "Dahl 1968, A solid friction model; Canudas de Wit et al. 1995, IEEE TAC 40(3)"
     required_motion = "many reversals"
     excitation = ("reversals", "slow")
-    linear = (
-        Linear(
-            "fcd",
-            TORQUE,
-            "Coulomb friction that builds up over a displacement after a reversal; negative by convention.",
-            sign=-1,
-        ),
-    )
+    linear = (Linear("fcd", TORQUE, "Coulomb friction that builds up after a reversal, times -1.", sign=-1),)
     shapes = (Shape("displacement", POSITION, "Characteristic displacement of Dahl's model."),)
 
     def columns(self, motion: Motion, place: Place, shapes: Mapping[str, float]) -> Array:
@@ -442,13 +402,7 @@ class FrictionDriftWithWork(FrictionDrift):
         Linear("fcdr", TORQUE, "Change of the Coulomb friction after much work."),
         Linear("fvdr", VISCOUS, "Change of the viscous friction after much work."),
     )
-    shapes = (
-        Shape(
-            "decay",
-            ("s/rad^2", "s/m^2"),
-            "Rate of the change per integral of the squared velocity, which is the work of viscous friction.",
-        ),
-    )
+    shapes = (Shape("decay", ("s/rad^2", "s/m^2"), "Rate of the change per integral of the squared velocity (work)."),)
 
     def _progress(self, motion: Motion, place: Place, shapes: Mapping[str, float]) -> Array:
         """Return the progress (N,): ``1 - exp(-decay work)``, the work that of a unit of viscous friction."""

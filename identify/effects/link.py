@@ -39,11 +39,7 @@ class JointSpringCubic(JointSpring):
     description = "a torque that grows faster than the joint's position: a stiffening spring, a bumper, a cable harness"
     linear = (
         *JointSpring.linear,
-        Linear(
-            "ks2",
-            ("N m/rad^2", "N/m^2"),
-            "Change of the stiffness with the position: torque per square of the position.",
-        ),
+        Linear("ks2", ("N m/rad^2", "N/m^2"), "Change of the stiffness: torque per square of the position."),
         Linear("ks3", ("N m/rad^3", "N/m^3"), "Stiffening: torque per cube of the position."),
     )
 

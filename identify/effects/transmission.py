@@ -91,11 +91,7 @@ class JointElasticity(TorqueDependent):
     excitation = ("accelerations",)
     linear = (Linear("compliance", ("rad/(N m)", "m/N"), "Compliance: deflection per transmitted torque.", sign=1),)
     shapes = (
-        Shape(
-            "frequency",
-            ("Hz", "Hz"),
-            "Natural frequency of the link on its elastic joint, at its mean inertia along the motion.",
-        ),
+        Shape("frequency", ("Hz", "Hz"), "Natural frequency of the link at its mean inertia along the motion."),
         Shape("damping", UNITLESS, "Damping ratio of that oscillation.", default=DAMPINGS[-1]),
         ROTOR,
     )
@@ -156,15 +152,7 @@ class Backlash(TorqueDependent):
     reference = "Nordin, Gutman 2002, Automatica 38(10)"
     required_motion = "many changes of the load's direction"
     excitation = ("reversals", "accelerations")
-    linear = (
-        Linear(
-            "behind",
-            UNITLESS,
-            "Size of the torque pulses relative to those of plastic impacts in the gap; 1: as computed.",
-            sign=1,
-            bounds=(0.1, 1.5),
-        ),
-    )
+    linear = (Linear("behind", UNITLESS, "Torque pulses over those of plastic impacts.", sign=1, bounds=(0.1, 1.5)),)
     shapes = (Shape("gap", POSITION, "Width of the gap at the joint, from side to side."), ROTOR)
     regressor_signals = "measured"
     instrument_signals = "measured"

@@ -36,11 +36,7 @@ class OfVelocity(Unnamed):
     law = "velocity"
     title = "a torque that depends on the velocity"
     linear = tuple(
-        Linear(
-            f"u{k}",
-            TORQUE,
-            f"Torque at {share:.0%} of the speed `top`, {way} velocity; between the speeds it is linear.",
-        )
+        Linear(f"u{k}", TORQUE, f"Torque at {share:.0%} of the speed `top`, {way} velocity; linear in between.")
         for k, (way, share) in enumerate(product(("positive", "negative"), KNOTS[:-2]))
     )
     shapes = TOP_SPEED

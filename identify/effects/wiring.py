@@ -104,16 +104,8 @@ class SignalScale(Wiring):
     reference = "Brunot 2017, equation 2.14"
     required_motion = "motion of the neighbouring joints"
     settings = (
-        Shape(
-            "position",
-            UNITLESS,
-            "True over recorded position; with another joint, the share of it to add.",
-        ),
-        Shape(
-            "torque",
-            UNITLESS,
-            "True over recorded torque; with another joint, the share of it to add.",
-        ),
+        Shape("position", UNITLESS, "True over recorded position; with another joint, the share of it to add."),
+        Shape("torque", UNITLESS, "True over recorded torque; with another joint, the share of it to add."),
     )
 
     def _exchange(self, n: int, first: int, second: int, value: float) -> Array:

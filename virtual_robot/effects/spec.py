@@ -38,9 +38,9 @@ class ParameterSpec:
 class EffectSpec:
     """Effect that can be hidden in the virtual arm.
 
-    ``other``: second joint of the effect. ``first_joint``: True if it concerns the base and is given at the first joint.
+    ``other``: second joint. ``first_joint``: True if it concerns the base and is given at the first joint.
     ``group``: ``armident diagnose`` finds a member of the catalogue by name and must report one outside it as
-    unexplained; a change of parameters leaves no error after a new identification. ``repeatable``: True if one joint may
+    unexplained; a change of parameters leaves no error after a new identification. ``repeatable``: one joint may
     have it several times. ``row``: parameters of a force for `effect_torque`, from the entry, the robot, and fv and fc
     of the joint.
     """
