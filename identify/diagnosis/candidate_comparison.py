@@ -36,8 +36,6 @@ class Addition:
 
     Parameters
     ----------
-    fitted
-        The candidate in the model.
     state
         Model with the effect, estimated with the weights of the step.
     gain

@@ -307,7 +307,7 @@ class Effect(ABC):
     @property
     def units(self) -> dict[str, tuple[str, str]]:
         """Units at a revolute and at a prismatic joint of linear and nonlinear parameters, by name."""
-        return {p.name: p.unit for p in (*self.linear, *self.shapes)}
+        return {p.name: p.unit for p in self.linear} | {s.name: s.unit for s in self.shapes}
 
     @property
     def defaults(self) -> dict[str, float]:

@@ -82,7 +82,7 @@ def _one(effect: Effect) -> None:
             print(f"{linear.name} requires {linear.requires} and absorbs {linear.absorbs} of the joint;")
             print(f"  `without: [{linear.name}]` in the configuration keeps {linear.absorbs}")
     print(f"required motion: {effect.required_motion}\nsource: {effect.reference}")
-    values = [f"{p.name}: ..." for p in (*effect.shapes, *effect.linear, *effect.settings)]
+    values = [f"{p.name}: ..." for p in effect.parameters_of_entry]
     law = f", law: {effect.law}" if effect.law else ""
     other = ", other: joint_2" if effect.two_joints else ""
     place = f"effect: {effect.name}{law}, joint: joint_1{other}"
