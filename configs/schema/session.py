@@ -1,7 +1,7 @@
 """Schema of a session: buses, drives, streams, recording, publication and identification."""
 
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Literal, Self
 
 from pydantic import Field, field_validator, model_validator
 
@@ -10,8 +10,6 @@ from armident.configs.schema.robot import JointName, Name, Positive
 
 ObjectName = Literal["position", "velocity", "current", "torque", "demand", "status"]
 Every = Annotated[int, Field(ge=1, le=240)]
-RENAMED = {"look_hz": "preview_hz"}
-"""Keys of ``recording`` that were renamed after version 0.1, by old name."""
 
 
 class Bus(FrozenModel):
@@ -218,15 +216,6 @@ class RecordingOptions(FrozenModel):
     min_free_gb: Annotated[float, Field(gt=0)] | None = None
     preview_hz: Annotated[float, Field(ge=0, le=1000)] = 50.0
     trigger: Trigger | None = None
-
-    @model_validator(mode="before")
-    @classmethod
-    def _renamed(cls, data: Any) -> Any:
-        """Accept keys by their names up to version 0.1: recordings of that version hold them."""
-        if not isinstance(data, dict):
-            return data
-        renamed = {old: new for old, new in RENAMED.items() if new not in data}
-        return {renamed.get(key, key): value for key, value in data.items()}
 
 
 class ZenohOptions(FrozenModel):

@@ -16,6 +16,7 @@ from armident.configs.schema.scenario import Scenario
 from armident.configs.schema.session import SessionConfig
 from armident.configs.schema.trajectory import Trajectory
 from armident.daq.cli import GROUP, application
+from armident.daq.interchange.readers import table_of_formats
 from armident.identify.diagnosis.criteria import Criteria
 from armident.identify.documents.diagnosis import DiagnosisDocument
 from armident.identify.documents.identification import IdentificationDocument
@@ -48,7 +49,7 @@ def setup(app: Sphinx) -> dict[str, Any]:
 
 
 def write_reference(app: Sphinx) -> None:
-    """Write the pages `reference/commands.md`, `files.md` and `glossary.md`, if their text has changed.
+    """Write the generated pages of `reference/`, if their text has changed.
 
     Parameters
     ----------
@@ -56,9 +57,11 @@ def write_reference(app: Sphinx) -> None:
         The Sphinx application.
     """
     folder = Path(app.srcdir) / "reference"
-    for name, text in (
-        ("commands.md", commands_page()), ("files.md", files_page()), ("glossary.md", glossary_page()),
-    ):  # fmt: skip
+    pages = {
+        "commands.md": commands_page, "files.md": files_page, "formats.md": formats_page, "glossary.md": glossary_page,
+    }  # fmt: skip
+    for name, page in pages.items():
+        text = page()
         path = folder / name
         if not path.is_file() or path.read_text(encoding="utf-8") != text:
             path.write_text(text, encoding="utf-8")
@@ -75,6 +78,11 @@ def commands_page() -> str:
         help_text = command.get_help(type(context)(command, parent=context, info_name=name, terminal_width=100))
         sections.append(f"## {name}\n\n```text\n{help_text.strip()}\n```")
     return "\n\n".join(sections) + "\n"
+
+
+def formats_page() -> str:
+    """Return the reference of the files of other tools, from their readers."""
+    return f"# Formats\n\n`armident import` reads, and `armident export` writes:\n\n{table_of_formats()}\n"
 
 
 def files_page() -> str:

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Literal
 
 from armident.configs import ArmidentError
-from armident.identify.monitoring.sqlite_reason import sqlite_reason
+from armident.configs.reasons import reason_of
 
 FILE = "worker.sqlite"
 """Name of the ledger in the folder of the results."""
@@ -312,7 +312,7 @@ class Ledger:
         try:
             yield
         except (sqlite3.OperationalError, OSError) as error:
-            raise LedgerError(f"{self.path}: {_reason(error)}") from error
+            raise LedgerError(f"{self.path}: {reason_of(error, BUSY_S, named=False)}") from error
         except sqlite3.DatabaseError as error:
             raise LedgerUnusable(
                 f"{self.path}: the ledger is damaged ({error}); move it away and start again, results are found"
@@ -337,12 +337,6 @@ def _use_write_ahead_log(db: sqlite3.Connection) -> None:
             if "locked" not in str(error) or time.monotonic() > until:
                 raise
             time.sleep(0.02)
-
-
-def _reason(error: OSError | sqlite3.Error) -> str:
-    if isinstance(error, OSError):
-        return error.strerror or str(error)
-    return sqlite_reason(error, BUSY_S)
 
 
 def _entry(row: tuple[str, str, str, State, int, str | None, str | None, int]) -> Entry:

@@ -12,11 +12,12 @@ from types import FrameType
 from typing import TypeVar
 
 from armident.configs import ArmidentError, DataError, RobotConfig, SessionConfig, load_robot, load_session
+from armident.configs.reasons import reason_of
 from armident.daq.streaming import Keys
 from armident.identify.identification.api import identify_recording
 from armident.identify.identification.options import Options
 from armident.identify.monitoring.announcements import Announcements
-from armident.identify.monitoring.intake import Intake, reason_of
+from armident.identify.monitoring.intake import Intake
 from armident.identify.monitoring.ledger import FILE, MOST_ATTEMPTS, Entry, Ledger, LedgerError, State, unique_owner
 from armident.identify.monitoring.recorded import (
     Captured,

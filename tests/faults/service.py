@@ -32,8 +32,8 @@ import zenoh
 
 from armident.configs import ArmidentError, DataError, SessionConfig, load_robot, load_session
 from armident.configs.schema.session import IdentificationOptions
-from armident.daq.capture.files import capture_stamp
 from armident.daq.capture.publisher import Publisher
+from armident.daq.capture.recording_files import capture_stamp
 from armident.daq.recording import RecordingWriter, StreamLayout, read_recording, write_recording
 from armident.daq.streaming import Block, Keys, encode_event, open_session
 from armident.daq.streaming.codec import end_content, start_content

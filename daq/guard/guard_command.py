@@ -22,6 +22,6 @@ def guard(
 
     Example: armident guard --config tx40_cell.yaml
     """
-    from armident.daq.guard.run import guard as run
+    from armident.daq.guard.guard_loop import guard as run
 
     run(config, following_s)

@@ -11,11 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armident.configs import DataError, RobotConfig
-from armident.daq.interchange.even_times import usual_rate
+from armident.daq.interchange.clocks import UNITS, JitterError, in_seconds
+from armident.daq.interchange.import_options import FLAGS, given
 from armident.daq.interchange.importing import import_recording, read_rows
+from armident.daq.interchange.resampling import usual_rate
 from armident.daq.interchange.stated_units import in_si, suspected
-from armident.daq.interchange.table_rows import EFFORTS, Rows
-from armident.daq.interchange.time_stamps import UNITS, JitterError, in_seconds
+from armident.daq.interchange.table_rows import EFFORTS, TableRows
 from armident.daq.recording import Recording, is_recording, read_recording
 
 SMOOTHED_S = 0.1
@@ -81,23 +82,22 @@ def examine(path: Path, robot: RobotConfig, stated: Mapping[str, Any]) -> Record
     """
     if is_recording(path):
         return _facts(path, read_recording(path), robot, {})
-    options = dict(stated)
-    _, rows = read_rows(path, robot, **{key: options[key] for key in _OF_ROWS if options.get(key)})
+    options: dict[str, Any] = dict(given(stated))
+    _, rows = read_rows(path, robot, **given(options, _OF_ROWS))
     if not options.get("units"):
         options["units"] = suspected(rows, robot)
     if not options.get("time_unit") and rows.times is not None:
         options["time_unit"] = _time_unit(in_si(rows, robot, options["units"]), robot, rows.time_unit)
-    options = {key: value for key, value in options.items() if value}
     with _quiet():
         try:
-            recording = import_recording(path, robot, **options)
+            recording = import_recording(path, robot, **given(options))
         except JitterError:
             if rows.times is None or "rate_hz" in options:
                 raise
             times = rows.times[np.append(True, np.diff(rows.times) > 0)]
             rate = usual_rate(times) / UNITS[options.get("time_unit") or rows.time_unit or "s"]
             options["resample_hz"] = float(f"{rate:.2g}")
-            recording = import_recording(path, robot, **options)
+            recording = import_recording(path, robot, **given(options))
     return _facts(path, recording, robot, options)
 
 
@@ -117,7 +117,7 @@ def _quiet() -> Iterator[None]:
         log.setLevel(level)
 
 
-def _time_unit(rows: Rows, robot: RobotConfig, named: str) -> str | None:
+def _time_unit(rows: TableRows, robot: RobotConfig, named: str) -> str | None:
     """Unit of the times if it is not the one of their name; seconds are that of a column without a unit."""
     assert rows.times is not None
     try:
@@ -176,26 +176,18 @@ def _largest_derivatives(q: Floats, sync: NDArray[np.int64], rate_hz: float) -> 
     return largest(1), largest(2)
 
 
-_OPTIONS = {
-    "effort": "--effort", "motor_side": "--motor-side", "rate_hz": "--rate", "names": "--map", "polled": "--polled",
-    "resample_hz": "--resample", "time_unit": "--time-unit", "topic": "--topic", "joints": "--joints",
-    "by_position": "--by-position", "units": "--units",
-}  # fmt: skip
-"""Options of the command by parameter of `import_recording`."""
-
-
 def _as_options(options: Mapping[str, Any]) -> dict[str, str]:
     """Options of the command line; a switch has an empty value."""
     made: dict[str, str] = {}
     for key, value in options.items():
         if isinstance(value, Mapping):
-            made[_OPTIONS[key]] = ",".join(f"{name}={one}" for name, one in value.items())
+            made[FLAGS[key]] = ",".join(f"{name}={one}" for name, one in value.items())
         elif isinstance(value, bool):
-            made[_OPTIONS[key]] = ""
+            made[FLAGS[key]] = ""
         elif isinstance(value, list | tuple):
-            made[_OPTIONS[key]] = ",".join(value)
+            made[FLAGS[key]] = ",".join(value)
         else:
-            made[_OPTIONS[key]] = f"{value:g}" if isinstance(value, float) else str(value)
+            made[FLAGS[key]] = f"{value:g}" if isinstance(value, float) else str(value)
     return made
 
 

@@ -9,15 +9,14 @@ from typing import Any
 from armident.configs import ConfigError, RobotConfig, load_robot, load_session
 from armident.configs.blanks import MARK, NEEDS, grouped, pattern
 from armident.daq.init.dh_table import Convention, from_dh_table
-from armident.daq.init.files import CellFacts, robot_content, session_content
 from armident.daq.init.geometry import Geometry, from_library, from_urdf, of_axes
-from armident.daq.init.recorded import RecordedFacts, examine
+from armident.daq.init.recorded_facts import RecordedFacts, examine
+from armident.daq.init.yaml_contents import CellFacts, robot_content, session_content
 from armident.daq.init.yaml_text import Noted, yaml_text
-from armident.daq.interchange.bag_files import is_bag
-from armident.daq.interchange.bus_log import SUFFIXES
-from armident.daq.interchange.importing import read_rows
-from armident.daq.interchange.table_files import read_table
-from armident.daq.interchange.table_rows import complete_rows
+from armident.daq.interchange.import_options import given
+from armident.daq.interchange.importing import read_rows, table_rows
+from armident.daq.interchange.readers import reader_of
+from armident.daq.interchange.table_files import Source
 from armident.daq.recording import is_recording
 
 
@@ -82,7 +81,7 @@ def run_init(options: InitOptions) -> str:
         raise ConfigError(
             f"{' and '.join(taken)}: exists already; --overwrite replaces it, --out chooses another folder"
         )
-    if options.recording is not None and options.recording.suffix.lower() in SUFFIXES:
+    if options.recording is not None and reader_of(options.recording).session:
         raise ConfigError(
             f"{options.recording}: the log of a bus needs a complete session; run armident init without --recording"
         )
@@ -123,12 +122,13 @@ def _fits(options: InitOptions) -> Callable[[RobotConfig], object] | None:
     path = options.recording
     if path is None or is_recording(path) or options.stated.get("effort"):
         return None
-    chosen = {key: options.stated[key] for key in ("joints", "by_position") if options.stated.get(key)}
-    names = dict(options.stated.get("names") or {})
-    if is_bag(path):
-        return lambda robot: read_rows(path, robot, names=names, topic=options.stated.get("topic"), **chosen)
-    table = read_table(path)
-    return lambda robot: complete_rows(table, robot, names, **chosen)
+    keys = ("names", "topic", "joints", "by_position")
+    chosen = given(options.stated, keys)
+    if reader_of(path).by_robot:
+        return lambda robot: read_rows(path, robot, **chosen)
+    table = reader_of(path).read(path, None, chosen)
+    assert isinstance(table, Source)
+    return lambda robot: table_rows(table, robot, chosen)
 
 
 def _signal(robot: Mapping[str, Any]) -> str:

@@ -10,7 +10,7 @@ from armident.daq.recording.layout import StreamLayout
 _FEWEST = 4096
 
 
-class Rows:
+class GrowingRows:
     """Rows of one stream read so far.
 
     ``layout``: layout of the stream's messages. ``expected``: expected number of rows, for which memory is reserved; 0

@@ -2,16 +2,20 @@
 
 import sys
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Unpack
 
 import typer
 
+from armident.daq.interchange.import_options import ImportOptions, with_import_options
+from armident.daq.interchange.readers import names_of_formats
 
+
+@with_import_options("polled", "resample_hz")
 def init(
     urdf: Annotated[Path | None, typer.Argument(help="URDF of the arm.")] = None,
     out: Annotated[Path, typer.Option("--out", help="Folder of robot.yaml and session.yaml.")] = Path(),
     recording: Annotated[
-        Path | None, typer.Option("--recording", help="Recording of the arm: CSV, MAT, NPZ, Parquet, rosbag2, or MCAP.")
+        Path | None, typer.Option("--recording", help=f"Recording of the arm: {names_of_formats()}.")
     ] = None,
     robot: Annotated[
         str | None, typer.Option("--robot", help="Robot of the library instead of a URDF: ur5e, ...")
@@ -36,29 +40,6 @@ def init(
     torque_sensors: Annotated[
         bool, typer.Option("--torque-sensors", help="Efforts are measured behind the gears: a model without rotors.")
     ] = False,
-    names: Annotated[
-        str, typer.Option("--map", help="Names in the recording: position=qm,torque=tau_J; demand=- omits it.")
-    ] = "",
-    joints: Annotated[
-        str, typer.Option("--joints", help="Joint names in the recording, in the robot's order: NAME,NAME,...")
-    ] = "",
-    by_position: Annotated[
-        bool, typer.Option("--by-position", help="Take joints of other names in the order of the recording.")
-    ] = False,
-    topic: Annotated[str | None, typer.Option("--topic", help="Topic of joint states in a bag.")] = None,
-    effort: Annotated[
-        Path | None, typer.Option("--effort", help="Second CSV file of the recording, one effort column per joint.")
-    ] = None,
-    motor_side: Annotated[bool, typer.Option("--motor-side", help="Recorded values are those of the motors.")] = False,
-    units: Annotated[
-        str, typer.Option("--units", help="Units of the recording: position=deg,torque=mnm. [default: by magnitude]")
-    ] = "",
-    time_unit: Annotated[
-        str | None, typer.Option("--time-unit", help="Unit of its times: s, ms, us, ns. [default: by magnitude]")
-    ] = None,
-    rate: Annotated[
-        float | None, typer.Option("--rate", help="Its sampling rate, Hz. [default: by its times]", min=0.001)
-    ] = None,
     gravity: Annotated[
         str, typer.Option("--gravity", help="Gravity in the frame of the base, X,Y,Z in m/s^2. [default: 0,0,-9.81]")
     ] = "",
@@ -72,6 +53,7 @@ def init(
     ] = "",
     eds: Annotated[str | None, typer.Option("--eds", help="Electronic data sheet of the drives.")] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace files that exist.")] = False,
+    **stated: Unpack[ImportOptions],
 ) -> None:
     """Write the configuration of an arm and of its cell, from what is known of it and a recording.
 
@@ -82,8 +64,7 @@ def init(
     Example: armident init arm.urdf --recording data.csv --out my_arm
     """
     from armident.configs import ConfigError
-    from armident.daq.init.command import InitOptions, run_init
-    from armident.daq.interchange.text_files import pairs_of
+    from armident.daq.init.initialize import InitOptions, run_init
 
     def numbers(option: str, text: str) -> list[float]:
         try:
@@ -95,17 +76,6 @@ def init(
     down = numbers("--gravity", gravity)
     if len(down) not in (0, 3):
         raise ConfigError(f"--gravity: expected X,Y,Z, found {gravity!r}")
-    stated = {
-        "effort": effort,
-        "names": pairs_of("--map", names),
-        "joints": [word.strip() for word in joints.split(",") if word.strip()],
-        "by_position": by_position,
-        "topic": topic,
-        "motor_side": motor_side,
-        "units": pairs_of("--units", units),
-        "time_unit": time_unit,
-        "rate_hz": rate,
-    }
     of_cell = {"cell": cell, "channel": channel, "bitrate": bitrate, "node_ids": nodes or None, "eds": eds}
     options = InitOptions(
         out=out,

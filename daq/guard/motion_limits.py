@@ -27,7 +27,7 @@ Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Limits:
+class MotionLimits:
     """Limits of the joints.
 
     ``low``, ``high``: range of position (n,), rad or m; ``velocity``: largest speed (n,), rad/s or m/s; ``torque``:
@@ -41,7 +41,7 @@ class Limits:
     following: Floats
 
 
-def limits_of(robot: RobotConfig, following_s: float = FOLLOWING_S) -> Limits:
+def motion_limits_of(robot: RobotConfig, following_s: float = FOLLOWING_S) -> MotionLimits:
     """Return the limits of a robot.
 
     ``robot``: robot whose joints have limits; ``following_s``: largest following error, as the time of motion at the
@@ -50,7 +50,7 @@ def limits_of(robot: RobotConfig, following_s: float = FOLLOWING_S) -> Limits:
     robot.check_movable()
     limits = [joint.limits for joint in robot.joints]
     velocity = np.array([limit.velocity for limit in limits])
-    return Limits(
+    return MotionLimits(
         low=np.array([limit.position[0] for limit in limits]),
         high=np.array([limit.position[1] for limit in limits]),
         velocity=velocity,

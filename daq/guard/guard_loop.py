@@ -12,8 +12,8 @@ import numpy as np
 
 from armident.configs import ArmidentError, ConfigError, RobotConfig, SessionConfig, load_robot, load_session
 from armident.configs.schema.session import Bus
-from armident.daq.guard.limits import FOLLOWING_S, limits_of
 from armident.daq.guard.monitor import Alarm, MotionMonitor
+from armident.daq.guard.motion_limits import FOLLOWING_S, motion_limits_of
 from armident.daq.matching.streams import bus_numbers, node_ids
 from armident.drivers.can.frames import STANDARD_ID_MASK, BusDown, FrameBus, Frames, frames
 from armident.drivers.can.scheduling import set_realtime_priority
@@ -143,7 +143,7 @@ def guard(config: str, following_s: float = FOLLOWING_S) -> None:
     session = load_session(config)
     robot = load_robot(session.robot)
     try:
-        monitor = MotionMonitor(session, robot, limits_of(robot, following_s))
+        monitor = MotionMonitor(session, robot, motion_limits_of(robot, following_s))
     except ConfigError as error:
         raise ConfigError(f"{config}: {error}") from error
     with ExitStack() as stack:

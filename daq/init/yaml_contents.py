@@ -7,7 +7,7 @@ from typing import Any
 from armident.configs.blanks import MARK, NEEDS
 from armident.configs.schema.robot import RobotConfig
 from armident.daq.init.geometry import UPRIGHT, Geometry
-from armident.daq.init.recorded import RecordedFacts, moved
+from armident.daq.init.recorded_facts import RecordedFacts, moved
 from armident.daq.init.yaml_text import Noted
 
 SYNC_US = (100, 1_000_000)
