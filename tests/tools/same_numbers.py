@@ -49,6 +49,9 @@ VALUES = {
 OPTIONAL = {"further_recordings", "considered"}
 """Keys that older or newer documents lack; null and an empty list count as absent."""
 
+EXTENDED = {"criteria"}
+"""Mappings to which newer documents add keys."""
+
 SKIPPED = {"timing_s", "versions", "path", "sha256"}
 """Keys whose values may differ wherever they stand: they tell of a run and its machine."""
 
@@ -318,6 +321,8 @@ class Comparison:
         for key in [*before, *(key for key in after if key not in before)]:
             place = f"{where}.{key}" if where else key
             if key in SKIPPED or (key in OPTIONAL and not before.get(key) and not after.get(key)):
+                continue
+            if key not in before and where.rpartition(".")[2] in EXTENDED:
                 continue
             if key not in before or key not in after:
                 self.differences.append(f"{place}: only {'before' if key in before else 'after'}")
