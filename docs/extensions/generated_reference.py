@@ -136,7 +136,8 @@ def listed(entries: Iterable[glossary.GlossaryEntry]) -> str:
 
 def parameter_table(entries: Iterable[glossary.GlossaryEntry]) -> str:
     """Return the Markdown table of parameters."""
-    rows = [f"| `{entry.name}` | {entry.unit.replace(' | ', ', ')} | {entry.text} |" for entry in entries]
+    text = {entry: entry.text.replace("|", chr(92) + "|") for entry in entries}
+    rows = [f"| `{entry.name}` | {entry.unit.replace(' | ', ', ')} | {text[entry]} |" for entry in text]
     return "\n".join(["| parameter | unit | meaning |", "| --- | --- | --- |", *rows])
 
 
