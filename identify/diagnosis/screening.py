@@ -45,7 +45,7 @@ def score_statistics(fit: IvFit, columns: Sequence[tuple[int, Array]], count: in
     able = np.isfinite(size) & (size > 0.0)
     scale = np.where(able, size, np.inf)
     scaled = [(j, np.where(able, own, 0.0) / scale) for j, own in columns]
-    gram, score = fit.regression.products_beside(scaled, count)
+    gram, score = fit.regression.orthogonal_products(scaled, count)
     power, right = np.linalg.eigh(gram)
     kept = power > fit.study.criteria.beyond_model**2
     along = np.einsum("gij,gi->gj", right, score)
@@ -76,7 +76,7 @@ def contained(fit: IvFit, candidate: Candidate, column_cache: ColumnCache, shape
     columns = column_cache.grid(candidate.effect, candidate.place, (shapes,), fit.noise, keep=False)
     size = np.sqrt(np.sum([np.einsum("ij,ij->j", own, own) for _, own in columns], axis=0))
     size = np.where(size > 0.0, size, 1.0)
-    gram = fit.regression.products_beside([(j, own / size) for j, own in columns], 1)[0][0]
+    gram = fit.regression.orthogonal_products([(j, own / size) for j, own in columns], 1)[0][0]
     kept: list[int] = []
     present = candidate.effect.present(dict(shapes))
     for k in present:
@@ -94,7 +94,7 @@ def orthogonal_directions(fit: IvFit, instruments: Array) -> tuple[Array, Array,
     scale = np.linalg.norm(instruments, axis=0)
     if np.any(scale == 0) or not np.isfinite(scale).all():
         return None
-    free = fit.regression.beside(instruments / scale)
+    free = fit.regression.orthogonalized(instruments / scale)
     # Through the small Gram matrix: candidates have a few columns and many rows.
     power, right = np.linalg.eigh(free.T @ free)
     kept = power > fit.study.criteria.beyond_model**2

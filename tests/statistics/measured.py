@@ -25,8 +25,8 @@ from armident.configs import RobotConfig, load_robot
 from armident.configs.loading import parse
 from armident.daq.interchange.importing import import_recording
 from armident.identify.diagnosis.diagnose import DiagnosisResult, run_diagnosis
-from armident.identify.experiment import Experiment
 from armident.identify.identification.from_recording import experiments_from_recording
+from armident.identify.signals.experiments import Experiment
 from tests.conftest import REPOSITORY
 
 FORCE_PER_VOLT = 35.15065
@@ -34,7 +34,7 @@ STANDSTILL_S = 7.5
 TX40_DT = 2e-4
 
 MOST_CPU_S = 60.0
-"""Most CPU time of a diagnosis, s."""
+"""Most CPU time of a diagnosis, s: one that takes longer is not repeated while a person waits."""
 MOST_MEMORY_GB = 2.0
 """Most memory of a diagnosis, GB: the same."""
 CERTAIN = 0.9

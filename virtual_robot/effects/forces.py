@@ -7,7 +7,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from armident.configs import Joint, RobotConfig
+from armident.configs import ConfigError, Joint, RobotConfig
 from armident.virtual_robot.effects.spec import (
     AUTO,
     PER_TURN,
@@ -57,15 +57,15 @@ def effect_torque(code, p, q, qd, motor, other, load, t, smoothing):  # type: ig
     """
     side = 2.0 / math.pi * math.atan(smoothing * qd)
     side_slope = 2.0 / math.pi * smoothing / (1.0 + (smoothing * qd) ** 2)
-    if code == 0:  # ratio fv |qd|
+    if code == 0:  # fva |qd|
         return p[0] * abs(qd), p[0] * math.copysign(1.0, qd)
-    if code == 1:  # ratio fc, which builds up with speed
+    if code == 1:  # fca, which builds up with speed
         film = math.tanh(qd / p[1])
         return p[0] * film * film, p[0] * 2.0 * film * (1.0 - film * film) / p[1]
     if code == 2:  # fv qd (1 / (1 + |qd / v0|^exponent) - 1)
         thin = abs(qd / p[1]) ** p[2]
         return -p[0] * qd * thin / (1.0 + thin), p[0] * ((1.0 + thin - p[2] * thin) / (1.0 + thin) ** 2 - 1.0)
-    if code == 3:  # coefficient |load|
+    if code == 3:  # fcl |load|
         return p[0] * abs(load) * side, p[0] * abs(load) * side_slope
     if code == 4:  # wave or tight spot
         level = p[0] * (math.exp(-0.5 * ((q - p[4]) / p[3]) ** 2) if p[3] > 0.0 else math.cos(p[1] * q + p[2]))
@@ -109,25 +109,32 @@ def _turn(h: Hidden, robot: RobotConfig) -> float:
     return 2.0 * math.pi / h["pitch"] / float(robot.transmission_matrix[h.joint, h.joint])
 
 
+def _at_most(h: Hidden, name: str, friction: float) -> float:
+    """Return a difference between the directions, which the friction of the joint bounds."""
+    if abs(h[name]) > friction:
+        raise ConfigError(f"{h.where}.parameters.{name}: expected at most the friction {friction:g}, found {h[name]:g}")
+    return h[name]
+
+
 EFFECTS: dict[str, EffectSpec] = {
     "asymmetric_viscous_friction": EffectSpec(
         "force",
         "viscous friction that depends on the direction of motion",
-        {"ratio": ParameterSpec("-", "Fv (1 + ratio) forwards, Fv (1 - ratio) backwards", None, -1.0, 1.0)},
-        row=lambda h, robot, fv, fc: (h["ratio"] * fv,),
+        {"fva": ParameterSpec("N m s/rad", "Fv + fva forwards, Fv - fva backwards; at most Fv")},
+        row=lambda h, robot, fv, fc: (_at_most(h, "fva", fv),),
     ),
     "asymmetric_coulomb_friction": EffectSpec(
         "force",
         "Coulomb friction that depends on the direction of motion, once the joint moves",
         {
-            "ratio": ParameterSpec("-", "Fc (1 + ratio) forwards, Fc (1 - ratio) backwards", None, -1.0, 1.0),
+            "fca": ParameterSpec("N m", "Fc + fca forwards, Fc - fca backwards; at most Fc"),
             "velocity": positive(
                 "rad/s", "speed at which it reaches 75 %; 1 % of the joint's limit unless given", AUTO
             ),
         },
         row=lambda h, robot, fv, fc: (
             # tanh^2 reaches three quarters at 1.317.
-            h["ratio"] * fc,
+            _at_most(h, "fca", fc),
             h.value_or("velocity", 0.01 * robot.joints[h.joint].limits.velocity) / math.atanh(math.sqrt(0.75)),
         ),
     ),
@@ -149,8 +156,8 @@ EFFECTS: dict[str, EffectSpec] = {
     "load_dependent_friction": EffectSpec(
         "force",
         "Coulomb friction that increases with the torque transmitted by the gear",
-        {"coefficient": positive("-", "friction torque per transmitted torque", None, 0.9)},
-        row=lambda h, robot, fv, fc: (h["coefficient"],),
+        {"fcl": positive("-", "friction torque per transmitted torque", None, 0.9)},
+        row=lambda h, robot, fv, fc: (h["fcl"],),
     ),
     "position_dependent_friction": EffectSpec(
         "force",
