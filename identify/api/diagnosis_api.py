@@ -22,7 +22,7 @@ from armident.identify.report.robot_file import robot_yaml
 from armident.identify.signals.experiments import Experiment
 
 if TYPE_CHECKING:
-    from armident.identify.diagnosis.diagnose import Diagnosis as DiagnosisResult
+    from armident.identify.diagnosis.diagnose import DiagnosisResult
 
 
 @dataclass(frozen=True, repr=False)
@@ -166,7 +166,7 @@ def diagnose(
     ('asymmetric_viscous_friction', 'joint_2')
     """
     from armident.identify.diagnosis.criteria import Criteria
-    from armident.identify.diagnosis.diagnose import diagnose as run
+    from armident.identify.diagnosis.diagnose import run_diagnosis
 
     if time_limit_s is not None and not time_limit_s > 0:
         raise ConfigError(f"--time-limit: expected a time greater than 0 s, found {time_limit_s:g}")
@@ -186,7 +186,7 @@ def diagnose(
     notes += rest_notes(training, config)
     criteria = Criteria(false_alarm_rate=false_alarm_rate, material_pct=material)
     references = [reference(recording) for recording in read]
-    found = run(
+    found = run_diagnosis(
         training,
         held_out,
         config,

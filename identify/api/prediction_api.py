@@ -20,7 +20,7 @@ from armident.identify.api.result_tables import Table
 from armident.identify.documents.base import reference, versions
 from armident.identify.documents.files import write_atomically
 from armident.identify.documents.prediction import PredictionDocument
-from armident.identify.effects.recorded import put_right
+from armident.identify.effects.recording_corrections import corrected_experiments
 from armident.identify.identification.equations import equations, least_rows, published_equations
 from armident.identify.identification.from_recording import NO_REFERENCE
 from armident.identify.identification.identification_result import relative_torque_errors
@@ -191,7 +191,7 @@ def predict(
     experiments, remarks = experiments_of([read], configured, name_files=False)
     setup = _setup(experiments, model, notes)
     options = _options(model.document.options)
-    experiments = shifted_experiments(put_right(experiments, configured), configured, options, setup, notes)
+    experiments = shifted_experiments(corrected_experiments(experiments, configured), configured, options, setup, notes)
     show("torques", 0.5)
     with threadpool_limits(1):
         signals, blocks = _equations(model, experiments, options)

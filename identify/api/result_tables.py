@@ -103,7 +103,7 @@ class EffectTable(Table):
                 effect.title,
                 effect.scope,
                 ", ".join(effect.units),
-                effect.needs,
+                effect.required_motion,
                 effect.reference,
             )
             for effect in found.values()

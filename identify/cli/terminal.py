@@ -184,17 +184,12 @@ def diagnosis_table(document: DiagnosisDocument) -> None:
             )
             where = f.joint if f.other is None else f"{f.joint}, {f.other}"
             closed = f"{f.gap_before:.2f} % → {f.gap_after:.2f} %"
-            if f.gap_without_derivative_noise is not None:
-                closed += f" ({f.gap_without_derivative_noise:.2f} % without derivative noise)"
             table.add_row(where, f.effect, values, f"{100 * f.confidence:.0f} %", closed)
         print_table(table, console)
         for f in document.findings:
             rivals = f.evidence.get("ambiguous_with", [])
             unsure = f"; ambiguous with {', '.join(rivals)}" if rivals else ""
             console.print(f"{f.joint}: {f.evidence['description']}{unsure}", highlight=False)
-    if document.considered:
-        named = ", ".join(f.rejection for f in document.considered)
-        console.print(f"considered and rejected: {named}", highlight=False, soft_wrap=True)
     for u in document.unexplained:
         console.print(
             f"unexplained: {u.joint}, {100 * u.share_of_residual:.0f} % of its residual varies with {u.varies_with}",

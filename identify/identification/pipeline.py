@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from armident.configs import DataError, RobotConfig
-from armident.identify.effects.recorded import put_right
+from armident.identify.effects.recording_corrections import corrected_experiments
 from armident.identify.effects.terms import arm_model
 from armident.identify.estimators.diagnostics import diagnose_estimate
 from armident.identify.estimators.essential import essential_parameters
@@ -116,7 +116,7 @@ def _identify(
     clock.enter("model", 0.0)
     moving = moving_joints(experiments, robot, criteria)
     require_motion(experiments, robot, moving)
-    experiments = shifted_experiments(put_right(experiments, robot), robot, options, setup, notes)
+    experiments = shifted_experiments(corrected_experiments(experiments, robot), robot, options, setup, notes)
     bandwidth = (
         options.bandwidth_hz
         or robot.bandwidth_hz

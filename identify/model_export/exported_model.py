@@ -8,7 +8,7 @@ import numpy as np
 
 from armident.configs import DataError, RobotConfig, load_robot
 from armident.identify.documents.identification import IdentificationDocument
-from armident.identify.effects.recorded import of_recording
+from armident.identify.effects.recording_corrections import of_recording
 from armident.identify.effects.registry import of_entry
 from armident.identify.effects.terms import effect_terms
 from armident.identify.identification.checks.excitation import workspace_postures

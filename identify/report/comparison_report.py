@@ -6,7 +6,7 @@ import numpy as np
 
 from armident.identify.documents.comparison import LEVEL_95, ComparedParameter, ComparisonDocument
 from armident.identify.documents.identification import IdentificationDocument
-from armident.identify.report.glossary import identification_entries, in_words
+from armident.identify.report.glossary import base_entries, in_words
 from armident.identify.report.page import MODEL, MUTED, RESIDUAL, render
 from armident.identify.report.plots import Plot, Series, plots_html
 
@@ -21,7 +21,7 @@ def comparison_report(document: ComparisonDocument, glossary_of: IdentificationD
         document=document,
         plots={joint: plots_html([_plot(joint, parameters)]) for joint, parameters in document.by_joint.items()},
         level=LEVEL_95,
-        glossary=identification_entries(glossary_of),
+        glossary=base_entries(p.name for p in glossary_of.parameters),
     )
 
 

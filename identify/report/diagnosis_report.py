@@ -6,25 +6,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from armident.identify.diagnosis.diagnose import Diagnosis
-from armident.identify.diagnosis.lack_of_fit import Dependence
-from armident.identify.documents.diagnosis import DiagnosisDocument, Finding
-from armident.identify.report.glossary import diagnosis_entries, meaning_of
+from armident.identify.diagnosis.criteria import Criteria
+from armident.identify.diagnosis.diagnose import DiagnosisResult
+from armident.identify.diagnosis.lack_of_fit import ResidualDependence
+from armident.identify.documents.diagnosis import VERDICTS, DiagnosisDocument, Finding
+from armident.identify.report.glossary import finding_entries, parameter_meaning
 from armident.identify.report.identification_report import torque_plots
 from armident.identify.report.page import BAND, INK, MEASURED, MODEL, MUTED, RESIDUAL, figure, render
 
 Array = NDArray[np.float64]
 
-VERDICTS = {
-    "no_gap": "The model explains the data; these recordings show no missing effect.",
-    "explained": "The model lacks effects, and the findings explain the gap.",
-    "partly_explained": "The model lacks effects; the findings explain a part of the gap.",
-    "unexplained": "The model lacks something that no effect of the catalogue explains.",
-}
 LEVELS = {"no_gap": "trustworthy", "explained": "doubtful", "partly_explained": "unusable", "unexplained": "unusable"}
 """Colours of the verdicts, by the levels of an identification."""
-LIKELY = 0.6
-"""Posterior probability below which a finding may be another effect: odds of 3 to 2 against all others together."""
 BINS, FILLED = 14, 5
 """Bins of a variable, and the fewest samples of one that is drawn."""
 SHOWN = 700
@@ -33,7 +26,7 @@ FOLLOWS = 0.6
 """Share of the power of a finding's torque that its means over a variable must have to be drawn over it."""
 
 
-def diagnosis_report(diagnosis: Diagnosis, document: DiagnosisDocument) -> str:
+def diagnosis_report(diagnosis: DiagnosisResult, document: DiagnosisDocument) -> str:
     """Return the HTML page of a diagnosis, complete in one file.
 
     ``diagnosis``: curves and configuration with the findings; ``document``: ``diagnosis.json``.
@@ -50,7 +43,7 @@ def diagnosis_report(diagnosis: Diagnosis, document: DiagnosisDocument) -> str:
         level=LEVELS[document.verdict],
         torques=torque_plots(diagnosis.t, diagnosis.measured, diagnosis.after, joints, units, before),
         detection_limits=_detection_limits(document),
-        glossary=diagnosis_entries(document),
+        glossary=finding_entries(document.findings),
         verdict=VERDICTS[document.verdict],
         findings=[
             {
@@ -58,7 +51,7 @@ def diagnosis_report(diagnosis: Diagnosis, document: DiagnosisDocument) -> str:
                 "title": finding.evidence.get("title", finding.effect.replace("_", " ")),
                 "where": finding.joint if finding.other is None else f"{finding.joint} and {finding.other}",
                 "probability": posterior_probability(finding),
-                "closed": closed_share(finding, document),
+                "closed": closed_gap_share(finding, document),
                 "rows": _rows(finding),
                 "picture": _finding_figure(diagnosis, joints.index(finding.joint), lacking, own),
             }
@@ -86,21 +79,21 @@ def _detection_limits(document: DiagnosisDocument) -> list[dict[str, str]]:
 
 def posterior_probability(finding: Finding) -> str:
     """Return the posterior probability of a finding in words, with the effects that it is ambiguous with."""
-    shown = "> 99.9 %" if finding.confidence > 0.999 else f"{100 * finding.confidence:.0f} %"
-    rivals = finding.evidence.get("ambiguous_with", [])
+    shown = "> 99.9 %" if finding.confidence > 0.999 else f"{100 * finding.confidence:.1f} %"
+    rivals = ", ".join(name.replace("_", " ") for name in finding.evidence.get("ambiguous_with", []))
     if rivals:
-        return f"{shown}, ambiguous with {', '.join(name.replace('_', ' ') for name in rivals)}"
-    return shown if finding.confidence >= LIKELY else f"{shown}, perhaps a similar effect outside the catalogue"
+        return f"{shown}, ambiguous with {rivals}"
+    doubtful = finding.confidence < Criteria.doubtful
+    return f"{shown}, perhaps a similar effect outside the catalogue" if doubtful else shown
 
 
-def closed_share(finding: Finding, document: DiagnosisDocument) -> float | None:
+def closed_gap_share(finding: Finding, document: DiagnosisDocument) -> float | None:
     """Return the share of the joint's held-out gap above the noise floor that a finding closes, 0 to 1.
 
     The gap after is that without derivative noise where this is smaller. Returns ``None`` if there is no gap above the
     noise floor.
     """
-    noiseless = finding.evidence.get("gap_without_derivative_noise")
-    after = finding.gap_after if noiseless is None else min(finding.gap_after, noiseless)
+    after = finding.gap_after
     floor = min(document.noise_floor.by_joint[finding.joint], after)
     gap = finding.gap_before**2 - floor**2
     if gap <= 0:
@@ -112,7 +105,7 @@ def _rows(finding: Finding) -> list[tuple[str, float, float | None, str, str]]:
     """Return the parameters with standard deviation, unit and meaning."""
     std, units = finding.evidence.get("std", {}), finding.evidence.get("units", {})
     return [
-        (name, value, std.get(name), units.get(name, ""), meaning_of(name, finding))
+        (name, value, std.get(name), units.get(name, ""), parameter_meaning(name, finding))
         for name, value in finding.parameters.items()
     ]
 
@@ -136,7 +129,7 @@ def _gap_figure(document: DiagnosisDocument) -> str:
     return picture[0]
 
 
-def _finding_figure(diagnosis: Diagnosis, joint: int, lacking: Array | None, own: Array | None) -> str:
+def _finding_figure(diagnosis: DiagnosisResult, joint: int, lacking: Array | None, own: Array | None) -> str:
     """Return a figure of the joint's held-out residual without and with a finding, over time and over its variable.
 
     ``joint``: index of the joint. ``lacking``: torques (M, n) of the model without the finding; ``None`` compares the
@@ -177,7 +170,7 @@ def telling_stretch(added: Array) -> slice:
     return slice(begin, begin + SHOWN)
 
 
-def followed_variable(diagnosis: Diagnosis, joint: int, added: Array) -> tuple[str, str, Array]:
+def followed_variable(diagnosis: DiagnosisResult, joint: int, added: Array) -> tuple[str, str, Array]:
     """Return the variable that a finding is drawn over: name, unit, values (M,).
 
     Speed, position or time, the first whose means have the share `FOLLOWS` of its power; otherwise its own torque.
@@ -219,12 +212,12 @@ def _over_cause(axis: Any, rest: Array, added: Array, cause: tuple[str, str, Arr
     axis.legend(frameon=False, fontsize=8.5, loc="best")
 
 
-def _unit(diagnosis: Diagnosis, joint: int) -> str:
+def _unit(diagnosis: DiagnosisResult, joint: int) -> str:
     return "N m" if diagnosis.robot.joints[joint].type == "revolute" else "N"
 
 
-def _curve(axis: Any, d: Dependence, unit: str) -> None:
-    """Draw a residual dependence with its uncertainty; a spectrum or transients with the noise level."""
+def _curve(axis: Any, d: ResidualDependence, unit: str) -> None:
+    """Draw a residual dependence with its uncertainty; a spectrum with the noise level."""
     x, value, band = d.curve.x, d.curve.value, d.curve.band
     low, high = (np.zeros_like(band), band) if d.of_noise else (value - band, value + band)
     axis.fill_between(x, low, high, color=BAND, linewidth=0)
@@ -234,7 +227,7 @@ def _curve(axis: Any, d: Dependence, unit: str) -> None:
     axis.set_ylabel(f"{unit}/√Hz" if d.kind == "motion" else unit)
 
 
-def _map_figure(diagnosis: Diagnosis, joints: Sequence[str]) -> str | None:
+def _map_figure(diagnosis: DiagnosisResult, joints: Sequence[str]) -> str | None:
     """Return a figure of the share of each joint's residual that each variable predicts, unexplained ones marked."""
     kinds = list(dict.fromkeys(d.kind for d in diagnosis.where))
     if not kinds:
@@ -260,12 +253,12 @@ def _map_figure(diagnosis: Diagnosis, joints: Sequence[str]) -> str | None:
     return picture[0]
 
 
-def _curve_figure(d: Dependence, unit: str) -> str:
+def _curve_figure(d: ResidualDependence, unit: str) -> str:
     """Return a figure of an unexplained residual dependence, in the unit of the joint's torque."""
     with figure(1, 1, 2.3) as (_, axes, picture):
         _curve(axes[0, 0], d, unit)
-        over = {"motion": "frequency; shaded: noise", "transients": "time; shaded: noise"}
-        axes[0, 0].set_title(f"{d.joint}: unexplained residual, over {over.get(d.kind, d.varies_with)}")
+        over = "frequency; shaded: noise" if d.kind == "motion" else d.varies_with
+        axes[0, 0].set_title(f"{d.joint}: unexplained residual, over {over}")
         axes[0, 0].axhline(0, color=MUTED, linewidth=0.6)
     return picture[0]
 

@@ -11,7 +11,7 @@ from armident.configs import RobotConfig
 from armident.daq.recording import Recording
 from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.identification.identification_result import IdentificationResult
-from armident.identify.report.glossary import identification_entries
+from armident.identify.report.glossary import base_entries
 from armident.identify.report.page import BAND, CONFIGURED, INK, MEASURED, MODEL, MUTED, RESIDUAL, figure, render
 from armident.identify.report.plots import Plot, Series, plots_html
 
@@ -48,7 +48,7 @@ def identification_report(
         controller=_controller_figure(document.controller),
         least_squares={} if document.comparison is None else {p.name: p.value for p in document.comparison.parameters},
         residuals=_residual_words(document),
-        glossary=identification_entries(document),
+        glossary=base_entries(p.name for p in document.parameters),
     )
 
 

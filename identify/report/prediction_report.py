@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 
 from armident.identify.documents.prediction import PredictionDocument
 from armident.identify.identification.robot_model import RobotModel
-from armident.identify.report.glossary import identification_entries
+from armident.identify.report.glossary import base_entries
 from armident.identify.report.identification_report import torque_plots
 from armident.identify.report.page import render
 
@@ -24,5 +24,5 @@ def prediction_report(
         document=document,
         robot=model.robot,
         torques=torque_plots(t, measured, predicted, list(document.units), list(document.units.values())),
-        glossary=identification_entries(model.document),
+        glossary=base_entries(p.name for p in model.document.parameters),
     )

@@ -8,4 +8,4 @@ from armident.identify.setup.result import SetupCheck
 def setup_report(document: SetupDocument, result: SetupCheck) -> str:
     """Return the HTML page of a check of the set-up, complete in one file."""
     shift = result.torque_shift
-    return render("setup.html", document=document, remark="" if shift is None else shift.remark, glossary=[])
+    return render("setup.html", document=document, remark="" if shift is None else shift.remark, glossary=None)

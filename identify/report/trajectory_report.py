@@ -13,7 +13,7 @@ from armident.identify.excitation.plot import limits_of
 from armident.identify.excitation.point_to_point import sample_trajectory
 from armident.identify.excitation.safety import CheckedTrajectory
 from armident.identify.identification.identification_result import units
-from armident.identify.report.glossary import CONVENTIONS, base_entries
+from armident.identify.report.glossary import base_entries
 from armident.identify.report.identification_report import FAIR_PCT, GOOD_PCT
 from armident.identify.report.page import MODEL, RESIDUAL, render
 from armident.identify.report.plots import Plot, Series, plots_html
@@ -42,7 +42,7 @@ def trajectory_report(found: CheckedTrajectory) -> str:
         rows=_rows(found, names),
         assumed_noise=ASSUMED_NOISE,
         slow={joint.name: share for joint, share in zip(robot.joints, design.slow_share, strict=True)},
-        glossary=[*base_entries(names), *CONVENTIONS],
+        glossary=base_entries(names),
     )
 
 

@@ -118,7 +118,7 @@ class TorqueShift:
 
     @property
     def confirmed(self) -> bool:
-        """True if it is longer than shifts of sampling, and two joints show it alone while none denies it.
+        """True if it exceeds one sample; at least two joints confirm it, none contradicts it.
 
         Without instruments it never is: friction and elasticity that the model lacks look like a shift, too.
         """

@@ -9,10 +9,10 @@ from threadpoolctl import threadpool_limits
 from armident.configs import RobotConfig, load_robot
 from armident.configs.schema.scenario import HiddenEffect
 from armident.daq.recording import Recording
-from armident.identify.diagnosis.comparison import Step
+from armident.identify.diagnosis.candidate_comparison import SelectionStep
 from armident.identify.diagnosis.selection import StepwiseSelection
 from armident.identify.diagnosis.study import build_study
-from armident.identify.effects.recorded import of_recording
+from armident.identify.effects.recording_corrections import of_recording
 from armident.identify.identification.from_recording import experiments_from_recording
 from tests.fixtures.arms import FAST, recording
 
@@ -105,7 +105,7 @@ def known_of(case: Case) -> RobotConfig:
     return robot
 
 
-def first_step(data: Recording, whole: RobotConfig, known: RobotConfig) -> tuple[StepwiseSelection, Step]:
+def first_step(data: Recording, whole: RobotConfig, known: RobotConfig) -> tuple[StepwiseSelection, SelectionStep]:
     """Comparison of all candidates beside a model that lacks at most one effect."""
     experiments, _ = experiments_from_recording(data, whole)
     with threadpool_limits(1):

@@ -232,7 +232,7 @@ def test_terms_of_the_wrist_coupling_are_those_of_the_configured_coupling(robot:
     )
 
 
-def test_exchanged_drives_are_put_right_before_anything_else(robot: RobotConfig) -> None:
+def test_exchanged_drives_are_corrected_before_anything_else(robot: RobotConfig) -> None:
     rng = np.random.default_rng(6)
     right = Experiment(rng.normal(size=(20, 6)), rng.normal(size=(20, 6)), rng.normal(size=(20, 6)), DT)
     swapped = with_effects(
@@ -250,11 +250,11 @@ def test_exchanged_drives_are_put_right_before_anything_else(robot: RobotConfig)
     np.testing.assert_allclose(again.tau, right.tau)
 
 
-def test_every_entry_of_the_catalogue_says_what_it_is(robot: RobotConfig) -> None:
+def test_every_entry_of_the_catalogue_is_described(robot: RobotConfig) -> None:
     for effect in catalogue().values():
         assert effect.title, effect.name
-        assert effect.says, effect.name
+        assert effect.description, effect.name
         assert effect.reference, effect.name
-        assert effect.needs, effect.name
+        assert effect.required_motion, effect.name
         names = [p.name for p in effect.linear] + [shape.name for shape in effect.shapes]
         assert len(set(names)) == len(names)

@@ -20,7 +20,7 @@ def of_recording(entry: Entry) -> bool:
     return of_entry(entry).corrects(entry)
 
 
-def put_right(experiments: Sequence[Experiment], robot: RobotConfig) -> Sequence[Experiment]:
+def corrected_experiments(experiments: Sequence[Experiment], robot: RobotConfig) -> Sequence[Experiment]:
     """Return the experiments corrected for the effects on signals of a robot's configuration.
 
     ``robot``: configuration with the effect entries. Raises ConfigError if the entry of a wiring error does not name
@@ -30,5 +30,5 @@ def put_right(experiments: Sequence[Experiment], robot: RobotConfig) -> Sequence
     for entry in robot.effects:
         effect = of_entry(entry)
         if isinstance(effect, Correction) and effect.corrects(entry):
-            experiments = kept((effect.put_right(e, robot, entry) for e in experiments), like=experiments)
+            experiments = kept((effect.corrected(e, robot, entry) for e in experiments), like=experiments)
     return experiments

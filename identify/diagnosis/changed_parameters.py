@@ -15,19 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special, stats
 
-from armident.identify.diagnosis.baseline import Change, Comparison, cautious, compared
+from armident.identify.diagnosis.baseline_comparison import BaselineComparison, Change, conservative_fit, with_baseline
 from armident.identify.diagnosis.candidates import ColumnCache
-from armident.identify.diagnosis.changes import changes, p_value, ranked
-from armident.identify.diagnosis.criteria import Criteria
+from armident.identify.diagnosis.changes import changes, p_value_of_change, ranked
 from armident.identify.diagnosis.precision import variance_of_sum
-from armident.identify.diagnosis.regression import Fit, relative_errors
+from armident.identify.diagnosis.regression import IvFit, relative_torque_errors
 from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.regression.multiple_testing import holm
 
 Array = NDArray[np.float64]
-
-ALTERNATIVES = 3
-CLOSE = Criteria.close
 
 
 @dataclass(frozen=True)
@@ -51,7 +47,7 @@ class NumbersFinding:
     ambiguous_with
         Effects at odds of less than 20 to 1.
     alternatives
-        Effect, joint and score (see `Standing`) of the candidates next to this one.
+        Effect, joint and score (see `RankedChange`) of the candidates next to this one.
     words
         Description in plain language.
     """
@@ -71,7 +67,7 @@ class NumbersFinding:
 
 
 def stale_numbers(
-    fit: Fit, column_cache: ColumnCache, baseline: IdentificationDocument, alpha: float = 0.01
+    fit: IvFit, column_cache: ColumnCache, baseline: IdentificationDocument, alpha: float = 0.01
 ) -> list[NumbersFinding]:
     """Changes of the plant since a baseline was identified.
 
@@ -79,21 +75,25 @@ def stale_numbers(
     ``baseline``: result of an earlier identification of the same robot; ``alpha``: probability of a false alarm. Raises
     DataError if the baseline is of another model, or has no covariance.
     """
-    comparison = compared(cautious(fit), baseline)
+    comparison = with_baseline(conservative_fit(fit), baseline)
     if not _stale(comparison, alpha):
         return []
     pool = list(changes(comparison, column_cache))
     found: list[Change] = []
     barred: list[Change] = []
     while True:
-        standings = ranked(comparison, found, [c for c in pool if c not in found and c not in barred])
-        passing = [standing.change for standing in standings if standing.p_value * len(pool) <= alpha]
+        others = ranked(comparison, found, [c for c in pool if c not in found and c not in barred])
+        passing = [other.change for other in others if other.p_value * len(pool) <= alpha]
         if not passing:
             break
         best = passing[0]
         if _closes(comparison, found, [*found, best], alpha):
             found.append(best)
-            found = [c for c in found if p_value(comparison, [o for o in found if o is not c], c) * len(pool) <= alpha]
+            found = [
+                c
+                for c in found
+                if p_value_of_change(comparison, [o for o in found if o is not c], c) * len(pool) <= alpha
+            ]
             if best not in found:
                 barred.append(best)
         else:
@@ -104,14 +104,16 @@ def stale_numbers(
     return [*findings, *_rest(comparison, found, alpha)]
 
 
-def _stale(comparison: Comparison, alpha: float) -> bool:
+def _stale(comparison: BaselineComparison, alpha: float) -> bool:
     """True if all parameters together, or any of them by itself, differ; half the false alarms for either test."""
     _, _, _, rest, free = comparison.solved([])
     together = float(stats.chi2.sf(rest, free))
     return together < alpha / 2 or bool(_changed_names(comparison, [], alpha / 2))
 
 
-def _changed_names(comparison: Comparison, changes: Sequence[Change], alpha: float) -> list[tuple[int, float, float]]:
+def _changed_names(
+    comparison: BaselineComparison, changes: Sequence[Change], alpha: float
+) -> list[tuple[int, float, float]]:
     """Known parameters that differ beyond the changes: number, difference and standard deviation, by Holm's method."""
     stack = np.column_stack([comparison.absorbed, *(c.directions for c in changes)])
     rest = comparison.difference - stack @ comparison.solved(changes)[0]
@@ -121,12 +123,12 @@ def _changed_names(comparison: Comparison, changes: Sequence[Change], alpha: flo
     return [(int(k), float(rest[k]), float(std[k])) for k in np.argsort(p) if adjusted[k] <= alpha]
 
 
-def _closes(comparison: Comparison, before: Sequence[Change], after: Sequence[Change], alpha: float) -> bool:
+def _closes(comparison: BaselineComparison, before: Sequence[Change], after: Sequence[Change], alpha: float) -> bool:
     """True if held-out torques follow the change."""
     return _held_out(comparison, comparison.predicted(before), comparison.predicted(after)) > stats.norm.isf(alpha)
 
 
-def _held_out(comparison: Comparison, before: Array, after: Array) -> float:
+def _held_out(comparison: BaselineComparison, before: Array, after: Array) -> float:
     """Projection of the held-out residual on the change of prediction, in standard deviations.
 
     Its variance comes from the noise, from the remaining serial correlation (Newey-West), and from the baseline.
@@ -144,23 +146,23 @@ def _held_out(comparison: Comparison, before: Array, after: Array) -> float:
 
 
 def _described(
-    comparison: Comparison,
+    comparison: BaselineComparison,
     before: Sequence[Change],
     change: Change,
     found: Sequence[Change],
     pool: Sequence[Change],
 ) -> NumbersFinding:
     """A change with its values in the model of all changes, the gaps of the order in which they were found."""
-    fit = comparison.fit
+    fit, criteria = comparison.fit, comparison.fit.study.criteria
     others = [c for c in found if c is not change]
     values, covariance, own, _, _ = comparison.solved([*others, change])
     m = change.directions.shape[1]
     names = [p.name for p in change.effect.linear]
-    told = {n: float(v) for n, v, o in zip(names, values[-m:], own[-m:], strict=True) if o}
+    known_values = {n: float(v) for n, v, o in zip(names, values[-m:], own[-m:], strict=True) if o}
     std = {n: float(np.sqrt(v)) for n, v, o in zip(names, np.diag(covariance)[-m:], own[-m:], strict=True) if o}
     gap_before = _gap(fit, comparison.predicted(before), change)
     gap_after = _gap(fit, comparison.predicted([*before, change]), change)
-    p = min(1.0, p_value(comparison, others, change) * len(pool))
+    p = min(1.0, p_value_of_change(comparison, others, change) * len(pool))
     every = ranked(comparison, others, [change, *(c for c in pool if c not in found)])
     own_score = next((s.score for s in every if s.change is change), -np.inf)
     rivals = [s for s in every if s.change is not change]
@@ -170,31 +172,33 @@ def _described(
         effect=change.effect.name,
         joint=joint,
         other=None,
-        parameters=told,
+        parameters=known_values,
         std=std,
         p_value=p,
         gap_before=gap_before,
         gap_after=gap_after,
         confidence=share * (1.0 - p),
-        ambiguous_with=tuple(s.change.effect.name for s in rivals if s.score > own_score - CLOSE),
-        alternatives=tuple((s.change.effect.name, _joint(fit, s.change), s.score) for s in rivals[:ALTERNATIVES]),
-        words=change.effect.change_in_words(joint, told, std),
+        ambiguous_with=tuple(s.change.effect.name for s in rivals if s.score > own_score - criteria.close),
+        alternatives=tuple(
+            (s.change.effect.name, _joint(fit, s.change), s.score) for s in rivals[: criteria.alternatives]
+        ),
+        words=change.effect.change_in_words(joint, known_values, std),
     )
 
 
-def _joint(fit: Fit, change: Change) -> str:
+def _joint(fit: IvFit, change: Change) -> str:
     """Name of the joint; a payload belongs to the last one, as in the configuration."""
     joints = fit.study.joints
     return joints[-1] if change.effect.name == "payload" else joints[change.place.joint]
 
 
-def _gap(fit: Fit, theta: Array, change: Change) -> float:
+def _gap(fit: IvFit, theta: Array, change: Change) -> float:
     """Relative torque error on held-out data, percent, of the joint or of all."""
-    overall, each = relative_errors(fit, theta, held=True)
+    overall, each = relative_torque_errors(fit, theta, held=True)
     return overall if change.effect.scope == "arm" else float(each[change.place.joint])
 
 
-def _rest(comparison: Comparison, found: Sequence[Change], alpha: float) -> list[NumbersFinding]:
+def _rest(comparison: BaselineComparison, found: Sequence[Change], alpha: float) -> list[NumbersFinding]:
     """Finding of the changed parameters that no candidate explains, if there are any."""
     fit = comparison.fit
     _, _, _, left, free = comparison.solved(found)
@@ -210,7 +214,7 @@ def _rest(comparison: Comparison, found: Sequence[Change], alpha: float) -> list
     names = [model.base.names[comparison.known[k]] for k, _, _ in changed]
     numbers = Counter(m.group(1) for name in names if (m := re.search(r"(\d)r?(?:_\d+)?$", name)))
     joint = model.robot.joints[min(int(numbers.most_common(1)[0][0]), model.n) - 1 if numbers else 0].name
-    told = "; ".join(
+    each = "; ".join(
         f"{name} was {comparison.theta0[k]:.4g}, differs by {rest:+.3g} (standard deviation {std:.2g})"
         for name, (k, rest, std) in zip(names, changed, strict=True)
     )
@@ -222,11 +226,11 @@ def _rest(comparison: Comparison, found: Sequence[Change], alpha: float) -> list
             parameters={name: rest for name, (_, rest, _) in zip(names, changed, strict=True)},
             std={name: std for name, (_, _, std) in zip(names, changed, strict=True)},
             p_value=p,
-            gap_before=relative_errors(fit, before, held=True)[0],
-            gap_after=relative_errors(fit, held=True)[0],
+            gap_before=relative_torque_errors(fit, before, held=True)[0],
+            gap_after=relative_torque_errors(fit, held=True)[0],
             confidence=1.0 - p,
             ambiguous_with=(),
             alternatives=(),
-            words=f"parameters differ from the baseline, and no effect of the catalogue explains it: {told}",
+            words=f"parameters differ from the baseline, and no effect of the catalogue explains it: {each}",
         )
     ]

@@ -1,13 +1,15 @@
 """Equations of a diagnosis: regressors of a model with its terms at measured and simulated signals, in one band."""
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from armident.identify.diagnosis.regressor_cache import Arrays
-from armident.identify.diagnosis.stretch import KINDS, Stretch
+from armident.identify.diagnosis.stretch import KINDS, MotionStretch
 from armident.identify.diagnosis.study import Study
 from armident.identify.effects.terms import Term, effect_terms
 from armident.identify.regression.equations import InstrumentedEquations
@@ -16,6 +18,7 @@ from armident.identify.robot.motion import Motion
 from armident.identify.signals.differentiate import Derivatives
 
 Array = NDArray[np.float64]
+T = TypeVar("T")
 
 HELD_AT_ZERO = 1e-10
 """Weight by which the parameters of terms are held at zero. Where rigid model and terms give the same torque, as the
@@ -31,6 +34,7 @@ class Equations:
 
     study: Study
     theta: Array | None
+    _parts: dict[str, Any] = field(default_factory=dict, repr=False)
 
     @property
     def parameters(self) -> int:
@@ -43,41 +47,48 @@ class Equations:
         model = self.study.model
         return np.repeat([0.0, HELD_AT_ZERO], [model.base.b - model.e, model.e])
 
-    @cached_property
+    @property
     def train(self) -> tuple[InstrumentedEquations, ...]:
         """Training equations, one entry per stretch."""
-        return tuple(self._of(s) for s in self.study.train)
+        return self._part("train", lambda: tuple(self._of(s) for s in self.study.train))
 
-    @cached_property
+    @property
     def held(self) -> tuple[InstrumentedEquations, ...]:
         """Held-out equations, one entry per stretch."""
-        return tuple(self._of(s) for s in self.study.held)
+        return self._part("held", lambda: tuple(self._of(s) for s in self.study.held))
 
-    @cached_property
+    @property
     def joints(self) -> tuple[JointEquations, ...]:
         """The training equations joint by joint, without the columns that are zero there."""
-        return tuple(JointEquations.of(self.train, j, copied=True) for j in range(self.study.robot.n))
+        joints = range(self.study.robot.n)
+        return self._part("joints", lambda: tuple(JointEquations.of(self.train, j, copied=True) for j in joints))
 
-    def with_held(self, study: Study) -> "Equations":
+    def of_study(self, study: Study) -> "Equations":
         """Equations of the same training part with another held-out part.
 
         ``study``: data with the same training stretches.
         """
-        other = Equations(study, self.theta)
-        other.__dict__.update({name: self.__dict__[name] for name in ("train", "joints") if name in self.__dict__})
-        return other
+        parts = self._parts
+        if study.held is not self.study.held:
+            parts = {name: part for name, part in parts.items() if name != "held"}
+        return Equations(study, self.theta, parts)
 
     def release(self) -> None:
         """Free the equations; they are computed again, with the same values, when they are next used."""
-        for name in ("train", "held", "joints"):
-            self.__dict__.pop(name, None)
+        self._parts.clear()
 
-    def _of(self, stretch: Stretch) -> InstrumentedEquations:
+    def _part(self, name: str, made: Callable[[], T]) -> T:
+        if name not in self._parts:
+            self._parts[name] = made()
+        part: T = self._parts[name]
+        return part
+
+    def _of(self, stretch: MotionStretch) -> InstrumentedEquations:
         x, z = regressors(self.study, stretch, self.theta)
         return InstrumentedEquations(stretch.y, x, np.ones(stretch.y.shape, dtype=np.bool_), stretch.t, z)
 
 
-def regressors(study: Study, stretch: Stretch, theta: Array | None) -> tuple[Array, Array]:
+def regressors(study: Study, stretch: MotionStretch, theta: Array | None) -> tuple[Array, Array]:
     """Regressor (M, n, b) at measured and at simulated signals, in the band of the comparison.
 
     Effects that depend on accelerations or torques are computed at simulated signals in both. Effects with jumps, which
@@ -114,7 +125,7 @@ class _Signals:
     """
 
     study: Study
-    stretch: Stretch
+    stretch: MotionStretch
     kind: str
     theta: Array | None
 
@@ -130,12 +141,12 @@ class _Signals:
     def rigid(self) -> Array:
         """Regressor of the rigid model in the band of the comparison, (M, n, b - e)."""
         model, signals = self.study.model, self._own
-        key = (id(signals), model.base.names[: -model.e or None], self._smoothing)
+        key = (signals, model.base.names[: -model.e or None], self._smoothing)
 
         def made() -> Arrays:
             return (self.study.decimation(model.rigid_regressor(signals.q, signals.qd, signals.qdd)),)
 
-        return self.study.regressors.get(key, signals, made)[0]
+        return self.study.regressors.get(key, made)[0]
 
     def fill(self, term: Term, out: Array) -> None:
         """Write the columns of a term in the band of the comparison; those of one joint are filtered alone.
@@ -145,7 +156,7 @@ class _Signals:
         signals, model = self._signals, self.study.model
         torques = (model.base.names[: -model.e or None], self._theta_bytes) if term.depends_on_torque else None
         place = (term.effect.key, term.place.joint, term.place.other, tuple(term.shapes.items()), term.kept)
-        key = (*map(id, signals), place, self._smoothing, torques)
+        key = (*signals, place, self._smoothing, torques)
 
         def made() -> Arrays:
             columns = term.columns(self.motion)[self.motion.lead :]
@@ -153,7 +164,7 @@ class _Signals:
             acts = np.flatnonzero(np.any(flat, axis=0))
             return acts, self.study.decimation(np.ascontiguousarray(flat[:, acts]))
 
-        acts, band = self.study.regressors.get(key, signals, made)
+        acts, band = self.study.regressors.get(key, made)
         whole = np.zeros((out.shape[0], out.shape[1] * out.shape[2]))
         whole[:, acts] = band
         out[...] = whole.reshape(out.shape)

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from armident.configs import DataError
-from armident.identify.diagnosis.regression import MAX_AR_ORDER, Fit
+from armident.identify.diagnosis.regression import MAX_AR_ORDER, IvFit
 from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.effects.effect import Effect, Place
 from armident.identify.regression.equations import COVARIANCE_PASSES, noise_models
@@ -16,10 +16,7 @@ from armident.identify.regression.equations import COVARIANCE_PASSES, noise_mode
 Array = NDArray[np.float64]
 
 RANK_TOLERANCE = 1e-7
-"""Relative singular value below which a direction of normalised changes is dropped."""
-
-ESTIMABLE = 0.999
-"""Share of a parameter in the observed directions above which it is estimable by itself."""
+"""Relative singular value below which a direction of normalised changes is dropped: rounding of the covariances."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +32,7 @@ class Change:
 
 
 @dataclass(frozen=True, eq=False)
-class Comparison:
+class BaselineComparison:
     """A fit and a baseline, with the covariance of their difference.
 
     Parameters
@@ -53,7 +50,7 @@ class Comparison:
         is unknown if they acted, so differences along these directions are no evidence.
     """
 
-    fit: Fit
+    fit: IvFit
     known: NDArray[np.int64]
     theta0: Array
     covariance0: Array
@@ -89,16 +86,16 @@ class Comparison:
         u, s, vt = u[:, kept], s[kept], vt[kept]
         inverse = (vt.T / s) / scale[:, None]
         rest = target - u @ (u.T @ target)
-        own = np.einsum("kj,kj->j", vt, vt) > ESTIMABLE
+        own = np.einsum("kj,kj->j", vt, vt) > self.fit.study.criteria.estimable
         return inverse @ (u.T @ target), inverse @ inverse.T, own, float(rest @ rest), target.size - int(kept.sum())
 
     def predicted(self, changes: Sequence[Change]) -> Array:
-        """Parameters (b,) of the baseline after these changes; terms that it lacks follow by :meth:`completed`."""
+        """Parameters (b,) of the baseline after these changes; terms that it lacks follow by `with_unknown`."""
         values = self.solved(changes)[0]
         stack = np.column_stack([self.absorbed, *(c.directions for c in changes)])
-        return self.completed(self.theta0 + stack @ values)
+        return self.with_unknown(self.theta0 + stack @ values)
 
-    def completed(self, known: Array) -> Array:
+    def with_unknown(self, known: Array) -> Array:
         """All parameters of the fit (b,) given those of the baseline: the others by conditional mean."""
         theta = self.fit.theta.copy()
         free = np.setdiff1d(np.arange(theta.size), self.known)
@@ -113,7 +110,7 @@ class Comparison:
         return theta
 
 
-def compared(fit: Fit, baseline: IdentificationDocument) -> Comparison:
+def with_baseline(fit: IvFit, baseline: IdentificationDocument) -> BaselineComparison:
     """Comparison of a fit with a baseline.
 
     ``fit``: fit of the present recording; ``baseline``: document of an earlier identification. Raises DataError if the
@@ -142,10 +139,10 @@ def compared(fit: Fit, baseline: IdentificationDocument) -> Comparison:
         through = cross[np.ix_(known, free)] * scale[free]
         absorbed = np.linalg.solve(cross[np.ix_(known, known)], through) / scale[known, None]
     covariance = fit.covariance[np.ix_(known, known)] + covariance0
-    return Comparison(fit, known, theta0, covariance0, covariance, absorbed)
+    return BaselineComparison(fit, known, theta0, covariance0, covariance, absorbed)
 
 
-def cautious(fit: Fit) -> Fit:
+def conservative_fit(fit: IvFit) -> IvFit:
     """Fit with conservative noise models: they include the part absorbed by the parameters, and their own uncertainty.
 
     A search compares candidates in one recording, and needs neither; two recordings are compared by covariances.

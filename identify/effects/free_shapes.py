@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from armident.identify.effects.effect import POSITION, Effect, Linear, Place, Shape, Trials
+from armident.identify.effects.effect import POSITION, VELOCITY, Effect, Linear, Place, Shape, Trials
 from armident.identify.robot.motion import Motion
 
 Array = NDArray[np.float64]
@@ -39,17 +39,30 @@ def table(x: Array, low: float, high: float) -> Array:
     return hats(x, np.linspace(low, high, KNOTS))[:, 1:]
 
 
-def values(prefix: str, unit: tuple[str, str]) -> tuple[Linear, ...]:
+def values(prefix: str, unit: tuple[str, str], curve: str) -> tuple[Linear, ...]:
     """Return the linear parameters of a table: its values at the knots after the first one.
 
     ``prefix``: beginning of their names; ``unit``: units at a revolute and at a prismatic joint.
     """
-    return tuple(Linear(f"{prefix}{k}", unit) for k in range(1, KNOTS))
+    quantity, variable = curve.split(" over ")
+    return tuple(
+        Linear(
+            f"{prefix}{k}", unit, f"Change of the {quantity} from knot 0 to knot {k} of {KNOTS - 1} over {variable}."
+        )
+        for k in range(1, KNOTS)
+    )
 
 
 def ends(unit: tuple[str, str]) -> tuple[Shape, ...]:
     """Return the nonlinear parameters of a table, its first and last knot, of a unit."""
-    return tuple(Shape(name, unit, continuous=(False, False)) for name in ("low", "high"))
+    return tuple(
+        Shape(name, unit, f"{end} knot.", continuous=(False, False))
+        for name, end in (("low", "First"), ("high", "Last"))
+    )
+
+
+TOP_SPEED = (Shape("top", VELOCITY, "Highest speed of the joint in the recordings.", continuous=(False, False)),)
+"""Nonlinear parameter of a table over the speed."""
 
 
 class FreeShape(Effect):

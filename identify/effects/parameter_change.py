@@ -46,10 +46,13 @@ class FrictionChange(ParameterChange):
 
     name = "friction_change"
     title = "a change of friction"
-    says = "viscous or Coulomb friction of a joint differs from the baseline: cold or aged grease, a worn gear"
+    description = "viscous or Coulomb friction of a joint differs from the baseline: cold or aged grease, a worn gear"
     reference = "Bittencourt, Gunnarsson 2012, J. Dyn. Sys. Meas. Control 134(5)"
-    needs = "a baseline identified before the change"
-    linear = (Linear("fvx", VISCOUS), Linear("fcx", TORQUE))
+    required_motion = "a baseline identified before the change"
+    linear = (
+        Linear("fvx", VISCOUS, "Change of the viscous friction since the baseline."),
+        Linear("fcx", TORQUE, "Change of the Coulomb friction since the baseline."),
+    )
 
     def parameters(self, place: Place, n: int) -> list[str]:
         """Return those of the joint."""

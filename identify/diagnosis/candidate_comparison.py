@@ -9,13 +9,13 @@ import numpy as np
 from armident.configs.schema.robot import Effect as Entry
 from armident.identify.diagnosis.candidates import Candidate, Key, Shapes
 from armident.identify.diagnosis.model_state import ModelState, acted_on
-from armident.identify.diagnosis.precision import p_value
+from armident.identify.diagnosis.precision import p_value_of_effect
 from armident.identify.effects.unnamed import NAME as UNNAMED
 from armident.identify.regression.ar_noise import ArModel
 
 
 @dataclass(frozen=True, eq=False)
-class Made:
+class FittedCandidate:
     """A candidate in the model, before it is compared with others.
 
     ``candidate``, ``shapes``: the effect with its place, and its nonlinear parameters; ``entry``: entry of the effect
@@ -36,8 +36,6 @@ class Addition:
 
     Parameters
     ----------
-    made
-        The candidate in the model.
     state
         Model with the effect, estimated with the weights of the step.
     gain
@@ -52,7 +50,7 @@ class Addition:
         Change of that joint's torque, percent of the root mean square of its torque.
     """
 
-    made: Made
+    fitted: FittedCandidate
     state: ModelState
     gain: float
     raw_gain: float
@@ -63,27 +61,27 @@ class Addition:
     @property
     def candidate(self) -> Candidate:
         """The effect with its place."""
-        return self.made.candidate
+        return self.fitted.candidate
 
     @property
     def shapes(self) -> Shapes:
         """Nonlinear parameters of the effect."""
-        return self.made.shapes
+        return self.fitted.shapes
 
     @property
     def entry(self) -> Entry:
         """Entry of the effect in the configuration."""
-        return self.made.entry
+        return self.fitted.entry
 
     @property
     def allowed(self) -> bool:
         """False if a linear parameter has a sign or a size that physics does not allow."""
-        return self.made.allowed
+        return self.fitted.allowed
 
     @cached_property
     def p_value(self) -> float:
         """Probability of its parameters if it is not there, by their own standard deviations."""
-        return p_value(self.state, self.entry)
+        return p_value_of_effect(self.state, self.entry)
 
     @property
     def named(self) -> bool:
@@ -99,7 +97,7 @@ class Addition:
 
 
 @dataclass(frozen=True, eq=False)
-class Step:
+class SelectionStep:
     """Candidates that were added to one model, highest log-likelihood first.
 
     Parameters
@@ -132,7 +130,9 @@ class Step:
         )
 
 
-def compared(state: ModelState, made: Sequence[Made], tests: int, passes: Callable[[Addition, int], bool]) -> Step:
+def compared_candidates(
+    state: ModelState, made: Sequence[FittedCandidate], tests: int, passes: Callable[[Addition, int], bool]
+) -> SelectionStep:
     """Compare models with candidates, all estimated and scored under the same noise models.
 
     They are those of the most likely model that physics allows, each under noise models of its own residual without
@@ -146,7 +146,7 @@ def compared(state: ModelState, made: Sequence[Made], tests: int, passes: Callab
     noise = _noise_of_best([state, *(m.state for m in made if m.allowed)])
     alike = state.under(noise)
     ranked = tuple(sorted((_compared(alike, m, noise) for m in made), key=lambda a: -a.log_likelihood))
-    return Step(alike, noise, ranked, tuple(a for a in ranked if passes(a, tests)), tests)
+    return SelectionStep(alike, noise, ranked, tuple(a for a in ranked if passes(a, tests)), tests)
 
 
 def advantage(one: ModelState, other: ModelState) -> float:
@@ -161,7 +161,7 @@ def _noise_of_best(models: Sequence[ModelState]) -> tuple[ArModel, ...]:
     return max(models, key=lambda one: one.score.log_likelihood_under(one.weights)).weights
 
 
-def _compared(state: ModelState, made: Made, noise: tuple[ArModel, ...]) -> Addition:
+def _compared(state: ModelState, made: FittedCandidate, noise: tuple[ArModel, ...]) -> Addition:
     """Comparison of a model with an effect with the one without it."""
     with_it = made.state.under(noise)
     share, changed = materiality(state, with_it)
