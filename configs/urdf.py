@@ -183,7 +183,7 @@ def _additions(
 ) -> dict[str, JointGiven]:
     """Additions of the configuration by name of the joint; joints are found by either of their names.
 
-    Raises ConfigError if the chain has no such joint, or a joint is there twice.
+    Raises ConfigError if the chain has no such joint, or a joint is a duplicate.
     """
     known = {joint_name(name).lower(): name for name in names}
     known |= {joint.name: name for joint, name in zip(joints, names, strict=True)}
@@ -194,7 +194,7 @@ def _additions(
             listed = ", ".join(joint.name for joint in joints)
             raise ConfigError(f"{where}: joints[{k}].name: the chain has no joint {more.name!r}; it has {listed}")
         if found in extra:
-            raise ConfigError(f"{where}: joints[{k}].name: {more.name!r} is there twice")
+            raise ConfigError(f"{where}: joints[{k}].name: duplicate joint {more.name!r}")
         extra[found] = more
     return extra
 

@@ -37,7 +37,7 @@ class _Loader(yaml.SafeLoader):
         for key, _ in node.value:
             name = (key.tag, key.value) if isinstance(key, yaml.ScalarNode) else None
             if name is not None and name in seen:
-                problem = f"the key {key.value[:80]!r} is there twice"
+                problem = f"duplicate key {key.value[:80]!r}"
                 raise yaml.composer.ComposerError(None, None, problem, key.start_mark)
             seen.add(name)
         return node

@@ -27,9 +27,9 @@ from armident.configs.blanks import listed, needed, pattern
 from armident.configs.loading import is_session
 from armident.configs.schema.session import Bus
 from armident.daq.capture.clock import clock_state
-from armident.daq.capture.files import chunk_duration_ns
+from armident.daq.capture.recording_files import chunk_duration_ns
 from armident.daq.matching.streams import captured_streams, unknown_phase
-from armident.daq.streaming.session import configuration, endpoints, unreadable_files
+from armident.daq.streaming.zenoh_session import configuration, endpoints, unreadable_files
 from armident.drivers.can.socketcan import RECEIVE_BUFFER, RawSocket
 from armident.drivers.can.timestamps import has_hardware_timestamps
 from armident.drivers.canopen.bus_load import check_fits
@@ -183,7 +183,7 @@ def _interface(bus: Bus) -> Iterator[Check]:
         timing = details.get(key)
         actual = timing.get("bitrate") if isinstance(timing, dict) else None
         if wanted is not None and actual is not None and actual != wanted:
-            yield Check("bus", "failed", f"{name} runs at {actual} bit/s ({key}), the configuration says {wanted}")
+            yield Check("bus", "failed", f"{name} runs at {actual} bit/s ({key}), the configuration has {wanted}")
             return
     state = details.get("state")
     if state not in (None, "ERROR-ACTIVE"):

@@ -1,14 +1,16 @@
 """Commands ``identify``, ``check``, ``diagnose``, ``predict`` and ``compare``: read, compute, write, print."""
 
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from armident.configs import ConfigError, DataError
+from armident.identify.diagnosis.diagnosis_options import DiagnosisOptions
 from armident.identify.documents.files import to_json, write_atomically
-from armident.identify.identification.options import Options, parse_decimation, parse_nvr
+from armident.identify.identification.options import Options
 
 if TYPE_CHECKING:
     from armident.identify.api.result import Result
@@ -22,23 +24,13 @@ FOUND = 4
 """Exit code: done, with findings, a change, or an unexplained residual."""
 
 
-def identify_command(
-    path: Path, config: Path | None, chosen: Mapping[str, Any], out: Path | None, *, as_json: bool
-) -> int:
-    """Carry out ``armident identify``.
-
-    ``config``: robot configuration; ``None``: that of the recording. ``chosen``: options of
-    `armident.identify.api.identify` as the user wrote them. ``out``: folder of the results; ``None``: beside the
-    recording. ``as_json``: print the document on stdout instead of a table. Returns the exit code: `UNUSABLE` if the
-    verdict says so, otherwise 0. Raises ConfigError or DataError if an option or a file is wrong, or the recording
-    cannot be identified.
-    """
+def identify_command(path: Path, config: Path | None, options: Options, out: Path | None, *, as_json: bool) -> int:
+    """Carry out ``armident identify``; the exit code is `UNUSABLE` if the verdict says so, otherwise 0."""
     from armident.identify.api import identify
     from armident.identify.cli_tables import identification_table, progress, verdict_lines, warn
 
-    as_written = {"nvr": parse_nvr(chosen.get("nvr")), "decimation": parse_decimation(chosen.get("decimation"))}
     with progress(f"identify {path.name}") as report:
-        result = identify(path, config, options=Options(**{**chosen, **as_written}), progress=report)
+        result = identify(path, config, options=options, progress=report)
     document, html = _saved(result, out or _beside(path, "identification"))
     if as_json:
         sys.stdout.write(result.to_json())
@@ -71,39 +63,17 @@ def diagnose_command(
     config: Path | None,
     validate: Path | None,
     baseline: Path | None,
-    chosen: Mapping[str, Any],
+    options: DiagnosisOptions,
     out: Path | None,
     *,
     as_json: bool,
 ) -> int:
-    """Carry out ``armident diagnose``.
-
-    Returns the exit code: 0 if the verdict is ``no_gap``, otherwise `FOUND`. Raises ConfigError or DataError if an
-    option or a file is wrong, or the recordings cannot support a diagnosis.
-
-    Parameters
-    ----------
-    paths
-        Recordings to fit.
-    config
-        Robot configuration; ``None``: that of the first recording.
-    validate
-        Held-out recording; ``None``: the last part of the data.
-    baseline
-        Identification whose parameters are tested for change.
-    chosen
-        ``false_alarm_rate``, ``material`` and ``time_limit_s``, as `armident.identify.api.diagnose` takes them; those
-        left out have its defaults.
-    out
-        Folder of the results; ``None``: beside the first recording.
-    as_json
-        Print the document on stdout instead of a table.
-    """
+    """Carry out ``armident diagnose``; the exit code is 0 if the verdict is ``no_gap``, otherwise `FOUND`."""
     from armident.identify.api import diagnose
     from armident.identify.cli_tables import diagnosis_table, progress, warn
 
     with progress("diagnose") as report:
-        found = diagnose(list(paths), config, validate=validate, baseline=baseline, progress=report, **chosen)
+        found = diagnose(list(paths), config, validate=validate, baseline=baseline, progress=report, **asdict(options))
     written, html, *model = _saved(found, out or _beside(paths[0], "diagnosis"))
     document = found.document
     if as_json:

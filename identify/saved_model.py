@@ -11,7 +11,7 @@ from armident.identify.documents.diagnosis import DiagnosisDocument
 from armident.identify.documents.files import load_document, read_json
 from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.effects.terms import arm_model
-from armident.identify.identification.api import identify_recording
+from armident.identify.identification.identify_recording import identify_recording
 from armident.identify.identification.options import Options
 from armident.identify.identification.sign_smoothing import with_numbers
 from armident.identify.robot_model import RobotModel

@@ -13,7 +13,12 @@ from pathlib import Path
 
 from armident.configs import ArmidentError, SessionConfig
 from armident.configs.schema.session import Bus
-from armident.daq.capture.files import (
+from armident.daq.capture.host_metadata import host_metadata
+from armident.daq.capture.journal import JournalHandler
+from armident.daq.capture.plan import CapturePlan, load_plan
+from armident.daq.capture.publisher import Publisher
+from armident.daq.capture.recorder import Outputs, Recorder
+from armident.daq.capture.recording_files import (
     RecordingRetention,
     capture_stamp,
     chunk_duration_ns,
@@ -22,11 +27,6 @@ from armident.daq.capture.files import (
     next_time,
     open_series,
 )
-from armident.daq.capture.host_metadata import host_metadata
-from armident.daq.capture.journal import JournalHandler
-from armident.daq.capture.plan import CapturePlan, load_plan
-from armident.daq.capture.publisher import Publisher
-from armident.daq.capture.recorder import Outputs, Recorder
 from armident.daq.capture.reload import Change, Reloader
 from armident.daq.capture.sink import Sink
 from armident.daq.logs import log_to

@@ -14,7 +14,7 @@ import zenoh.ext
 from armident.configs import ConfigError, SessionConfig
 from armident.daq.capture.remote_commands import Commands
 from armident.daq.streaming import Block, Keys, encode_block, open_session
-from armident.daq.streaming.session import configuration
+from armident.daq.streaming.zenoh_session import configuration
 
 _EVENTS_KEPT = 64
 """Events that late subscribers can query."""

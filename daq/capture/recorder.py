@@ -18,7 +18,7 @@ from armident.daq.capture.jitter import SyncJitter, worst
 from armident.daq.capture.plan import CapturePlan
 from armident.daq.capture.publisher import Publisher
 from armident.daq.capture.remote_commands import Command
-from armident.daq.capture.setpoints import SetpointSchedule, StandstillDetector, plan_setpoints
+from armident.daq.capture.setpoint_source import SetpointSchedule, StandstillDetector, plan_setpoints
 from armident.daq.capture.sink import Sink
 from armident.daq.matching.assembler import LATE_S, Assembler
 from armident.drivers.can.frames import BusDown

@@ -8,14 +8,14 @@ from numba import njit
 from armident.configs import ConfigError, RobotConfig, SessionConfig
 from armident.configs.schema.session import Stream
 from armident.configs.units import counts_per_si
-from armident.daq.guard.limits import (
+from armident.daq.guard.motion_limits import (
     HEARTBEAT_MARGIN_S,
     HEARTBEATS_MISSED,
     TORQUE_PEAK,
     TORQUE_S,
     TORQUE_SAMPLES,
     VELOCITY_S,
-    Limits,
+    MotionLimits,
 )
 from armident.daq.matching.streams import bus_numbers, node_ids
 from armident.drivers.can.frames import Frames
@@ -68,7 +68,7 @@ class MotionMonitor:
     limits of the joints. Raises ConfigError if the session plays no set points, or its streams carry no position.
     """
 
-    def __init__(self, session: SessionConfig, robot: RobotConfig, limits: Limits) -> None:
+    def __init__(self, session: SessionConfig, robot: RobotConfig, limits: MotionLimits) -> None:
         if session.setpoints is None:
             raise ConfigError("setpoints: missing, so the arm does not move; the guard needs a session with set points")
         self._robot, self._limits, n = robot, limits, robot.n
@@ -221,7 +221,7 @@ def check_limits(  # type: ignore[no-untyped-def]
     velocity_s
         Time between the oldest and the newest of ``positions``, s.
     low, high, velocity, torque, following
-        Limits of the joints, as in `armident.daq.guard.limits.Limits`, shape (n,) each.
+        Limits of the joints, as in `armident.daq.guard.motion_limits.Limits`, shape (n,) each.
     state
         State of the monitor, int64, shape (3,); its element ``JOINT`` is set on an alarm.
     value

@@ -5,8 +5,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from armident.daq.init.command import InitOptions
 from armident.daq.init.geometry import URDF_SUFFIXES, identifier
+from armident.daq.init.initialize import InitOptions
+from armident.daq.interchange.readers import names_of_formats
 
 Ask = Callable[[str, str], str]
 """Function that shows a question with its default and returns the answer."""
@@ -28,7 +29,7 @@ def questionnaire(options: InitOptions, ask: Ask, tell: Callable[[str], None]) -
     tell("Enter takes the value in brackets. What you do not know stays a blank that is listed at the end.")
     source = ask("URDF, table of DH parameters, or robot of the library (ur5e, panda, ...); empty: none", "")
     options = replace(options, **_source(source, ask))
-    recording = ask("Recording of the arm (CSV, MAT, NPZ, Parquet, bag); empty: none", "")
+    recording = ask(f"Recording of the arm ({names_of_formats()}); empty: none", "")
     changes: dict[str, Any] = {"recording": Path(recording) if recording else None}
     if not recording:
         question = "Effort that the drives report: torque, current or voltage"

@@ -25,16 +25,17 @@ from mcap.records import Channel, Chunk, McapRecord, Message, Schema
 from mcap.stream_reader import breakup_chunk
 
 from armident.configs import ConfigError, DataError
+from armident.daq.interchange.readers import RosBag
 from armident.daq.interchange.text_files import listed as listed_names
 from armident.daq.interchange.text_files import shortened
 from armident.daq.recording.mcap_records import MAGIC, RECORD_HEAD, records
 
-SUFFIXES = (".mcap", ".db3", ".mcap.zstd", ".db3.zstd")
-"""Suffixes of the files of a bag."""
 METADATA = "metadata.yaml"
 """File of a bag folder that lists the other files."""
 ROS_1 = ".bag"
 """Suffix of the bags of ROS 1, which are refused with the command that converts them."""
+SUFFIXES = tuple(suffix for suffix in RosBag.suffixes if suffix != ROS_1)
+"""Suffixes of the files of a bag."""
 
 _CDR = "cdr"
 _NUMBER_AT_END = re.compile(r"[-_.]?\d+$")
@@ -58,11 +59,6 @@ class BagMessage(NamedTuple):
     topic: str
     logged_ns: int
     data: bytes
-
-
-def is_bag(path: Path) -> bool:
-    """Return True if a path has the name of a bag file, one of ROS 1 included, or is a folder."""
-    return path.name.lower().endswith((*SUFFIXES, ROS_1)) or path.is_dir()
 
 
 def bag_files(path: Path) -> tuple[list[Path], list[str]]:
@@ -141,7 +137,7 @@ class BagReader:
     def __iter__(self) -> Iterator[BagMessage]:
         """Yield the messages in CDR of the type, of every topic."""
         files, absent = bag_files(self._path)
-        self.losses += [f"{name}, which {METADATA} lists, is not there" for name in absent]
+        self.losses += [f"{name}, which {METADATA} lists, is missing" for name in absent]
         unusable: list[DataError] = []
         for file in files:
             try:
@@ -178,14 +174,14 @@ class BagReader:
                 raise DataError(f"{file}: {error}") from error
 
     def _decompress(self, file: Path, inner: Path, where: str) -> None:
-        """Write the content of a compressed file, as far as it is whole."""
+        """Write the content of a compressed file, up to the first damaged block."""
         with file.open("rb") as packed, inner.open("wb") as plain:
             try:
                 zstandard.ZstdDecompressor().copy_stream(packed, plain)
             except zstandard.ZstdError:
                 self.losses.append(f"{where}the compressed file is damaged after {plain.tell()} bytes of its content")
             if plain.tell() == 0:
-                raise DataError(f"{file}: not a whole zstd file")
+                raise DataError(f"{file}: truncated zstd file")
 
     def _mcap(self, file: Path, where: str) -> Iterator[BagMessage]:
         """Yield the messages of the undamaged records of an MCAP file, in file order."""
@@ -247,7 +243,7 @@ class BagReader:
             self.topics[channel.topic] = schema.name + encoded
 
     def _database(self, file: Path, where: str) -> Iterator[BagMessage]:
-        """Yield the messages of a SQLite file, in the order in which they were written, as far as it is whole."""
+        """Yield the messages of a SQLite file in the order of writing, up to the first damaged page."""
         try:
             with closing(sqlite3.connect(f"file:{quote(str(file.resolve()))}?mode=ro", uri=True)) as database:
                 # Without it, SQLite refuses to read a truncated database at all.

@@ -329,7 +329,7 @@ def _slow(path: Path, encoding: str, head: _Head) -> CsvTable:
     if commas:
         notes.append(f"decimal commas are read as decimal points ({commas} lines)")
     if repeated:
-        notes.append(f"header repeated and passed over: {repeated} times")
+        notes.append(f"repeated header ignored: {repeated} times")
     return CsvTable(head.header, head.units, values, np.array(numbers), tuple(notes))
 
 

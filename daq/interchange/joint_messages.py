@@ -97,7 +97,7 @@ class TopicMessages:
                 self._refuse(f"has {len(values)} {what} of {len(names)} joints")
                 return
         if len(set(names)) < len(names):
-            self._refuse(f"has a joint twice: {listed(names)}")
+            self._refuse(f"has a duplicate joint: {listed(names)}")
             return
         if not (len(q) or len(tau)):
             self._refuse("has neither positions nor efforts")

@@ -50,7 +50,7 @@ def match_joints(
     """
     twice = sorted({name for name in found if list(found).count(name) > 1})
     if twice:
-        raise DataError(f"joint name {', '.join(twice)} is there twice: {listed(found)}")
+        raise DataError(f"duplicate joint name {', '.join(twice)}: {listed(found)}")
     if joints is not None:
         return _as_chosen(found, wanted, joints)
     if by_position:

@@ -10,10 +10,12 @@ from numpy.typing import NDArray
 
 from armident.configs import DataError, RobotConfig
 from armident.daq.interchange.bag_files import BagReader
+from armident.daq.interchange.clocks import FASTEST_HZ, SLOWEST_HZ
+from armident.daq.interchange.import_options import ImportOptions
 from armident.daq.interchange.joint_messages import DEFINITION, MESSAGE_TYPE, MessageTable, TopicMessages
 from armident.daq.interchange.joint_names import JointMatch, match_joints
+from armident.daq.interchange.table_files import Source
 from armident.daq.interchange.text_files import listed, printable, shortened
-from armident.daq.interchange.time_stamps import FASTEST_HZ, SLOWEST_HZ
 
 TOPIC = "/joint_states"
 _NS = 1_000_000_000
@@ -87,6 +89,14 @@ def read_joint_states(
     return JointStates(t_ns, q, tau, (*match.remarks, *remarks, *passed, *chosen.remarks(), *reader.losses))
 
 
+def joint_state_table(path: Path, robot: RobotConfig, options: ImportOptions) -> Source:
+    """Return the joint states of a bag as a table, with its stamps."""
+    chosen = {name: options.get(name) for name in ("topic", "joints", "by_position") if options.get(name)}
+    states = read_joint_states(path, robot, **chosen)  # type: ignore[arg-type]
+    times = (states.t_ns - states.t_ns[0]) / 1e9
+    return Source(path, {"t": times, "q": states.q, "tau": states.tau}, notes=states.remarks, t_ns=states.t_ns)
+
+
 def _choose(
     reader: BagReader,
     found: dict[str, TopicMessages],
@@ -139,7 +149,7 @@ def _samples(
     if others:
         names = dict.fromkeys(name for table in others for name in table.names)
         count = sum(table.number.size for table in others)
-        remarks.append(f"{count} messages of other joints passed over: {', '.join(names)}")
+        remarks.append(f"{count} messages of other joints ignored: {', '.join(names)}")
     for what, given in (("positions", [t.q for t in ours]), ("efforts", [t.tau for t in ours])):
         if all(values is None for values in given):
             raise DataError(f"the messages on {messages.topic} have no {what} of {', '.join(match.names)}")
@@ -152,7 +162,7 @@ def _samples(
     for table, t in zip(ours, times, strict=True):
         repeated += _fill(values, known, np.searchsorted(stamps, t), table, match.names, messages.topic)
     if repeated:
-        remarks.append(f"{repeated} messages on {messages.topic} repeat the one before, and are passed over")
+        remarks.append(f"{repeated} messages on {messages.topic} repeat the one before: ignored")
     whole = known.all(axis=(0, 2))
     if not whole.any():
         raise DataError(

@@ -29,7 +29,7 @@ _UNEXPLAINED_SHARE = 0.5
 """Largest share of the power of a joint's motion that its demand may leave unexplained."""
 
 
-def unit_of(quantity: str, robot: RobotConfig) -> str:
+def si_unit_of(quantity: str, robot: RobotConfig) -> str:
     """Return the SI unit of a quantity of a robot's joints.
 
     ``quantity``: ``position``, ``demand``, ``torque``, ``current`` or ``voltage``; ``robot``: for the types of its
@@ -109,7 +109,7 @@ def fast_note(robot: RobotConfig, position: NDArray[np.float64], rate_hz: float)
         return ()
     most = float((speeds / limits).max())
     return (
-        f"{', '.join(fast)}: velocities of up to {most:.3g} times the limit, as of positions in degrees "
+        f"{', '.join(fast)}: velocities of up to {most:.3g} times the limit; check for positions in degrees "
         "(--units position=deg), times in another unit (--time-unit), or two sources of one joint",
     )
 

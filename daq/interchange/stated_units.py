@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from armident.configs import ConfigError, RobotConfig
 from armident.daq.interchange.column_units import SCALES
-from armident.daq.interchange.table_rows import Rows
+from armident.daq.interchange.table_rows import TableRows
 from armident.daq.recording.model import Quantity
 
 CHOICES: Mapping[str, tuple[str, ...]] = {
@@ -32,7 +32,7 @@ SUSPICIOUS = 3.0
 Floats = NDArray[np.float64]
 
 
-def in_si(rows: Rows, robot: RobotConfig, units: Mapping[str, str]) -> Rows:
+def in_si(rows: TableRows, robot: RobotConfig, units: Mapping[str, str]) -> TableRows:
     """Rows in SI units.
 
     ``rows``: rows of a table in the units of the file. ``robot``: for the types of its joints: ``deg`` is that of
@@ -70,7 +70,7 @@ def _factors(robot: RobotConfig, unit: str) -> Floats:
     return factors
 
 
-def suspected(rows: Rows, robot: RobotConfig) -> dict[str, str]:
+def suspected(rows: TableRows, robot: RobotConfig) -> dict[str, str]:
     """Units by magnitude: those in which values beyond the limits of the joints are within them.
 
     ``rows``: rows in the units of the file. ``robot``: the robot with its limits; joints without limits do not tell a

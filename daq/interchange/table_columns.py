@@ -43,7 +43,7 @@ Table = Mapping[str, NDArray[np.float64]]
 
 
 @dataclass(frozen=True)
-class Columns:
+class TableColumns:
     """Values of one quantity.
 
     ``values`` (N, n). ``labels``: name of each column in the file. ``notes``: sentences on what was assumed.
@@ -113,7 +113,7 @@ def find_columns(
     *,
     by_position: bool = False,
     joints: Sequence[str] | None = None,
-) -> Columns | None:
+) -> TableColumns | None:
     """Return the columns of a quantity in the robot's order, or ``None`` if there are none.
 
     ``table``: columns (N,), or arrays (N, n), by name; ``quantity``: a key of `NAMES`; ``robot``: for number and names
@@ -146,7 +146,7 @@ def unused_demand(table: Table) -> str:
     )
 
 
-def _demand(table: Table, robot: RobotConfig, by_position: bool, joints: Sequence[str] | None) -> Columns | None:
+def _demand(table: Table, robot: RobotConfig, by_position: bool, joints: Sequence[str] | None) -> TableColumns | None:
     """Return the positions with a word for a demand in their names, such as ``q1_ref``, ``reference1``, ``elbow_cmd``.
 
     Names alone decide here, so that columns which do not fit the joints are no error (`unused_demand`).
@@ -171,17 +171,17 @@ def _demand(table: Table, robot: RobotConfig, by_position: bool, joints: Sequenc
         columns = [rest for rest, values in positions.items() if values.ndim == 1]
         if found is None and columns:
             match = match_joints(columns, robot.joints, joints=joints)
-            found = Columns(np.stack([positions[one] for one in match.names], axis=1), match.names, match.remarks)
+            found = TableColumns(np.stack([positions[one] for one in match.names], axis=1), match.names, match.remarks)
     except (DataError, ValueError):
         return None
     if found is None:
         return None
     labels = tuple(origin.get(label, label) for label in found.labels)
     notes = [*found.notes] + ([f"demand taken from {listed(labels)}, not from {listed(twice)}"] if twice else [])
-    return Columns(found.values, labels, tuple(notes))
+    return TableColumns(found.values, labels, tuple(notes))
 
 
-def _numbered(table: Table, base: str, n: int) -> Columns | None:
+def _numbered(table: Table, base: str, n: int) -> TableColumns | None:
     """Return an array of a name, or the columns ``base1..basen`` or ``base0..base(n-1)``."""
     found = list(table)
     lower = {each.lower(): each for each in reversed(found)}
@@ -190,7 +190,7 @@ def _numbered(table: Table, base: str, n: int) -> Columns | None:
         values = whole[:, None] if whole.ndim == 1 else whole
         if values.ndim != 2 or values.shape[1] != n:
             raise DataError(f"{base} has {values.shape[-1]} axes, the robot has {n}; found {listed(found)}")
-        return Columns(values, (base,) * n if whole.ndim == 1 else tuple(f"{base}{j + 1}" for j in range(n)))
+        return TableColumns(values, (base,) * n if whole.ndim == 1 else tuple(f"{base}{j + 1}" for j in range(n)))
     numbers = {}
     for key, each in lower.items():
         digits = re.fullmatch(re.escape(base.lower()) + r"[_.\[( ]?(\d{1,2})[\])]?", key)
@@ -208,7 +208,7 @@ def _numbered(table: Table, base: str, n: int) -> Columns | None:
     if any(table[label].ndim != 1 for label in labels):
         raise DataError(f"{labels[0]} has {table[labels[0]].ndim} dimensions, expected a column")
     note = (f"columns are counted from 0: {labels[0]} is {_FIRST}",) if first == 0 else ()
-    return Columns(_side_by_side(table, labels), tuple(labels), note)
+    return TableColumns(_side_by_side(table, labels), tuple(labels), note)
 
 
 _FIRST = "the first joint"
@@ -216,7 +216,7 @@ _FIRST = "the first joint"
 
 def _by_joint(
     table: Table, quantity: str, robot: RobotConfig, by_position: bool, joints: Sequence[str] | None
-) -> Columns | None:
+) -> TableColumns | None:
     """Return the columns that are named after joints and quantity, such as ``/joint_states/elbow/position``."""
     of_joint: dict[str, str] = {}
     for name, values in table.items():
@@ -232,7 +232,7 @@ def _by_joint(
                   for rest, name in of_joint.items()}  # fmt: skip
     match = match_joints(list(chosen), robot.joints, by_position=by_position, joints=joints)
     labels = tuple(chosen[each] for each in match.names)
-    return Columns(_side_by_side(table, labels), labels, match.remarks, match.names)
+    return TableColumns(_side_by_side(table, labels), labels, match.remarks, match.names)
 
 
 def _joint_of(name: str, quantity: str) -> str | None:

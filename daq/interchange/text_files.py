@@ -4,8 +4,6 @@ import codecs
 from collections.abc import Sequence
 from pathlib import Path
 
-from armident.configs import ConfigError
-
 _HEAD = 65536
 """Bytes at the beginning of a file that decide its encoding."""
 _ZEROS_OF_UTF16 = 0.9
@@ -56,15 +54,3 @@ def listed(names: Sequence[str]) -> str:
     """Return names for a message. ``names``: any number of names; the first ones are listed."""
     more = f" and {len(names) - _LISTED} more" if len(names) > _LISTED else ""
     return ", ".join(map(shortened, names[:_LISTED])) + more
-
-
-def pairs_of(option: str, text: str) -> dict[str, str]:
-    """Return the pairs of an option, ``QUANTITY=NAME,...``.
-
-    ``option``: name of the option, for the message. Raises ConfigError if a pair is incomplete.
-    """
-    pairs = [pair.partition("=") for pair in text.split(",") if pair]
-    for key, equals, value in pairs:
-        if not (key and equals and value):
-            raise ConfigError(f"{option}: expected QUANTITY=NAME,..., found {key + equals + value!r}")
-    return {key: value for key, _, value in pairs}

@@ -161,7 +161,7 @@ class StreamLayout:
                     raise DataError(f"a stream layout with {what} {value!r:.60}; expected {', '.join(known)}")
         names = [f.name for f in fields]
         if len(set(names)) < len(names) or len(set(layout.joints)) < len(layout.joints):
-            raise DataError("a stream layout that names a field or a joint twice")
+            raise DataError("a stream layout that names a duplicate field or joint")
         if type(layout.every) is not int or layout.every < 1 or not fields or not layout.joints:
             raise DataError("a stream layout without fields, joints or interval")
         return layout

@@ -13,6 +13,7 @@ from mcap.records import ChunkIndex, Metadata, MetadataIndex
 
 from armident.configs import ArmidentError, ConfigError, DataError
 from armident.daq.recording import mcap_records as mcap
+from armident.daq.recording.mcap_summary import Summary
 from armident.daq.recording.names import COUNTERS, RECORDING, RECOVERED
 from armident.daq.recording.reader import recovered_words
 from armident.daq.recording.scan import (
@@ -23,7 +24,6 @@ from armident.daq.recording.scan import (
     RecordingScan,
     RecordItem,
 )
-from armident.daq.recording.summary import Summary
 from armident.daq.recording.writer import checksum_record
 
 _COPY = 1 << 24

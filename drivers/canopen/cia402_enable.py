@@ -27,7 +27,7 @@ LADDER = (DriveState.SWITCH_ON_DISABLED, DriveState.READY, DriveState.SWITCHED_O
 """States on the way to operation enabled, in order; some drives pass several of them at one command."""
 
 
-def read_state(sdo: DriveSdo) -> DriveState | None:
+def read_drive_state(sdo: DriveSdo) -> DriveState | None:
     """State of the drive from its statusword (6041h); ``None`` for a pattern that CiA 402 does not define."""
     return od.drive_state(sdo.read(od.STATUSWORD, 0, "H"))
 
@@ -48,7 +48,7 @@ def enable_drive(sdo: DriveSdo) -> None:
 
     Raises ArmidentError if the drive stays in another state; names the state.
     """
-    state = read_state(sdo)
+    state = read_drive_state(sdo)
     while state != DriveState.ENABLED:
         if state not in TO_ENABLED:
             state = _await_state(sdo, DriveState.ENABLED, *TO_ENABLED)
@@ -63,7 +63,7 @@ def enable_drive(sdo: DriveSdo) -> None:
 
 def _await_state(sdo: DriveSdo, *wanted: DriveState) -> DriveState:
     deadline = time.monotonic() + ENABLE_TIMEOUT
-    while (state := read_state(sdo)) not in wanted:
+    while (state := read_drive_state(sdo)) not in wanted:
         if time.monotonic() > deadline:
             raise ArmidentError(
                 f"{sdo.label}: cannot be enabled: stays in state '{state or 'unknown'}'{_fault_cause(sdo)}, "

@@ -32,7 +32,7 @@ def check_drive(sdo: DriveSdo, robot: RobotConfig) -> None:
             sdo.remark(f"has no {what} (1018h:{sub}): it is not checked")
         elif expected and found != expected:
             eds = sdo.drive.eds.name
-            raise ConfigError(f"{sdo.label}: {what} (1018h:{sub}) is {found:X}h, {eds} says {expected:X}h")
+            raise ConfigError(f"{sdo.label}: {what} (1018h:{sub}) is {found:X}h, {eds} has {expected:X}h")
     _check_scales(sdo, robot.name, next(j for j in robot.joints if j.name == sdo.drive.joint))
 
 
@@ -47,7 +47,7 @@ def _check_scales(sdo: DriveSdo, robot: str, joint: Joint) -> None:
         elif not turns or abs(increments / turns - expected) > 0.5:
             raise ConfigError(
                 f"{sdo.label}: encoder has {increments}/{turns} counts per turn (608Fh), "
-                f"robot {robot} says {expected:g}; check drive and robot configuration"
+                f"robot {robot} has {expected:g}; check drive and robot configuration"
             )
     if joint.drive.signal == "current":
         rated = sdo.read_optional(od.RATED_CURRENT, 0, "I")
@@ -55,7 +55,7 @@ def _check_scales(sdo: DriveSdo, robot: str, joint: Joint) -> None:
             sdo.remark(f"has no rated current (6075h): {joint.drive.rated:g} A of {robot} are not checked")
         elif rated != od.rated_milliamperes(joint.drive):
             raise ConfigError(
-                f"{sdo.label}: rated current is {rated} mA (6075h), robot {robot} says "
+                f"{sdo.label}: rated current is {rated} mA (6075h), robot {robot} has "
                 f"{od.rated_milliamperes(joint.drive)} mA; check drive and robot configuration"
             )
 

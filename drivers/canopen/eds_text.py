@@ -117,7 +117,7 @@ def sections_of(text: str, remarks: Remarks) -> dict[str, Section]:
             continue
         word, value = _key(key), _value(value)
         if section.setdefault(word, value) != value:
-            kind = "sections that are there twice and differ" if repeated else "keys that are there twice and differ"
+            kind = "duplicate sections that differ" if repeated else "duplicate keys that differ"
             place = f"[{name}] {word}"
             remarks.add(f"{kind}, the first value counts", place)
     return found

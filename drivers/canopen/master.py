@@ -17,7 +17,7 @@ from armident.configs.schema.robot import RobotConfig
 from armident.configs.schema.session import DriveNode, SessionConfig
 from armident.drivers.can.frames import BusDown
 from armident.drivers.canopen import objects as od
-from armident.drivers.canopen.cia402_enable import POLL_INTERVAL, enable_drive, hold_position, read_state
+from armident.drivers.canopen.cia402_enable import POLL_INTERVAL, enable_drive, hold_position, read_drive_state
 from armident.drivers.canopen.drive_setup import await_mode, check_drive, set_heartbeat, set_sync_counter
 from armident.drivers.canopen.network import NodeNetwork
 from armident.drivers.canopen.node_supervision import NodeSupervision
@@ -192,7 +192,7 @@ class DriveMaster:
 
     def states(self) -> list[DriveState | None]:
         """CiA 402 states from the statuswords over SDO, in the order of the session's drives."""
-        return [read_state(sdo) for sdo in self._drives]
+        return [read_drive_state(sdo) for sdo in self._drives]
 
     def quick_stop(self) -> None:
         """Command a quick stop of every drive that is not lost; raises nothing."""

@@ -166,7 +166,7 @@ class DriveSdo:
         if not (stated == len(data) >= size or (stated is None and len(data) in (size, max(size, _EXPEDITED)))):
             raise ConfigError(
                 f"{self.label}: {_name(index, sub)} has {'more than ' * (len(data) > _LARGEST)}"
-                f"{min(len(data), _LARGEST)} bytes{'' if stated is None else f', says {stated}'}; expected {size}"
+                f"{min(len(data), _LARGEST)} bytes{'' if stated is None else f', states {stated}'}; expected {size}"
             )
         return data[:size]
 

@@ -15,11 +15,13 @@ from armident.identify.api.arguments import Progress, Recorded, Robot, recording
 from armident.identify.api.result import Result
 from armident.identify.documents.files import load_document
 from armident.identify.documents.identification import IdentificationDocument, VerdictReason
-from armident.identify.identification.api import identify_recording
-from armident.identify.identification.options import ControllerName, DerivativesName, Method, Options
-from armident.identify.identification.result import Identification as Estimation
+from armident.identify.estimators.methods import Method
+from armident.identify.identification.identification_result import IdentificationResult
+from armident.identify.identification.identify_recording import identify_recording
+from armident.identify.identification.options import ControllerName, Options
 from armident.identify.robot_model import IN_MEMORY, RobotModel
 from armident.identify.saved_model import model_of, used_configuration
+from armident.identify.signals.choices import DerivativesName
 from armident.identify.tables import ParameterTable, Table
 
 Array = NDArray[np.float64]
@@ -56,7 +58,7 @@ class Identification(Result):
     document: IdentificationDocument
     robot: RobotConfig
     recordings: tuple[Recording, ...] = ()
-    estimate: "Estimation | None" = None
+    estimate: IdentificationResult | None = None
     path: Path = IN_MEMORY
     file = "identification.json"
 

@@ -8,7 +8,7 @@ from armident.identify.api.arguments import Recorded, Robot, recordings_of, robo
 from armident.identify.api.result import Result
 from armident.identify.documents.base import plain, reference, versions
 from armident.identify.documents.setup import SetupDocument, SetupMistake
-from armident.identify.identification.api import experiments_of
+from armident.identify.identification.identify_recording import experiments_of
 from armident.identify.setup.check import check_setup
 from armident.identify.setup.result import SetupCheck
 from armident.identify.tables import Table

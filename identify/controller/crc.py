@@ -18,10 +18,11 @@ PREWHITENING_ORDER = 10
 """AR order of the prewhitening, the thesis's usual choice (table 5.12)."""
 
 HELD_OUT = 0.3
-"""Share of the data that is held out of the fit and used to compare the candidates."""
+"""Share of the data that is held out of the fit and used to compare the candidates: 20 taps need few of the rest."""
 
 GAIN_WORTH_A_TAP = 0.002
-"""Relative decrease of the held-out error below which the shorter response is taken."""
+"""Relative decrease of the held-out error below which the shorter response is taken: the shape of the controller then
+changes the simulated torques by less than their noise does, and a tap without effect adds only variance."""
 
 PIECE = 16384
 """Samples of a signal whose products at all lags are formed while they are in the cache."""

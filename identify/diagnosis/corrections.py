@@ -60,7 +60,7 @@ def _at_simulated(
         changes.append(at_joints * s.moving[:, joints, None])
     series = whitened_series(changes, [fit.noise[j] for j in joints])
     columns = [(int(j), np.concatenate(parts)) for j, parts in zip(joints, series, strict=True)]
-    gram, score = fit.regression.products_beside(columns, len(values))
+    gram, score = fit.regression.orthogonal_products(columns, len(values))
     return np.asarray(2.0 * score[:, 0] - gram[:, 0, 0])
 
 

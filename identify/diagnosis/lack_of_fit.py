@@ -314,7 +314,7 @@ class LackOfFit:
             band = np.concatenate([c - e.z[:, j] @ away for c, e in zip(unseen, blocks, strict=True)])
             out.append(
                 JointResidual(
-                    j, rows[j], held_rows[j], d, fit.regression.beside(full), change, residual, held_residual,
+                    j, rows[j], held_rows[j], d, fit.regression.orthogonalized(full), change, residual, held_residual,
                     band, np.concatenate([e[:, j] for e in errors]), held_rows, regressor, fit.covariance,
                 )
             )  # fmt: skip

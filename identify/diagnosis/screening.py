@@ -59,7 +59,7 @@ def score_statistics(fit: Fit, columns: Sequence[tuple[int, Array]], count: int,
     able = np.isfinite(size) & (size > 0.0)
     scale = np.where(able, size, np.inf)
     scaled = [(j, np.where(able, own, 0.0) / scale) for j, own in columns]
-    gram, score = fit.regression.products_beside(scaled, count)
+    gram, score = fit.regression.orthogonal_products(scaled, count)
     power, right = np.linalg.eigh(gram)
     kept = power > RANK_TOLERANCE**2
     along = np.einsum("gij,gi->gj", right, score)
@@ -90,7 +90,7 @@ def contained(fit: Fit, candidate: Candidate, column_cache: ColumnCache, shapes:
     columns = column_cache.grid(candidate.effect, candidate.place, (shapes,), fit.noise, keep=False)
     size = np.sqrt(np.sum([np.einsum("ij,ij->j", own, own) for _, own in columns], axis=0))
     size = np.where(size > 0.0, size, 1.0)
-    gram = fit.regression.products_beside([(j, own / size) for j, own in columns], 1)[0][0]
+    gram = fit.regression.orthogonal_products([(j, own / size) for j, own in columns], 1)[0][0]
     kept: list[int] = []
     present = candidate.effect.present(dict(shapes))
     for k in present:
@@ -108,7 +108,7 @@ def directions_beside(fit: Fit, instruments: Array) -> tuple[Array, Array, Array
     scale = np.linalg.norm(instruments, axis=0)
     if np.any(scale == 0) or not np.isfinite(scale).all():
         return None
-    beside = fit.regression.beside(instruments / scale)
+    beside = fit.regression.orthogonalized(instruments / scale)
     # Through the small Gram matrix: candidates have a few columns and many rows.
     power, right = np.linalg.eigh(beside.T @ beside)
     kept = power > RANK_TOLERANCE**2

@@ -27,7 +27,7 @@ Beyond it they touch when the angle between them is below ``2 asin(1 / (2 * 1.5)
 ALWAYS = 0.95
 """Share of random postures in which two bodies overlap by construction: that of the set-up assistant of MoveIt."""
 
-POSTURES = 300
+CONTACT_POSTURES = 300
 """Number of these postures."""
 
 STRIDE = 10
@@ -238,7 +238,7 @@ class CollisionModel:
         if not self._pairs:
             return
         bounds = np.clip(np.array([joint.limits.position for joint in robot.joints]), -2 * np.pi, 2 * np.pi)
-        q = np.random.default_rng(0).uniform(bounds[:, 0], bounds[:, 1], (POSTURES, robot.n))
+        q = np.random.default_rng(0).uniform(bounds[:, 0], bounds[:, 1], (CONTACT_POSTURES, robot.n))
         frames, every = self._motion(q)[0], self._pairs
         touching: list[tuple[int, int]] = []
         for pair in every:

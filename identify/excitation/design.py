@@ -14,7 +14,7 @@ the base parameters have a small weight.
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal, Protocol, TypeVar
+from typing import Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -36,11 +36,11 @@ from armident.identify.excitation.point_to_point import (
     sample_trajectory,
     slow_share,
 )
+from armident.identify.excitation.trajectory_options import Shape
 from armident.identify.robot.arm import ArmModel
 from armident.identify.robot.chain import Floats
 from armident.identify.signals.decimate import design
 
-Shape = Literal["moves", "fourier"]
 C = TypeVar("C")
 
 PERIOD = 1e-3

@@ -9,10 +9,10 @@ from scipy import signal
 from armident.configs import DataError, RobotConfig
 from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.effects.terms import arm_model
-from armident.identify.identification.criteria import IdentificationCriteria
+from armident.identify.identification.checks.excitation import workspace_postures
+from armident.identify.identification.checks.physics import impossible_values
 from armident.identify.identification.equations import LS_CUTOFF
-from armident.identify.identification.excitation_check import workspace_postures
-from armident.identify.identification.physics_check import impossible_values
+from armident.identify.identification.identification_criteria import IdentificationCriteria
 
 FREQUENCIES = 4096
 """Number of frequencies of a noise spectrum."""

@@ -14,10 +14,11 @@ from armident.identify.controller.nominal import known_controller, nominal_contr
 from armident.identify.controller.parametric import ControlLaw, identify_parametric
 from armident.identify.estimators.auxiliary_model import AuxiliaryModel
 from armident.identify.estimators.measured_instruments import MotionInstruments
+from armident.identify.estimators.methods import estimator
 from armident.identify.experiment import Experiment
 from armident.identify.identification.equations import PIV_CUTOFF, Prepared
+from armident.identify.identification.identification_criteria import IdentificationCriteria
 from armident.identify.identification.options import CONTROLLERS, Options
-from armident.identify.identification.solvers import MEASURED
 from armident.identify.robot.arm import ArmModel
 from armident.identify.robot.controller import DiscreteController
 from armident.identify.robot.simulation import Simulation
@@ -27,10 +28,8 @@ from armident.identify.signals.differentiate import Derivatives, differentiate
 from armident.identify.streamed import kept, mapped
 
 RUNAWAY = 3.0
-"""Speed of a simulated joint, over the highest measured speed, beyond which the simulation has diverged."""
-
-RELEVANT = 0.3
-"""Relative velocity error of the auxiliary model below which its instruments are relevant enough."""
+"""Speed of a simulated joint, over the highest measured speed, beyond which the simulation has diverged: a stable loop
+oversteps its set points by less than their own speed, so that it stays below two."""
 
 NO_REFERENCE = (
     "There is no reference trajectory in the recording. Instruments: simulation of a stiff PD controller that "
@@ -99,7 +98,7 @@ def closed_loop(
                 fastest,
                 anchor=start,
                 # Methods without a measured regressor have the torque's band in both their sides.
-                band_hz=PIV_CUTOFF * bandwidth if options.method in MEASURED else np.inf,
+                band_hz=PIV_CUTOFF * bandwidth if estimator(options.method).measured else np.inf,
                 starts=[e.start for e in experiments],
                 measured=_bandpassed(options, bandwidth, dt),
                 feedback=description["kind"] in CONTROLLERS,
@@ -112,10 +111,10 @@ def closed_loop(
                 found = description | {"start": origin, "velocity_error_pct": 100 * error}
                 closest = error, ClosedLoop(auxiliary, start, found)
             break
-        if closest is not None and closest[0] < RELEVANT:
+        if closest is not None and closest[0] < IdentificationCriteria.max_velocity_error:
             break
     if closest is None:
-        if options.method not in MEASURED or options.noise_model == "grey-box":
+        if not estimator(options.method).measured or options.noise_model == "grey-box":
             raise DataError(
                 f"{options.method} needs a simulated closed loop, which diverges with every controller and start "
                 "tried. Next: judge the recording by --method idim-ls, or armident check RECORDING"
@@ -133,7 +132,7 @@ def _bandpassed(options: Options, bandwidth: float, dt: float) -> Callable[[Arra
     Without it the instruments of IDIM-PIV hold frequencies that the measured regressor lacks, and the prefilter takes
     them for information.
     """
-    if options.derivatives != "bandpass" or options.method not in MEASURED:
+    if options.derivatives != "bandpass" or not estimator(options.method).measured:
         return None
     return lambda q, _: differentiate(q, dt, "bandpass", bandwidth_hz=bandwidth)
 

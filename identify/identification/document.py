@@ -15,11 +15,11 @@ from armident.identify.documents.identification import (
     Whiteness,
     parameter,
 )
-from armident.identify.identification.result import Identification
+from armident.identify.identification.identification_result import IdentificationResult
 
 
 def identification_document(
-    result: Identification, recordings: Sequence[Recording], robot: RobotConfig, notes: Sequence[str] = ()
+    result: IdentificationResult, recordings: Sequence[Recording], robot: RobotConfig, notes: Sequence[str] = ()
 ) -> IdentificationDocument:
     """Return the document of an identification.
 

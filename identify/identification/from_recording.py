@@ -11,14 +11,14 @@ from armident.configs import DataError, Joint, RobotConfig
 from armident.configs.schema.limits import ENDLESS
 from armident.daq.recording import Recording, Stream
 from armident.identify.experiment import Experiment
+from armident.identify.identification.identification_criteria import IdentificationCriteria
+from armident.identify.identification.set_points import between_set_points
 from armident.identify.streamed import OnDisk
 
 MAX_MISSING_SHARE = 0.05
 """Largest share of missing samples of an experiment; with more, the rest is no longer the designed motion."""
 MIN_PIECE_S = 0.5
 """Shortest piece between two gaps, s: edge effects of the filters cover shorter ones."""
-STILL_SHARE = 1e-3
-"""Share of its position range below which a joint counts as not moving."""
 RATE_TOLERANCE = 0.01
 """Relative difference between the nominal rate and the receive times above which a note is added."""
 NO_REFERENCE = "no reference trajectory was recorded: identified without one"
@@ -230,7 +230,7 @@ def _check_counters(recording: Recording) -> None:
     for name, stream in recording.streams.items():
         counted = recording.counters.get(f"{name}.rows")
         if counted is not None and counted != stream.sync.size:
-            raise DataError(f"the recording's counter says {counted} samples of {name!r}, it holds {stream.sync.size}")
+            raise DataError(f"the recording holds {stream.sync.size} samples of {name!r}, its counter is {counted}")
 
 
 def _finite(stream: Stream, name: str, robot: RobotConfig) -> Array:
@@ -265,8 +265,8 @@ def _reference(stream: Stream, samples: Stream, robot: RobotConfig) -> Array:
     knots = joint_positions(stream, "demand", robot)
     if stream is samples:
         return knots
-    _, low, share = _between_knots(stream, samples.sync)
-    q_ref: Array = knots[low] + share[:, None] * (knots[low + 1] - knots[low])
+    _, low, high, share = between_set_points(stream.sync, stream.every, samples.sync)
+    q_ref: Array = knots[low] + share * (knots[high] - knots[low])
     return q_ref
 
 
@@ -274,23 +274,8 @@ def _has_reference(stream: Stream, sync: NDArray[np.int64]) -> NDArray[np.bool_]
     """Mask (N,) of samples with a reference, found piece by piece: the numbers of all knots would fill the memory."""
     if stream.sync is sync:
         return np.ones(sync.size, dtype=bool)
-    return np.concatenate([_between_knots(stream, part)[0] for part in np.array_split(sync, 1 + sync.size // PIECE)])
-
-
-def _between_knots(stream: Stream, sync: NDArray[np.int64]) -> tuple[NDArray[np.bool_], NDArray[np.int64], Array]:
-    """Mask (N,) of samples with a reference, number of the knot before each, and its place between that and the next.
-
-    ``sync``: SYNC numbers of the samples, (N,).
-    """
-    if stream.sync is sync:
-        return np.ones(sync.size, dtype=bool), np.arange(sync.size), np.zeros(sync.size)
-    before = np.searchsorted(stream.sync, sync, side="right") - 1
-    on_knot = (before >= 0) & (stream.sync[np.maximum(before, 0)] == sync)
-    between = (before >= 0) & (before < stream.sync.size - 1)
-    low = np.clip(before, 0, stream.sync.size - 2)
-    width = stream.sync[low + 1] - stream.sync[low]
-    share = np.clip((sync - stream.sync[low]) / width, 0.0, 1.0)
-    return on_knot | (between & (width == stream.every)), low, share
+    pieces = np.array_split(sync, 1 + sync.size // PIECE)
+    return np.concatenate([between_set_points(stream.sync, stream.every, part)[0] for part in pieces])
 
 
 def _signal_notes(experiments: Sequence[Experiment], robot: RobotConfig) -> list[str]:
@@ -340,7 +325,7 @@ def rest_notes(experiments: Sequence[Experiment], robot: RobotConfig) -> list[st
     return [
         f"{joint.name} does not move: its own parameters cannot be determined from this recording"
         for joint, width in zip(robot.joints, np.ptp(q, axis=0), strict=True)
-        if width < STILL_SHARE * _usual_range(joint)
+        if width < IdentificationCriteria.rest_limit_share * _usual_range(joint)
     ]
 
 

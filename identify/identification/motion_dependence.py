@@ -30,7 +30,7 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Dependence:
+class MotionDependence:
     """Dependence of the residuals of one joint on its motion.
 
     ``joint``: index of the joint; ``variable``: ``position`` (and direction) or ``velocity``; ``share``: share of the
@@ -44,7 +44,9 @@ class Dependence:
     deviation: float
 
 
-def motion_dependence(prepared: Prepared, blocks: Sequence[ExperimentEquations], theta: Array) -> list[Dependence]:
+def motion_dependence(
+    prepared: Prepared, blocks: Sequence[ExperimentEquations], theta: Array
+) -> list[MotionDependence]:
     """Return the dependence of the residuals of every joint on its own position and velocity.
 
     ``prepared``: experiments with the derivatives of their positions; ``theta``: base parameters (b,), SI.
@@ -59,7 +61,7 @@ def motion_dependence(prepared: Prepared, blocks: Sequence[ExperimentEquations],
         kept = [np.where(used[:, j], e[:, j], 0.0) for e, used in zip(errors, keep, strict=True)]
         q, qd = (signal[:, j] for signal in motion)
         for variable, bins in (("position", _position_bins(q, qd)), ("velocity", _velocity_bins(qd))):
-            found.append(Dependence(j, variable, *_explained(kept, bins)))
+            found.append(MotionDependence(j, variable, *_explained(kept, bins)))
     return found
 
 

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from armident.configs import DataError, RobotConfig
 from armident.identify.experiment import Experiment
-from armident.identify.identification.criteria import IdentificationCriteria
+from armident.identify.identification.identification_criteria import IdentificationCriteria
 from armident.identify.signals.differentiate import encoder_resolution
 from armident.identify.streamed import mapped
 

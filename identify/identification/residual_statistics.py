@@ -12,16 +12,17 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from armident.identify.effects.tables import hats
 from armident.identify.identification.equations import Prepared
 from armident.identify.regression.ar_noise import ArModel
 from armident.identify.regression.equations import (
-    MAX_AR_ORDER,
     Estimate,
     ExperimentEquations,
     instants,
     noise_models,
     residuals,
 )
+from armident.identify.regression.orders import MAX_AR_ORDER
 from armident.identify.regression.whitening import whitened
 
 Array = NDArray[np.float64]
@@ -131,10 +132,8 @@ def motion_functions(q: Array, qd: Array, limits: tuple[float, float], fastest: 
 
 
 def _hats(x: Array, knots: Array) -> Array:
-    """Piecewise linear functions, each one at its knot and zero at the others, shape (M, knots)."""
-    width = max(float(knots[1] - knots[0]), 1e-300)
-    inside = np.clip(x, knots[0], knots[-1])
-    return np.maximum(1.0 - np.abs(inside[:, None] - knots) / width, 0.0)
+    """Piecewise linear functions (M, k), each one at its knot; all one for a signal that never changes."""
+    return hats(x, knots) if knots[-1] > knots[0] else np.ones((x.size, knots.size))
 
 
 def band_powers(series: Sequence[Array], noise: ArModel) -> tuple[Array, Array]:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from armident.configs import RobotConfig
 from armident.identify.experiment import Experiment
+from armident.identify.identification.identification_criteria import IdentificationCriteria
 from armident.identify.signals.bandpass import butterworth, central_difference
 from armident.identify.signals.bandwidth import position_noise
 from armident.identify.streamed import Streamed
@@ -27,13 +28,6 @@ sign reaches 0.99 at 14 % of the top speed.
 
 TOP_QUANTILE = 0.99
 """Quantile of the absolute velocity that counts as the top speed."""
-
-SATURATED = 0.98
-"""Least smoothed sign at the root mean square velocity of a joint; below it a warning names the joint.
-
-The missing part of Coulomb friction, ``2 / (pi g qd)``, varies with the velocity, and viscous friction absorbs it: a
-lift at 150 s/m and 0.1 m/s rms misses 4 %, and its viscous friction comes out at 45 instead of 60 N s/m.
-"""
 
 SPEEDS_PER_PERIOD = 8
 """Velocities per period of the low-pass from which the top speed of a long recording is taken: all of them would take
@@ -118,7 +112,7 @@ def unsaturated_joints(
     reached = 2 / np.pi * np.arctan(robot.sign_smoothing * speeds.rms)
     warnings = []
     for j, joint in enumerate(robot.joints):
-        if reached[j] >= SATURATED or speeds.rms[j] == 0.0:
+        if reached[j] >= IdentificationCriteria.min_smoothed_sign or speeds.rms[j] == 0.0:
             continue
         unit = "s/rad" if joint.type == "revolute" else "s/m"
         wanted = SATURATION / max(float(speeds.top[j]), 1e-300)

@@ -16,7 +16,7 @@ from scipy import signal, stats
 from armident.identify.estimators.auxiliary_model import AuxiliaryModel
 from armident.identify.experiment import Experiment
 from armident.identify.identification.equations import Prepared, aligned_torque
-from armident.identify.identification.options import DerivativesName
+from armident.identify.identification.identification_criteria import IdentificationCriteria
 from armident.identify.regression.ar_noise import ArModel
 from armident.identify.regression.equations import (
     Estimate,
@@ -33,13 +33,10 @@ from armident.identify.robot.controller import DiscreteController
 from armident.identify.robot.simulation import Simulation
 from armident.identify.signals.bandpass import central_difference
 from armident.identify.signals.bandwidth import position_noise
+from armident.identify.signals.choices import DerivativesName
 from armident.identify.signals.decimate import Decimation
 from armident.identify.signals.differentiate import Derivatives, differentiate
 from armident.identify.streamed import kept, mapped
-
-RELEVANT_BIAS = 0.5
-"""Bias in standard deviations above which an estimate is corrected: a 2-sigma interval with this bias holds the truth
-in 92.7 % of the cases instead of 95.4 %."""
 
 SIMULATION_ERROR = 0.15
 """Standard deviation of the part of the bias that the simulation misses, over the bias.
@@ -166,7 +163,7 @@ def corrected(estimate: Estimate, found: SimulatedBias, blocks: Sequence[Experim
 
 
 def _relevant(errors: Sequence[Array], estimate: Estimate) -> bool:
-    return bool(np.any(np.abs(np.mean(errors, axis=0)) > RELEVANT_BIAS * estimate.std))
+    return bool(np.any(np.abs(np.mean(errors, axis=0)) > IdentificationCriteria.max_bias_std * estimate.std))
 
 
 def _recorded(

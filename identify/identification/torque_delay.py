@@ -32,11 +32,12 @@ from armident.identify.signals.differentiate import Derivatives, differentiate
 HELD = 0.5
 """Delay in samples of a drive that reports the torque it holds until the next sample."""
 
-MAX_AR_ORDER = 10
-"""Highest order of the noise models after decimation, for the standard deviations."""
+DELAY_AR_ORDER = 10
+"""Highest order of the noise models, for the standard deviations. The equations have a rate of four closed-loop
+bandwidths (`LS_CUTOFF`): ten coefficients reach over two and a half periods, and the residuals keep little beyond."""
 
 REWEIGHTINGS = 2
-"""Weighted fits after the first, unweighted one."""
+"""Weighted fits after the first, unweighted one: the delay is linear in the last theta, which hardly changes."""
 
 _CHUNK_SAMPLES = 32768
 
@@ -139,7 +140,7 @@ def torque_delay(
         theta, blocks = solve(z, x, noise)
         noise = joint_variances(blocks, theta)
     covariance = serial_covariance(z, x, keep, noise, noise)
-    coloured = noise_models(blocks, theta, covariance, MAX_AR_ORDER)
+    coloured = noise_models(blocks, theta, covariance, DELAY_AR_ORDER)
     covariance = serial_covariance(z, x, keep, noise, coloured)
     return TorqueDelay(theta[b:], np.sqrt(np.diag(covariance)[b:]), experiments[0].dt, instrumented)
 

@@ -2,35 +2,13 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal, Protocol
+from typing import Any
 
-from armident.identify.setup.result import TorqueShift
-
-Level = Literal["trustworthy", "doubtful", "unusable"]
-LEVELS: tuple[Level, ...] = ("trustworthy", "doubtful", "unusable")
+from armident.identify.estimators.reason import LEVELS, Kind, Level, Reason
+from armident.identify.setup.result import SetupCheck, SetupFinding
 
 AT_REST = ("standstill", "joint_at_rest")
 """Findings of the set-up that are a matter of the excitation."""
-
-Kind = Literal[
-    "setup", "error", "physics", "excitation", "convergence", "loop", "residual", "uncertainty", "instruments", "delay"
-]
-
-
-@dataclass(frozen=True)
-class Reason:
-    """One defect of a result.
-
-    ``level``: level of the verdict that the defect causes. ``message``: the defect in one sentence, with figures.
-    ``next_step``: action that removes it. ``joint``: joint concerned; ``None``: several, or none in particular.
-    ``kind``: property that was judged.
-    """
-
-    level: Level
-    message: str
-    next_step: str
-    joint: str | None = None
-    kind: Kind = "error"
 
 
 @dataclass(frozen=True)
@@ -57,54 +35,6 @@ class Verdict:
                 for r in self.reasons
             ],
         }
-
-
-class SetupFinding(Protocol):
-    """Finding of the check of the set-up, as far as the verdict uses it."""
-
-    @property
-    def kind(self) -> str:
-        """Kind of the mistake, for example ``time_shift`` or ``joint_at_rest``."""
-
-    @property
-    def joints(self) -> tuple[str, ...]:
-        """Joints concerned."""
-
-    @property
-    def probability(self) -> float:
-        """Posterior probability among the hypotheses tried, 0 to 1."""
-
-    @property
-    def message(self) -> str:
-        """Finding in one sentence."""
-
-    @property
-    def remedy(self) -> str:
-        """Line of configuration, or option, that corrects it."""
-
-    @property
-    def decisive(self) -> bool:
-        """True if results without the correction are unusable."""
-
-
-class SetupCheck(Protocol):
-    """Result of the check of the set-up, as far as the verdict uses it."""
-
-    @property
-    def findings(self) -> Sequence[SetupFinding]:
-        """Findings, the most probable first."""
-
-    @property
-    def joints_not_understood(self) -> tuple[str, ...]:
-        """Joints of whose torque more than a third stays, with every hypothesis."""
-
-    @property
-    def tried(self) -> tuple[str, ...]:
-        """Hypotheses that were tried, in words."""
-
-    @property
-    def torque_shift(self) -> TorqueShift | None:
-        """Common shift of the torques by less than a sample; ``None``: not estimated."""
 
 
 def judge(reasons: Sequence[Reason], setup: SetupCheck | None = None) -> Verdict:

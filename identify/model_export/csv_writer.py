@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from armident.identify.documents.files import write_atomically
-from armident.identify.identification.result import unit
+from armident.identify.identification.identification_result import unit
 from armident.identify.model_export.code_writer import EVERY_PART
 from armident.identify.model_export.exported_model import ExportedModel
 from armident.identify.model_export.sheet import LimitationSheet, limitation_sheet

@@ -1,7 +1,7 @@
 """Announcements of a worker: each result and failure in the ledger is announced once, also if workers are killed."""
 
 from armident.daq.streaming import Keys
-from armident.identify.monitoring.ledger import Entry, Ledger
+from armident.identify.monitoring.ledger import Ledger, LedgerEntry
 from armident.identify.monitoring.status_messages import failure_status, status
 from armident.identify.monitoring.worker_link import LinkDown, WorkerLink
 from armident.identify.monitoring.worker_receiver import content_hash
@@ -66,7 +66,7 @@ class Announcements:
         self._heard.clear()
 
 
-def _outcome(entry: Entry) -> tuple[bytes | None, str]:
+def _outcome(entry: LedgerEntry) -> tuple[bytes | None, str]:
     """Return the document of a result and its verdict; ``None`` and the reason if there is none."""
     if entry.result is None:
         return None, entry.message or ""
@@ -76,7 +76,7 @@ def _outcome(entry: Entry) -> tuple[bytes | None, str]:
         return None, f"{entry.result}: the result was removed before it was announced"
 
 
-def _contents(entry: Entry) -> list[bytes]:
+def _contents(entry: LedgerEntry) -> list[bytes]:
     """Return the messages that announce an entry, by whichever program."""
     document, message = _outcome(entry)
     if document is not None:

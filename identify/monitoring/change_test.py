@@ -24,7 +24,8 @@ RANK_TOLERANCE = 1e-9
 
 
 MUCH_WORSE = 10.0
-"""Median ratio of standard deviations of the two identifications above which the test is inconclusive."""
+"""Median ratio of standard deviations of the two identifications above which the test is inconclusive: a change by the
+three standard deviations that the better one would show is a third of a standard deviation of the worse one."""
 
 
 class Inconclusive(DataError):

@@ -34,7 +34,7 @@ _STAMP = re.compile(r"(\d{8}T\d{6})-\d{3}Z")
 
 
 @dataclass(frozen=True)
-class Run:
+class HistoryRun:
     """Identification in the history; ``recorded`` is the time of its recording (UTC)."""
 
     number: int
@@ -163,7 +163,7 @@ class History:
         except sa.exc.SQLAlchemyError as error:
             raise ConfigError(f"{self.url}: the history cannot be written: {reason(error)}") from error
 
-    def first(self, robot: str, cell: str | None = None) -> Run | None:
+    def first(self, robot: str, cell: str | None = None) -> HistoryRun | None:
         """Return the oldest converged identification of an arm, or ``None``.
 
         ``cell``: cell of the robot; ``None``: all. Runs whose cell the history does not know are included.
@@ -171,7 +171,7 @@ class History:
         found = self._read(_of(robot, cell).where(runs.c.converged).limit(1))
         return found[0] if found else None
 
-    def runs(self, robot: str | None = None, cell: str | None = None) -> list[Run]:
+    def runs(self, robot: str | None = None, cell: str | None = None) -> list[HistoryRun]:
         """Return identifications in the order of their recordings.
 
         ``robot``: name of the robot; ``None``: all. ``cell``: cell of the robot, as arms of one type often share a
@@ -198,9 +198,11 @@ class History:
         except sa.exc.SQLAlchemyError as error:
             raise ConfigError(f"{self.url}: the history cannot be read: {reason(error)}") from error
 
-    def _read(self, query: sa.Select[Any]) -> list[Run]:
+    def _read(self, query: sa.Select[Any]) -> list[HistoryRun]:
         return [
-            Run(number, recorded.replace(tzinfo=datetime.UTC), from_json(text, IdentificationDocument, f"run {number}"))
+            HistoryRun(
+                number, recorded.replace(tzinfo=datetime.UTC), from_json(text, IdentificationDocument, f"run {number}")
+            )
             for number, recorded, text in self._rows(query)
         ]
 

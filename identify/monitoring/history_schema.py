@@ -13,7 +13,7 @@ from typing import Any
 import sqlalchemy as sa
 
 from armident.configs import ConfigError
-from armident.identify.monitoring.sqlite_reason import sqlite_reason
+from armident.configs.reasons import reason_of
 
 BUSY_S = 15.0
 """Longest wait for another process that writes to the database, s."""
@@ -216,7 +216,7 @@ def reason(error: Exception) -> str:
         text = text.removeprefix("connection failed: ")
         return f"no connection to the server ({text}); check that it runs, and host, port, user and database of the URL"
     if isinstance(cause, sqlite3.Error):
-        text = sqlite_reason(cause, BUSY_S)
+        text = reason_of(cause, BUSY_S)
         damaged = "; restore a copy, or begin a new history and add the results to it"
         return text + damaged if text.startswith("damaged") else text
     return text

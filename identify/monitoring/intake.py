@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from armident.configs import ArmidentError, DataError
+from armident.configs.reasons import reason_of
 from armident.daq.recording import Recording
 from armident.identify.monitoring.ledger import Ledger
 from armident.identify.monitoring.recorded import Captured, captured_as, is_of, result_of
@@ -129,9 +130,3 @@ class Intake:
         message = f"{error}, and {where}"
         log.error("%s", message)
         self._refused(assembly.capture, message, error.exit_code)
-
-
-def reason_of(error: OSError) -> str:
-    """Return the file and the reason of an error of the operating system."""
-    where = f"{error.filename}: " if error.filename else ""
-    return f"{where}{error.strerror or type(error).__name__}"

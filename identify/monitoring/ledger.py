@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Literal
 
 from armident.configs import ArmidentError
-from armident.identify.monitoring.sqlite_reason import sqlite_reason
+from armident.configs.reasons import reason_of
 
 FILE = "worker.sqlite"
 """Name of the ledger in the folder of the results."""
@@ -68,7 +68,7 @@ class LedgerUnusable(ArmidentError):
 
 
 @dataclass(frozen=True)
-class Entry:
+class LedgerEntry:
     """Recording in the ledger.
 
     Parameters
@@ -170,7 +170,9 @@ class Ledger:
             )
             return bool(done.rowcount)
 
-    def claim(self, sha256: str | None = None, held: Sequence[str] = (), *, announce: bool = True) -> Entry | None:
+    def claim(
+        self, sha256: str | None = None, held: Sequence[str] = (), *, announce: bool = True
+    ) -> LedgerEntry | None:
         """Claim a recording without a result or announcement, and return it; ``None`` if there is none.
 
         The one with the fewest attempts comes first, so that a recording that ends its workers does not hold up others.
@@ -236,7 +238,7 @@ class Ledger:
             )
             yield bool(done.rowcount)
 
-    def unannounced(self) -> list[Entry]:
+    def unannounced(self) -> list[LedgerEntry]:
         """Return the entries with a result or a failure that has not been announced."""
         query = f"SELECT {_COLUMNS} FROM experiments WHERE announced = 0 AND state != 'waiting'"
         with self._transaction() as db:
@@ -249,13 +251,13 @@ class Ledger:
                 "UPDATE experiments SET announced = 1, owner = NULL WHERE sha256 = ? AND state != 'waiting'", (sha256,)
             )
 
-    def entry(self, sha256: str) -> Entry | None:
+    def entry(self, sha256: str) -> LedgerEntry | None:
         """Return the entry of a recording, or ``None``."""
         with self._transaction() as db:
             row = db.execute(f"SELECT {_COLUMNS} FROM experiments WHERE sha256 = ?", (sha256,)).fetchone()
         return None if row is None else _entry(row)
 
-    def entries(self) -> list[Entry]:
+    def entries(self) -> list[LedgerEntry]:
         """Return all entries in the order in which they were added."""
         with self._transaction() as db:
             return [_entry(row) for row in db.execute(f"SELECT {_COLUMNS} FROM experiments ORDER BY added, name")]
@@ -312,7 +314,7 @@ class Ledger:
         try:
             yield
         except (sqlite3.OperationalError, OSError) as error:
-            raise LedgerError(f"{self.path}: {_reason(error)}") from error
+            raise LedgerError(f"{self.path}: {reason_of(error, BUSY_S, named=False)}") from error
         except sqlite3.DatabaseError as error:
             raise LedgerUnusable(
                 f"{self.path}: the ledger is damaged ({error}); move it away and start again, results are found"
@@ -339,17 +341,11 @@ def _use_write_ahead_log(db: sqlite3.Connection) -> None:
             time.sleep(0.02)
 
 
-def _reason(error: OSError | sqlite3.Error) -> str:
-    if isinstance(error, OSError):
-        return error.strerror or str(error)
-    return sqlite_reason(error, BUSY_S)
-
-
-def _entry(row: tuple[str, str, str, State, int, str | None, str | None, int]) -> Entry:
+def _entry(row: tuple[str, str, str, State, int, str | None, str | None, int]) -> LedgerEntry:
     sha256, name, paths, state, attempts, result, message, announced = row
     files = tuple(Path(path) for path in json.loads(paths))
     found = None if result is None else Path(result)
-    return Entry(sha256, name, files, state, attempts, found, message, bool(announced))
+    return LedgerEntry(sha256, name, files, state, attempts, found, message, bool(announced))
 
 
 def _texts(paths: Sequence[Path]) -> str:

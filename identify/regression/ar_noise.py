@@ -70,7 +70,7 @@ WHITE = ArModel(np.empty(0), 1.0, 0.0)
 
 
 @dataclass(frozen=True)
-class Whiteness:
+class WhitenessTest:
     """Autocorrelation of residuals against the 2-sigma band of white noise.
 
     ``autocorrelation``: autocorrelation at lags 1..L, shape (L,); ``bound``: half width of the band.
@@ -211,7 +211,7 @@ def lagged_sums(x: NDArray[np.float64], max_lag: int, first: int = 0) -> NDArray
     return _lagged_sums(np.ascontiguousarray(x, dtype=np.float64), max_lag, first)
 
 
-def whiteness(series: Sequence[NDArray[np.float64]], lags: int = 20) -> Whiteness:
+def whiteness(series: Sequence[NDArray[np.float64]], lags: int = 20) -> WhitenessTest:
     """Autocorrelation of residuals pooled over experiments, with the bound ``2 / sqrt(M)``.
 
     ``series``: residuals of one joint, one array (M,) per experiment.
@@ -223,7 +223,7 @@ def whiteness(series: Sequence[NDArray[np.float64]], lags: int = 20) -> Whitenes
         centred = s - mean
         for lag in range(min(lags, centred.size - 1) + 1):
             r[lag] += centred[lag:] @ centred[: centred.size - lag]
-    return Whiteness(r[1:] / r[0] if r[0] > 0 else np.zeros(lags), 2 / float(np.sqrt(total)))
+    return WhitenessTest(r[1:] / r[0] if r[0] > 0 else np.zeros(lags), 2 / float(np.sqrt(total)))
 
 
 @compiled

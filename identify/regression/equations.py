@@ -17,9 +17,6 @@ from armident.identify.signals.decimate import Decimation
 from armident.identify.signals.differentiate import Derivatives
 from armident.identify.streamed import mapped
 
-MAX_AR_ORDER = 60
-"""Highest order tried for the noise models."""
-
 COVARIANCE_PASSES = 3
 """Noise model and covariance need each other; the third pass changes standard deviations by less than 1 %."""
 

@@ -68,7 +68,7 @@ class IvProducts:
         solved: Array = linalg.lu_solve(self._factors, through, check_finite=False)
         return (solved.T / self.scale).T
 
-    def beside(self, through: Array) -> Array:
+    def projection_weights(self, through: Array) -> Array:
         """Weights W (b, k) of the combinations with ``X' Q W`` = ``through``.
 
         Instruments less ``Q W`` are orthogonal to the regressor, where ``through`` are their products with it. Raises

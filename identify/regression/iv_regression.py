@@ -109,20 +109,20 @@ class IvRegression:
             rest[own] -= rows[:, : joint.x.size] @ theta[joint.x]
         return rest
 
-    def beside(self, instruments: Array) -> Array:
+    def orthogonalized(self, instruments: Array) -> Array:
         """Instruments (R, k) orthogonal to the regressor: ``D - Z (X'Z)^-1 X'D``.
 
         ``instruments``: whitened instruments D of all joints, (R, k).
         """
         x, _ = self._through([(j, instruments[own]) for j, own in enumerate(self.rows_of)], instruments.shape[1])
-        weights = self.solution.beside(x) / self.solution.scale[:, None]
+        weights = self.solution.projection_weights(x) / self.solution.scale[:, None]
         rest = instruments.copy()
         for joint, rows, own in zip(self.equations.joints, self.rows, self.rows_of, strict=True):
             rest[own] -= rows[:, joint.x.size : -1] @ weights[joint.z]
         return rest
 
-    def products_beside(self, columns: Sequence[tuple[int, Array]], count: int) -> tuple[Array, Array]:
-        """``B'B`` (G, k, k) and ``B' residual`` (G, k) of ``B = beside(instruments)``, without computing B.
+    def orthogonal_products(self, columns: Sequence[tuple[int, Array]], count: int) -> tuple[Array, Array]:
+        """``B'B`` (G, k, k) and ``B' residual`` (G, k) of ``B = orthogonalized(D)``, without computing B.
 
         ``columns``: instruments (R_j, G k) of each joint on which they act, with its number, group after group;
         ``count``: number of groups, G.
@@ -134,7 +134,7 @@ class IvRegression:
             groups = own.reshape(own.shape[0], count, -1).transpose(1, 0, 2)
             gram += groups.transpose(0, 2, 1) @ groups
         x, q = self._through(columns, width)
-        weights = self.solution.beside(x)
+        weights = self.solution.projection_weights(x)
 
         def products(right: Array) -> Array:
             left, other = (part.reshape(part.shape[0], count, -1).transpose(1, 0, 2) for part in (weights, right))

@@ -23,8 +23,8 @@ VERDICTS = {
 }
 LEVELS = {"no_gap": "trustworthy", "explained": "doubtful", "partly_explained": "unusable", "unexplained": "unusable"}
 """Colours of the verdicts, by the levels of an identification."""
-CERTAIN, LIKELY = 0.95, 0.6
-"""Confidence from which a finding is called certain, and likely."""
+LIKELY = 0.6
+"""Posterior probability below which a finding may be another effect: odds of 3 to 2 against all others together."""
 BINS, FILLED = 14, 5
 """Bins of a variable, and the fewest samples of one that is drawn."""
 SHOWN = 700
@@ -57,7 +57,7 @@ def diagnosis_report(diagnosis: Diagnosis, document: DiagnosisDocument) -> str:
                 "f": finding,
                 "title": finding.evidence.get("title", finding.effect.replace("_", " ")),
                 "where": finding.joint if finding.other is None else f"{finding.joint} and {finding.other}",
-                "sure": certainty(finding),
+                "probability": posterior_probability(finding),
                 "closed": closed_share(finding, document),
                 "rows": _rows(finding),
                 "picture": _finding_figure(diagnosis, joints.index(finding.joint), lacking, own),
@@ -84,14 +84,13 @@ def _detection_limits(document: DiagnosisDocument) -> list[dict[str, str]]:
     ]
 
 
-def certainty(finding: Finding) -> str:
-    """Return the confidence of a finding in words."""
+def posterior_probability(finding: Finding) -> str:
+    """Return the posterior probability of a finding in words, with the effects that it is ambiguous with."""
+    shown = "> 99.9 %" if finding.confidence > 0.999 else f"{100 * finding.confidence:.0f} %"
     rivals = finding.evidence.get("ambiguous_with", [])
     if rivals:
-        return "ambiguous with " + ", ".join(name.replace("_", " ") for name in rivals)
-    if finding.confidence >= CERTAIN:
-        return "certain"
-    return "likely" if finding.confidence >= LIKELY else "uncertain: a similar effect, perhaps outside the catalogue"
+        return f"{shown}, ambiguous with {', '.join(name.replace('_', ' ') for name in rivals)}"
+    return shown if finding.confidence >= LIKELY else f"{shown}, perhaps a similar effect outside the catalogue"
 
 
 def closed_share(finding: Finding, document: DiagnosisDocument) -> float | None:

@@ -6,7 +6,7 @@ import yaml
 
 from armident.configs import RobotConfig
 from armident.identify.documents.files import to_json, write_atomically
-from armident.identify.identification.api import IdentificationOutcome
+from armident.identify.identification.identify_recording import IdentificationOutcome
 
 
 def write_identification(outcome: IdentificationOutcome, out: Path) -> tuple[Path, Path]:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from armident.configs import RobotConfig
 from armident.daq.recording import Recording
 from armident.identify.documents.identification import IdentificationDocument
-from armident.identify.identification.result import Identification
+from armident.identify.identification.identification_result import IdentificationResult
 from armident.identify.report.glossary import identification_entries
 from armident.identify.report.page import BAND, CONFIGURED, INK, MEASURED, MODEL, MUTED, RESIDUAL, figure, render
 from armident.identify.report.plots import Plot, Series, plots_html
@@ -24,7 +24,10 @@ FAIR_PCT = 20.0
 
 
 def identification_report(
-    recordings: Sequence[Recording], robot: RobotConfig, result: Identification | None, document: IdentificationDocument
+    recordings: Sequence[Recording],
+    robot: RobotConfig,
+    result: IdentificationResult | None,
+    document: IdentificationDocument,
 ) -> str:
     """Return the HTML page of an identification, complete in one file.
 
@@ -43,7 +46,7 @@ def identification_report(
         autocorrelation=result
         and _autocorrelation_figure(result.residual_autocorrelation, result.autocorrelation_bound, joints),
         controller=_controller_figure(document.controller),
-        beside={} if document.comparison is None else {p.name: p.value for p in document.comparison.parameters},
+        least_squares={} if document.comparison is None else {p.name: p.value for p in document.comparison.parameters},
         residuals=_residual_words(document),
         glossary=identification_entries(document),
     )

@@ -19,14 +19,14 @@ STEP = 1e-6
 """Step of the finite differences, rad and rad/s or m and m/s."""
 
 
-POSTURES = 64
+WORKSPACE_POSTURES = 64
 """Number P of postures for mean values over the workspace."""
 
 
 @cache
 def _spread(revolute: tuple[bool, ...]) -> Array:
     """Points (P, n) of the Halton sequence over a turn of each revolute joint, rad; prismatic joints are at zero."""
-    points = qmc.Halton(len(revolute), scramble=False).random(POSTURES)
+    points = qmc.Halton(len(revolute), scramble=False).random(WORKSPACE_POSTURES)
     return np.ascontiguousarray(np.where(revolute, np.pi * (2.0 * points - 1.0), 0.0))
 
 

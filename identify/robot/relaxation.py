@@ -29,7 +29,7 @@ ROUNDS = 16
 SETTLED = 1e-3
 """Difference between the torque of the terms and the applied load, over that torque, at which the iteration ends."""
 
-POSTURES = 100
+INERTIA_POSTURES = 100
 """Approximate number of postures of a motion at which the joint inertias are evaluated."""
 
 MEMORY = 6
@@ -164,7 +164,7 @@ def _slow(values: Floats, dt: float, band_hz: float) -> Floats:
 def _inertia(model: ArmModel, theta: Floats, q: Floats, torque: Floats, qdd: Floats) -> Floats:
     """Inertia (n,) of each joint that fits the torque (N, n) of the terms, zero where it is small; kg m^2 or kg."""
     found = np.sum(torque * qdd, axis=0) / np.maximum(np.sum(qdd * qdd, axis=0), 1e-300)
-    postures = q[:: max(1, q.shape[0] // POSTURES)]
+    postures = q[:: max(1, q.shape[0] // INERTIA_POSTURES)]
     own = np.maximum(np.einsum("kjj->kj", model.mass_matrix(theta, postures)).min(axis=0), 0.0)
     found = np.maximum(found, (LEAST_INERTIA - 1.0) * own)
     return np.where(np.abs(found) > FELT_INERTIA * own, found, 0.0)

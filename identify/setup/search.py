@@ -52,7 +52,7 @@ WHITE = 0.05
 """Least correlation of neighbouring residuals that counts as structure: below it, estimates are noise."""
 
 NOT_UNDERSTOOD = 1.0 / 3.0
-"""Largest relative error of a joint that the rigid model explains (DIAGNOSIS.md, principle 1)."""
+"""Largest relative error of a joint that the rigid model explains (a third is more than friction or a load takes)."""
 
 WELL_UNDERSTOOD = 0.2
 """Largest relative error of a joint for which no whole orders and no mistakes of several joints are tried."""

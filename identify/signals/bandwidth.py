@@ -12,7 +12,8 @@ POWER_SHARE = 0.95
 """Fraction of the power of the velocity that lies below the bandwidth of the motion."""
 
 MARGIN = 5.0
-"""Ratio of the closed-loop bandwidth assumed for the filters to the bandwidth of the motion."""
+"""Ratio of the closed-loop bandwidth assumed for the filters to the bandwidth of the motion: inertia torques have the
+bandwidth of the acceleration, friction about reversals several harmonics more."""
 
 SIGNIFICANT = 10.0
 """Power relative to the noise floor above which a frequency counts as motion; white noise exceeds it once in 20000."""

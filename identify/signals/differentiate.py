@@ -4,21 +4,14 @@ import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from armident.configs import DataError, RobotConfig
 from armident.identify.signals.bandpass import butterworth, central_difference
+from armident.identify.signals.choices import NVR_RULES, DerivativesName, NvrRule
 from armident.identify.signals.irwsm import automatic_nvr, cross_validated_nvr, irwsm, optimal_nvr
-
-Method = Literal["irwsm", "irwsm2", "bandpass"]
-
-NvrRule = Literal["automatic", "cross-validation", "likelihood", "tracking-error"]
-"""Rule that determines the noise-variance ratio if no number is given."""
-
-NVR_RULES: tuple[NvrRule, ...] = ("automatic", "cross-validation", "likelihood", "tracking-error")
 
 NVR_BY_HAND = 1e-5
 """Noise-variance ratio chosen manually in the thesis (section 5.3.1)."""
@@ -52,7 +45,7 @@ class Derivatives:
 def differentiate(
     q: NDArray[np.float64],
     dt: float,
-    derivatives: Method = "irwsm",
+    derivatives: DerivativesName = "irwsm",
     nvr: float | Sequence[float] | NDArray[np.float64] | NvrRule | None = None,
     bandwidth_hz: float | None = None,
     *,
@@ -156,7 +149,7 @@ def encoder_resolution(robot: RobotConfig) -> NDArray[np.float64]:
 
 def _ratios(
     q: NDArray[np.float64],
-    derivatives: Method,
+    derivatives: DerivativesName,
     nvr: float | Sequence[float] | NDArray[np.float64] | NvrRule | None,
     q_ref: NDArray[np.float64] | None,
     resolution: float | Sequence[float] | NDArray[np.float64] | None,

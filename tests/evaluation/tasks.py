@@ -116,7 +116,7 @@ def identify_file(task: IdentificationTask) -> None:
     ``task``: recording, robot and file of the document. Raises ConfigError or DataError if the robot or the recording
     does not support an identification.
     """
-    from armident.identify.identification.api import identify_recording
+    from armident.identify.identification.identify_recording import identify_recording
 
     document = identify_recording(read_recording(task.recording), load_robot(task.robot)).document
     write_atomically(task.out, to_json(document))

@@ -22,14 +22,16 @@ from armident.identify.estimators.idim_piv import idim_piv
 from armident.identify.estimators.sep_pem import sep_pem
 from armident.identify.identification.auxiliary_loop import RUNAWAY, initial_parameters
 from armident.identify.identification.equations import equations
-from armident.identify.identification.result import relative_errors
-from armident.identify.regression.equations import MAX_AR_ORDER, Estimate, ExperimentEquations
+from armident.identify.identification.identification_result import relative_torque_errors
+from armident.identify.regression.equations import Estimate, ExperimentEquations
+from armident.identify.regression.orders import MAX_AR_ORDER
 from armident.identify.robot.arm import ArmModel
 from armident.identify.robot.controller import DiscreteController
 from armident.identify.robot.simulation import Simulation
 from armident.identify.signals.bandpass import butterworth, central_difference
+from armident.identify.signals.choices import NvrRule
 from armident.identify.signals.decimate import Decimation, design
-from armident.identify.signals.differentiate import Derivatives, NvrRule, differentiate, encoder_resolution
+from armident.identify.signals.differentiate import Derivatives, differentiate, encoder_resolution
 from tests.reproduction.recordings import Recorded
 from tests.reproduction.reference import essential_names
 from tests.reproduction.subset import restricted_to
@@ -250,7 +252,7 @@ class Laboratory:
         simulations = 0 if auxiliary is None else len(auxiliary.asked)
         if auxiliary is not None and method in SIMULATED:
             blocks = auxiliary.equations(blocks, estimate.theta)
-        return Run(estimate, relative_errors(blocks, estimate.theta)[0], seconds, simulations)
+        return Run(estimate, relative_torque_errors(blocks, estimate.theta)[0], seconds, simulations)
 
     def _iterate(
         self, method: Method, case: Case, blocks: Sequence[ExperimentEquations], auxiliary: AuxiliaryModel

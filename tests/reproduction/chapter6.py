@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import signal
 
-from armident.identify.identification.result import relative_errors
+from armident.identify.identification.identification_result import relative_torque_errors
 from armident.identify.regression.ar_noise import ArModel
 from tests.reproduction.cached_estimates import PIV_CUTOFF_HZ, Case, Laboratory, Run
 from tests.reproduction.chapter5 import GOOD, POOR_IV
@@ -201,7 +201,7 @@ def inverse_error(lab: Laboratory, run: Run, case: Case) -> float:
 
     ``lab``: arm with its cached estimates; ``case``: filters of the equations.
     """
-    return relative_errors(lab.equations(case), run.estimate.theta)[0]
+    return relative_torque_errors(lab.equations(case), run.estimate.theta)[0]
 
 
 def simulated_error(lab: Laboratory, run: Run, case: Case) -> float:
@@ -209,7 +209,7 @@ def simulated_error(lab: Laboratory, run: Run, case: Case) -> float:
 
     ``lab``: arm with its cached estimates; ``case``: filters and auxiliary simulation.
     """
-    return relative_errors(lab.simulated(run, case), run.estimate.theta)[0]
+    return relative_torque_errors(lab.simulated(run, case), run.estimate.theta)[0]
 
 
 def simulated_variances(lab: Laboratory, run: Run, case: Case) -> list[float]:

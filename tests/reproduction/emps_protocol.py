@@ -30,7 +30,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armident.identify.signals.bandpass import butterworth, central_difference
-from armident.identify.signals.differentiate import Derivatives, NvrRule, differentiate
+from armident.identify.signals.choices import NvrRule
+from armident.identify.signals.differentiate import Derivatives, differentiate
 from armident.identify.signals.irwsm import irwsm
 from tests.reproduction.emps_derivatives import (
     CUTOFF_HZ,

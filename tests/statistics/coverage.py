@@ -23,8 +23,9 @@ from scipy import stats
 
 from armident.configs import RobotConfig, Trajectory, load_robot, load_trajectory
 from armident.identify.effects.terms import arm_model
+from armident.identify.estimators.methods import METHODS, Method
 from armident.identify.identification.from_recording import experiments_from_recording
-from armident.identify.identification.options import METHODS, Method, Options
+from armident.identify.identification.options import Options
 from armident.identify.identification.pipeline import identify_experiment
 from armident.virtual_robot.inertias import plant_parameters
 from armident.virtual_robot.offline import simulate_recording

@@ -34,7 +34,7 @@ STANDSTILL_S = 7.5
 TX40_DT = 2e-4
 
 MOST_CPU_S = 60.0
-"""Most CPU time of a diagnosis, s: design page of the diagnosis, principle 9."""
+"""Most CPU time of a diagnosis, s: one that takes longer is not repeated while a person waits."""
 MOST_MEMORY_GB = 2.0
 """Most memory of a diagnosis, GB: the same."""
 CERTAIN = 0.9

@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 from scipy import signal
 
 from armident.configs import RobotConfig
+from armident.identify.estimators.methods import Method
 from armident.identify.experiment import Experiment
 from armident.identify.identification.from_recording import experiments_from_recording
-from armident.identify.identification.options import Method, Options
+from armident.identify.identification.options import Options
 from armident.identify.identification.pipeline import identify_experiment
 from armident.virtual_robot.offline import simulate_recording, with_encoder_counts
 from tests.statistics import axis

@@ -21,7 +21,7 @@ from armident.configs import Trajectory, load_robot, load_trajectory
 from armident.configs.schema.scenario import HiddenEffect, Scenario
 from armident.daq.recording import Recording
 from armident.identify.documents.identification import IdentificationDocument
-from armident.identify.identification.api import identify_recording
+from armident.identify.identification.identify_recording import identify_recording
 from armident.identify.monitoring.recursive.estimator import RecursiveEstimator
 from armident.identify.monitoring.recursive.replay import blocks_of
 from armident.virtual_robot.offline import simulate_recording

@@ -12,7 +12,7 @@ from armident.configs import ArmidentError, DataError, RobotConfig
 from armident.daq.recording import Recording
 from armident.identify.documents.files import load_document, to_json
 from armident.identify.documents.identification import IdentificationDocument
-from armident.identify.identification.api import identify_recording
+from armident.identify.identification.identify_recording import identify_recording
 from armident.identify.identification.options import Options
 from armident.identify.monitoring.ledger import FILE, Ledger, LedgerError, LedgerUnusable, unique_owner
 from armident.identify.monitoring.recorded import captured_in, result_of
@@ -190,8 +190,8 @@ def _identified(recording: Recording, robot: RobotConfig, options: Options, fold
         path, _ = write_identification(outcome, folder)
     except OSError as error:
         raise ArmidentError(
-            f"{error.filename or folder}: the result cannot be written: {error.strerror}; mend that, "
-            f"then a worker of the cell identifies the recording, or: armident identify {recording.path}"
+            f"{error.filename or folder}: the result cannot be written: {error.strerror}; fix this; "
+            f"a worker of the cell then identifies the recording, or run armident identify {recording.path}"
         ) from error
     return OnceIdentified(outcome.document, path, ours=True)
 

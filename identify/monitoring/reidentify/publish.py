@@ -10,7 +10,7 @@ import zenoh
 from armident.configs import ConfigError, RobotConfig, SessionConfig
 from armident.daq.streaming import Announcer, Keys, open_session
 from armident.daq.streaming.announcer import longest_retry_s
-from armident.daq.streaming.session import configuration
+from armident.daq.streaming.zenoh_session import configuration
 from armident.identify.monitoring.status_messages import failure_status, status
 
 log = logging.getLogger(__name__)

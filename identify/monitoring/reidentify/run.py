@@ -31,9 +31,9 @@ from armident.identify.monitoring.change_test import Inconclusive, ParameterChan
 from armident.identify.monitoring.reidentify.baseline import Baseline, baseline_of
 from armident.identify.monitoring.reidentify.identify_once import identify_once
 from armident.identify.monitoring.reidentify.keep import HistoryEntry, history_or_reason, kept
-from armident.identify.monitoring.reidentify.options import ReidentifyOptions
 from armident.identify.monitoring.reidentify.publish import StatusPublisher
 from armident.identify.monitoring.reidentify.record_run import Say, record_run, start_process
+from armident.identify.monitoring.reidentify.reidentify_options import ReidentifyOptions
 from armident.identify.monitoring.reidentify.summary import change_lines, finding_lines
 from armident.processes import Start
 

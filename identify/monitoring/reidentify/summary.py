@@ -10,7 +10,8 @@ from armident.identify.monitoring.change_test import ParameterChangeTest
 
 _NAME = re.compile(r"([a-z]+)(\d+)r?(?:_\d+)?$")
 CLEAR = 2.0
-"""Least difference, in standard deviations, of a parameter that is listed for a changed group."""
+"""Least difference, in standard deviations, of a parameter that is listed for a changed group: by chance one in 20 has
+it, and the group as a whole has been tested before."""
 
 _SHARED = ("ia", "fv", "fc")
 """Kinds of parameters of a coupling of two joints."""
