@@ -1,14 +1,14 @@
 """Identification, diagnosis, comparison and trajectory design, as ``import armident`` offers them."""
 
-from armident.identify.api.comparison import ChangeTest, compare
-from armident.identify.api.diagnosis import Diagnosis, diagnose, effects
-from armident.identify.api.identification import Identification, identify, load_identification
-from armident.identify.api.prediction import TorquePrediction, predict
-from armident.identify.api.setup import CheckedSetup, check
-from armident.identify.api.trajectory import Design, design_trajectory
+from armident.identify.api.comparison_api import ChangeTest, compare
+from armident.identify.api.diagnosis_api import Diagnosis, diagnose, effects
+from armident.identify.api.identification_api import Identification, identify, load_identification
+from armident.identify.api.prediction_api import TorquePrediction, predict
+from armident.identify.api.setup_api import CheckedSetup, check
+from armident.identify.api.trajectory_api import Design, design_trajectory
 from armident.identify.effects.effect import Effect, Linear, Motion, Place, Shape
 from armident.identify.identification.options import Options
-from armident.identify.robot_model import RobotModel
+from armident.identify.identification.robot_model import RobotModel
 
 __all__ = [
     "ChangeTest",

@@ -31,7 +31,7 @@ from armident.identify.monitoring.stream_buffer import (
     drop_oldest,
 )
 from armident.identify.monitoring.worker import Worker
-from armident.identify.report.files import write_identification
+from armident.identify.report.robot_file import write_identification
 from tests.fixtures import arms
 from tests.integration.test_worker import LONGEST_S, in_a_cell, publish
 from tests.unit.daq.test_streaming import blocks, events

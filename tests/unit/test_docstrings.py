@@ -32,7 +32,7 @@ DOOR: dict[str, set[str] | None] = {
     "identify/estimators/*": None,
     "identify/model_export/exported_model.py": None,
     "identify/robot/motion.py": {"Motion"},
-    "identify/robot_model.py": None,
+    "identify/identification/robot_model.py": None,
     "src/armident/__init__.py": None,
     "src/armident/testing/*": None,
     "virtual_robot/api.py": None,

@@ -16,7 +16,7 @@ from armident.daq.recording import write_recording
 from tests.fixtures import arms
 
 REPOSITORY = Path(__file__).resolve().parents[2]
-DIAGNOSE = "armident.identify.api.diagnosis.diagnose"
+DIAGNOSE = "armident.identify.api.diagnosis_api.diagnose"
 
 
 @pytest.fixture(scope="module")
@@ -277,13 +277,13 @@ def test_a_mistake_is_one_clear_line(call: object, expected: str) -> None:
         "armident",
         "armident.configs.loading",
         "armident.daq.recording.model",
-        "armident.identify.api.comparison",
-        "armident.identify.api.diagnosis",
-        "armident.identify.api.identification",
-        "armident.identify.api.prediction",
-        "armident.identify.api.setup",
-        "armident.identify.api.trajectory",
-        "armident.identify.robot_model",
+        "armident.identify.api.comparison_api",
+        "armident.identify.api.diagnosis_api",
+        "armident.identify.api.identification_api",
+        "armident.identify.api.prediction_api",
+        "armident.identify.api.setup_api",
+        "armident.identify.api.trajectory_api",
+        "armident.identify.identification.robot_model",
         "armident.virtual_robot.api",
         "armident.identify.robot.arm",
     ],

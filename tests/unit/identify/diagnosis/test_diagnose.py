@@ -11,7 +11,7 @@ from armident.identify.effects.registry import catalogue
 from armident.identify.effects.terms import arm_model, entry_of
 from armident.identify.identification.identify_recording import identify_recording
 from armident.identify.identification.options import Options
-from armident.identify.report.files import robot_yaml
+from armident.identify.report.robot_file import robot_yaml
 from tests.fixtures.arms import FAST, recording
 from tests.fixtures.diagnoses import diagnosis
 

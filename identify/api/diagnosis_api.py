@@ -8,18 +8,18 @@ from typing import TYPE_CHECKING
 
 from armident.configs import ConfigError, DataError, RobotConfig
 from armident.identify.api.arguments import Progress, Recorded, Robot, recordings_of, robot_of
-from armident.identify.api.identification import Identification, identified
-from armident.identify.api.result import Result
+from armident.identify.api.identification_api import Identification, identified
+from armident.identify.api.result_base import Result
+from armident.identify.api.result_tables import EffectTable, Table
 from armident.identify.documents.base import reference
 from armident.identify.documents.diagnosis import DiagnosisDocument
 from armident.identify.documents.files import write_atomically
 from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.effects.registry import catalogue
-from armident.identify.experiment import Experiment
 from armident.identify.identification.from_recording import rest_notes
 from armident.identify.identification.identify_recording import experiments_of
-from armident.identify.report.files import robot_yaml
-from armident.identify.tables import EffectTable, Table
+from armident.identify.report.robot_file import robot_yaml
+from armident.identify.signals.experiments import Experiment
 
 if TYPE_CHECKING:
     from armident.identify.diagnosis.diagnose import Diagnosis as DiagnosisResult
@@ -96,7 +96,7 @@ class Diagnosis(Result):
         return *replace(self, document=document).save(folder), model
 
     def _html(self) -> str:
-        from armident.identify.report.diagnosis import diagnosis_report
+        from armident.identify.report.diagnosis_report import diagnosis_report
 
         return diagnosis_report(self.result, self.document)
 

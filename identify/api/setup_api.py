@@ -5,13 +5,13 @@ from dataclasses import dataclass
 
 from armident.configs import RobotConfig
 from armident.identify.api.arguments import Recorded, Robot, recordings_of, robot_of
-from armident.identify.api.result import Result
+from armident.identify.api.result_base import Result
+from armident.identify.api.result_tables import Table
 from armident.identify.documents.base import plain, reference, versions
 from armident.identify.documents.setup import SetupDocument, SetupMistake
 from armident.identify.identification.identify_recording import experiments_of
 from armident.identify.setup.check import check_setup
 from armident.identify.setup.result import SetupCheck
-from armident.identify.tables import Table
 
 
 @dataclass(frozen=True, repr=False)
@@ -68,7 +68,7 @@ class CheckedSetup(Result):
         return "\n".join(lines)
 
     def _html(self) -> str:
-        from armident.identify.report.setup import setup_report
+        from armident.identify.report.setup_report import setup_report
 
         return setup_report(self.document, self.result)
 

@@ -6,9 +6,9 @@ from numpy.typing import NDArray
 from armident.configs import DataError, Trajectory
 from armident.daq.recording import Field, Recording, Stream
 from armident.identify.controller.nominal import known_controller, nominal_controller
+from armident.identify.identification.robot_model import RobotModel
 from armident.identify.robot.controller import DiscreteController
 from armident.identify.robot.relaxation import simulate_with_terms
-from armident.identify.robot_model import RobotModel
 from armident.identify.signals.bandwidth import motion_bandwidth
 
 

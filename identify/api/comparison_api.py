@@ -3,12 +3,12 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from armident.identify.api.identification import Identification, identified
-from armident.identify.api.result import Result
+from armident.identify.api.identification_api import Identification, identified
+from armident.identify.api.result_base import Result
+from armident.identify.api.result_tables import Table
 from armident.identify.documents.comparison import ComparisonDocument
 from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.monitoring.comparison import compare_models
-from armident.identify.tables import Table
 
 
 @dataclass(frozen=True, repr=False)
@@ -48,7 +48,7 @@ class ChangeTest(Result):
         return self.changed
 
     def _html(self) -> str:
-        from armident.identify.report.comparison import comparison_report
+        from armident.identify.report.comparison_report import comparison_report
 
         return comparison_report(self.document, self.now)
 

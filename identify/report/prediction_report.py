@@ -4,10 +4,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armident.identify.documents.prediction import PredictionDocument
+from armident.identify.identification.robot_model import RobotModel
 from armident.identify.report.glossary import identification_entries
-from armident.identify.report.identification import torque_plots
+from armident.identify.report.identification_report import torque_plots
 from armident.identify.report.page import render
-from armident.identify.robot_model import RobotModel
 
 Array = NDArray[np.float64]
 

@@ -13,8 +13,8 @@ from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.effects.terms import arm_model
 from armident.identify.identification.identify_recording import identify_recording
 from armident.identify.identification.options import Options
+from armident.identify.identification.robot_model import RobotModel
 from armident.identify.identification.sign_smoothing import with_numbers
-from armident.identify.robot_model import RobotModel
 
 REFIT: Options = Options(method="idim-iv")
 """Estimation of a diagnosed model: unbiased in closed loop (thesis section 2.3.3), and needs no noise model."""

@@ -14,10 +14,10 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, Ti
 from rich.table import Table
 
 from armident.configs import RobotConfig
+from armident.identify.cli.print_table import print_table
 from armident.identify.documents.diagnosis import DiagnosisDocument
 from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.effects.terms import arm_model
-from armident.identify.print_table import print_table
 
 if TYPE_CHECKING:
     from armident.identify.documents.prediction import PredictionDocument, PredictionsDocument

@@ -14,13 +14,13 @@ from threadpoolctl import threadpool_limits
 from armident.configs import DataError
 from armident.daq.recording import Recording
 from armident.identify.api.arguments import Progress, Recorded, Robot, recordings_of, robot_of
-from armident.identify.api.identification import Identification
-from armident.identify.api.result import Result
+from armident.identify.api.identification_api import Identification
+from armident.identify.api.result_base import Result
+from armident.identify.api.result_tables import Table
 from armident.identify.documents.base import reference, versions
 from armident.identify.documents.files import write_atomically
 from armident.identify.documents.prediction import PredictionDocument
 from armident.identify.effects.recorded import put_right
-from armident.identify.experiment import Experiment
 from armident.identify.identification.equations import equations, least_rows, published_equations
 from armident.identify.identification.from_recording import NO_REFERENCE
 from armident.identify.identification.identification_result import relative_torque_errors
@@ -33,15 +33,15 @@ from armident.identify.identification.pipeline import (
     smoothed_derivatives,
 )
 from armident.identify.identification.residual_statistics import SPEED_QUANTILE
+from armident.identify.identification.robot_model import RobotModel
+from armident.identify.identification.saved_model import load_model, model_of
 from armident.identify.identification.solvers import decimation_of
 from armident.identify.regression.equations import ExperimentEquations
-from armident.identify.robot_model import RobotModel
-from armident.identify.saved_model import load_model, model_of
 from armident.identify.setup.check import check_setup
 from armident.identify.setup.result import SetupCheck
 from armident.identify.signals.bandwidth import motion_bandwidth
 from armident.identify.signals.differentiate import Derivatives
-from armident.identify.tables import Table
+from armident.identify.signals.experiments import Experiment
 
 Array = NDArray[np.float64]
 
@@ -126,7 +126,7 @@ class TorquePrediction(Result):
         return *super().save(folder), torques
 
     def _html(self) -> str:
-        from armident.identify.report.prediction import prediction_report
+        from armident.identify.report.prediction_report import prediction_report
 
         return prediction_report(self.document, self.model, self.t, self.measured, self.predicted)
 

@@ -12,17 +12,17 @@ from numpy.typing import NDArray
 from armident.configs import RobotConfig
 from armident.daq.recording import Recording
 from armident.identify.api.arguments import Progress, Recorded, Robot, recordings_of, robot_of
-from armident.identify.api.result import Result
+from armident.identify.api.result_base import Result
+from armident.identify.api.result_tables import ParameterTable, Table
 from armident.identify.documents.files import load_document
 from armident.identify.documents.identification import IdentificationDocument, VerdictReason
 from armident.identify.estimators.methods import Method
 from armident.identify.identification.identification_result import IdentificationResult
 from armident.identify.identification.identify_recording import identify_recording
 from armident.identify.identification.options import ControllerName, Options
-from armident.identify.robot_model import IN_MEMORY, RobotModel
-from armident.identify.saved_model import model_of, used_configuration
+from armident.identify.identification.robot_model import IN_MEMORY, RobotModel
+from armident.identify.identification.saved_model import model_of, used_configuration
 from armident.identify.signals.choices import DerivativesName
-from armident.identify.tables import ParameterTable, Table
 
 Array = NDArray[np.float64]
 
@@ -156,7 +156,7 @@ class Identification(Result):
         return tuple(export_model(model, format, Path(path))[0])
 
     def _html(self) -> str:
-        from armident.identify.report.identification import identification_report
+        from armident.identify.report.identification_report import identification_report
 
         return identification_report(self.recordings, self.robot, self.estimate, self.document)
 

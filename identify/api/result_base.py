@@ -7,8 +7,8 @@ from typing import Any, ClassVar
 
 from pydantic import BaseModel
 
+from armident.identify.api.result_tables import Table
 from armident.identify.documents.files import to_json, write_atomically
-from armident.identify.tables import Table
 
 
 class Result(ABC):

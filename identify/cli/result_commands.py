@@ -13,9 +13,9 @@ from armident.identify.documents.files import to_json, write_atomically
 from armident.identify.identification.options import Options
 
 if TYPE_CHECKING:
-    from armident.identify.api.result import Result
+    from armident.identify.api.result_base import Result
     from armident.identify.documents.prediction import PredictionDocument
-    from armident.identify.robot_model import RobotModel
+    from armident.identify.identification.robot_model import RobotModel
 
 UNUSABLE = DataError.exit_code
 """Exit code: the data cannot support the request as they are configured, and the result says why."""
@@ -27,7 +27,7 @@ FOUND = 4
 def identify_command(path: Path, config: Path | None, options: Options, out: Path | None, *, as_json: bool) -> int:
     """Carry out ``armident identify``; the exit code is `UNUSABLE` if the verdict says so, otherwise 0."""
     from armident.identify.api import identify
-    from armident.identify.cli_tables import identification_table, progress, verdict_lines, warn
+    from armident.identify.cli.terminal import identification_table, progress, verdict_lines, warn
 
     with progress(f"identify {path.name}") as report:
         result = identify(path, config, options=options, progress=report)
@@ -50,7 +50,7 @@ def check_command(paths: Sequence[Path], config: Path | None, *, as_json: bool) 
     understood, otherwise 0. Raises ConfigError or DataError if a file is wrong, or the recordings cannot be checked.
     """
     from armident.identify.api import check
-    from armident.identify.cli_tables import progress
+    from armident.identify.cli.terminal import progress
 
     with progress("check"):
         result = check(list(paths), config)
@@ -70,7 +70,7 @@ def diagnose_command(
 ) -> int:
     """Carry out ``armident diagnose``; the exit code is 0 if the verdict is ``no_gap``, otherwise `FOUND`."""
     from armident.identify.api import diagnose
-    from armident.identify.cli_tables import diagnosis_table, progress, warn
+    from armident.identify.cli.terminal import diagnosis_table, progress, warn
 
     with progress("diagnose") as report:
         found = diagnose(list(paths), config, validate=validate, baseline=baseline, progress=report, **asdict(options))
@@ -98,7 +98,7 @@ def predict_command(paths: Sequence[Path], model: Path, config: Path | None, out
     """
     from armident.daq.recording import read_recording
     from armident.identify.api import predict
-    from armident.identify.cli_tables import prediction_table, predictions_table, progress, warn
+    from armident.identify.cli.terminal import prediction_table, predictions_table, progress, warn
     from armident.identify.documents.prediction import predictions_document
 
     folders = _prediction_folders(paths, out)
@@ -167,7 +167,7 @@ def compare_command(
         Print the document on stdout instead of a table.
     """
     from armident.identify.api import compare
-    from armident.identify.cli_tables import warn
+    from armident.identify.cli.terminal import warn
     from armident.identify.monitoring.comparison import comparison_table
 
     test = compare(baseline, now, common=common, false_alarm_rate=false_alarms)

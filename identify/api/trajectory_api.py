@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from armident.configs import RobotConfig, Trajectory
 from armident.identify.api.arguments import Progress, Robot, robot_of
-from armident.identify.api.identification import Identification, identified
-from armident.identify.api.result import Result
+from armident.identify.api.identification_api import Identification, identified
+from armident.identify.api.result_base import Result
 from armident.identify.documents.files import write_atomically
 from armident.identify.documents.identification import IdentificationDocument
 
@@ -82,7 +82,7 @@ class Design(Result):
         return (Path(path),)
 
     def _html(self) -> str:
-        from armident.identify.report.trajectory import trajectory_report
+        from armident.identify.report.trajectory_report import trajectory_report
 
         return trajectory_report(self.checked)
 
