@@ -102,6 +102,7 @@ def _as_arguments(message: str) -> str:
 
 
 def _from_table(robot: RobotConfig, source: Source, options: ImportOptions, facts: Mapping[str, str]) -> Recording:
+    """Return a table as a recording, after checks of content, units and clock."""
     path = source.path
     rate_hz, resample_hz = options.get("rate_hz"), options.get("resample_hz")
     polled, motor_side = options.get("polled", False), options.get("motor_side", False)
