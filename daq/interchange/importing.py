@@ -55,8 +55,7 @@ def import_recording(
     effort = options.get("effort")
     if effort is not None:
         facts |= {"effort": effort.name, "effort_sha256": _digest(effort)}
-    rows = in_si(table_rows(found, config, options), config, options.get("units") or {})
-    return _from_table(found, rows, config, facts, options)
+    return _from_table(config, found, options, facts)
 
 
 @np.errstate(over="ignore", invalid="ignore", divide="ignore")
@@ -80,11 +79,8 @@ def recording_of_arrays(
                     f"each time and one column for each joint of {robot.name}"
                 )
     _check_rates(None, False, resample_hz)
-    source = Source(Path("arrays"), table)
     try:
-        rows = complete_rows(source, robot, {})
-        options: ImportOptions = {} if resample_hz is None else {"resample_hz": resample_hz}
-        return _from_table(source, rows, robot, {"source": "arrays"}, options)
+        return _from_table(robot, Source(Path("arrays"), table), {"resample_hz": resample_hz}, {"source": "arrays"})
     except DataError as error:
         raise type(error)(_as_arguments(str(error))) from error
 
@@ -105,13 +101,12 @@ def _as_arguments(message: str) -> str:
     return message
 
 
-def _from_table(
-    source: Source, rows: TableRows, robot: RobotConfig, facts: Mapping[str, str], options: ImportOptions
-) -> Recording:
-    """Return the rows of a table as a recording, after checks of content, units and clock."""
+def _from_table(robot: RobotConfig, source: Source, options: ImportOptions, facts: Mapping[str, str]) -> Recording:
+    """Return a table as a recording, after checks of content, units and clock."""
     path = source.path
     rate_hz, resample_hz = options.get("rate_hz"), options.get("resample_hz")
     polled, motor_side = options.get("polled", False), options.get("motor_side", False)
+    rows = in_si(table_rows(source, robot, options), robot, options.get("units") or {})
     _refuse_immense(source, rows)
     side: Side = "motor" if motor_side else "joint"
     fields: dict[str, Field] = {

@@ -58,7 +58,7 @@ class Identification(Result):
     document: IdentificationDocument
     robot: RobotConfig
     recordings: tuple[Recording, ...] = ()
-    estimate: "IdentificationResult | None" = None
+    estimate: IdentificationResult | None = None
     path: Path = IN_MEMORY
     file = "identification.json"
 

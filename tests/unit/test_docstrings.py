@@ -31,7 +31,6 @@ DOOR: dict[str, set[str] | None] = {
     "identify/effects/effect.py": None,
     "identify/estimators/*": None,
     "identify/model_export/exported_model.py": None,
-    "identify/identification/options.py": {"Options"},
     "identify/robot/motion.py": {"Motion"},
     "identify/identification/robot_model.py": None,
     "src/armident/__init__.py": None,
