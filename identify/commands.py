@@ -182,7 +182,7 @@ def compare_command(
         Print the document on stdout instead of a table.
     """
     from armident.identify.cli_tables import warn
-    from armident.identify.monitoring.comparison import compare_models, comparison_table
+    from armident.identify.monitoring.change.comparison import compare_models, comparison_table
     from armident.identify.report.comparison import comparison_report
 
     files = [each / "identification.json" if each.is_dir() else each for each in (baseline, now)]

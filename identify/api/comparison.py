@@ -5,8 +5,8 @@ from pathlib import Path
 
 from armident.identify.api.identification import Identification, document_of
 from armident.identify.documents.identification import IdentificationDocument
-from armident.identify.monitoring.change_test import ParameterChangeTest
-from armident.identify.monitoring.change_test import compare as test_parameter_change
+from armident.identify.monitoring.change.change_test import ParameterChangeTest
+from armident.identify.monitoring.change.change_test import compare as test_parameter_change
 from armident.identify.tables import Table
 
 
