@@ -37,8 +37,8 @@ from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.effects.friction import TRANSITION
 from armident.identify.effects.recorded import of_recording
 from armident.identify.effects.unnamed import NAME as UNNAMED
-from armident.identify.experiment import Experiment
 from armident.identify.regression.equations import applied
+from armident.identify.signals.experiments import Experiment
 
 Array = NDArray[np.float64]
 Progress = Callable[[str, float], None]

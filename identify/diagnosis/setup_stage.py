@@ -7,10 +7,10 @@ import numpy as np
 
 from armident.configs import DataError, RobotConfig
 from armident.identify.documents.diagnosis import Finding, Gap, Unexplained
-from armident.identify.experiment import Experiment
 from armident.identify.setup.check import check_setup
 from armident.identify.setup.result import CONVENTIONS, SetupCheck, SetupFinding, with_torque_shift
 from armident.identify.setup.search import NOT_UNDERSTOOD
+from armident.identify.signals.experiments import Experiment
 
 SIGNALS = {"position_sign": "position", "torque_sign": "torque"}
 

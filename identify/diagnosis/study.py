@@ -18,7 +18,6 @@ from armident.identify.effects.terms import arm_model, terms_of
 from armident.identify.effects.wiring import Wiring
 from armident.identify.estimators.auxiliary_model import AuxiliaryModel
 from armident.identify.estimators.idim_ls import idim_ls
-from armident.identify.experiment import Experiment, check_one_rate
 from armident.identify.identification.auxiliary_loop import closed_loop
 from armident.identify.identification.equations import Prepared, equations, least_rows
 from armident.identify.identification.options import CONTROLLERS, Options
@@ -31,6 +30,7 @@ from armident.identify.robot.simulation import Simulation
 from armident.identify.signals.bandwidth import motion_bandwidth
 from armident.identify.signals.decimate import Decimation, design
 from armident.identify.signals.differentiate import Derivatives, differentiate
+from armident.identify.signals.experiments import Experiment, check_one_rate
 
 Array = NDArray[np.float64]
 
@@ -136,7 +136,7 @@ class Study:
     def with_torque_shift(self, samples: float) -> "Study":
         """The study with torques that are late by another time.
 
-        ``samples``: shift of all torques, see `armident.identify.experiment.Experiment`.
+        ``samples``: shift of all torques, see `armident.identify.signals.experiments.Experiment`.
         """
         training, validation = ([replace(e, torque_shift=samples) for e in part] for part in self.sources)
         return self._with_torques((training, validation))

@@ -263,3 +263,12 @@ class IdentificationDocument(Document):
     configuration: dict[str, Any] | None = None
     held_out_error_pct: float | None = None
     held_out_error_pct_by_joint: dict[str, float] | None = None
+
+    @property
+    def sentence(self) -> str:
+        """Verdict and, if not trustworthy, its first reason."""
+        level = self.verdict or "not judged"
+        if not self.reasons:
+            return level
+        more = len(self.reasons) - 1
+        return f"{level}: {self.reasons[0].message}" + (f" (and {more} more)" if more else "")

@@ -12,8 +12,8 @@ from scipy import signal
 from armident.configs import RobotConfig
 from armident.configs.schema.robot import Effect as Entry
 from armident.identify.effects.effect import Linear, Periodic, Place, Shape, TorqueDependent, Trials
-from armident.identify.experiment import Experiment
 from armident.identify.robot.motion import Motion
+from armident.identify.signals.experiments import Experiment
 
 Array = NDArray[np.float64]
 

@@ -65,7 +65,7 @@ def effects_command(name: str | None, *, as_json: bool) -> None:
         return
     from rich.table import Table
 
-    from armident.identify.print_table import print_table
+    from armident.identify.cli.print_table import print_table
 
     table = Table(title="effects", title_justify="left")
     for heading in ("effect", "title", "parameters", "scope"):

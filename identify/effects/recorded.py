@@ -7,8 +7,8 @@ from armident.configs.schema.robot import Effect as Entry
 from armident.identify.effects.drive import Correction
 from armident.identify.effects.registry import of_entry
 from armident.identify.effects.wiring import rewired
-from armident.identify.experiment import Experiment
-from armident.identify.streamed import kept
+from armident.identify.signals.experiments import Experiment
+from armident.identify.signals.streamed import kept
 
 
 def of_recording(entry: Entry) -> bool:

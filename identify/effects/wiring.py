@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from armident.configs import ConfigError, RobotConfig
 from armident.configs.schema.robot import Effect as Entry
 from armident.identify.effects.effect import Effect, Place, Scope, Shapes
-from armident.identify.experiment import Experiment
 from armident.identify.robot.motion import Motion
+from armident.identify.signals.experiments import Experiment
 
 Array = NDArray[np.float64]
 

@@ -16,7 +16,6 @@ from armident.identify.estimators.essential import essential_parameters
 from armident.identify.estimators.idim_ls import idim_ls
 from armident.identify.estimators.methods import estimator
 from armident.identify.estimators.reason import Reason
-from armident.identify.experiment import Experiment, check_one_rate
 from armident.identify.identification.auxiliary_loop import ClosedLoop, closed_loop, velocity_error
 from armident.identify.identification.checks.interval import doubts_of_least_squares, interval_reason
 from armident.identify.identification.checks.judged import Judged
@@ -53,7 +52,8 @@ from armident.identify.setup.result import SetupCheck, with_torque_shift
 from armident.identify.signals.bandwidth import motion_bandwidth
 from armident.identify.signals.decimate import Decimation
 from armident.identify.signals.differentiate import Derivatives, differentiate, encoder_resolution
-from armident.identify.streamed import kept, mapped
+from armident.identify.signals.experiments import Experiment, check_one_rate
+from armident.identify.signals.streamed import kept, mapped
 
 TORQUE_PREDICTIONS = 2
 """Largest number of predictions of the torques on which terms depend."""

@@ -10,7 +10,6 @@ from threadpoolctl import threadpool_limits
 
 from armident.configs import DataError, RobotConfig
 from armident.identify.effects.recorded import put_right
-from armident.identify.experiment import Experiment, check_one_rate
 from armident.identify.setup import signals
 from armident.identify.setup.bench import Bench, make_bench
 from armident.identify.setup.clipping import clipped_torques
@@ -19,6 +18,7 @@ from armident.identify.setup.fit import Hypothesis, joint_errors
 from armident.identify.setup.result import SetupCheck, SetupFinding, TorqueShift
 from armident.identify.setup.search import NOT_UNDERSTOOD, STRUCTURED, Search, Step
 from armident.identify.setup.torque_shift import SHIFT_RATE, long_torque_shift, torque_shift
+from armident.identify.signals.experiments import Experiment, check_one_rate
 
 Array = NDArray[np.float64]
 

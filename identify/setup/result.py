@@ -4,8 +4,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from armident.configs import RobotConfig
-from armident.identify.experiment import Experiment
-from armident.identify.streamed import mapped
+from armident.identify.signals.experiments import Experiment
+from armident.identify.signals.streamed import mapped
 
 SIGNIFICANT = 3.0
 """Standard deviations between a shift and a convention from which they differ: one false alarm in 370."""

@@ -19,7 +19,7 @@ from armident.identify.monitoring.worker.announcements import Announcements
 from armident.identify.monitoring.worker.ledger import FILE, Ledger, LedgerEntry, LedgerError
 from armident.identify.monitoring.worker.worker import Worker
 from armident.identify.monitoring.worker.worker_link import WorkerLink
-from armident.identify.report.files import write_identification
+from armident.identify.report.robot_file import write_identification
 from tests.faults.service import Audience, cell_of
 from tests.integration.test_worker_failures import recorded
 

@@ -25,8 +25,8 @@ from armident.configs import RobotConfig, load_robot
 from armident.configs.loading import parse
 from armident.daq.interchange.importing import import_recording
 from armident.identify.diagnosis.diagnose import Diagnosis, diagnose
-from armident.identify.experiment import Experiment
 from armident.identify.identification.from_recording import experiments_from_recording
+from armident.identify.signals.experiments import Experiment
 from tests.conftest import REPOSITORY
 
 FORCE_PER_VOLT = 35.15065

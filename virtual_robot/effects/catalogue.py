@@ -64,13 +64,13 @@ CATALOGUE: dict[str, EffectSpec] = {
     "asymmetric_viscous_friction": EffectSpec(
         "force",
         "viscous friction that depends on the direction of motion",
-        {"ratio": ParameterSpec("-", "Fv (1 + ratio) forwards, Fv (1 - ratio) backwards", None, -1.0, 1.0)},
+        {"fva": ParameterSpec("N m s/rad", "Fv + fva forwards, Fv - fva backwards; at most Fv")},
     ),
     "asymmetric_coulomb_friction": EffectSpec(
         "force",
         "Coulomb friction that depends on the direction of motion, once the joint moves",
         {
-            "ratio": ParameterSpec("-", "Fc (1 + ratio) forwards, Fc (1 - ratio) backwards", None, -1.0, 1.0),
+            "fca": ParameterSpec("N m", "Fc + fca forwards, Fc - fca backwards; at most Fc"),
             "velocity": _positive(
                 "rad/s", "speed at which it reaches 75 %; 1 % of the joint's limit unless given", AUTO
             ),
@@ -101,7 +101,7 @@ CATALOGUE: dict[str, EffectSpec] = {
     "load_dependent_friction": EffectSpec(
         "force",
         "Coulomb friction that increases with the torque transmitted by the gear",
-        {"coefficient": _positive("-", "friction torque per transmitted torque", None, 0.9)},
+        {"fcl": _positive("-", "friction torque per transmitted torque", None, 0.9)},
     ),
     "presliding_friction": EffectSpec(
         "bristle",

@@ -7,7 +7,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from armident.configs import Joint, RobotConfig
+from armident.configs import ConfigError, Joint, RobotConfig
 from armident.virtual_robot.effects.hidden import Hidden
 
 CODES = (
@@ -54,15 +54,15 @@ def effect_torque(code, p, q, qd, motor, other, load, t, smoothing):  # type: ig
     """
     side = 2.0 / math.pi * math.atan(smoothing * qd)
     side_slope = 2.0 / math.pi * smoothing / (1.0 + (smoothing * qd) ** 2)
-    if code == 0:  # ratio fv |qd|
+    if code == 0:  # fva |qd|
         return p[0] * abs(qd), p[0] * math.copysign(1.0, qd)
-    if code == 1:  # ratio fc, which builds up with speed
+    if code == 1:  # fca, which builds up with speed
         film = math.tanh(qd / p[1])
         return p[0] * film * film, p[0] * 2.0 * film * (1.0 - film * film) / p[1]
     if code == 2:  # fv qd (1 / (1 + |qd / v0|^exponent) - 1)
         thin = abs(qd / p[1]) ** p[2]
         return -p[0] * qd * thin / (1.0 + thin), p[0] * ((1.0 + thin - p[2] * thin) / (1.0 + thin) ** 2 - 1.0)
-    if code == 3:  # coefficient |load|
+    if code == 3:  # fcl |load|
         return p[0] * abs(load) * side, p[0] * abs(load) * side_slope
     if code == 4:  # wave or tight spot
         level = p[0] * (math.exp(-0.5 * ((q - p[4]) / p[3]) ** 2) if p[3] > 0.0 else math.cos(p[1] * q + p[2]))
@@ -106,19 +106,27 @@ def force_table(hidden: Sequence[Hidden], robot: RobotConfig, friction: NDArray[
     return table
 
 
+def _at_most(h: Hidden, name: str, friction: float) -> float:
+    """Return a difference between the directions, which the friction of the joint bounds."""
+    if abs(h[name]) > friction:
+        raise ConfigError(f"{h.where}.parameters.{name}: expected at most the friction {friction:g}, found {h[name]:g}")
+    return h[name]
+
+
 def _row(h: Hidden, robot: RobotConfig, fv: float, fc: float) -> tuple[float, ...]:
     joint, ratio = robot.joints[h.joint], robot.transmission_matrix[h.joint, h.joint]
     match h.effect:
         case "asymmetric_viscous_friction":
-            return (h["ratio"] * fv,)
+            return (_at_most(h, "fva", fv),)
         case "asymmetric_coulomb_friction":
             # tanh^2 reaches three quarters at 1.317.
-            return h["ratio"] * fc, h.value_or("velocity", 0.01 * joint.limits.velocity) / math.atanh(math.sqrt(0.75))
+            speed = h.value_or("velocity", 0.01 * joint.limits.velocity)
+            return _at_most(h, "fca", fc), speed / math.atanh(math.sqrt(0.75))
         case "nonlinear_viscous_friction":
             speed = h.value_or("velocity", 0.5 * joint.limits.velocity)
             return fv, speed * (1.0 / h["thinning"] - 1.0) ** (1.0 / h["exponent"]), h["exponent"]
         case "load_dependent_friction":
-            return (h["coefficient"],)
+            return (h["fcl"],)
         case "position_dependent_friction":
             return h["ratio"] * fc, waves(h, joint), h["phase"], h["width"], h["position"]
         case "friction_drift":

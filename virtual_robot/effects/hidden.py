@@ -83,7 +83,8 @@ def _values(entry: HiddenEffect, kind: str, at: str) -> dict[str, float]:
     known = EFFECTS[entry.effect].parameters
     for name in entry.parameters:
         if name not in known:
-            raise ConfigError(f"{at}.parameters.{name}: unknown ({entry.effect} takes {', '.join(known)})")
+            takes = ", ".join(f"{one} ({parameter.unit})" for one, parameter in known.items())
+            raise ConfigError(f"{at}.parameters.{name}: unknown ({entry.effect} takes {takes})")
     values: dict[str, float] = {}
     for name, parameter in known.items():
         if name in entry.parameters and parameter.only not in (None, kind):

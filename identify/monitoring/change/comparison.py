@@ -11,9 +11,9 @@ from armident.configs import DataError
 from armident.identify.documents.comparison import LEVEL_95, ComparedModel, ComparedParameter, ComparisonDocument
 from armident.identify.documents.identification import IdentificationDocument, Parameter
 from armident.identify.effects.terms import terms_of
+from armident.identify.identification.saved_model import configuration_of
 from armident.identify.monitoring.change.change_test import FALSE_ALARMS, ParameterChangeTest, compare
 from armident.identify.monitoring.change.model_differences import model_differences
-from armident.identify.saved_model import configuration_of
 
 
 def compare_models(

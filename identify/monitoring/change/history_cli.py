@@ -139,7 +139,7 @@ def _table(
 ) -> None:
     from rich.table import Table
 
-    from armident.identify.print_table import print_table
+    from armident.identify.cli.print_table import print_table
 
     table = Table(title=title)
     for heading in ("recorded (UTC)", "recording", "error", *parameters, "compared with the first"):

@@ -21,7 +21,7 @@ from armident.identify.monitoring.change.change_test import ParameterChangeTest,
 from armident.identify.monitoring.change.history import History
 from armident.identify.monitoring.reidentify.reidentify_options import ReidentifyOptions
 from armident.identify.monitoring.reidentify.summary import change_lines
-from armident.identify.report.files import write_identification
+from armident.identify.report.robot_file import write_identification
 
 if TYPE_CHECKING:
     from distributed import Client

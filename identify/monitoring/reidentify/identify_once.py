@@ -18,7 +18,7 @@ from armident.identify.monitoring.reidentify.publish import StatusPublisher
 from armident.identify.monitoring.reidentify.record_run import Say
 from armident.identify.monitoring.worker.ledger import FILE, Ledger, LedgerError, LedgerUnusable, unique_owner
 from armident.identify.monitoring.worker.recorded import captured_in, result_of
-from armident.identify.report.files import write_identification
+from armident.identify.report.robot_file import write_identification
 
 RENEW_S = 1.0
 """Interval at which the lease is renewed, s."""

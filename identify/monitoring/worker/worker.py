@@ -36,7 +36,7 @@ from armident.identify.monitoring.worker.recorded import (
 )
 from armident.identify.monitoring.worker.stream_buffer import LARGEST_BLOCK, LARGEST_EVENT, StreamBuffer
 from armident.identify.monitoring.worker.worker_link import LinkDown, WorkerLink
-from armident.identify.report.files import write_identification
+from armident.identify.report.robot_file import write_identification
 from armident.systemd import Notifier
 
 log = logging.getLogger(__name__)

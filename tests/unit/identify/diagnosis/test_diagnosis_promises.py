@@ -73,7 +73,7 @@ def test_other_friction_of_one_joint_is_another_number_and_no_structure() -> Non
 
 
 def test_a_structural_effect_is_no_other_number() -> None:
-    worn = HiddenEffect(effect="asymmetric_viscous_friction", joint="joint_2", parameters={"ratio": 0.2})
+    worn = HiddenEffect(effect="asymmetric_viscous_friction", joint="joint_2", parameters={"fva": 0.2 * 5.5})
     (finding,) = against_baseline(4, worn)
     assert (finding.kind, finding.effect, finding.joint) == ("structure", "asymmetric_viscous_friction", "joint_2")
 

@@ -40,7 +40,7 @@ def test_a_larger_model_begins_with_the_rigid_parameters_of_the_smaller_one() ->
 
 def test_a_correction_of_the_recordings_acts_on_all_joints_also_beside_a_term() -> None:
     first = selection(
-        5, hide("asymmetric_viscous_friction", "joint_2", ratio=0.3), arm="tx40", motion="tx40_excitation"
+        5, hide("asymmetric_viscous_friction", "joint_2", fva=0.3 * 5.5), arm="tx40", motion="tx40_excitation"
     )[1]
     term = Effect(effect="asymmetric_viscous_friction", joint="joint_2")
     correction = Effect(effect="drive_gain_error", joint="joint_4", parameters={"gain_error": 0.05})

@@ -13,7 +13,7 @@ from armident.identify.diagnosis.model_state import ModelState, fitted, with_ent
 from armident.identify.diagnosis.precision import p_value, standard_deviations
 from armident.identify.diagnosis.screening import contained
 from armident.identify.diagnosis.study import build_study
-from armident.identify.experiment import Experiment
+from armident.identify.signals.experiments import Experiment
 from tests.fixtures import setups
 from tests.fixtures.diagnoses import SPRING, selection
 

@@ -126,7 +126,7 @@ def test_an_effect_beside_which_a_finding_stays_does_not_take_its_place() -> Non
 
 
 def test_only_effects_on_a_joint_of_a_finding_compete_with_it() -> None:
-    worn = hide("asymmetric_viscous_friction", "joint_2", ratio=0.3)
+    worn = hide("asymmetric_viscous_friction", "joint_2", fva=0.3 * 5.5)
     steps, first = selection(5, worn, arm="tx40", motion="tx40_excitation")
     every = shortlist(first, steps.criteria, None)
     joints = np.arange(6) == 1

@@ -14,7 +14,7 @@ from armident.identify.diagnosis.study import Study, _aligned, build_study
 from armident.identify.effects.drive import Correction
 from armident.identify.effects.recorded import put_right
 from armident.identify.effects.registry import known
-from armident.identify.experiment import Experiment
+from armident.identify.signals.experiments import Experiment
 from tests.fixtures import setups
 
 Array = NDArray[np.float64]

@@ -12,12 +12,12 @@ from armident.identify.effects.effect import Effect, Place
 from armident.identify.effects.registry import catalogue
 from armident.identify.effects.tables import FreeShape
 from armident.identify.effects.terms import arm_model, entry_of
-from armident.identify.experiment import Experiment
 from armident.identify.identification.from_recording import experiments_from_recording
 from armident.identify.identification.options import Options
 from armident.identify.identification.pipeline import identify_experiment
-from armident.identify.report.files import robot_yaml
+from armident.identify.report.robot_file import robot_yaml
 from armident.identify.robot.motion import Motion
+from armident.identify.signals.experiments import Experiment
 from tests.fixtures.arms import FAST, recording
 from tests.fixtures.diagnoses import SPRING
 

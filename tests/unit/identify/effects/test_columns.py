@@ -17,8 +17,8 @@ from armident.identify.effects.registry import catalogue
 from armident.identify.effects.rotor import rotors
 from armident.identify.effects.terms import arm_model
 from armident.identify.effects.transmission import crossing, swinging
-from armident.identify.experiment import Experiment
 from armident.identify.robot.motion import Motion
+from armident.identify.signals.experiments import Experiment
 from armident.virtual_robot.inertias import plant_parameters
 
 DT = 1e-3

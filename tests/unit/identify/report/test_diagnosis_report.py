@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from armident.identify.diagnosis.diagnose import Diagnosis
-from armident.identify.report.diagnosis import SHOWN, diagnosis_report, followed_variable, telling_stretch
+from armident.identify.report.diagnosis_report import SHOWN, diagnosis_report, followed_variable, telling_stretch
 from tests.fixtures import diagnoses
 from tests.fixtures.diagnoses import WORN_AND_SPRUNG
 

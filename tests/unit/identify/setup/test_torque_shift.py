@@ -10,7 +10,6 @@ from scipy.interpolate import CubicSpline
 
 from armident.configs import RobotConfig, load_robot
 from armident.identify.diagnosis.setup_stage import set_up
-from armident.identify.experiment import Experiment
 from armident.identify.identification.equations import aligned_torque
 from armident.identify.identification.from_recording import experiments_from_recording
 from armident.identify.identification.options import Options
@@ -20,6 +19,7 @@ from armident.identify.setup.check import check_setup
 from armident.identify.setup.fit import Hypothesis
 from armident.identify.setup.result import TorqueShift, with_torque_shift
 from armident.identify.setup.torque_shift import long_torque_shift
+from armident.identify.signals.experiments import Experiment
 from tests.fixtures import setups
 from tests.fixtures.arms import FAST, recording
 from tests.statistics.late_torques import moved

@@ -33,7 +33,7 @@ def identify(
 
     Example: armident identify tx40.mcap --out results
     """
-    from armident.identify.commands import identify_command
+    from armident.identify.cli.result_commands import identify_command
 
     code = identify_command(recording, config, options, out, as_json=json)
     if code:
@@ -52,7 +52,7 @@ def check(
 
     Example: armident check tx40.mcap --config configs/tx40.yaml
     """
-    from armident.identify.commands import check_command
+    from armident.identify.cli.result_commands import check_command
 
     code = check_command(recordings, config, as_json=json)
     if code:
@@ -97,7 +97,7 @@ def diagnose(
 
     Example: armident diagnose monday.mcap --validate tuesday.mcap
     """
-    from armident.identify.commands import diagnose_command
+    from armident.identify.cli.result_commands import diagnose_command
 
     code = diagnose_command(recordings, config, validate, baseline, options, out, as_json=json)
     if code:
@@ -123,7 +123,7 @@ def predict(
 
     Example: armident predict tuesday.mcap --model monday.identification
     """
-    from armident.identify.commands import predict_command
+    from armident.identify.cli.result_commands import predict_command
 
     code = predict_command(recordings, model, config, out, as_json=json)
     if code:
@@ -151,7 +151,7 @@ def compare(
 
     Example: armident compare monday.identification tuesday.identification
     """
-    from armident.identify.commands import compare_command
+    from armident.identify.cli.result_commands import compare_command
 
     code = compare_command(baseline, now, out, false_alarms, common=common, as_json=json)
     if code:
@@ -217,7 +217,7 @@ def trajectory(
     """
     from armident.identify.documents.files import write_atomically
     from armident.identify.excitation.trajectory_command import trajectory_command
-    from armident.identify.report.trajectory import trajectory_report
+    from armident.identify.report.trajectory_report import trajectory_report
 
     found = trajectory_command(options)
     page = report or (found.path or Path(f"{found.robot.name}_trajectory")).with_suffix(".html")

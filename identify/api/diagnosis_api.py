@@ -8,18 +8,18 @@ from typing import TYPE_CHECKING
 
 from armident.configs import ConfigError, DataError, RobotConfig
 from armident.identify.api.arguments import Progress, Recorded, Robot, recordings_of, robot_of
-from armident.identify.api.identification import Identification, document_of
-from armident.identify.api.result import Result
+from armident.identify.api.identification_api import Identification, identified
+from armident.identify.api.result_base import Result
+from armident.identify.api.result_tables import EffectTable, Table
 from armident.identify.documents.base import reference
 from armident.identify.documents.diagnosis import DiagnosisDocument
-from armident.identify.documents.files import to_json, write_atomically
+from armident.identify.documents.files import write_atomically
 from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.effects.registry import catalogue
-from armident.identify.experiment import Experiment
 from armident.identify.identification.from_recording import rest_notes
 from armident.identify.identification.identify_recording import experiments_of
-from armident.identify.report.files import robot_yaml
-from armident.identify.tables import EffectTable, Table
+from armident.identify.report.robot_file import robot_yaml
+from armident.identify.signals.experiments import Experiment
 
 if TYPE_CHECKING:
     from armident.identify.diagnosis.diagnose import Diagnosis as DiagnosisResult
@@ -45,6 +45,7 @@ class Diagnosis(Result):
     robot: RobotConfig
     configured: RobotConfig
     result: "DiagnosisResult"
+    file = "diagnosis.json"
 
     @property
     def verdict(self) -> str:
@@ -74,7 +75,7 @@ class Diagnosis(Result):
         gap = self.document.gap.validation
         return gap.before.all, gap.after.all
 
-    def save(self, folder: str | Path) -> DiagnosisDocument:
+    def save(self, folder: str | Path) -> tuple[Path, ...]:
         """Write ``diagnosis.json``, ``report.html`` and, where effects were found, the new model ``model.yaml``.
 
         Parameters
@@ -84,21 +85,18 @@ class Diagnosis(Result):
 
         Returns
         -------
-        DiagnosisDocument
-            The document as written, with the path of the model.
+        tuple of Path
+            The two or three files.
         """
-        place, document = Path(folder), self.document
-        if self.robot != self.configured:
-            model = place / "model.yaml"
-            write_atomically(model, robot_yaml(self.robot))
-            document = document.model_copy(update={"model": str(model)})
-        write_atomically(place / "diagnosis.json", to_json(document))
-        written = replace(self, document=document)
-        written.report(place / "report.html")
-        return document
+        if self.robot == self.configured or self.document.model is not None:
+            return super().save(folder)
+        model = Path(folder) / "model.yaml"
+        write_atomically(model, robot_yaml(self.robot))
+        document = self.document.model_copy(update={"model": str(model)})
+        return *replace(self, document=document).save(folder), model
 
     def _html(self) -> str:
-        from armident.identify.report.diagnosis import diagnosis_report
+        from armident.identify.report.diagnosis_report import diagnosis_report
 
         return diagnosis_report(self.result, self.document)
 
@@ -175,7 +173,7 @@ def diagnose(
     begin = time.monotonic()
     read = recordings_of(recordings)
     config = robot_of(robot, read)
-    numbers = None if baseline is None else document_of(baseline)
+    numbers = None if baseline is None else identified(baseline)[0]
     if numbers is not None and numbers.robot != config.name:
         name = baseline if isinstance(baseline, str | Path) else "baseline"
         raise DataError(f"{name}: the baseline is of robot {numbers.robot!r}, the recording of {config.name!r}")

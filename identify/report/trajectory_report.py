@@ -14,7 +14,7 @@ from armident.identify.excitation.point_to_point import sample_trajectory
 from armident.identify.excitation.safety import CheckedTrajectory
 from armident.identify.identification.identification_result import units
 from armident.identify.report.glossary import CONVENTIONS, base_entries
-from armident.identify.report.identification import FAIR_PCT, GOOD_PCT
+from armident.identify.report.identification_report import FAIR_PCT, GOOD_PCT
 from armident.identify.report.page import MODEL, RESIDUAL, render
 from armident.identify.report.plots import Plot, Series, plots_html
 

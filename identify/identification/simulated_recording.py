@@ -6,13 +6,13 @@ from numpy.typing import NDArray
 from armident.configs import DataError, Trajectory
 from armident.daq.recording import Field, Recording, Stream
 from armident.identify.controller.nominal import known_controller, nominal_controller
+from armident.identify.identification.robot_model import RobotModel
 from armident.identify.robot.controller import DiscreteController
 from armident.identify.robot.relaxation import simulate_with_terms
-from armident.identify.saved_model import SavedModel
 from armident.identify.signals.bandwidth import motion_bandwidth
 
 
-def simulate_model(model: SavedModel, trajectory: Trajectory, rate_hz: float | None = None) -> Recording:
+def simulate_model(model: RobotModel, trajectory: Trajectory, rate_hz: float | None = None) -> Recording:
     """Simulate the recording of an arm that is exactly the model, with its effects, and without noise.
 
     The dynamics are those of the identification (thesis section B.3), not those of the virtual arm. The controller is
@@ -51,7 +51,7 @@ def simulate_model(model: SavedModel, trajectory: Trajectory, rate_hz: float | N
     )
 
 
-def _controller(model: SavedModel, reference: NDArray[np.float64], dt: float) -> DiscreteController:
+def _controller(model: RobotModel, reference: NDArray[np.float64], dt: float) -> DiscreteController:
     if model.robot.controller is not None:
         return known_controller(model.robot, dt)
     bandwidth = model.robot.bandwidth_hz or motion_bandwidth([reference], dt)

@@ -10,7 +10,7 @@ from armident.identify.diagnosis.diagnose import Diagnosis
 from armident.identify.diagnosis.lack_of_fit import Dependence
 from armident.identify.documents.diagnosis import DiagnosisDocument, Finding
 from armident.identify.report.glossary import diagnosis_entries, meaning_of
-from armident.identify.report.identification import torque_plots
+from armident.identify.report.identification_report import torque_plots
 from armident.identify.report.page import BAND, INK, MEASURED, MODEL, MUTED, RESIDUAL, figure, render
 
 Array = NDArray[np.float64]

@@ -1,9 +1,10 @@
 """Identification of a model from recordings, and the check of their set-up."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
-from typing import Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,20 +12,17 @@ from numpy.typing import NDArray
 from armident.configs import RobotConfig
 from armident.daq.recording import Recording
 from armident.identify.api.arguments import Progress, Recorded, Robot, recordings_of, robot_of
-from armident.identify.api.result import Result
-from armident.identify.documents.files import load_document, to_json, write_atomically
-from armident.identify.documents.identification import IdentificationDocument
+from armident.identify.api.result_base import Result
+from armident.identify.api.result_tables import ParameterTable, Table
+from armident.identify.documents.files import load_document
+from armident.identify.documents.identification import IdentificationDocument, VerdictReason
 from armident.identify.estimators.methods import Method
-from armident.identify.estimators.reason import Reason
-from armident.identify.identification.identification_result import IdentificationResult as Estimation
-from armident.identify.identification.identify_recording import experiments_of, identify_recording
-from armident.identify.identification.options import ControllerName, NoiseModelName, Options
-from armident.identify.regression.orders import MAX_AR_ORDER
-from armident.identify.saved_model import model_of
-from armident.identify.setup.check import check_setup
-from armident.identify.setup.result import SetupCheck
-from armident.identify.signals.choices import DerivativesName, NvrRule
-from armident.identify.tables import ParameterTable, Table
+from armident.identify.identification.identification_result import IdentificationResult
+from armident.identify.identification.identify_recording import identify_recording
+from armident.identify.identification.options import ControllerName, Options
+from armident.identify.identification.robot_model import IN_MEMORY, RobotModel
+from armident.identify.identification.saved_model import model_of, used_configuration
+from armident.identify.signals.choices import DerivativesName
 
 Array = NDArray[np.float64]
 
@@ -40,25 +38,39 @@ class Identification(Result):
     robot
         Configuration that the model is of.
     recordings
-        The recordings it was identified from.
-    result
-        The estimate with its curves: residuals, measured and predicted torques.
+        The recordings it was identified from; none if it was read from a file.
+    estimate
+        Curves of the report: residuals, measured and predicted torques; ``None`` if it was read from a file.
+    path
+        File that it was read from.
+
+    Examples
+    --------
+    >>> import armident
+    >>> recording = armident.simulate_recording("emps", "emps_excitation", seed=1)
+    >>> result = armident.identify(recording, method="idim-ls")
+    >>> result.names
+    ('m1', 'fv1', 'fc1', 'off1')
+    >>> result.model.inverse_dynamics([[0.1]], [[0.0]], [[1.0]]).shape
+    (1, 1)
     """
 
     document: IdentificationDocument
     robot: RobotConfig
-    recordings: tuple[Recording, ...]
-    result: Estimation
+    recordings: tuple[Recording, ...] = ()
+    estimate: "IdentificationResult | None" = None
+    path: Path = IN_MEMORY
+    file = "identification.json"
 
     @property
     def verdict(self) -> str:
         """``trustworthy``, ``doubtful`` or ``unusable``; an unusable result must not be used."""
-        return self.result.verdict.level
+        return self.document.verdict or "not judged"
 
     @property
-    def reasons(self) -> tuple[Reason, ...]:
+    def reasons(self) -> tuple[VerdictReason, ...]:
         """Reasons of the verdict with the next step in words, the most severe first; empty if trustworthy."""
-        return self.result.verdict.reasons
+        return tuple(self.document.reasons)
 
     @property
     def parameters(self) -> ParameterTable:
@@ -68,22 +80,22 @@ class Identification(Result):
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the base parameters, (b,)."""
-        return self.result.names
+        return tuple(p.name for p in self.document.parameters)
 
     @property
     def theta(self) -> Array:
         """Values of the base parameters, (b,), each in its unit."""
-        return self.result.theta
+        return np.array([p.value for p in self.document.parameters])
 
     @property
     def std(self) -> Array:
         """Standard deviations of the base parameters, (b,), each in its unit."""
-        return self.result.std
+        return np.array([p.std for p in self.document.parameters])
 
     @property
     def covariance(self) -> Array:
         """Covariance matrix of the base parameters, (b, b)."""
-        return self.result.covariance
+        return np.array(self.document.covariance)
 
     @property
     def relative_error_pct(self) -> float:
@@ -95,22 +107,16 @@ class Identification(Result):
         """Remarks on data and result, one sentence each."""
         return tuple(self.document.warnings)
 
-    def save(self, folder: str | Path) -> tuple[Path, Path]:
-        """Write ``identification.json`` and ``report.html``.
+    @cached_property
+    def model(self) -> RobotModel:
+        """The identified model, which knows its parameters: ``result.model.inverse_dynamics(q, qd, qdd)``.
 
-        Parameters
-        ----------
-        folder
-            Folder of the files; made if it does not exist.
-
-        Returns
-        -------
-        tuple of Path
-            The document and the report.
+        Raises
+        ------
+        DataError
+            If the identification is unusable.
         """
-        document = Path(folder) / "identification.json"
-        write_atomically(document, to_json(self.document))
-        return document, self.report(Path(folder) / "report.html")
+        return model_of(self.document, self.path, self.robot)
 
     def export(
         self, path: str | Path, format: str, *, urdf: str | Path | None = None, nearest: bool = False
@@ -144,23 +150,22 @@ class Identification(Result):
         from armident.identify.model_export.formats import export_model
         from armident.identify.model_export.source_urdf import source_for
 
-        saved = model_of(self.document, Path("identification.json"), self.robot)
-        model = exported_model(saved, nearest=nearest)
+        model = exported_model(self.model, nearest=nearest)
         if urdf is not None:
             model = model.in_frames_of(source_for(self.robot, Path(urdf)))
         return tuple(export_model(model, format, Path(path))[0])
 
     def _html(self) -> str:
-        from armident.identify.report.identification import identification_report
+        from armident.identify.report.identification_report import identification_report
 
-        return identification_report(self.recordings, self.robot, self.result, self.document)
+        return identification_report(self.recordings, self.robot, self.estimate, self.document)
 
     def _summary(self) -> str:
         document = self.document
         essential = sum(p.essential for p in document.parameters)
         return (
             f"{document.robot}, {document.method}: torque error {document.relative_error_pct:.2f} %, "
-            f"{essential} of {len(document.parameters)} base parameters essential, {self.result.verdict.sentence}"
+            f"{essential} of {len(document.parameters)} base parameters essential, {document.sentence}"
         )
 
     def _table(self) -> Table:
@@ -172,16 +177,12 @@ def identify(
     recordings: Recorded | Sequence[Recorded],
     robot: Robot | None = None,
     *,
-    method: Method = "idim-piv",
+    method: Method | None = None,
     derivatives: DerivativesName | None = None,
-    controller: ControllerName = "crc",
-    nvr: float | NvrRule | None = None,
-    noise_model: NoiseModelName = "black-box",
-    max_ar_order: int = MAX_AR_ORDER,
+    controller: ControllerName | None = None,
     bandwidth_hz: float | None = None,
-    decimation: int | Literal["noise"] | None = None,
-    weighted: bool = True,
-    physical: bool = False,
+    physical: bool | None = None,
+    options: Options | None = None,
     progress: Progress | None = None,
 ) -> Identification:
     """Identify the dynamic model of a robot from one or several recordings.
@@ -193,29 +194,19 @@ def identify(
     robot
         Configuration to use, or the path or shipped name of one; by default the one inside the first recording.
     method
-        ``idim-piv`` (thesis section 6.2), ``idim-iv`` (2.3.3), ``idim-ls`` (2.3.1), ``didim``, ``clie``, ``cloe`` or
-        ``sep-pem``.
+        ``idim-piv`` (thesis section 6.2, the default), ``idim-iv`` (2.3.3), ``idim-ls`` (2.3.1), ``didim``, ``clie``,
+        ``cloe`` or ``sep-pem``.
     derivatives
         ``irwsm``, ``irwsm2`` or ``bandpass``; by default IRWSM of order 1 (thesis chapter 5).
     controller
-        ``crc`` (impulse response by correlation analysis), ``parametric`` (cascade or PID by refined instrumental
-        variables) or ``known`` (gains of the configuration).
-    nvr
-        Noise-variance ratio of IRWSM, or the rule that finds it: ``automatic``, ``cross-validation``, ``likelihood``,
-        ``tracking-error``.
-    noise_model
-        Noise model of IDIM-PIV: ``black-box`` (thesis 6.27) or ``grey-box`` (6.28).
-    max_ar_order
-        Highest order of the autoregressive noise models.
+        ``crc`` (impulse response by correlation analysis, the default), ``parametric`` (cascade or PID by refined
+        instrumental variables) or ``known`` (gains of the configuration).
     bandwidth_hz
         Closed-loop bandwidth, Hz; by default from the configuration, else from the data.
-    decimation
-        Keep one sample of so many, or ``noise``: of as many as the noise is correlated over (thesis 6.2.3); by default
-        from the bandwidth.
-    weighted
-        True to weight each joint of IDIM-LS by its noise (thesis 2.23).
     physical
         True to compute the nearest physically consistent parameters, too.
+    options
+        All options, such as ``armident.Options(nvr="likelihood", decimation=20)``; those above replace its own.
     progress
         Called with the name of a stage and the share done, 0 to 1.
 
@@ -239,77 +230,63 @@ def identify(
     >>> result.theta.shape, result.covariance.shape
     ((61,), (61, 61))
     """
-    options = Options(
-        method=method,
-        derivatives=derivatives,
-        controller=controller,
-        decimation=decimation,
-        nvr=nvr,
-        bandwidth_hz=bandwidth_hz,
-        noise_model=noise_model,
-        max_ar_order=max_ar_order,
-        weighted=weighted,
-        physical=physical,
-    )
+    usual = {
+        "method": method,
+        "derivatives": derivatives,
+        "controller": controller,
+        "bandwidth_hz": bandwidth_hz,
+        "physical": physical,
+    }
+    chosen: dict[str, Any] = {name: value for name, value in usual.items() if value is not None}
+    every = replace(options or Options(), **chosen)
     read = recordings_of(recordings)
     config = robot_of(robot, read)
-    outcome = identify_recording(read, config, options, progress)
+    outcome = identify_recording(read, config, every, progress)
     return Identification(outcome.document, outcome.robot, read, outcome.result)
 
 
-def check(recordings: Recorded | Sequence[Recorded], robot: Robot | None = None) -> SetupCheck:
-    """Check signs, order, units, gear ratios, gravity and clocks of recordings against the configuration; seconds.
+def load_identification(path: str | Path, robot: Robot | None = None) -> Identification:
+    """Read the result of an identification, which stands wherever a fresh one does; its report has no curves.
 
     Parameters
     ----------
-    recordings
-        A recording, the path of one, or a sequence of them; all of one robot at one sampling rate.
+    path
+        ``identification.json``, or the folder that `Identification.save` wrote.
     robot
-        Configuration to check, or the path or shipped name of one; by default the one inside the first recording.
+        Configuration of the model, or the path or shipped name of one; by default that of the document.
 
     Returns
     -------
-    SetupCheck
-        Mistakes with their probability and the line of configuration that corrects each.
+    Identification
+        The result as it was saved.
 
     Raises
     ------
     ConfigError
-        If a file does not exist or a configuration is wrong.
+        If there is no such file, or the document is of a former version and has no configuration.
     DataError
-        If the recordings are too short, or their sampling rates differ.
+        If the file is no such document, or of another robot.
 
     Examples
     --------
-    >>> import armident
-    >>> recording = armident.simulate_recording("tx40", "tx40_excitation", seed=1)
-    >>> armident.check(recording).findings
-    ()
+    >>> import armident, tempfile
+    >>> recording = armident.simulate_recording("emps", "emps_excitation", seed=1)
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     written = armident.identify(recording, method="idim-ls").save(folder)
+    ...     armident.load_identification(folder).names
+    ('m1', 'fv1', 'fc1', 'off1')
     """
-    read = recordings_of(recordings)
-    config = robot_of(robot, read)
-    experiments, _ = experiments_of(read, config, name_files=True)
-    return check_setup(experiments, config)
+    document, file = identified(path)
+    given = None if robot is None else robot_of(robot, ())
+    return Identification(document, used_configuration(document, file, given), path=file)
 
 
-def document_of(given: Identification | IdentificationDocument | str | Path) -> IdentificationDocument:
-    """Return the document of an identification.
-
-    Parameters
-    ----------
-    given
-        An identification, its document, or the path of ``identification.json`` or of its folder.
-
-    Raises
-    ------
-    ConfigError
-        If there is no such file.
-    DataError
-        If the file is no such document.
-    """
+def identified(given: Identification | IdentificationDocument | str | Path) -> tuple[IdentificationDocument, Path]:
+    """Return the document of an identification, or of the file or folder of one, and its file for messages."""
     if isinstance(given, Identification):
-        return given.document
+        return given.document, given.path
     if isinstance(given, IdentificationDocument):
-        return given
+        return given, IN_MEMORY
     path = Path(given)
-    return load_document(path / "identification.json" if path.is_dir() else path, IdentificationDocument)
+    file = path / "identification.json" if path.is_dir() else path
+    return load_document(file, IdentificationDocument), file

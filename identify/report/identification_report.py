@@ -24,11 +24,15 @@ FAIR_PCT = 20.0
 
 
 def identification_report(
-    recordings: Sequence[Recording], robot: RobotConfig, result: IdentificationResult, document: IdentificationDocument
+    recordings: Sequence[Recording],
+    robot: RobotConfig,
+    result: IdentificationResult | None,
+    document: IdentificationDocument,
 ) -> str:
     """Return the HTML page of an identification, complete in one file.
 
-    ``recordings``: recordings that were used; ``result``: estimates and curves; ``document``: ``identification.json``.
+    ``recordings``: recordings that were used, none if they are not at hand; ``result``: estimates and curves, ``None``
+    if only the document is left.
     """
     joints = [joint.name for joint in robot.joints]
     return render(
@@ -38,8 +42,9 @@ def identification_report(
         recorded=[recorded(recording) for recording in recordings],
         essential=_rows(document),
         others=[p for p in document.parameters if not p.essential],
-        torques=torque_plots(result.t, result.tau_measured, result.tau_predicted, joints, _units(robot)),
-        autocorrelation=_autocorrelation_figure(result.residual_autocorrelation, result.autocorrelation_bound, joints),
+        torques=result and torque_plots(result.t, result.tau_measured, result.tau_predicted, joints, _units(robot)),
+        autocorrelation=result
+        and _autocorrelation_figure(result.residual_autocorrelation, result.autocorrelation_bound, joints),
         controller=_controller_figure(document.controller),
         least_squares={} if document.comparison is None else {p.name: p.value for p in document.comparison.parameters},
         residuals=_residual_words(document),

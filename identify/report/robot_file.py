@@ -15,7 +15,7 @@ def write_identification(outcome: IdentificationOutcome, out: Path) -> tuple[Pat
     ``outcome``: result with its document. ``out``: folder; created if it is missing. Returns paths of document and
     report.
     """
-    from armident.identify.report.identification import identification_report
+    from armident.identify.report.identification_report import identification_report
 
     document, report = out / "identification.json", out / "report.html"
     # The document comes last: where there is one, the report is there, too.

@@ -1,17 +1,21 @@
 """Commands ``identify``, ``check``, ``diagnose``, ``predict`` and ``compare``: read, compute, write, print."""
 
-import json
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from armident.configs import ConfigError, DataError
 from armident.identify.diagnosis.diagnosis_options import DiagnosisOptions
-from armident.identify.documents.files import load_document, to_json, write_atomically
-from armident.identify.documents.identification import IdentificationDocument
+from armident.identify.documents.files import to_json, write_atomically
 from armident.identify.identification.options import Options
+
+if TYPE_CHECKING:
+    from armident.identify.api.result_base import Result
+    from armident.identify.documents.prediction import PredictionDocument
+    from armident.identify.identification.robot_model import RobotModel
 
 UNUSABLE = DataError.exit_code
 """Exit code: the data cannot support the request as they are configured, and the result says why."""
@@ -23,15 +27,13 @@ FOUND = 4
 def identify_command(path: Path, config: Path | None, options: Options, out: Path | None, *, as_json: bool) -> int:
     """Carry out ``armident identify``; the exit code is `UNUSABLE` if the verdict says so, otherwise 0."""
     from armident.identify.api import identify
-    from armident.identify.cli_tables import identification_table, progress, verdict_lines, warn
+    from armident.identify.cli.terminal import identification_table, progress, verdict_lines, warn
 
     with progress(f"identify {path.name}") as report:
-        result = identify(path, config, **asdict(options), progress=report)
-    folder = out or _beside(path, "identification")
-    with _writing(folder):
-        document, html = result.save(folder)
+        result = identify(path, config, options=options, progress=report)
+    document, html = _saved(result, out or _beside(path, "identification"))
     if as_json:
-        sys.stdout.write(to_json(result.document))
+        sys.stdout.write(result.to_json())
     else:
         verdict_lines(result.document)
         warn(result.document.warnings)
@@ -48,20 +50,12 @@ def check_command(paths: Sequence[Path], config: Path | None, *, as_json: bool) 
     understood, otherwise 0. Raises ConfigError or DataError if a file is wrong, or the recordings cannot be checked.
     """
     from armident.identify.api import check
-    from armident.identify.cli_tables import progress, setup_table
+    from armident.identify.cli.terminal import progress
 
     with progress("check"):
         result = check(list(paths), config)
-    if as_json:
-        content = {**vars(result), "findings": [vars(finding) for finding in result.findings]}
-        content["torque_shift"] = None if result.torque_shift is None else asdict(result.torque_shift)
-        robot = result.corrected_robot
-        content["corrected_robot"] = None if robot is None else robot.model_dump(mode="json", by_alias=True)
-        sys.stdout.write(json.dumps(content, indent=2) + "\n")
-    else:
-        setup_table(result)
-    wrong = result.joints_not_understood or any(finding.decisive for finding in result.findings)
-    return UNUSABLE if wrong else 0
+    print(result.to_json() if as_json else result, end="" if as_json else "\n")
+    return 0 if result.passed else UNUSABLE
 
 
 def diagnose_command(
@@ -76,21 +70,20 @@ def diagnose_command(
 ) -> int:
     """Carry out ``armident diagnose``; the exit code is 0 if the verdict is ``no_gap``, otherwise `FOUND`."""
     from armident.identify.api import diagnose
-    from armident.identify.cli_tables import diagnosis_table, progress, warn
+    from armident.identify.cli.terminal import diagnosis_table, progress, warn
 
     with progress("diagnose") as report:
         found = diagnose(list(paths), config, validate=validate, baseline=baseline, progress=report, **asdict(options))
-    folder = out or _beside(paths[0], "diagnosis")
-    with _writing(folder):
-        document = found.save(folder)
+    written, html, *model = _saved(found, out or _beside(paths[0], "diagnosis"))
+    document = found.document
     if as_json:
-        sys.stdout.write(to_json(document))
+        sys.stdout.write(written.read_text(encoding="utf-8"))
     else:
         warn(document.warnings)
         diagnosis_table(document)
-        print(f"result: {folder / 'diagnosis.json'}\nreport: {folder / 'report.html'}")
-        if document.model is not None:
-            print(f"model:  {document.model}")
+        print(f"result: {written}\nreport: {html}")
+        if model:
+            print(f"model:  {model[0]}")
     return 0 if document.verdict == "no_gap" else FOUND
 
 
@@ -103,36 +96,28 @@ def predict_command(paths: Sequence[Path], model: Path, config: Path | None, out
     the torques of a recording no better than none, otherwise 0. Raises ConfigError or DataError if a file is wrong, the
     model is unusable, or a recording cannot be used.
     """
-    from armident.configs import load_robot
     from armident.daq.recording import read_recording
-    from armident.identify.cli_tables import prediction_table, predictions_table, progress, warn
+    from armident.identify.api import predict
+    from armident.identify.cli.terminal import prediction_table, predictions_table, progress, warn
     from armident.identify.documents.prediction import predictions_document
-    from armident.identify.prediction import predict_recording
-    from armident.identify.report.prediction import prediction_report
-    from armident.identify.saved_model import load_model
 
     folders = _prediction_folders(paths, out)
-    robot = None if config is None else load_robot(config, "identify")
-    loaded, found = None, []
+    found: list[PredictionDocument] = []
+    used: Path | RobotModel = model
     for path, folder in zip(paths, folders, strict=True):
         with progress(f"predict {path.name}") as report:
-            recording = read_recording(path)
-            loaded = loaded or load_model(model, robot, default=recording.robot, progress=report)
-            prediction = predict_recording(recording, loaded, report)
-        with _writing(folder):
-            write_atomically(folder / "torques.csv", prediction.csv())
-            write_atomically(folder / "report.html", prediction_report(prediction, loaded.robot, loaded.document))
-            write_atomically(folder / "prediction.json", to_json(prediction.document))
+            prediction = predict(read_recording(path), used, config if used is model else None, progress=report)
+        used = prediction.model
+        written, html, torques = _saved(prediction, folder)
         found.append(prediction.document)
         if not as_json:
             warn([line if len(paths) == 1 else f"{path}: {line}" for line in prediction.document.warnings])
     if len(paths) == 1:
         if as_json:
-            sys.stdout.write(to_json(found[0]))
+            sys.stdout.write(prediction.to_json())
         else:
             prediction_table(found[0])
-            print(f"result: {folders[0] / 'prediction.json'}\ntorques: {folders[0] / 'torques.csv'}")
-            print(f"report: {folders[0] / 'report.html'}")
+            print(f"result: {written}\ntorques: {torques}\nreport: {html}")
         return FOUND if found[0].worthless else 0
     together = predictions_document(found)
     if out is not None:
@@ -181,24 +166,25 @@ def compare_command(
     as_json
         Print the document on stdout instead of a table.
     """
-    from armident.identify.cli_tables import warn
-    from armident.identify.monitoring.change.comparison import compare_models, comparison_table
-    from armident.identify.report.comparison import comparison_report
+    from armident.identify.api import compare
+    from armident.identify.cli.terminal import warn
+    from armident.identify.monitoring.change.comparison import comparison_table
 
-    files = [each / "identification.json" if each.is_dir() else each for each in (baseline, now)]
-    first, second = (load_document(file, IdentificationDocument) for file in files)
-    document = compare_models((first, files[0]), (second, files[1]), common=common, false_alarms=false_alarms)
-    folder = out or files[1].parent / "comparison"
-    with _writing(folder):
-        write_atomically(folder / "report.html", comparison_report(document, second))
-        write_atomically(folder / "comparison.json", to_json(document))
+    test = compare(baseline, now, common=common, false_alarm_rate=false_alarms)
+    written, html = _saved(test, out or (now if now.is_dir() else now.parent) / "comparison")
     if as_json:
-        sys.stdout.write(to_json(document))
+        sys.stdout.write(test.to_json())
     else:
-        warn(document.warnings)
-        comparison_table(document)
-        print(f"result: {folder / 'comparison.json'}\nreport: {folder / 'report.html'}")
-    return FOUND if document.verdict == "changed" else 0
+        warn(test.document.warnings)
+        comparison_table(test.document)
+        print(f"result: {written}\nreport: {html}")
+    return FOUND if test.changed else 0
+
+
+def _saved(result: "Result", folder: Path) -> tuple[Path, ...]:
+    """Write a result to the folder of the results."""
+    with _writing(folder):
+        return result.save(folder)
 
 
 @contextmanager

@@ -1,11 +1,8 @@
 """Identified models read back from result documents: configuration, parameters and their covariance."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from armident.configs import ConfigError, DataError, RobotConfig, load_robot
@@ -16,47 +13,11 @@ from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.effects.terms import arm_model
 from armident.identify.identification.identify_recording import identify_recording
 from armident.identify.identification.options import Options
+from armident.identify.identification.robot_model import RobotModel
 from armident.identify.identification.sign_smoothing import with_numbers
-from armident.identify.robot.arm import ArmModel
-
-Array = NDArray[np.float64]
 
 REFIT: Options = Options(method="idim-iv")
 """Estimation of a diagnosed model: unbiased in closed loop (thesis section 2.3.3), and needs no noise model."""
-
-
-@dataclass(frozen=True, eq=False)
-class SavedModel:
-    """A robot configuration with identified parameters.
-
-    ``robot``: configuration that the parameters belong to, with its effects and with numbers for the smoothing of the
-    sign; ``path``: file that it was read from.
-    """
-
-    robot: RobotConfig
-    document: IdentificationDocument
-    path: Path
-
-    @property
-    def arm(self) -> ArmModel:
-        """The arm; terms that depend on torques predict them with the parameters of this model."""
-        return arm_model(self.robot).anchored(self.theta)
-
-    @property
-    def theta(self) -> Array:
-        """Base parameters (b,), SI."""
-        return np.array([p.value for p in self.document.parameters])
-
-    @property
-    def covariance(self) -> Array:
-        """Covariance of the base parameters, (b, b)."""
-        return np.array(self.document.covariance, dtype=np.float64)
-
-    @property
-    def recording_hashes(self) -> tuple[str, ...]:
-        """SHA-256 of the recordings that the model was identified from."""
-        further = self.document.further_recordings or []
-        return tuple(each.sha256 for each in (self.document.recording, *further))
 
 
 def load_model(
@@ -65,7 +26,7 @@ def load_model(
     *,
     default: RobotConfig | None = None,
     progress: Callable[[str, float], None] | None = None,
-) -> SavedModel:
+) -> RobotModel:
     """Read an identified model from a result.
 
     The structure that a diagnosis found is identified by IDIM-IV from the recordings of the diagnosis.
@@ -88,15 +49,18 @@ def model_of(
     robot: RobotConfig | None = None,
     *,
     default: RobotConfig | None = None,
-) -> SavedModel:
-    """Return the model of an identification.
-
-    ``path``: its file, for messages; ``robot``, ``default``: as for `load_model`. Raises ConfigError if there is no
-    configuration; DataError if the document is judged unusable, or belongs to another configuration.
-    """
+) -> RobotModel:
+    """Return the model of an identification that is not judged unusable; its file is for messages."""
     if document.verdict == "unusable":
         reason = document.reasons[0]
         raise DataError(f"{path}: the model is unusable: {reason.message}. Next: {reason.next_step}")
+    return RobotModel(used_configuration(document, path, robot, default), identification=document, path=path)
+
+
+def used_configuration(
+    document: IdentificationDocument, path: Path, robot: RobotConfig | None, default: RobotConfig | None = None
+) -> RobotConfig:
+    """Return the configuration of an identification, with its smoothing of the sign; refuse one of other parameters."""
     config = robot or configuration_of(document, path) or default
     if config is None:
         raise ConfigError(f"{path}: written by a former version, without the robot: add --config ROBOT")
@@ -114,7 +78,7 @@ def model_of(
         if set(smoothing) != {joint.name for joint in config.joints}:
             raise DataError(f"{path}: its joints are {', '.join(smoothing)}, other names than in the configuration")
         config = with_numbers(config, [smoothing[joint.name] for joint in config.joints])
-    return SavedModel(config, document, path)
+    return config
 
 
 def _file(path: Path) -> Path:
@@ -156,7 +120,7 @@ def _beside(document: Path, name: str | None) -> Path | None:
     return next((file for file in candidates if file.is_file()), None)
 
 
-def _diagnosed(path: Path, robot: RobotConfig | None, progress: Callable[[str, float], None] | None) -> SavedModel:
+def _diagnosed(path: Path, robot: RobotConfig | None, progress: Callable[[str, float], None] | None) -> RobotModel:
     """Identify the structure that a diagnosis found from the recordings that it names."""
     document = load_document(path, DiagnosisDocument)
     recordings = []

@@ -14,11 +14,10 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, Ti
 from rich.table import Table
 
 from armident.configs import RobotConfig
+from armident.identify.cli.print_table import print_table
 from armident.identify.documents.diagnosis import DiagnosisDocument
 from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.effects.terms import arm_model
-from armident.identify.print_table import print_table
-from armident.identify.setup.result import SetupCheck
 
 if TYPE_CHECKING:
     from armident.identify.documents.prediction import PredictionDocument, PredictionsDocument
@@ -85,26 +84,6 @@ def warn(lines: list[str]) -> None:
     """Print one line per warning on stderr."""
     for line in lines:
         print(f"armident: warning: {line}", file=sys.stderr)
-
-
-def setup_table(result: SetupCheck) -> None:
-    """Print the findings of a set-up check, one below the other, and its hypotheses where it explains no joint."""
-    before = ", ".join(f"{error:.1f}" for error in result.relative_error_pct)
-    after = ", ".join(f"{error:.1f}" for error in result.corrected_error_pct)
-    if not result.findings:
-        print("set-up: no mistake found")
-    for finding in result.findings:
-        print(f"{finding.kind}: {finding.message} (probability {finding.probability:.2f})")
-        print(f"  correct it by: {finding.remedy}")
-    if result.torque_shift is not None and result.torque_shift.applied:
-        print(f"remark: {result.torque_shift.remark}")
-    corrected = f", corrected {after}" if any(f.decisive for f in result.findings) else ""
-    if any(error != 100.0 for error in result.relative_error_pct):
-        print(f"torque error of the rigid model by joint: {before} %{corrected}{' %' if corrected else ''}")
-    if result.joints_not_understood:
-        names = ", ".join(result.joints_not_understood)
-        print(f"not explained: the rigid model leaves more than a third of the torque of {names}")
-        print(f"  tried: {'; '.join(result.tried)}")
 
 
 def design_table(robot: RobotConfig, theta: NDArray[np.float64] | None, std: NDArray[np.float64]) -> None:

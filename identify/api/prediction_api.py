@@ -2,8 +2,9 @@
 
 import csv
 import io
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,10 +13,14 @@ from threadpoolctl import threadpool_limits
 
 from armident.configs import DataError
 from armident.daq.recording import Recording
+from armident.identify.api.arguments import Progress, Recorded, Robot, recordings_of, robot_of
+from armident.identify.api.identification_api import Identification
+from armident.identify.api.result_base import Result
+from armident.identify.api.result_tables import Table
 from armident.identify.documents.base import reference, versions
+from armident.identify.documents.files import write_atomically
 from armident.identify.documents.prediction import PredictionDocument
 from armident.identify.effects.recorded import put_right
-from armident.identify.experiment import Experiment
 from armident.identify.identification.equations import equations, least_rows, published_equations
 from armident.identify.identification.from_recording import NO_REFERENCE
 from armident.identify.identification.identification_result import relative_torque_errors
@@ -28,13 +33,15 @@ from armident.identify.identification.pipeline import (
     smoothed_derivatives,
 )
 from armident.identify.identification.residual_statistics import SPEED_QUANTILE
+from armident.identify.identification.robot_model import RobotModel
+from armident.identify.identification.saved_model import load_model, model_of
 from armident.identify.identification.solvers import decimation_of
 from armident.identify.regression.equations import ExperimentEquations
-from armident.identify.saved_model import SavedModel
 from armident.identify.setup.check import check_setup
 from armident.identify.setup.result import SetupCheck
 from armident.identify.signals.bandwidth import motion_bandwidth
 from armident.identify.signals.differentiate import Derivatives
+from armident.identify.signals.experiments import Experiment
 
 Array = NDArray[np.float64]
 
@@ -42,14 +49,16 @@ BEYOND = 0.1
 """Share of the identified range by which a motion may leave it without a warning (as for equal motions)."""
 
 
-@dataclass(frozen=True, eq=False)
-class TorquePrediction:
+@dataclass(frozen=True, repr=False, eq=False)
+class TorquePrediction(Result):
     """Torques that a model predicts along a recording, beside those measured.
 
     Parameters
     ----------
     document
-        Errors in total and per joint.
+        Everything that ``prediction.json`` holds: errors in total and by joint.
+    model
+        The model that predicts.
     t
         Decimated instants (M,), s; a step back begins another experiment.
     measured, predicted
@@ -59,10 +68,34 @@ class TorquePrediction:
     """
 
     document: PredictionDocument
+    model: RobotModel
     t: Array
     measured: Array
     predicted: Array
     std: Array
+    file = "prediction.json"
+
+    @property
+    def relative_error_pct(self) -> float:
+        """Norm of the torque error relative to that of the torque, percent."""
+        return self.document.relative_error_pct
+
+    @property
+    def errors(self) -> Table:
+        """Table of the errors by joint: percent, on the data of the identification, and root mean squares."""
+        document = self.document
+        rows = [
+            (
+                joint,
+                document.relative_error_pct_by_joint[joint],
+                document.identification_error_pct_by_joint.get(joint),
+                document.error_rms[joint],
+                document.torque_rms[joint],
+                unit,
+            )
+            for joint, unit in document.units.items()
+        ]
+        return Table(("joint", "error_pct", "own_data_pct", "error_rms", "torque_rms", "unit"), rows)
 
     def csv(self) -> str:
         """Return the torques as CSV: ``t``, and for each joint ``measured``, ``predicted`` and ``std``."""
@@ -75,38 +108,104 @@ class TorquePrediction:
         writer.writerows([[f"{v:.9g}" for v in row] for row in np.column_stack([self.t, values])])
         return stream.getvalue()
 
+    def save(self, folder: str | Path) -> tuple[Path, ...]:
+        """Write ``prediction.json``, ``report.html`` and ``torques.csv``.
 
-def predict_recording(
-    recording: Recording, model: SavedModel, progress: Callable[[str, float], None] | None = None
+        Parameters
+        ----------
+        folder
+            Folder of the files; made if it does not exist.
+
+        Returns
+        -------
+        tuple of Path
+            The three files.
+        """
+        torques = Path(folder) / "torques.csv"
+        write_atomically(torques, self.csv())
+        return *super().save(folder), torques
+
+    def _html(self) -> str:
+        from armident.identify.report.prediction_report import prediction_report
+
+        return prediction_report(self.document, self.model, self.t, self.measured, self.predicted)
+
+    def _summary(self) -> str:
+        return f"{self.document.robot}: {self.document.sentence}"
+
+    def _table(self) -> Table:
+        return self.errors
+
+
+def predict(
+    recording: Recorded,
+    model: Identification | RobotModel | str | Path,
+    robot: Robot | None = None,
+    *,
+    progress: Progress | None = None,
 ) -> TorquePrediction:
-    """Predict the torques of a recording, filtered as in the identification of the model.
+    """Predict the torques of a recording with an identified model, filtered as in its identification.
 
-    Positions are differentiated, and torques aligned, by the steps of `armident.identify`, so that the recording of the
-    identification has the error that its document states.
+    Parameters
+    ----------
+    recording
+        A recording, or the path of one; best one that the model was not identified from.
+    model
+        An identification, its model, or the path of ``identification.json``, ``diagnosis.json`` or the folder of one.
+    robot
+        Configuration of the model, or the path or shipped name of one; by default that of the result.
+    progress
+        Called with the name of a stage and the share done, 0 to 1.
 
-    ``recording``: of the same robot; ``progress``: called with the name of a stage and the share done, 0 to 1. Raises
-    DataError if the recording is of another robot, or too short.
+    Returns
+    -------
+    TorquePrediction
+        Measured and predicted torques (M, n), N m or N, and the ``document`` with the errors.
+
+    Raises
+    ------
+    ConfigError
+        If a file does not exist.
+    DataError
+        If the model is unusable, or the recording is of another robot or too short.
+
+    Examples
+    --------
+    >>> import armident
+    >>> seen, unseen = (armident.simulate_recording("emps", name, seed=1) for name in ("emps_1", "emps_2"))
+    >>> found = armident.predict(unseen, armident.identify(seen, method="idim-ls"))
+    >>> found.document.held_out, found.predicted.shape == found.measured.shape
+    (True, True)
     """
+    (read,) = recordings_of(recording)
+    config = None if robot is None else robot_of(robot, ())
+    if isinstance(model, Identification):
+        model = model.model
+    if isinstance(model, RobotModel):
+        model = model if config is None else model_of(model.document, model.path, config)
+    else:
+        model = load_model(Path(model), config, default=read.robot, progress=progress)
     show = progress or (lambda stage, share: None)
-    robot, notes = model.robot, Notes()
+    notes, configured = Notes(), model.robot
     show("set-up", 0.0)
-    experiments, remarks = experiments_of([recording], robot, name_files=False)
+    experiments, remarks = experiments_of([read], configured, name_files=False)
     setup = _setup(experiments, model, notes)
     options = _options(model.document.options)
-    experiments = shifted_experiments(put_right(experiments, robot), robot, options, setup, notes)
+    experiments = shifted_experiments(put_right(experiments, configured), configured, options, setup, notes)
     show("torques", 0.5)
     with threadpool_limits(1):
         signals, blocks = _equations(model, experiments, options)
     if not any(block.t.size for block in blocks):
-        raise DataError(f"{recording.path}: too short to predict: the filters leave no sample. Next: record longer")
+        raise DataError(f"{read.path}: too short to predict: the filters leave no sample. Next: record longer")
     # A prediction needs no reference.
     remarks = [remark for remark in remarks if remark != NO_REFERENCE]
-    document = _document(recording, model, blocks, [*remarks, *_beyond(signals, model), *notes.warnings])
+    document = _document(read, model, blocks, [*remarks, *_beyond(signals, model), *notes.warnings])
     show("done", 1.0)
     theta, covariance = model.theta, model.covariance
     variance = [np.einsum("kjb,bc,kjc->kj", block.x, covariance, block.x, optimize=True) for block in blocks]
     return TorquePrediction(
         document,
+        model,
         np.concatenate([block.t for block in blocks]),
         np.concatenate([block.y for block in blocks]),
         np.concatenate([block.x @ theta for block in blocks]),
@@ -114,7 +213,7 @@ def predict_recording(
     )
 
 
-def _setup(experiments: Sequence[Experiment], model: SavedModel, notes: Notes) -> SetupCheck | None:
+def _setup(experiments: Sequence[Experiment], model: RobotModel, notes: Notes) -> SetupCheck | None:
     """Check the set-up of the recording; decisive findings become warnings."""
     try:
         found = check_setup(experiments, model.robot)
@@ -132,7 +231,7 @@ def _options(written: dict[str, Any]) -> Options:
 
 
 def _equations(
-    model: SavedModel, experiments: Sequence[Experiment], options: Options
+    model: RobotModel, experiments: Sequence[Experiment], options: Options
 ) -> tuple[Sequence[Derivatives], Sequence[ExperimentEquations]]:
     """Return the derivatives, and the equations after the filters of IDIM-LS as in an identification."""
     robot, arm = model.robot, model.arm
@@ -146,7 +245,7 @@ def _equations(
 
 
 def _document(
-    recording: Recording, model: SavedModel, blocks: Sequence[ExperimentEquations], warnings: Sequence[str]
+    recording: Recording, model: RobotModel, blocks: Sequence[ExperimentEquations], warnings: Sequence[str]
 ) -> PredictionDocument:
     names = [joint.name for joint in model.robot.joints]
     overall, by_joint = relative_torque_errors(blocks, model.theta)
@@ -157,17 +256,17 @@ def _document(
     def named(values: Array) -> dict[str, float]:
         return {name: float(value) for name, value in zip(names, values, strict=True)}
 
-    used = reference(recording)
+    used, known = reference(recording), model.document
     return PredictionDocument(
         robot=model.robot.name,
         model=str(model.path),
-        method=model.document.method,
+        method=known.method,
         recording=used,
-        held_out=used.sha256 not in model.recording_hashes,
+        held_out=all(used.sha256 != own.sha256 for own in (known.recording, *(known.further_recordings or ()))),
         relative_error_pct=overall,
         relative_error_pct_by_joint=named(by_joint),
-        identification_error_pct=model.document.relative_error_pct,
-        identification_error_pct_by_joint=model.document.relative_error_pct_by_joint,
+        identification_error_pct=known.relative_error_pct,
+        identification_error_pct_by_joint=known.relative_error_pct_by_joint,
         error_rms=named(torque_rms * by_joint / 100),
         torque_rms=named(torque_rms),
         units={joint.name: "N m" if joint.type == "revolute" else "N" for joint in model.robot.joints},
@@ -183,7 +282,7 @@ def _rate(blocks: Sequence[ExperimentEquations]) -> float:
     return float(1.0 / (t[1] - t[0])) if t.size > 1 else 0.0
 
 
-def _beyond(signals: Sequence[Derivatives], model: SavedModel) -> list[str]:
+def _beyond(signals: Sequence[Derivatives], model: RobotModel) -> list[str]:
     """Return a warning for every joint that leaves the range over which the model was identified."""
     found = []
     q = np.concatenate([s.q for s in signals])

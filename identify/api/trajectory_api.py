@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from armident.configs import RobotConfig, Trajectory
 from armident.identify.api.arguments import Progress, Robot, robot_of
-from armident.identify.api.identification import Identification, document_of
-from armident.identify.api.result import Result
+from armident.identify.api.identification_api import Identification, identified
+from armident.identify.api.result_base import Result
 from armident.identify.documents.files import write_atomically
 from armident.identify.documents.identification import IdentificationDocument
 
@@ -64,7 +64,7 @@ class Design(Result):
         """Predicted standard deviations of the base parameters, (b,); ``None`` where the torque noise is unknown."""
         return self.result.std
 
-    def save(self, path: str | Path) -> Path:
+    def save(self, path: str | Path) -> tuple[Path, ...]:
         """Write the trajectory as a YAML file that ``capture`` and ``robot`` play.
 
         Parameters
@@ -74,23 +74,20 @@ class Design(Result):
 
         Returns
         -------
-        Path
+        tuple of Path
             The file.
         """
         content = self.trajectory.model_dump(mode="json", by_alias=True, exclude_defaults=True)
         write_atomically(Path(path), yaml.safe_dump(content, sort_keys=False))
-        return Path(path)
+        return (Path(path),)
 
     def _html(self) -> str:
-        from armident.identify.report.trajectory import trajectory_report
+        from armident.identify.report.trajectory_report import trajectory_report
 
         return trajectory_report(self.checked)
 
     def _summary(self) -> str:
         return f"{self.robot.name}: {self.trajectory.duration:.2f} s, condition number {self.condition:.0f}"
-
-    def _table(self) -> None:
-        return None
 
 
 def design_trajectory(
@@ -164,8 +161,8 @@ def design_trajectory(
     from armident.identify.excitation.previous_estimate import physical_estimate
     from armident.identify.excitation.safety import checked_trajectory, safety_model
 
-    config = robot_of(robot, ())
-    earlier = None if known is None else physical_estimate(document_of(known), config, "known")
+    config = robot_of(robot, (), "trajectory")
+    earlier = None if known is None else physical_estimate(identified(known)[0], config, "known")
     safety = safety_model(
         config,
         None if isinstance(robot, RobotConfig) else robot,
