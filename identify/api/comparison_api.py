@@ -8,7 +8,7 @@ from armident.identify.api.result_base import Result
 from armident.identify.api.result_tables import Table
 from armident.identify.documents.comparison import ComparisonDocument
 from armident.identify.documents.identification import IdentificationDocument
-from armident.identify.monitoring.comparison import compare_models
+from armident.identify.monitoring.change.comparison import compare_models
 
 
 @dataclass(frozen=True, repr=False)

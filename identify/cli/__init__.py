@@ -70,7 +70,7 @@ def worker(
 
     Example: armident worker --config configs/tx40_cell.yaml
     """
-    from armident.identify.monitoring.worker import run_worker
+    from armident.identify.monitoring.worker.worker import run_worker
 
     code = run_worker(config, once=once, out=out)
     if code:
@@ -195,7 +195,7 @@ def history(
 
     Example: armident history recordings/*.identification/identification.json --plot history.png
     """
-    from armident.identify.monitoring.history_cli import history_command
+    from armident.identify.monitoring.change.history_cli import history_command
 
     code = history_command(documents or [], database, robot, cell, parameter or [], plot, false_alarms, as_json=json)
     if code:

@@ -168,7 +168,7 @@ def compare_command(
     """
     from armident.identify.api import compare
     from armident.identify.cli.terminal import warn
-    from armident.identify.monitoring.comparison import comparison_table
+    from armident.identify.monitoring.change.comparison import comparison_table
 
     test = compare(baseline, now, common=common, false_alarm_rate=false_alarms)
     written, html = _saved(test, out or (now if now.is_dir() else now.parent) / "comparison")

@@ -1,10 +1,10 @@
 """Announcements of a worker: each result and failure in the ledger is announced once, also if workers are killed."""
 
 from armident.daq.streaming import Keys
-from armident.identify.monitoring.ledger import Ledger, LedgerEntry
-from armident.identify.monitoring.status_messages import failure_status, status
-from armident.identify.monitoring.worker_link import LinkDown, WorkerLink
-from armident.identify.monitoring.worker_receiver import content_hash
+from armident.identify.monitoring.worker.ledger import Ledger, LedgerEntry
+from armident.identify.monitoring.worker.status_messages import failure_status, status
+from armident.identify.monitoring.worker.worker_link import LinkDown, WorkerLink
+from armident.identify.monitoring.worker.worker_receiver import content_hash
 
 COMPONENTS = ("worker", "reidentify")
 """Programs that announce the entries of a ledger."""

@@ -18,9 +18,9 @@ from armident.configs.reasons import reason_of
 from armident.daq.streaming import Keys
 from armident.identify.identification.identify_recording import identify_recording
 from armident.identify.identification.options import Options
-from armident.identify.monitoring.announcements import Announcements
-from armident.identify.monitoring.intake import Intake
-from armident.identify.monitoring.ledger import (
+from armident.identify.monitoring.worker.announcements import Announcements
+from armident.identify.monitoring.worker.intake import Intake
+from armident.identify.monitoring.worker.ledger import (
     FILE,
     MOST_ATTEMPTS,
     Ledger,
@@ -29,13 +29,13 @@ from armident.identify.monitoring.ledger import (
     State,
     unique_owner,
 )
-from armident.identify.monitoring.recorded import (
+from armident.identify.monitoring.worker.recorded import (
     Captured,
     captured_in,
     result_of,
 )
-from armident.identify.monitoring.stream_buffer import LARGEST_BLOCK, LARGEST_EVENT, StreamBuffer
-from armident.identify.monitoring.worker_link import LinkDown, WorkerLink
+from armident.identify.monitoring.worker.stream_buffer import LARGEST_BLOCK, LARGEST_EVENT, StreamBuffer
+from armident.identify.monitoring.worker.worker_link import LinkDown, WorkerLink
 from armident.identify.report.robot_file import write_identification
 from armident.systemd import Notifier
 

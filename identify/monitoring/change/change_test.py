@@ -11,7 +11,7 @@ from scipy import stats
 
 from armident.configs import DataError
 from armident.identify.documents.identification import IdentificationDocument, Parameter
-from armident.identify.monitoring.residual_test import ResidualChange, ResidualTest, compare_residuals
+from armident.identify.monitoring.change.residual_test import ResidualChange, ResidualTest, compare_residuals
 from armident.identify.regression.multiple_testing import holm
 
 Array = NDArray[np.float64]

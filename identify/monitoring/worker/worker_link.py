@@ -11,8 +11,8 @@ from armident.configs import ArmidentError, ConfigError, SessionConfig
 from armident.daq.streaming import Announcer, Keys, open_session
 from armident.daq.streaming.announcer import longest_retry_s
 from armident.daq.streaming.zenoh_session import configuration
-from armident.identify.monitoring.status_messages import status
-from armident.identify.monitoring.worker_receiver import Take, WorkerReceiver
+from armident.identify.monitoring.worker.status_messages import status
+from armident.identify.monitoring.worker.worker_receiver import Take, WorkerReceiver
 
 log = logging.getLogger(__name__)
 

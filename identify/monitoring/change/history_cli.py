@@ -9,8 +9,8 @@ import numpy as np
 from armident.configs import ConfigError
 from armident.identify.documents.files import load_document
 from armident.identify.documents.identification import IdentificationDocument
-from armident.identify.monitoring.change_test import Inconclusive, ParameterChangeTest, compare
-from armident.identify.monitoring.history import History, HistoryRun, recorded_at
+from armident.identify.monitoring.change.change_test import Inconclusive, ParameterChangeTest, compare
+from armident.identify.monitoring.change.history import History, HistoryRun, recorded_at
 
 DRIFTED = 4
 """Exit code: done, and the last run differs significantly from the first."""

@@ -8,9 +8,9 @@ from pathlib import Path
 from armident.configs import ArmidentError, DataError
 from armident.configs.reasons import reason_of
 from armident.daq.recording import Recording
-from armident.identify.monitoring.ledger import Ledger
-from armident.identify.monitoring.recorded import Captured, captured_as, is_of, result_of
-from armident.identify.monitoring.stream_buffer import Assembly, StreamBuffer, drop_oldest
+from armident.identify.monitoring.worker.ledger import Ledger
+from armident.identify.monitoring.worker.recorded import Captured, captured_as, is_of, result_of
+from armident.identify.monitoring.worker.stream_buffer import Assembly, StreamBuffer, drop_oldest
 
 log = logging.getLogger(__name__)
 
