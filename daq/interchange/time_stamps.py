@@ -198,8 +198,6 @@ def clock_of(times: Floats, rate_hz: float | None, repeated: float = 0.0) -> Clo
     if missing > _MOST_MISSING * advance.sum() and np.any(advance > 1) and (advance > 1).mean() > EVEN:
         raise DataError(f"{missing} of {int(advance.sum()) + 1} samples are missing at {measured:.6g} Hz")
     _check_rate(rate_hz, measured, f"steps of {median:.6g} s")
-    if not missing:
-        measured = steps.size / float(times[-1] - times[0])
     numbers = np.append(0, np.cumsum(advance)).astype(np.int64)
     return Clock(rate_hz or measured, numbers)
 
