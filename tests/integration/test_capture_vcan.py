@@ -90,7 +90,7 @@ def test_ten_seconds_at_5_khz_and_six_axes_lose_nothing(vcan_bus: str, tmp_path:
     assert np.array_equal(ends[0], ends[1])
 
 
-@pytest.mark.proof
+@pytest.mark.nightly
 @pytest.mark.usefixtures("robot")
 def test_sixty_seconds_at_5_khz_and_six_axes_lose_nothing(vcan_bus: str, tmp_path: Path) -> None:
     """On a busy machine the capture waits for drives that lag."""

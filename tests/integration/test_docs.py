@@ -86,7 +86,7 @@ RUNNING = [page for page in PAGES if (read := read_page(REPOSITORY / page)).comm
 @pytest.mark.slow
 @pytest.mark.timeout(PAGE_S + 20)
 @pytest.mark.parametrize(
-    "page", [pytest.param(p, marks=[pytest.mark.proof] if p.name in LONG else [], id=str(p)) for p in RUNNING]
+    "page", [pytest.param(p, marks=[pytest.mark.nightly] if p.name in LONG else [], id=str(p)) for p in RUNNING]
 )
 def test_the_blocks_of_a_page_run(page: Path, tmp_path: Path) -> None:
     blocks = read_page(REPOSITORY / page)

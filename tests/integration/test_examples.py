@@ -6,9 +6,9 @@ import pytest
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 EXAMPLES = {
-    "emps": pytest.mark.proof,
-    "tx40": pytest.mark.proof,
-    "kuka_lwr4": pytest.mark.proof,
+    "emps": pytest.mark.nightly,
+    "tx40": pytest.mark.nightly,
+    "kuka_lwr4": pytest.mark.nightly,
     "panda": pytest.mark.slow,
 }
 """Names of the notebooks; three of them take 40 s and more."""

@@ -164,7 +164,7 @@ def test_the_loops_of_the_wheel_match_frames_as_those_of_numba_do(base: Path, tm
 
 
 @pytest.mark.vcan
-@pytest.mark.proof
+@pytest.mark.nightly
 def test_the_base_captures_six_axes_at_5_khz_without_a_loss(base: Path, vcan_bus: str, tmp_path: Path) -> None:
     session = tmp_path / "cell.yaml"
     session.write_text(config_path("tx40_cell.yaml").read_text().replace("vcan0", vcan_bus))

@@ -109,7 +109,7 @@ SCENARIOS = {
 
 @pytest.mark.slow
 @pytest.mark.timeout(900)
-@pytest.mark.parametrize("robot", [pytest.param("tx40", marks=pytest.mark.proof), "emps"])
+@pytest.mark.parametrize("robot", [pytest.param("tx40", marks=pytest.mark.nightly), "emps"])
 def test_every_shipped_scenario_is_found_in_one_run(vcan_bus: str, tmp_path: Path, robot: str) -> None:
     """One healthy run, then one run of each scenario: exit code 4, and the findings name the joint."""
     assert {path.stem for path in config_path("scenarios/tx40_miswired.yaml").parent.glob("*.yaml")} == SCENARIOS.keys()

@@ -116,7 +116,7 @@ def test_three_seconds_at_5_khz_lose_nothing(shipped: str, pack: int, channels: 
     assert {recording.metadata[k] for k in recording.metadata if k.startswith("timestamps.")} == {"software"}
 
 
-@pytest.mark.parametrize("shipped", ["tx40_two_fd.yaml", pytest.param("tx40_one_fd.yaml", marks=pytest.mark.proof)])
+@pytest.mark.parametrize("shipped", ["tx40_two_fd.yaml", pytest.param("tx40_one_fd.yaml", marks=pytest.mark.nightly)])
 def test_replayed_samples_arrive_unchanged_on_all_buses(shipped: str, channels: list[str], tmp_path: Path) -> None:
     """Drives on CAN FD replay a recording of the classic CAN cell."""
     classic = session_file(tmp_path, "tx40_replay.yaml", channels, sync=SLOW)

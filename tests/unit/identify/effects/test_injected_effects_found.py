@@ -82,7 +82,7 @@ SAMPLE = [
         if c.effect in ("joint_elasticity", "time_delay", "gravity_direction") or c.leave_out == "couplings"
     ),
 ]
-"""One effect of each family on the TX40 and all of the EMPS, whose diagnoses are short; `make proof` has the rest."""
+"""One effect of each family on the TX40 and all of the EMPS, whose diagnoses are short; `make nightly` has the rest."""
 
 
 def recorded(robot: str, seed: int, *effects: HiddenEffect) -> Recording:
@@ -116,7 +116,7 @@ def first_step(data: Recording, whole: RobotConfig, known: RobotConfig) -> tuple
 @pytest.mark.parametrize(
     "case",
     [
-        *(pytest.param(c, marks=() if c in SAMPLE else pytest.mark.proof, id=str(c)) for c in (*TX40, *EMPS)),
+        *(pytest.param(c, marks=() if c in SAMPLE else pytest.mark.nightly, id=str(c)) for c in (*TX40, *EMPS)),
         pytest.param(STRIBECK, marks=MISSED, id=str(STRIBECK)),
     ],
 )
