@@ -70,7 +70,8 @@ class Cell:
 def session_file(folder: Path, bus: Bus) -> Path:
     shipped = config_path("tx40_cell.yaml")
     data = yaml.safe_load(shipped.read_text())
-    data |= {"cell": "guarded", "robot": str(config_path(data["robot"])), "bus": bus.model_dump(include={"interface", "channel"})}
+    data |= {"cell": "guarded", "robot": str(config_path(data["robot"]))}
+    data["bus"] = {"interface": bus.interface, "channel": bus.channel}
     data |= {"sync": {"period_us": round(PERIOD_S * 1e6)}, "heartbeat_ms": HEARTBEAT_MS}
     for drive in data["drives"]:
         drive["eds"] = str(config_path(drive["eds"]))
