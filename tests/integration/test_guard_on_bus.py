@@ -30,8 +30,6 @@ from armident.drivers.canopen.objects import (
     tpdo_cob,
 )
 
-pytestmark = pytest.mark.timeout(120)
-
 PERIOD_S = 0.02
 """SYNC period, s; long in comparison with the wake-up time of a process on a busy machine."""
 HEARTBEAT_MS = 100
