@@ -48,6 +48,7 @@ def test_a_worn_joint_is_named_and_its_size_is_right(period: float | None, repea
 
 
 @pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize(("period", "repeats"), RATES)
 def test_a_cogging_motor_is_named_with_its_harmonic(period: float | None, repeats: int) -> None:
     cogging = HiddenEffect(effect="cogging_torque", joint="joint_3", parameters={"amplitude": 1.2, "harmonic": 1.0})
