@@ -17,7 +17,6 @@ from armident.daq.matching.streams import CapturedStream, bus_numbers, captured_
 from armident.drivers.can.frames import STANDARD_ID_MASK, Filter
 from armident.drivers.canopen.bus_load import check_fits
 from armident.drivers.canopen.objects import COB_SDO_REQUEST, COB_SYNC
-from armident.drivers.compiled import require_compiled
 
 
 @dataclass(frozen=True)
@@ -108,10 +107,8 @@ def load_plan(
     Raises
     ------
     ConfigError
-        If the configuration is invalid, the trajectory exceeds the limits of the robot, a bus is overloaded, or the
-        loops of the bus are not compiled.
+        If the configuration is invalid, the trajectory exceeds the limits of the robot or a bus is overloaded.
     """
-    require_compiled()
     session = load_session(config, "capture")
     robot = load_robot(session.robot, "capture")
     check_fits(session, str(config))
