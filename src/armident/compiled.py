@@ -30,6 +30,8 @@ from numba.core.registry import cpu_target
 from numba.core.serialize import dumps
 from numba.core.sigutils import normalize_signature
 
+from armident.extras import needed_extra
+
 F = TypeVar("F", bound=Callable[..., Any])
 
 BASELINE = "x86-64-v3"
@@ -58,8 +60,7 @@ def compiled(*signatures: str, nogil: bool = True, **options: Any) -> Callable[[
     """
 
     def decorate(function: F) -> F:
-        unwrapped = {} if signatures else {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
-        kernel: Any = numba.njit(nogil=nogil, **options, **unwrapped)(function)
+        kernel: Any = numba.njit(nogil=nogil, no_cfunc_wrapper=True, **options)(function)
         if signatures:
             kernel._cache = _MachineCode(kernel)
             _KERNELS.append((kernel, signatures))
@@ -97,7 +98,7 @@ class _MachineCode:
     """Cache of a kernel, in the protocol of numba's dispatcher: a file for each signature and processor."""
 
     def __init__(self, kernel: Dispatcher) -> None:
-        self._kernel, self._meaning = kernel, b""
+        self._kernel, self.meaning = kernel, b""
         self.cache_path = str(SHIPPED)
 
     def load_overload(self, signature: Any, target: Any) -> CompileResult | None:
@@ -125,7 +126,7 @@ class _MachineCode:
 
     def names(self, signature: Any, target: Any) -> tuple[str, ...]:
         """Return the names of the file for the processor of a wheel, if this one has its features, and for this one."""
-        self._meaning = self._meaning or b"\0".join(_meaning(self._kernel, set()))
+        self.meaning = self.meaning or b"\0".join(_meaning(self._kernel, set()))
         types = normalize_signature(signature)[0]
         fields = [getattr(kind, "fields", ()) for kind in types]
         here = target.codegen().magic_tuple()
@@ -133,7 +134,7 @@ class _MachineCode:
         found = []
         for processor in dict.fromkeys(((here[0], BASELINE, ""), here) if _has_baseline() else (here,)):
             kept = repr((processor, types, fields, numba.__version__, sys.implementation.cache_tag)).encode()
-            digest = hashlib.sha256(kept + self._meaning).hexdigest()
+            digest = hashlib.sha256(kept + self.meaning).hexdigest()
             found.append(f"{function.__module__}.{function.__qualname__}-{digest[:32]}.code")
         return tuple(found)
 
@@ -212,35 +213,38 @@ def main() -> None:
     if _has_baseline():
         numba.config.CPU_NAME, numba.config.CPU_FEATURES = BASELINE, ""
     for module in _modules():
-        import_module(module)
+        try:
+            import_module(module)
+        except ImportError as error:
+            if needed_extra(error) is None:
+                raise
     target = cpu_target.target_context
     target.refresh()
-    tasks: dict[str, list[tuple[int, str]]] = {}
+    tasks: list[tuple[int, int, str]] = []
     current = set()
     for number, (kernel, signatures) in enumerate(_KERNELS):
         for signature in signatures:
             name = kernel._cache.names(declared(signature), target)[-1]
             current.add(name)
             if not (SHIPPED / name).is_file():
-                tasks.setdefault(kernel.py_func.__module__, []).append((number, signature))
+                tasks.append((len(kernel._cache.meaning), number, signature))
     SHIPPED.mkdir(exist_ok=True)
     for path in SHIPPED.iterdir():
         if path.name not in current:
-            path.unlink()
-    missing = sum(map(len, tasks.values()))
-    if not missing:
+            path.unlink(missing_ok=True)
+    if not tasks:
         return
     processes = len(os.sched_getaffinity(0))
-    print(f"compiling {missing} kernels on {processes} processors", file=sys.stderr)
+    print(f"compiling {len(tasks)} kernels on {processes} processors", file=sys.stderr)
     with ProcessPoolExecutor(processes, mp_context=get_context("fork")) as pool:
-        for _ in pool.map(_compile, sorted(tasks.values(), key=len, reverse=True)):
+        for _ in pool.map(_compile, sorted(tasks, reverse=True)):
             pass
     print(f"compiled in {time.monotonic() - begun:.0f} s", file=sys.stderr)
 
 
-def _compile(task: list[tuple[int, str]]) -> None:
-    for number, signature in task:
-        _KERNELS[number][0].compile(declared(signature))
+def _compile(task: tuple[int, int, str]) -> None:
+    _, number, signature = task
+    _KERNELS[number][0].compile(declared(signature))
 
 
 def _modules() -> Iterator[str]:
