@@ -15,10 +15,10 @@ WITH_VCAN := $(PY) -m armident.drivers.vcan -n 2 --
 PARALLEL := -n auto --dist worksteal
 LINT := $(PY) -m ruff check $(SOURCES) && $(PY) -m ruff format --check $(SOURCES) && $(PY) -m mypy && $(VENV)/bin/lint-imports
 
-.PHONY: help install develop demo check test proof off-bus on-bus coverage lint vcan suite docs bench lock clean
+.PHONY: help install develop demo check test proof off-bus on-bus coverage lint vcan suite reproduce docs bench lock clean
 
 help: ## what there is to do
-	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "make %-8s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "make %-9s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 
 $(PY):
 	@if [ -z "$(PYTHON)" ]; then
@@ -112,7 +112,10 @@ vcan: install ## fetch what the vcan guest needs, where this kernel has no Socke
 	@$(PY) -m armident.drivers.vcan --setup
 
 suite: install ## hide effects in virtual arms and count what is found (SUITE="--quick" passes options), two hours
-	@$(VENV)/bin/armident diagnose-suite $(SUITE)
+	@$(PY) -m tests.evaluation $(SUITE)
+
+reproduce: install ## the tables of the thesis beside ours (REPRODUCE="--quick" passes options)
+	@$(PY) -m tests.reproduction $(REPRODUCE)
 
 docs: develop ## the documentation as a site, .cache/site/index.html
 	@$(PY) -m sphinx -q -W --keep-going -b html docs .cache/site
@@ -129,4 +132,4 @@ lock: install ## write both lock files anew from the ranges in pyproject.toml
 	awk 'NR == FNR {have[$$1]; next} /^[^ ]/ {keep = !($$1 in have)} keep' requirements.lock .cache/all.lock >requirements-dev.lock
 
 clean: ## remove what make and the tools created
-	@rm -rf $(VENV) .cache src/armident/kernels .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache *.egg-info build dist out demo suite
+	@rm -rf $(VENV) .cache src/armident/kernels .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache *.egg-info build dist out demo suite reproduction

@@ -1,8 +1,6 @@
 """Loading and checking of configuration files; an error is one line that names file, key and expected value."""
 
 import difflib
-import logging
-from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -12,8 +10,7 @@ from armident.configs.blanks import check_filled, needed, without_marks
 from armident.configs.errors import ConfigError
 from armident.configs.schema.robot import RobotConfig
 from armident.configs.schema.scenario import Scenario
-from armident.configs.schema.session import RENAMED, DriveNode, SessionConfig
-from armident.configs.schema.suite import SuiteConfig
+from armident.configs.schema.session import DriveNode, SessionConfig
 from armident.configs.schema.trajectory import Trajectory
 from armident.configs.suspected_units import suspected_units
 from armident.configs.urdf import UrdfGeometry, geometry_from_urdf, urdf_file
@@ -26,19 +23,16 @@ KINDS: dict[str, type[BaseModel]] = {
     "robot": RobotConfig,
     "session": SessionConfig,
     "trajectory": Trajectory,
-    "suite": SuiteConfig,
     "scenario": Scenario,
 }
 """Kinds of files by the word in their ``schema`` key."""
-SHIPPED = ("robots", "cells", "trajectories", "scenarios", "suites", "eds", "zenoh")
+SHIPPED = ("robots", "cells", "trajectories", "scenarios", "eds", "zenoh")
 """Folders of shipped files, in the order of the search for a bare name."""
 _LONGEST = 80
 """Maximum number of characters of a file that a message quotes."""
 _LISTED = 12
 """Maximum number of missing keys that a message lists."""
 T = TypeVar("T", bound=BaseModel)
-
-log = logging.getLogger(__name__)
 
 
 def config_path(name: str | Path, listed: tuple[str, ...] = ("robots", "cells")) -> Path:
@@ -254,13 +248,7 @@ def load_session(name: str | Path, command: str | None = None) -> SessionConfig:
         names all.
     """
     path = config_path(name)
-    data = _marked(path)
-    session = _checked(data, SessionConfig, str(path))
-    for key in data.get("recording", {}):
-        if key in RENAMED:
-            _warn_once(
-                f"{path}: recording.{key} is now recording.{RENAMED[key]}; the next release refuses the old name"
-            )
+    session = _checked(_marked(path), SessionConfig, str(path))
     base = path.resolve().parent
 
     def resolved(relative: Path, key: str) -> Path:
@@ -304,22 +292,6 @@ def _with_known_joints(session: SessionConfig, robot: RobotConfig, path: Path) -
     return tuple(d.model_copy(update={"joint": joints[d.joint.lower()]}) for d in session.drives)
 
 
-def load_suite(name: str | Path) -> SuiteConfig:
-    """Load the cases of a diagnosis suite.
-
-    Parameters
-    ----------
-    name
-        A path, or the name of a shipped file (see `config_path`).
-
-    Raises
-    ------
-    ConfigError
-        If the file is missing or wrong; names file, key and expected value.
-    """
-    return _load(config_path(name), SuiteConfig)
-
-
 def load_scenario(name: str | Path) -> Scenario:
     """Load the hidden effects of a virtual arm.
 
@@ -334,11 +306,6 @@ def load_scenario(name: str | Path) -> Scenario:
         If the file is missing or wrong; names file, key and expected value.
     """
     return _load(config_path(name, listed=("scenarios",)), Scenario)
-
-
-@cache
-def _warn_once(message: str) -> None:
-    log.warning(message)
 
 
 def _load(path: Path, kind: type[T]) -> T:

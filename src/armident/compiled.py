@@ -53,15 +53,16 @@ _KERNELS: list[tuple[Dispatcher, tuple[str, ...]]] = []
 _TYPES: dict[str, Any] = dict(vars(numba.types))
 
 
-def compiled(*signatures: str, nogil: bool = True, **options: Any) -> Callable[[F], F]:
+def compiled(*signatures: str, kept: bool = False, nogil: bool = True, **options: Any) -> Callable[[F], F]:
     """Compile a kernel that Python calls with arguments of the ``signatures``, or kernels only: then without any.
 
-    A signature lists numba's types, ``f8[:, ::1], i8``, and named tuples that `structure` declares.
+    A signature lists numba's types, ``f8[:, ::1], i8``, and named tuples that `structure` declares. ``kept``: keep the
+    machine code of a kernel that is compiled when it is first called.
     """
 
     def decorate(function: F) -> F:
         kernel: Any = numba.njit(nogil=nogil, no_cfunc_wrapper=True, **options)(function)
-        if signatures:
+        if signatures or kept:
             kernel._cache = _MachineCode(kernel)
             _KERNELS.append((kernel, signatures))
         found: F = kernel
@@ -230,7 +231,7 @@ def main() -> None:
                 tasks.append((len(kernel._cache.meaning), number, signature))
     SHIPPED.mkdir(exist_ok=True)
     for path in SHIPPED.iterdir():
-        if path.name not in current:
+        if path.name.startswith("armident.") and path.name not in current:
             path.unlink(missing_ok=True)
     if not tasks:
         return

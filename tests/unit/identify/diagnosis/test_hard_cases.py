@@ -7,11 +7,11 @@ from typing import Any
 
 import pytest
 
-from armident.configs.loading import load_suite
 from armident.identify.documents.files import to_json
-from armident.identify.evaluation.cases import all_cases
-from armident.identify.evaluation.tasks import DiagnosisTask, diagnose_file
-from armident.virtual_robot.json_server import simulate_request
+from tests.evaluation.cases import all_cases
+from tests.evaluation.plants.json_server import simulate_request
+from tests.evaluation.schema import load_suite
+from tests.evaluation.tasks import DiagnosisTask, diagnose_file
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
 MISSED = pytest.mark.xfail(strict=True, reason="the stepwise selection misses it: docs/diagnosis.md, What is missed")
@@ -22,7 +22,7 @@ proof = pytest.mark.proof
 
 def diagnosed(name: str, folder: Path) -> tuple[dict[str, Any], dict[str, float]]:
     """Diagnosis of a case, with the model that the suite would give it, and what is hidden in it first."""
-    (case,) = (case for case in all_cases(load_suite("suite.yaml")) if case.name == name)
+    (case,) = (case for case in all_cases(load_suite()) if case.name == name)
     file = folder / "case.mcap"
     request = {
         "id": case.key,

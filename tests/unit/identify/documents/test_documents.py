@@ -12,13 +12,13 @@ from armident.configs.schema.base import DescribedModel, split_docstring
 from armident.configs.schema.robot import RobotConfig
 from armident.configs.schema.scenario import Scenario
 from armident.configs.schema.session import SessionConfig
-from armident.configs.schema.suite import SuiteConfig
 from armident.configs.schema.trajectory import Trajectory
 from armident.identify.documents.base import plain
 from armident.identify.documents.diagnosis import BeforeAfter, DiagnosisDocument, Gap, Gaps
 from armident.identify.documents.files import from_json, load_document, to_json, write_atomically
 from armident.identify.documents.identification import IdentificationDocument, parameter
 from armident.identify.documents.schemas import SCHEMA_FILES, schema_text
+from tests.evaluation.schema import SuiteConfig
 
 
 def diagnosis() -> DiagnosisDocument:

@@ -13,7 +13,7 @@ from armident.identify.robot.controller import DiscreteController
 from armident.identify.robot.simulation import Simulation, simulate
 from armident.identify.signals.decimate import Decimation, design
 from armident.identify.signals.differentiate import Derivatives, differentiate
-from armident.identify.thesis.emps_derivatives import DURATIONS, polynomial_moves
+from tests.reproduction.emps_derivatives import DURATIONS, polynomial_moves
 
 DT = 1e-3
 THETA = np.array([96.0, 205.0, 20.0, -3.0])
