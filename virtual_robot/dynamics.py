@@ -168,7 +168,7 @@ def advance(  # type: ignore[no-untyped-def]
     tau
         Joint torques, shape (n,).
     mass, bias
-        Pinocchio's mass matrix (lower triangle) and nonlinear effects at the predicted middle of the period.
+        Pinocchio's mass matrix (upper triangle) and nonlinear effects at the predicted middle of the period.
     rotor
         Additional inertias, shape (N, N).
     link
@@ -192,8 +192,8 @@ def advance(  # type: ignore[no-untyped-def]
         full[a, a] += mass[i, i]
         for j in range(i + 1, link.size):
             b = link[j]
-            full[a, b] += mass[j, i]
-            full[b, a] += mass[j, i]
+            full[a, b] += mass[i, j]
+            full[b, a] += mass[i, j]
     force, slope, matrix = np.empty(total), np.empty((total, total)), np.empty((total, total))
     gives = gears.shape[0] > 0
     stiff = np.empty((total, total) if gives else (0, 0))
@@ -287,7 +287,7 @@ def advance(  # type: ignore[no-untyped-def]
                 load[i] = bias[i]
                 for j in range(link.size):
                     a = link[j]
-                    load[i] += mass[max(i, j), min(i, j)] * (qd[a] - last[a]) / h
+                    load[i] += mass[min(i, j), max(i, j)] * (qd[a] - last[a]) / h
             last[:] = qd
     for i in range(total):
         half = 0.5 * (qd[i] - before[i])

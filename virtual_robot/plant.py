@@ -200,8 +200,7 @@ class Plant:
             middle, speed = middle[self._link], speed[self._link]
         if self._fine:
             steps = max(steps, math.ceil(period / FINE_STEP))
-        # Its columns are contiguous; only the upper triangle is filled.
-        mass = pin.crba(self.model, self._data, middle).T
+        mass = pin.crba(self.model, self._data, middle)
         bias = pin.nonLinearEffects(self.model, self._data, middle, speed)
         arguments = (
             period, steps, self._time, self._state, self.bristles, tau, mass, bias, self.rotor, self._link,

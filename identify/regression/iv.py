@@ -297,7 +297,12 @@ def _combinations(blocks: Sequence[InstrumentedEquations], noise: Sequence[ArMod
     return combined, scale
 
 
-@compiled("f8[:, :], f8[:, :], f8[:], i8[::1], i8[::1]", **ARITHMETIC)
+@compiled(
+    "f8[:, :], f8[:, :], f8[:], i8[::1], i8[::1]",
+    "f8[:, ::1], f8[:, ::1], f8[:], i8[::1], i8[::1]",
+    "f8[:, ::1], f8[:, ::1], f8[::1], i8[::1], i8[::1]",
+    **ARITHMETIC,
+)
 def _side_by_side(x: Array, z: Array, y: Array, of_x: NDArray[np.int64], of_z: NDArray[np.int64]) -> Array:
     out = np.empty((y.size, of_x.size + of_z.size + 1))
     for m in range(y.size):

@@ -62,7 +62,7 @@ def columns_of(values: Array) -> NDArray[np.int64]:
     return np.flatnonzero(_acting(values[:, :, None]))
 
 
-@compiled("f8[:, :, :]", "f8[:, :, ::1]", **ARITHMETIC)
+@compiled("f8[:, :, :]", "f8[:, :, ::1]", "f8[::1, :, :]", **ARITHMETIC)
 def _acting(columns: Array) -> NDArray[np.bool_]:
     acting = np.zeros(columns.shape[1], np.bool_)
     for j in range(columns.shape[1]):
