@@ -6,6 +6,7 @@ import shutil
 import socket
 import statistics
 import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -13,6 +14,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Literal
 
+from armident.compiled import BASELINE, missing
 from armident.configs import (
     ArmidentError,
     ConfigError,
@@ -34,7 +36,6 @@ from armident.drivers.can.socketcan import RECEIVE_BUFFER, RawSocket
 from armident.drivers.can.timestamps import has_hardware_timestamps
 from armident.drivers.canopen.bus_load import check_fits
 from armident.drivers.canopen.eds import read_eds
-from armident.drivers.compiled import MODE, require_compiled
 from armident.drivers.vcan.interfaces import NETWORK, have_socketcan, is_up
 
 Verdict = Literal["ok", "warning", "failed"]
@@ -237,12 +238,17 @@ def _receive_buffer(bus: Bus) -> Check:
 
 
 def _installation() -> Check:
-    """Check that the loops that handle every frame are compiled."""
-    try:
-        require_compiled()
-    except ConfigError as error:
-        return Check("installation", "failed", str(error))
-    return Check("installation", "ok", f"armident {version('armident')}, loops of the bus compiled {MODE}")
+    """Check that the kernels of a capture are compiled for this machine."""
+    absent = missing("armident.daq.matching.pdo_matching", "armident.drivers.canopen.sync_loop")
+    if absent:
+        return Check(
+            "installation",
+            "warning",
+            f"armident {version('armident')} has no machine code of {', '.join(absent)}: a wheel has it for processors "
+            f"with the features of {BASELINE}. It is compiled at the first start, or now: "
+            f"{sys.executable} -m armident.compiled",
+        )
+    return Check("installation", "ok", f"armident {version('armident')}, kernels are compiled")
 
 
 def _clock() -> Check:

@@ -329,7 +329,7 @@ def _removals(system: System, cell: str) -> Iterator[InstallStep]:
             yield step(f"remove {kind} /{file.relative_to(system.root)}", file.unlink)
     cache = system.root / CACHE
     if units and cache.is_dir():
-        yield step(f"remove folder /{CACHE} (compiled code)", lambda: shutil.rmtree(cache))
+        yield step(f"remove folder /{CACHE} (fonts, compiled kernels)", lambda: shutil.rmtree(cache))
     if (units or links) and system.has_systemd:
         yield step("units known to systemd", partial(system.run, "systemctl", "daemon-reload"))
 

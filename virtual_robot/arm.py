@@ -103,7 +103,7 @@ class Arm:
         self._ratio = robot.transmission_matrix
         drives = [joint.drive for joint in robot.joints]
         self._per_rad = counts_per_si(robot)
-        self._torque = self._ratio.T * np.array([drive.gain for drive in drives])
+        self._torque = np.ascontiguousarray(self._ratio.T * [drive.gain for drive in drives])
         self._limit = np.array([drive.saturation or np.inf for drive in drives])
         self._permille = np.array([1000.0 / drive.rated for drive in drives])
         # Drives are tuned for the arm without hidden effects.

@@ -7,8 +7,8 @@ effects N = n.
 import math
 
 import numpy as np
-from numba import njit
 
+from armident.compiled import PLAIN, compiled
 from armident.virtual_robot.effects.bristles import bristle_rate
 from armident.virtual_robot.effects.forces import LOAD_CODE, effect_torque
 from armident.virtual_robot.effects.gears import gear_torque
@@ -22,7 +22,10 @@ C21, C31, C32 = -1.0156171083877702091975600115545, 4.07599564525376998248058353
 M2, M3 = 6.1697947043828245592553615689730, -0.42772256543218573326238373806514
 
 
-@njit(cache=True, error_model="numpy")
+@compiled(
+    "f8[::1], f8[::1], f8, f8[:, ::1], f8[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[::1], f8[::1], f8[:, ::1]",
+    **PLAIN,
+)
 def friction_torques(q, qd, t, friction, smoothing, pairs, ratio, table, load, out, slope):  # type: ignore[no-untyped-def]
     """Torques of friction, couplings (equation B.1), brakes and hidden effects, and their slopes over the velocities.
 
@@ -78,7 +81,7 @@ def friction_torques(q, qd, t, friction, smoothing, pairs, ratio, table, load, o
         slope[j, j] += max(steep, 0.0) if steep > 0.0 else max(steep, -0.9 * slope[j, j])
 
 
-@njit(cache=True, error_model="numpy")
+@compiled("f8[::1], f8[::1], f8[:, ::1], f8[::1], f8[:, ::1], f8[:, ::1]", **PLAIN)
 def gear_torques(q, qd, gears, out, slope, stiff):  # type: ignore[no-untyped-def]
     """Add the torques of elastic gears and their slopes.
 
@@ -106,7 +109,7 @@ def gear_torques(q, qd, gears, out, slope, stiff):  # type: ignore[no-untyped-de
             stiff[b, a] -= steep
 
 
-@njit(cache=True, error_model="numpy")
+@compiled(**PLAIN)
 def _factor(a):  # type: ignore[no-untyped-def]
     """Cholesky factor of ``a`` (n, n) in its lower triangle, in place, with inverted diagonal."""
     n = a.shape[0]
@@ -123,7 +126,7 @@ def _factor(a):  # type: ignore[no-untyped-def]
             a[i, j] = s * d
 
 
-@njit(cache=True, error_model="numpy")
+@compiled(**PLAIN)
 def _solve(a, x):  # type: ignore[no-untyped-def]
     """Solve with the factor of ``_factor``, in place."""
     n = x.size
@@ -139,7 +142,11 @@ def _solve(a, x):  # type: ignore[no-untyped-def]
         x[i] = s * a[i, i]
 
 
-@njit(cache=True, error_model="numpy")
+@compiled(
+    "f8, i8, f8, f8[:, ::1], f8[::1], f8[::1], f8[:, ::1], f8[::1], f8[:, ::1], i8[::1], f8[:, ::1], f8[::1], "
+    "f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[::1], f8[:, ::1], f8[:, ::1]",
+    **PLAIN,
+)
 def advance(  # type: ignore[no-untyped-def]
     period, substeps, t, state, z, tau, mass, bias, rotor, link,
     friction, smoothing, pairs, ratio, table, load, gears, bristles,

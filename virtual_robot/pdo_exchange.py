@@ -4,9 +4,9 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from armident.compiled import PLAIN, compiled
 from armident.drivers.can.frames import BIT_RATE_SWITCH, FD_FLAG, fd_length, frames
 from armident.drivers.canopen.objects import (
     ARRAY_OFFSET,
@@ -48,7 +48,13 @@ HISTORY = 64
 """Number of SYNCs whose live values are kept for packed samples."""
 
 
-@njit(cache=True, error_model="numpy")
+@compiled(
+    "u4[:], u1[:], u1[:, :], i8, i8, i8, f8, i4[::1], i4[::1], i2[::1], i4[::1], i8[:, ::1], i8[:, :, ::1], "
+    "i8[::1], i8[::1], i8[::1], i8[::1], i8[::1], i8[::1], i8[::1], u4[::1], u1[::1], u4[:], u1[:], u1[:, :], "
+    "i8[::1], i8[::1], i8[::1], i8[::1], i8[::1], i8[::1], i8[::1], i8[::1], u1[:, ::1], b1[::1], i8[::1], "
+    "i4[::1], b1[::1], i8[::1], i8[::1]",
+    **PLAIN,
+)
 def _exchange(  # type: ignore[no-untyped-def]
     ids, lengths, data, start, stop, sequence, period, position, before, current, demand, values, history,
     tx_kinds, tx_first, tx_row, tx_drive, tx_offset, tx_size, tx_back, tx_ids, tx_lengths,

@@ -5,9 +5,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from armident.compiled import PLAIN, compiled
 from armident.configs import ConfigError, RobotConfig
 from armident.configs.schema.robot import Controller
 
@@ -57,7 +57,12 @@ class Servo:
         return 1.0 - math.exp(-2 * math.pi * self.filter_hz * self.period)
 
 
-@njit(cache=True, error_model="numpy")
+@compiled(
+    "f8, b1, f8[::1], f8[:, ::1], f8[::1], f8[::1], f8[::1], i8[::1], i8[::1], b1[::1], f8[::1], f8[::1], f8, "
+    "f8[::1], f8[::1], f8[::1], f8[:, ::1], f8[::1], f8[::1], i4[::1], i2[::1], i4[::1], f8[:, ::1], f8[::1], "
+    "f8[::1]",
+    **PLAIN,
+)
 def control(  # type: ignore[no-untyped-def]
     period, feedback, q, ratio, counts_per_rad, origin, target, age, steps, held, kp, kv, smooth, limit, noise,
     permille, past, rate, current, position, reported, demand, torque, disturbance, tau,

@@ -17,7 +17,6 @@ from armident.daq.matching.streams import CapturedStream, bus_numbers, captured_
 from armident.drivers.can.frames import STANDARD_ID_MASK, Filter
 from armident.drivers.canopen.bus_load import check_fits
 from armident.drivers.canopen.objects import COB_SDO_REQUEST, COB_SYNC
-from armident.drivers.compiled import require_compiled
 
 
 @dataclass(frozen=True)
@@ -79,9 +78,8 @@ def load_plan(
     ``config``: session configuration. ``out``: directory of the recordings; default: that of the session. ``duration``:
     time after which the capture ends, s. ``listen_only``: send nothing to the buses. ``sniff_s``: with ``listen_only``:
     time to discover the TPDOs of the drives, s. Raises ConfigError if the configuration is invalid, the trajectory
-    exceeds the limits of the robot, a bus is overloaded, or the loops of the bus are not compiled.
+    exceeds the limits of the robot, or a bus is overloaded.
     """
-    require_compiled()
     session = load_session(config, "capture")
     robot = load_robot(session.robot, "capture")
     check_fits(session, str(config))

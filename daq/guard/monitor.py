@@ -3,8 +3,8 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
+from armident.compiled import compiled
 from armident.configs import ConfigError, RobotConfig, SessionConfig
 from armident.configs.schema.session import Stream
 from armident.configs.units import counts_per_si
@@ -81,7 +81,7 @@ class MotionMonitor:
         period = session.sync_period * pack
         self._per_count = np.linalg.inv(robot.transmission_matrix) / counts_per_si(robot)
         torque = np.array([joint.drive.gain * joint.drive.rated / 1000.0 for joint in robot.joints])
-        self._per_mille = robot.transmission_matrix.T * torque
+        self._per_mille = np.ascontiguousarray(robot.transmission_matrix.T * torque)
         velocity, mean = max(1, round(VELOCITY_S / period)), max(TORQUE_SAMPLES // pack, round(TORQUE_S / period), 1)
         self._positions, self._efforts = np.zeros((velocity + 1, n), np.int64), np.zeros((mean, n))
         self._samples = np.zeros(n, np.int64)
@@ -183,7 +183,7 @@ def _byte_offsets(stream: Stream) -> dict[str, int]:
     return offsets
 
 
-@njit(cache=True)
+@compiled(nogil=False)
 def _number(data, k, at, size):  # type: ignore[no-untyped-def]
     """Return the signed little-endian number of ``size`` bytes."""
     value = np.int64(0)
@@ -193,7 +193,11 @@ def _number(data, k, at, size):  # type: ignore[no-untyped-def]
     return value - 2 * top if value & top else value
 
 
-@njit(cache=True)
+@compiled(
+    "i8, i8[:, ::1], b1[::1], b1[::1], f8[:, ::1], f8[:, ::1], i8[:, ::1], f8[:, ::1], i8[::1], f8, f8[::1], "
+    "f8[::1], f8[::1], f8[::1], f8[::1], i8[::1], f8[::1]",
+    nogil=False,
+)
 def check_limits(  # type: ignore[no-untyped-def]
     moved, raw, seen, demanded, per_count, per_mille, positions, efforts, samples, velocity_s,
     low, high, velocity, torque, following, state, value,
@@ -261,7 +265,15 @@ def check_limits(  # type: ignore[no-untyped-def]
     return NO_ALARM
 
 
-@njit(cache=True)
+@compiled(
+    "u4[:], u1[:], u1[:, :], i8, i8, i8[::1], i8[::1], i8[::1], b1, i8, i8[:, ::1], b1[::1], b1[::1], i8[::1], "
+    "i8, f8[:, ::1], f8[:, ::1], i8[:, ::1], f8[:, ::1], i8[::1], f8, f8[::1], f8[::1], f8[::1], f8[::1], "
+    "f8[::1], i8[::1], i8[:, ::1], f8[::1]",
+    "u4[::1], u1[::1], u1[:, ::1], i8, i8, i8[::1], i8[::1], i8[::1], b1, i8, i8[:, ::1], b1[::1], b1[::1], "
+    "i8[::1], i8, f8[:, ::1], f8[:, ::1], i8[:, ::1], f8[:, ::1], i8[::1], f8, f8[::1], f8[::1], f8[::1], "
+    "f8[::1], f8[::1], i8[::1], i8[:, ::1], f8[::1]",
+    nogil=False,
+)
 def check_batch(  # type: ignore[no-untyped-def]
     ids, lengths, data, now, bus, kinds, joints, at, own_demand, every, raw, seen, demanded, beat, silence,
     per_count, per_mille, positions, efforts, samples, velocity_s,

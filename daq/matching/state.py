@@ -6,6 +6,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from armident.compiled import structure
+
 LOST, RECEIVED, WRONG_LENGTH, AMBIGUOUS, NO_SYNC, WRONG_MAPPING = range(6)
 """States of one joint's sample at one SYNC."""
 
@@ -70,6 +72,11 @@ SEND_TIMES = 1 << 16
 """Number of SYNCs of the own producer whose send times are kept."""
 
 
+@structure(
+    "i8[:, ::1], i8[::1], i8[:, ::1], *[i8[::1]] * 3, *[i8[:, ::1]] * 2, i8[::1], *[i8[:, ::1]] * 4, "
+    "i8[:, :, ::1], *[i8[:, ::1]] * 8, i8[:, :, ::1], u8[:, :, :, ::1], u1[:, :, ::1], "
+    "i8[:, ::1], i8[:, :, :, ::1], u1[:, :, ::1], u8[:, :, :, ::1]"
+)
 class MatcherState(NamedTuple):
     """Rows to be answered and answers received; B buses, S streams, n joints, rows as ordinals ``u`` per stream.
 
@@ -163,6 +170,7 @@ class MatcherState(NamedTuple):
     row_data: NDArray[np.uint64]
 
 
+@structure("i8[::1], i8[:, ::1], i8[:, ::1], u1[:, :, ::1], u8[:, :, :, ::1]")
 class MatchedSamples(NamedTuple):
     """Decided samples; S streams, n joints, space for N rows.
 

@@ -5,11 +5,12 @@ import socket
 from typing import Any
 
 import numpy as np
+from numba import carray, types
 from numpy.typing import NDArray
 
+from armident.compiled import compiled
 from armident.drivers.can.socketcan import Messages
 from armident.drivers.canopen.objects import COB_SYNC
-from armident.drivers.compiled import MODE, compiled
 
 MAX_LATE_PERIODS = 10
 """Delay, in periods, beyond which the time grid moves instead of being caught up with."""
@@ -38,15 +39,12 @@ _ABSOLUTE = 1
 _EINTR, _EAGAIN, _ENOBUFS = errno.EINTR, errno.EAGAIN, errno.ENOBUFS
 _DONTWAIT = int(socket.MSG_DONTWAIT)
 
-if MODE == "by numba":
-    from numba import carray, types
-
-    _clock_nanosleep: Any = types.ExternalFunction(
-        "clock_nanosleep", types.int32(types.int32, types.int32, types.intp, types.intp)
-    )
-    _clock_gettime: Any = types.ExternalFunction("clock_gettime", types.int32(types.int32, types.intp))
-    _sendmmsg: Any = types.ExternalFunction("sendmmsg", types.int32(types.int32, types.intp, types.uint32, types.int32))
-    _errno_location: Any = types.ExternalFunction("__errno_location", types.voidptr())
+_clock_nanosleep: Any = types.ExternalFunction(
+    "clock_nanosleep", types.int32(types.int32, types.int32, types.intp, types.intp)
+)
+_clock_gettime: Any = types.ExternalFunction("clock_gettime", types.int32(types.int32, types.intp))
+_sendmmsg: Any = types.ExternalFunction("sendmmsg", types.int32(types.int32, types.intp, types.uint32, types.int32))
+_errno_location: Any = types.ExternalFunction("__errno_location", types.voidptr())
 
 
 def is_knot(k: int, every: int) -> bool:
@@ -127,14 +125,14 @@ class Loop:
         _run(*self._fixed, state, *self._shared, messages.address, body, first, place, rows, every, self._spec)
 
 
-@compiled
+@compiled()
 def monotonic_ns(spec: NDArray[np.int64]) -> int:
     """Read CLOCK_MONOTONIC, ns. ``spec``: memory of a ``struct timespec``, int64, shape (2,)."""
     _clock_gettime(_MONOTONIC, spec.ctypes.data)
     return int(spec[0] * 1_000_000_000 + spec[1])
 
 
-@compiled
+@compiled()
 def utc_ns(spec: NDArray[np.int64]) -> int:
     """Read CLOCK_REALTIME, ns: the clock of the kernel's frame stamps.
 
@@ -144,7 +142,7 @@ def utc_ns(spec: NDArray[np.int64]) -> int:
     return int(spec[0] * 1_000_000_000 + spec[1])
 
 
-@compiled
+@compiled()
 def sleep_until(deadline: int, spec: NDArray[np.int64]) -> None:
     """Sleep until CLOCK_MONOTONIC reaches a deadline. ``spec``: memory of a ``struct timespec``, int64, shape (2,)."""
     spec[0], spec[1] = deadline // 1_000_000_000, deadline % 1_000_000_000
@@ -152,7 +150,7 @@ def sleep_until(deadline: int, spec: NDArray[np.int64]) -> None:
         pass
 
 
-@compiled
+@compiled()
 def send_messages(descriptor: int, address: int, count: int, attempts: int, spec: NDArray[np.int64]) -> int:
     """Send messages by ``sendmmsg``; return 0, or errno if the kernel refuses them.
 
@@ -174,7 +172,10 @@ def send_messages(descriptor: int, address: int, count: int, attempts: int, spec
     return int(code)
 
 
-@compiled
+@compiled(
+    "i8[::1], i8, i8, i8[::1], i8[::1], i8[::1], i8[::1], i8[::1], i8, i4[:, ::1], i8[::1], i8[::1], "
+    "i4[:, ::1], i8, i8[::1]"
+)
 def _run(
     descriptors: Any, period: int, counter: int, state: Any, late: Any, errors: Any, unsent: Any, times: Any,
     address: int, body: Any, first: Any, place: Any, rows: Any, every: int, spec: Any,

@@ -33,7 +33,7 @@ NICENESS = -10
 """Nice value of the guest."""
 MALLOC_TUNABLES = "glibc.malloc.mmap_threshold=1073741824:glibc.malloc.trim_threshold=1073741824"
 """Tunables of glibc that keep freed memory in the process, because page faults are slow in a guest."""
-CACHES = {"NUMBA_CACHE_DIR": "numba", "MPLCONFIGDIR": "matplotlib", "XDG_CACHE_HOME": "guest"}
+CACHES = {"MPLCONFIGDIR": "matplotlib", "XDG_CACHE_HOME": "guest"}
 """Environment variables of cache folders, and their default folders in the cache of armident. The user's own caches are
 read-only in the guest, which Matplotlib and Fontconfig report on stderr."""
 MAPPINGS = Path("/proc/sys/vm/max_map_count")

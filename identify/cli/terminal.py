@@ -38,7 +38,7 @@ class _Compilation(event.Listener):
         """Print the line before the first compilation."""
         if not self._printed:
             self._printed = True
-            print(f"{self._what}: compiling for this machine, once: later runs find it cached", file=sys.stderr)
+            print(f"{self._what}: compiling for this machine, once: later runs find it", file=sys.stderr)
 
     def on_end(self, event: event.Event) -> None:
         """Do nothing at the end of a compilation."""

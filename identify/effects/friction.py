@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from armident.compiled import ARITHMETIC, compiled
 from armident.identify.effects.effect import (
     POSITION,
     TORQUE,
@@ -22,7 +23,6 @@ from armident.identify.effects.effect import (
 )
 from armident.identify.effects.free_shapes import TOP_SPEED, FreeShape, OverPosition, hats, table, values
 from armident.identify.effects.rotor import ROTOR, rotors
-from armident.identify.robot.compiled import compiled
 from armident.identify.robot.motion import Motion
 
 Array = NDArray[np.float64]
@@ -299,7 +299,7 @@ class PreslidingFriction(Effect):
         return (float(motion.span[place.joint]) * np.geomspace(0.0002, 0.1, 12),)
 
 
-@compiled
+@compiled("f8[:], f8", "f8[::1], f8", **ARITHMETIC)
 def dahl(q: Array, displacement: float) -> Array:
     """Return Dahl's friction over its level, shape (N,), integrated exactly between samples.
 

@@ -5,6 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from armident.compiled import ARITHMETIC, compiled
 from armident.identify.effects.effect import (
     POSITION,
     TORQUE,
@@ -17,7 +18,6 @@ from armident.identify.effects.effect import (
     Trials,
 )
 from armident.identify.effects.rotor import ROTOR, rotors
-from armident.identify.robot.compiled import compiled
 from armident.identify.robot.motion import Motion
 
 Array = NDArray[np.float64]
@@ -116,7 +116,7 @@ class JointElasticity(TorqueDependent):
         return np.geomspace(4.0, min(80.0, 0.2 / motion.dt), 7), DAMPINGS, rotors(motion, place.joint)
 
 
-@compiled
+@compiled("f8[::1], f8[::1], f8, f8, f8", **ARITHMETIC)
 def swinging(pull: Array, share: Array, w: float, damping: float, dt: float) -> tuple[Array, Array, Array]:
     """Return position, velocity and acceleration (N,) of ``share x'' + 2 damping w x' + w^2 x = w^2 pull``, from rest.
 
@@ -186,7 +186,7 @@ def falls(motion: Motion, joint: int, rotor: float = 0.0) -> Array:
     return away
 
 
-@compiled
+@compiled("f8[::1], f8, f8", **ARITHMETIC)
 def crossing(pull: Array, gap: float, dt: float) -> tuple[Array, Array, Array]:
     """Return position, velocity and acceleration (N,) of a link relative to its motor, in the gap of the gear.
 

@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from armident.compiled import ARITHMETIC, compiled
 from armident.identify.regression.fir import filter_columns
-from armident.identify.robot.compiled import compiled
 
 LEAST_VARIANCE = 1e-300
 """Variance of a residual that is zero, in squared units of the series: its inverse is finite."""
@@ -177,7 +177,7 @@ def fit_spectrum(power: NDArray[np.float64], order: int) -> ArModel:
     return ArModel(coefficients[last, :last].copy(), float(variances[last]), -np.inf)
 
 
-@compiled
+@compiled("f8[::1]", **ARITHMETIC)
 def levinson_durbin(r: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Solutions of the Yule-Walker equations of every order by the Levinson-Durbin recursion (6.21 to 6.23).
 
@@ -226,7 +226,7 @@ def whiteness(series: Sequence[NDArray[np.float64]], lags: int = 20) -> Whitenes
     return WhitenessTest(r[1:] / r[0] if r[0] > 0 else np.zeros(lags), 2 / float(np.sqrt(total)))
 
 
-@compiled
+@compiled("f8[::1], i8", **ARITHMETIC)
 def _lowest_aic(r: NDArray[np.float64], samples: int) -> tuple[NDArray[np.float64], float, float]:
     """Coefficients, variance and criterion of the model with the lowest AIC."""
     coefficients, variances = levinson_durbin(r)
@@ -238,7 +238,7 @@ def _lowest_aic(r: NDArray[np.float64], samples: int) -> tuple[NDArray[np.float6
     return coefficients[best, :best].copy(), variances[best], lowest
 
 
-@compiled
+@compiled("f8[:, ::1], i8, i8", **ARITHMETIC)
 def _lagged_sums(x: NDArray[np.float64], max_lag: int, first: int) -> NDArray[np.float64]:
     samples, width = x.shape
     # The previous sample is the previous row of the array: one long sum per lag, in pieces that stay in the cache.

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.lib.stride_tricks import as_strided
 from numpy.typing import NDArray
 
-from armident.identify.robot.compiled import compiled
+from armident.compiled import ARITHMETIC, compiled
 
 _ROWS = 8
 """Fewest rows per product. Half as many rows as taps are fastest: fewer cost calls, more cost zeros off the band."""
@@ -54,7 +54,7 @@ def filter_columns(taps: NDArray[np.float64], x: NDArray[np.float64]) -> NDArray
     return out
 
 
-@compiled
+@compiled("f8[::1], f8[:, ::1], f8[:, ::1]", **ARITHMETIC)
 def _add_delayed(taps: NDArray[np.float64], x: NDArray[np.float64], out: NDArray[np.float64]) -> None:
     span, width = taps.size - 1, x.shape[1]
     # The previous sample is the previous row of the array: one long sum per tap.

@@ -16,13 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg, signal
 
+from armident.compiled import ARITHMETIC, compiled
 from armident.identify.regression.ar_noise import ArModel
 from armident.identify.regression.equations import InstrumentedEquations
 from armident.identify.regression.fir import filter_columns
 from armident.identify.regression.least_squares import column_norms
 from armident.identify.regression.qr import triangularize, triangularize_parts
 from armident.identify.regression.whitening import columns_of, whitened
-from armident.identify.robot.compiled import compiled
 from armident.identify.signals.decimate import Decimation
 
 Array = NDArray[np.float64]
@@ -297,7 +297,12 @@ def _combinations(blocks: Sequence[InstrumentedEquations], noise: Sequence[ArMod
     return combined, scale
 
 
-@compiled
+@compiled(
+    "f8[:, :], f8[:, :], f8[:], i8[::1], i8[::1]",
+    "f8[:, ::1], f8[:, ::1], f8[:], i8[::1], i8[::1]",
+    "f8[:, ::1], f8[:, ::1], f8[::1], i8[::1], i8[::1]",
+    **ARITHMETIC,
+)
 def _side_by_side(x: Array, z: Array, y: Array, of_x: NDArray[np.int64], of_z: NDArray[np.int64]) -> Array:
     out = np.empty((y.size, of_x.size + of_z.size + 1))
     for m in range(y.size):

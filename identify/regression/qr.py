@@ -11,7 +11,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from armident.identify.robot.compiled import compiled
+from armident.compiled import ARITHMETIC, compiled
 
 _ROWS = 64
 """Rows eliminated at a time: with a hundred columns they fit the second-level cache."""
@@ -56,7 +56,7 @@ def triangularize_parts(
     return top, np.where(norms > 0.0, norms, 1.0)
 
 
-@compiled
+@compiled("f8[:, ::1], f8[:, ::1]", "f8[::1, :], f8[:, ::1]", **ARITHMETIC)
 def _reflect(a: NDArray[np.float64], top: NDArray[np.float64]) -> None:
     """Reduce ``a`` (m, p), which is overwritten, into the triangle kept in ``top`` (b, p)."""
     rows, width = a.shape

@@ -6,8 +6,8 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from armident.compiled import ARITHMETIC, compiled
 from armident.identify.regression.ar_noise import ArModel
-from armident.identify.robot.compiled import compiled
 
 Array = NDArray[np.float64]
 
@@ -62,7 +62,7 @@ def columns_of(values: Array) -> NDArray[np.int64]:
     return np.flatnonzero(_acting(values[:, :, None]))
 
 
-@compiled
+@compiled("f8[:, :, :]", "f8[:, :, ::1]", "f8[::1, :, :]", **ARITHMETIC)
 def _acting(columns: Array) -> NDArray[np.bool_]:
     acting = np.zeros(columns.shape[1], np.bool_)
     for j in range(columns.shape[1]):

@@ -5,6 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from armident.compiled import structure
 from armident.configs import RobotConfig
 
 Floats = NDArray[np.float64]
@@ -14,6 +15,7 @@ INERTIAL = ("xx", "xy", "xz", "yy", "yz", "zz", "mx", "my", "mz", "m")
 """Inertial parameters of a link, in the order of the columns (thesis equation 2.6)."""
 
 
+@structure("f8[::1], f8[::1], f8[::1], f8[::1], f8[::1], b1[::1], f8[::1]")
 class Chain(NamedTuple):
     """Geometry of a serial chain in modified Denavit-Hartenberg notation (thesis section 2.1.1).
 
@@ -31,6 +33,7 @@ class Chain(NamedTuple):
     gravity: Floats
 
 
+@structure("i8[:, ::1], i8[::1], i8[::1], i8[::1], i8[::1], i8[:, ::1], i8[:, ::1]")
 class Columns(NamedTuple):
     """Regressor column of each parameter; -1 for a parameter without one.
 
@@ -55,6 +58,7 @@ class Columns(NamedTuple):
     coupling: Ints
 
 
+@structure("f8[:, ::1], f8[::1], f8[::1], f8[::1], f8[::1], i8[:, ::1], f8[:, ::1], f8[::1]")
 class Values(NamedTuple):
     """Parameter values in SI units, one array per kind of parameter.
 

@@ -7,8 +7,8 @@ precision). The code has no branches; errors are a few units in the last place f
 
 import numpy as np
 
+from armident.compiled import inlined
 from armident.identify.robot.chain import Floats
-from armident.identify.robot.compiled import inlined
 
 LANES = 4
 """Array lengths are rounded up to a multiple of this number, so that no element needs a scalar loop."""

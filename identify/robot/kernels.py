@@ -7,8 +7,8 @@ Sizes: N samples, n joints.
 
 import numpy as np
 
+from armident.compiled import ARITHMETIC, compiled, inlined
 from armident.identify.robot.chain import Chain, Columns, Floats, Values
-from armident.identify.robot.compiled import compiled, inlined
 from armident.identify.robot.elementary import padded, sines_cosines
 
 TWO_OVER_PI = 2.0 / np.pi
@@ -57,7 +57,7 @@ def turn(n: int, chain: Chain, q: Floats, angle: Floats, sine: Floats, cosine: F
     sines_cosines(angle, sine, cosine)
 
 
-@compiled
+@compiled("Chain, Columns, f8[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, :, ::1]", **ARITHMETIC)
 def fill_regressor(
     chain: Chain, columns: Columns, smoothing: Floats, q: Floats, qd: Floats, qdd: Floats, out: Floats
 ) -> None:
@@ -364,7 +364,7 @@ def fill_mass_matrix(
         mass[j, i] += values.coupling[k, 0]
 
 
-@compiled
+@compiled("Chain, Values, f8[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1]", **ARITHMETIC)
 def fill_inverse_dynamics(
     chain: Chain, values: Values, smoothing: Floats, q: Floats, qd: Floats, qdd: Floats, out: Floats
 ) -> None:
@@ -389,7 +389,7 @@ def fill_inverse_dynamics(
             out[k, j] += values.coupling[m, 0] * qdd[k, i]
 
 
-@compiled
+@compiled("Chain, Values, f8[:, ::1], f8[:, :, ::1]", **ARITHMETIC)
 def fill_mass_matrices(chain: Chain, values: Values, q: Floats, out: Floats) -> None:
     """Compute the mass matrices of several postures; see `fill_mass_matrix`.
 
@@ -448,7 +448,7 @@ def solve_factored(factor: Floats, n: int, x: Floats) -> None:
         x[i] = value
 
 
-@compiled
+@compiled("Chain, Values, f8[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1]", **ARITHMETIC)
 def fill_forward_dynamics(
     chain: Chain, values: Values, smoothing: Floats, q: Floats, qd: Floats, tau: Floats, out: Floats
 ) -> int:

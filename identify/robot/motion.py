@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import qmc
 
-from armident.identify.robot.compiled import compiled
+from armident.compiled import ARITHMETIC, compiled
 
 if TYPE_CHECKING:
     from armident.identify.robot.arm import ArmModel
@@ -278,7 +278,7 @@ class Motion:
         return self.theta
 
 
-@compiled
+@compiled("f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[::1], f8[::1], f8[::1], i8, f8", **ARITHMETIC)
 def _first_order(
     position: Array,
     velocity: Array,

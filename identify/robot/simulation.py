@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from armident.compiled import ARITHMETIC, compiled, inlined
 from armident.identify.robot.arm import ArmModel
 from armident.identify.robot.chain import Chain, Floats, Ints, Values
-from armident.identify.robot.compiled import compiled, inlined
 from armident.identify.robot.controller import DiscreteController
 from armident.identify.robot.elementary import arctangents, padded
 from armident.identify.robot.kernels import TWO_OVER_PI, cholesky, fill_mass_matrix, rigid_torque, solve_factored, turn
@@ -37,6 +37,13 @@ MOST_STEPS = 16
 
 HISTORY = 1024
 """Number of samples after which the past of the controller is copied to the front of its arrays."""
+
+UNROLLED = ((1, 0), (2, 0), (3, 0), (4, 0), (5, 0), (6, 0), (6, 1), (7, 0))
+"""Numbers of joints and of couplings for which the loop is compiled before its use; others are compiled when needed."""
+_SIGNATURE = (
+    "Chain, Values, *[f8[:, ::1]] * 5, f8[::1], i8, *[f8[:, ::1]] * 2, f8, f8[::1], *[f8[:, ::1]] * 4, "
+    "Tuple([i8] * {}), Tuple([i8] * {})"
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -260,7 +267,7 @@ def stiffen(
         stiff[max(i, j), min(i, j)] += GAMMA * step * pair_slope[m]
 
 
-@compiled
+@compiled(*(_SIGNATURE.format(n, pairs) for n, pairs in UNROLLED), **ARITHMETIC)
 def run(
     chain: Chain,
     values: Values,

@@ -19,10 +19,10 @@ too little smoothing.
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from armident.compiled import compiled
 from armident.configs import DataError
 
 LOG10_NVR_RANGE = {2: (-12.0, 4.0), 3: (-14.0, 4.0)}
@@ -195,7 +195,7 @@ def _transient(order: int, nvr: float) -> int:
     return int(SETTLED * nvr ** (-0.5 / order)) + 10
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled()
 def _row(band, d, low, i, p):  # type: ignore[no-untyped-def]
     """Row i of ``V = L diag(d) L'``: fill ``low[i % (p + 1)]`` (distances 1..p) and return d_i.
 
@@ -212,7 +212,7 @@ def _row(band, d, low, i, p):  # type: ignore[no-untyped-def]
     return pivot
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled("f8[::1], f8[::1], i8")
 def _profile(w, band, transient):  # type: ignore[no-untyped-def]
     """``m log(w' V^-1 w) + log|V|`` in one forward sweep; after ``transient`` rows the factors are constant."""
     m, p = w.size, band.size - 1
@@ -244,7 +244,7 @@ def _profile(w, band, transient):  # type: ignore[no-untyped-def]
     return m * np.log(quadratic) + logdet
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled()
 def _forward(w, band, transient):  # type: ignore[no-untyped-def]
     """``L^-1 w`` with ``V = L diag(d) L'``, and the first rows of L and d; all later rows equal the last one."""
     m, p = w.size, band.size - 1
@@ -271,7 +271,7 @@ def _forward(w, band, transient):  # type: ignore[no-untyped-def]
     return z, rows, pivots
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled("f8[::1], f8[::1], f8[::1], i8")
 def _correction(w, band, stencil, transient):  # type: ignore[no-untyped-def]
     """``D' V^-1 w``, shape (m + order,); after ``transient`` rows the factors are constant."""
     m, p = w.size, band.size - 1
@@ -290,7 +290,7 @@ def _correction(w, band, stencil, transient):  # type: ignore[no-untyped-def]
     return out
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled("f8[::1], f8[::1], f8[::1], i8")
 def _residual_sum(w, band, stencil, transient):  # type: ignore[no-untyped-def]
     """``|D' V^-1 w|^2``; after ``transient`` rows the factors are constant."""
     m, p = w.size, band.size - 1

@@ -9,10 +9,10 @@ the noise-variance ratio. It has the same meaning as in :mod:`armident.identify.
 
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from armident.compiled import compiled
 from armident.configs import DataError
 
 PRIOR = 1e10
@@ -152,7 +152,7 @@ def _driven(order: int) -> Array:
     return np.array([[1 / 20, 1 / 8, 1 / 6], [1 / 8, 1 / 3, 1 / 2], [1 / 6, 1 / 2, 1.0]])
 
 
-@numba.njit(cache=True)
+@compiled("f8[:, ::1], f8[::1], f8[:, ::1], f8[:, ::1], f8[:, :, ::1], f8[::1], i8[::1], f8[:, :, ::1]", nogil=False)
 def _filter(y, nvr, driven, x, p, squares, measured, out):  # type: ignore[no-untyped-def]
     """Predict and update every joint at every sample; ``x`` (n, order), ``p`` (n, order, order) in place."""
     order = driven.shape[0]
@@ -185,7 +185,7 @@ def _filter(y, nvr, driven, x, p, squares, measured, out):  # type: ignore[no-un
                 out[a, k, j] = x[j, a]
 
 
-@numba.njit(cache=True)
+@compiled(nogil=False)
 def _predict(x, p, nvr, driven, half):  # type: ignore[no-untyped-def]
     """``x = F x``, ``P = F P F' + nvr driven`` for the transition of one sample."""
     order = x.size
@@ -214,7 +214,7 @@ def _predict(x, p, nvr, driven, half):  # type: ignore[no-untyped-def]
             p[a, b] += nvr * driven[a, b]
 
 
-@numba.njit(cache=True)
+@compiled(nogil=False)
 def _update(x, p, innovation, variance, gain):  # type: ignore[no-untyped-def]
     """Measurement update in Joseph's form, which keeps the covariance symmetric and positive."""
     order = x.size

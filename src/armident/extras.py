@@ -5,10 +5,10 @@ from contextlib import contextmanager
 
 EXTRAS: dict[str, tuple[str, ...]] = {
     "identify": (
-        "clarabel", "coal", "filterpy", "jinja2", "markupsafe", "matplotlib", "numba", "scipy", "sqlalchemy",
+        "clarabel", "coal", "filterpy", "jinja2", "markupsafe", "matplotlib", "scipy", "sqlalchemy",
         "threadpoolctl",
     ),
-    "virtual": ("clarabel", "numba", "pinocchio", "scipy"),
+    "virtual": ("clarabel", "pinocchio", "scipy"),
     "fleet": ("distributed",),
     "parquet": ("pyarrow",),
     "postgresql": ("psycopg",),

@@ -7,9 +7,9 @@ from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from armident.compiled import compiled
 from armident.drivers.can.socketcan import Messages, RawSocket
 from armident.drivers.canopen.objects import COB_SYNC
 from armident.drivers.canopen.sync_loop import monotonic_ns, send_messages, sleep_until
@@ -31,7 +31,7 @@ def current_of(sync: Any, joint: Any) -> Any:
     return (sync * 31 + joint * 1009) % 32_749
 
 
-@njit(cache=True, nogil=True)
+@compiled(kept=True)
 def _send(descriptors, address, body, first, joints, period, count, lossy, control):  # type: ignore[no-untyped-def]
     spec = np.zeros(2, dtype=np.int64)
     base = monotonic_ns(spec) + period

@@ -10,7 +10,6 @@ from typer.testing import CliRunner
 from armident.daq.cli import application
 from armident.daq.recording import Recording, write_recording
 from armident.identify.estimators.methods import METHODS, Method, estimator
-from armident.identify.identification.options import METHODS
 from tests.fixtures.arms import recording
 
 pytestmark = pytest.mark.slow

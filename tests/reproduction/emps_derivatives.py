@@ -9,10 +9,10 @@ rate is that of the TX40: the position error of the bandpass, noise below 40 Hz 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from armident.compiled import compiled
 from armident.configs import DataError
 from armident.identify.signals.bandpass import butterworth
 from armident.identify.signals.differentiate import NVR_BY_HAND, Derivatives, differentiate
@@ -186,14 +186,14 @@ def relative_errors(run: EmpsRun, found: Derivatives, border: int = 0) -> Errors
     return relative(found.q, run.q), relative(found.qd, run.qd), relative(found.qdd, run.qdd)
 
 
-@numba.njit(cache=True)
+@compiled(nogil=False)
 def _acceleration(q, qd, q_ref, parameters):  # type: ignore[no-untyped-def]
     mass, viscous, coulomb, smoothing, loop, kp = parameters
     force = loop * (kp * (q_ref - q) - qd)
     return (force - viscous * qd - coulomb * 2.0 / np.pi * np.arctan(smoothing * qd)) / mass
 
 
-@numba.njit(cache=True)
+@compiled(kept=True, nogil=False)
 def _integrate(q_ref_dd, dt, steps, parameters, out):  # type: ignore[no-untyped-def]
     """Classical Runge-Kutta; fills reference, position, velocity and acceleration at the samples, (4, N)."""
     h = dt / steps

@@ -5,11 +5,11 @@ The axis is integrated apart from the package: 20 steps per sample of the method
 
 from itertools import pairwise
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 from scipy import signal
 
+from armident.compiled import compiled
 from armident.configs import RobotConfig
 from armident.identify.signals.experiments import Experiment
 
@@ -93,7 +93,7 @@ def _reference(moves: int) -> Floats:
     return np.concatenate(parts)
 
 
-@numba.njit(cache=True)
+@compiled(kept=True, nogil=False)
 def _simulate(reference: Floats, noise: Floats, count: float) -> tuple[Floats, Floats]:
     """Recorded positions and forces (N,)."""
     q, force = np.empty(reference.size), np.empty(reference.size)

@@ -4,9 +4,9 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from armident.compiled import PLAIN, compiled
 from armident.configs import ConfigError, RobotConfig
 from armident.virtual_robot.effects.spec import AUTO, EffectSpec, Hidden, ParameterSpec, positive
 
@@ -39,7 +39,7 @@ EFFECTS: dict[str, EffectSpec] = {
 """Effects of this module."""
 
 
-@njit(cache=True, error_model="numpy")
+@compiled("f8[::1], f8", **PLAIN)
 def sliding_level(row, qd):  # type: ignore[no-untyped-def]
     """Magnitude of the friction (N m) when sliding, and its slope over ``abs(qd)``.
 
@@ -51,7 +51,7 @@ def sliding_level(row, qd):  # type: ignore[no-untyped-def]
     return row[1] + bump, -bump * row[4] * ratio / max(speed, 1e-12)
 
 
-@njit(cache=True, error_model="numpy")
+@compiled(**PLAIN)
 def bristle_rate(row, z, qd):  # type: ignore[no-untyped-def]
     """Rate of a bristle's deflection, ``qd - abs(qd) z stiffness / g(qd)``, and its slopes over ``z`` and ``qd``.
 

@@ -4,9 +4,9 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from armident.compiled import PLAIN, compiled
 from armident.configs import ConfigError, Joint, RobotConfig
 from armident.virtual_robot.effects.spec import (
     AUTO,
@@ -24,7 +24,7 @@ PARAMETERS = 6
 """Number of parameters of a row, after code, joint and other joint."""
 
 
-@njit(cache=True, error_model="numpy")
+@compiled(**PLAIN)
 def _random(seed, cell):  # type: ignore[no-untyped-def]
     """Uniform random number in [0, 1) of a seed and the number of an interval (splitmix64, Steele et al. 2014)."""
     x = np.uint64(seed) * np.uint64(0xD1342543DE82EF95) + np.uint64(cell + 1) * np.uint64(0x9E3779B97F4A7C15)
@@ -34,7 +34,7 @@ def _random(seed, cell):  # type: ignore[no-untyped-def]
     return (x >> np.uint64(11)) * (1.0 / 9007199254740992.0)
 
 
-@njit(cache=True, error_model="numpy")
+@compiled(**PLAIN)
 def effect_torque(code, p, q, qd, motor, other, load, t, smoothing):  # type: ignore[no-untyped-def]
     """Torque against the joint (N m) and its slope over ``qd`` (N m s/rad).
 

@@ -4,9 +4,9 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from armident.compiled import PLAIN, compiled
 from armident.configs import ConfigError, RobotConfig
 from armident.virtual_robot.effects.spec import AUTO, EffectSpec, Hidden, ParameterSpec, positive
 
@@ -47,7 +47,7 @@ EFFECTS: dict[str, EffectSpec] = {
 """Effects of this module."""
 
 
-@njit(cache=True, error_model="numpy")
+@compiled(**PLAIN)
 def _press(way, rounding):  # type: ignore[no-untyped-def]
     """Compression of a contact that has closed by ``way`` (negative: open), and its slope."""
     if way <= -rounding:
@@ -57,7 +57,7 @@ def _press(way, rounding):  # type: ignore[no-untyped-def]
     return (way + rounding) ** 2 / (4.0 * rounding), (way + rounding) / (2.0 * rounding)
 
 
-@njit(cache=True, error_model="numpy")
+@compiled("f8[::1], f8, f8", **PLAIN)
 def gear_torque(row, twist, rate):  # type: ignore[no-untyped-def]
     """Torque between motor and link (N m), and its slopes over twist and rate.
 

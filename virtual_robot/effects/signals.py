@@ -4,9 +4,9 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from armident.compiled import PLAIN, compiled
 from armident.configs import RobotConfig
 from armident.virtual_robot.effects.forces import waves
 from armident.virtual_robot.effects.spec import (
@@ -92,7 +92,7 @@ EFFECTS: dict[str, EffectSpec] = {
 """Effects of this module."""
 
 
-@njit(cache=True, error_model="numpy")
+@compiled("f8[::1], f8[:, ::1], f8[:, ::1]", **PLAIN)
 def _measured(q, encoders, to_joints):  # type: ignore[no-untyped-def]
     """Joint positions (n,) with encoder errors; rows of joint, amplitude, phase and wave numbers (n,)."""
     n = q.size
@@ -108,7 +108,7 @@ def _measured(q, encoders, to_joints):  # type: ignore[no-untyped-def]
     return out
 
 
-@njit(cache=True, error_model="numpy")
+@compiled("f8[::1], f8[::1], f8[::1], f8[::1], f8[::1], f8, f8[:, ::1]", **PLAIN)
 def _applied(signal, level, knee, lag, lagging, period, torque):  # type: ignore[no-untyped-def]
     """Joint torques (n,) of signals (n,); ``lagging`` is advanced in place."""
     n = signal.size
@@ -128,7 +128,7 @@ def _applied(signal, level, knee, lag, lagging, period, torque):  # type: ignore
     return out
 
 
-@njit(cache=True, error_model="numpy")
+@compiled("f8[::1], f8[:, ::1], i8, f8[::1], f8[:, ::1], f8[:, ::1], f8", **PLAIN)
 def _reported(signal, past, newest, delay, leak, ripples, t):  # type: ignore[no-untyped-def]
     """Signals (n,) as reported at ``t``; row ``newest`` of the ring ``past`` (L, n) receives the present ones.
 
@@ -150,7 +150,7 @@ def _reported(signal, past, newest, delay, leak, ripples, t):  # type: ignore[no
     return out
 
 
-@njit(cache=True, error_model="numpy")
+@compiled("f8[::1], f8[::1], f8[::1], i2[::1]", **PLAIN)
 def _permille(signal, noise, permille, out):  # type: ignore[no-untyped-def]
     """Write signals (n,) with noise as numbers of the bus, int16, to ``out`` (n,)."""
     for j in range(signal.size):
@@ -158,7 +158,7 @@ def _permille(signal, noise, permille, out):  # type: ignore[no-untyped-def]
         out[j] = np.int16(min(max(raw, -32768.0), 32767.0))
 
 
-@njit(cache=True, error_model="numpy")
+@compiled("i2[::1], i8[::1], i8[::1], i8, i8, i2[::1]", "i4[::1], i8[::1], i8[::1], i8, i8, i4[::1]", **PLAIN)
 def _rewired(own, origin, sign, low, high, out):  # type: ignore[no-untyped-def]
     """Write numbers (n,) of permuted drives with changed signs, limited to the bus's range, to ``out`` (n,)."""
     for j in range(own.size):
@@ -192,7 +192,7 @@ class Signals:
         self._encoders = np.array(encoders).reshape(len(encoders), 3 + n)
         self._to_joints = np.linalg.inv(ratio) * np.diag(ratio)
 
-        self._torque = ratio.T * gain
+        self._torque = np.ascontiguousarray(ratio.T * gain)
         self._level, self._knee, self._lag = np.ones(n), np.full(n, np.inf), np.zeros(n)
         self._lagging = np.zeros(n)
         for h in mine:

@@ -1,13 +1,14 @@
 """Compiled loops of the recursive estimator; no result depends on the number of threads or of rows in a call."""
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from armident.compiled import compiled
 
 Array = NDArray[np.float64]
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled("f8[:, ::1], f8[:, ::1], f8[:, ::1]")
 def to_joint_side(raw: Array, factor: Array, out: Array) -> None:
     """Multiply every row by a matrix.
 
@@ -21,7 +22,7 @@ def to_joint_side(raw: Array, factor: Array, out: Array) -> None:
             out[k, i] = total
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled("f8[:, ::1], f8[::1], f8[::1]")
 def first_order_lag(x: Array, share: Array, state: Array) -> None:
     """Filter every column with a first-order lag, in place.
 
@@ -34,7 +35,7 @@ def first_order_lag(x: Array, share: Array, state: Array) -> None:
             x[k, j] = state[j]
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled("f8[:, ::1], f8[::1], i8, i8, i8, f8[:, ::1]")
 def low_pass(data: Array, taps: Array, factor: int, seen: int, done: int, rows: Array) -> None:
     """Add the contribution of further samples to the decimated rows that are not complete.
 
@@ -53,7 +54,7 @@ def low_pass(data: Array, taps: Array, factor: int, seen: int, done: int, rows: 
                 row[c] += weight * data[k, c]
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled("f8[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[::1], f8[::1], b1[::1]")
 def update(
     state: Array, covariance: Array, x: Array, z: Array, y: Array, variance: Array, use: NDArray[np.bool_]
 ) -> None:
@@ -92,7 +93,7 @@ def update(
                 covariance[k, i] = value
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled("f8[:, ::1], f8[:, ::1], f8[::1], f8[:, ::1], f8[:, ::1], f8[::1], f8[::1], b1[::1]")
 def add_products(
     sums: Array, squares: Array, right: Array, x: Array, z: Array, y: Array, variance: Array, use: NDArray[np.bool_]
 ) -> None:
@@ -115,7 +116,7 @@ def add_products(
                 squares[i, k] += scaled * z[j, k]
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled("f8[:, ::1], f8[:, ::1]")
 def solve(matrix: Array, right: Array) -> bool:
     """Solve ``matrix x = right`` by elimination with partial pivoting, in place.
 
@@ -151,7 +152,7 @@ def solve(matrix: Array, right: Array) -> bool:
     return True
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled("f8[::1], b1[::1], f8, f8[:, ::1], b1[:, ::1], f8[:, ::1], f8[:, ::1]")
 def add_residuals(
     residual: Array,
     use: NDArray[np.bool_],

@@ -7,10 +7,11 @@ tests compare mass matrix and nonlinear effects with Pinocchio.
 import math
 
 import numpy as np
-from numba import njit
+
+from armident.compiled import PLAIN, compiled
 
 
-@njit(cache=True, error_model="numpy")
+@compiled(**PLAIN)
 def cross(ax, ay, az, bx, by, bz):  # type: ignore[no-untyped-def]
     """Cross product of two vectors, as three numbers.
 
@@ -19,7 +20,7 @@ def cross(ax, ay, az, bx, by, bz):  # type: ignore[no-untyped-def]
     return ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
 
 
-@njit(cache=True, error_model="numpy")
+@compiled(**PLAIN)
 def place(q, mdh, prismatic, mass, com, inertia, axes, bodies):  # type: ignore[no-untyped-def]
     """Joint axes and link inertias in the base frame.
 
@@ -87,7 +88,7 @@ def place(q, mdh, prismatic, mass, com, inertia, axes, bodies):  # type: ignore[
         bodies[j, 9] = T[2, 2] + m * (cx * cx + cy * cy)
 
 
-@njit(cache=True, error_model="numpy")
+@compiled(**PLAIN)
 def momentum(body, v, out):  # type: ignore[no-untyped-def]
     """Product of a spatial inertia and a spatial vector, angular before linear.
 
@@ -106,7 +107,7 @@ def momentum(body, v, out):  # type: ignore[no-untyped-def]
     out[5] = m * u2 - c2
 
 
-@njit(cache=True, error_model="numpy")
+@compiled(**PLAIN)
 def mass_and_bias(qd, gravity, axes, bodies, M, bias):  # type: ignore[no-untyped-def]
     """Mass matrix, and torques of gravity, Coriolis and centrifugal effects.
 
@@ -164,7 +165,7 @@ def mass_and_bias(qd, gravity, axes, bodies, M, bias):  # type: ignore[no-untype
             M[i, j] = M[j, i] = total
 
 
-@njit(cache=True, error_model="numpy")
+@compiled(kept=True, **PLAIN)
 def evaluate(q, qd, gravity, mdh, prismatic, mass, com, inertia):  # type: ignore[no-untyped-def]
     """Mass matrix, shape (n, n), and bias torques, shape (n,), at one state.
 

@@ -2,8 +2,7 @@
 
 import math
 
-from numba import njit
-
+from armident.compiled import PLAIN, compiled
 from tests.evaluation.plants.slots import (
     COULOMB,
     COULOMB_FORWARD,
@@ -42,7 +41,7 @@ COLDEST = 0.02
 """Smallest factor of friction that warming leaves."""
 
 
-@njit(cache=True, error_model="numpy")
+@compiled(**PLAIN)
 def warmed(law, t, work):  # type: ignore[no-untyped-def]
     """Factor of friction after a time and an amount of dissipated work.
 
@@ -56,7 +55,7 @@ def warmed(law, t, work):  # type: ignore[no-untyped-def]
     return max(out, COLDEST)
 
 
-@njit(cache=True, error_model="numpy")
+@compiled(**PLAIN)
 def dry_level(law, q, v, forward, faded, load):  # type: ignore[no-untyped-def]
     """Dry friction of a joint in one direction, N m or N.
 
@@ -77,7 +76,7 @@ def dry_level(law, q, v, forward, faded, load):  # type: ignore[no-untyped-def]
     return max(level, 0.0)
 
 
-@njit(cache=True, error_model="numpy")
+@compiled(**PLAIN)
 def smooth_torque(law, q, v):  # type: ignore[no-untyped-def]
     """Torque of the joint's springs, ripple, offset and curved friction against the motion, N m or N.
 
@@ -96,7 +95,7 @@ def smooth_torque(law, q, v):  # type: ignore[no-untyped-def]
     return out
 
 
-@njit(cache=True, error_model="numpy")
+@compiled(**PLAIN)
 def one_impulse(speed, weight, forward, backward, smoothing):  # type: ignore[no-untyped-def]
     """Impulse of one row of dry friction: bounded, or bounded times ``tanh`` of the velocity after the step.
 
@@ -122,7 +121,7 @@ def one_impulse(speed, weight, forward, backward, smoothing):  # type: ignore[no
     return out
 
 
-@njit(cache=True, error_model="numpy")
+@compiled(**PLAIN)
 def friction_impulses(v, AJ, rows, bounds, smoothing, impulses):  # type: ignore[no-untyped-def]
     """Dry friction of a step by projected Gauss-Seidel.
 

@@ -2,8 +2,7 @@
 
 import math
 
-from numba import njit
-
+from armident.compiled import PLAIN, compiled
 from tests.evaluation.plants.slots import (
     ECCENTRICITY,
     ECCENTRICITY_ORDER,
@@ -19,7 +18,7 @@ from tests.evaluation.plants.slots import (
 )
 
 
-@njit(cache=True, error_model="numpy")
+@compiled(**PLAIN)
 def read_encoder(law, x, resolution):  # type: ignore[no-untyped-def]
     """Position that an encoder reads, rad or m.
 
@@ -30,7 +29,7 @@ def read_encoder(law, x, resolution):  # type: ignore[no-untyped-def]
     return math.floor(x / resolution + 0.5) * resolution
 
 
-@njit(cache=True, error_model="numpy")
+@compiled(**PLAIN)
 def command(gains, k, j, step, reading, qr, qdr, speed, integral):  # type: ignore[no-untyped-def]
     """Torque that the controller of a joint demands, N m or N.
 

@@ -8,8 +8,8 @@ suffices; with a smooth one (``tanh`` of the velocity) the impulse is that of th
 import math
 
 import numpy as np
-from numba import njit
 
+from armident.compiled import PLAIN, compiled
 from tests.evaluation.plants.bodies import mass_and_bias, place
 from tests.evaluation.plants.friction import dry_level, friction_impulses, smooth_torque, warmed
 from tests.evaluation.plants.loops import command, read_encoder
@@ -30,7 +30,7 @@ FARTHEST = 1e3
 """Position, rad or m, beyond which a loop counts as diverged."""
 
 
-@njit(cache=True, error_model="numpy")
+@compiled(**PLAIN)
 def invert(A, out):  # type: ignore[no-untyped-def]
     """Inverse of a symmetric positive definite matrix by Cholesky's method.
 
@@ -64,7 +64,7 @@ def invert(A, out):  # type: ignore[no-untyped-def]
             out[i, c] = x / A[i, i]
 
 
-@njit(cache=True, error_model="numpy")
+@compiled(**PLAIN)
 def presliding(law, level, step, speed, bristle):  # type: ignore[no-untyped-def]
     """Impulse of the bristles of a joint, and the stiffness of those that stick times half a squared step.
 
@@ -85,7 +85,7 @@ def presliding(law, level, step, speed, bristle):  # type: ignore[no-untyped-def
     return impulse, stiff
 
 
-@njit(cache=True, error_model="numpy")
+@compiled(**PLAIN)
 def move_bristles(law, move, bristle):  # type: ignore[no-untyped-def]
     """Move the bristles of a joint by a distance; each slides beyond its reach.
 
@@ -96,7 +96,7 @@ def move_bristles(law, move, bristle):  # type: ignore[no-untyped-def]
         bristle[e] = min(max(bristle[e] + move, -reach), reach)
 
 
-@njit(cache=True, error_model="numpy")
+@compiled(**PLAIN)
 def slosh_impulse(law, step, acceleration, slosh):  # type: ignore[no-untyped-def]
     """Impulse of a mass on a spring on the link, and its motion.
 
@@ -110,7 +110,7 @@ def slosh_impulse(law, step, acceleration, slosh):  # type: ignore[no-untyped-de
     return -step * law[SLOSH] * pull
 
 
-@njit(cache=True, error_model="numpy")
+@compiled(**PLAIN)
 def add_gears(gears, motor, step, q, v, A, right):  # type: ignore[no-untyped-def]
     """Add the torques of flexible gears and of contacts with play.
 
@@ -137,7 +137,7 @@ def add_gears(gears, motor, step, q, v, A, right):  # type: ignore[no-untyped-de
         A[j, m] -= both
 
 
-@njit(cache=True, error_model="numpy")
+@compiled(**PLAIN)
 def solve_step(A, right, rows, bounds, smoothing, impulses, new):  # type: ignore[no-untyped-def]
     """Velocities after a step.
 
@@ -160,7 +160,7 @@ def solve_step(A, right, rows, bounds, smoothing, impulses, new):  # type: ignor
     friction_impulses(new, AJ, rows, bounds, smoothing, impulses)
 
 
-@njit(cache=True, error_model="numpy")
+@compiled(**PLAIN)
 def friction_rows(motor, pairs):  # type: ignore[no-untyped-def]
     """Coordinates of each row of dry friction, shape (R, 2): the motors, then the pairs.
 
@@ -174,7 +174,7 @@ def friction_rows(motor, pairs):  # type: ignore[no-untyped-def]
     return rows
 
 
-@njit(cache=True, error_model="numpy")
+@compiled(kept=True, **PLAIN)
 def run(  # type: ignore[no-untyped-def]
     step, gravity, mdh, prismatic, mass, com, inertia, rotor, laws, gears, pairs, external, resolution, control, qr,
     qdr, position, velocity, acceleration, reading, torque,

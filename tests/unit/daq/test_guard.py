@@ -94,7 +94,7 @@ def test_the_following_error_is_that_of_the_demand_which_the_drives_send(
 ) -> None:
     """Set points that the drives do not follow yet are no following error of drives that send their demand."""
     q = np.zeros(robot.n)
-    q[joint] = 1.02 * limits_of(robot).following[joint]
+    q[joint] = 1.02 * motion_limits_of(robot).following[joint]
     ahead = np.rint(robot.transmission_matrix @ q * counts_per_si(robot)).astype(np.int64)
     far = [int(count).to_bytes(4, "little", signed=True) for count in ahead]
     still = on_the_bus(robot, np.zeros((10, robot.n)))

@@ -13,7 +13,7 @@ def test_the_compiler_message_appears_once(capsys: pytest.CaptureFixture[str]) -
         assert one(1) + two(1) == 5
     lines = capsys.readouterr().err.splitlines()
     assert [line for line in lines if "compiling" in line] == [
-        "identify tx40.mcap: compiling for this machine, once: later runs find it cached"
+        "identify tx40.mcap: compiling for this machine, once: later runs find it"
     ]
     with progress("identify tx40.mcap"):
         assert one(1) == 2
