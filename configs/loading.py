@@ -1,8 +1,6 @@
 """Loading and checking of configuration files; an error is one line that names file, key and expected value."""
 
 import difflib
-import logging
-from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -12,7 +10,7 @@ from armident.configs.blanks import check_filled, needed, without_marks
 from armident.configs.errors import ConfigError
 from armident.configs.schema.robot import RobotConfig
 from armident.configs.schema.scenario import Scenario
-from armident.configs.schema.session import RENAMED, DriveNode, SessionConfig
+from armident.configs.schema.session import DriveNode, SessionConfig
 from armident.configs.schema.trajectory import Trajectory
 from armident.configs.suspected_units import suspected_units
 from armident.configs.urdf import UrdfGeometry, geometry_from_urdf, urdf_file
@@ -35,8 +33,6 @@ _LONGEST = 80
 _LISTED = 12
 """Maximum number of missing keys that a message lists."""
 T = TypeVar("T", bound=BaseModel)
-
-log = logging.getLogger(__name__)
 
 
 def config_path(name: str | Path, listed: tuple[str, ...] = ("robots", "cells")) -> Path:
@@ -252,13 +248,7 @@ def load_session(name: str | Path, command: str | None = None) -> SessionConfig:
         names all.
     """
     path = config_path(name)
-    data = _marked(path)
-    session = _checked(data, SessionConfig, str(path))
-    for key in data.get("recording", {}):
-        if key in RENAMED:
-            _warn_once(
-                f"{path}: recording.{key} is now recording.{RENAMED[key]}; the next release refuses the old name"
-            )
+    session = _checked(_marked(path), SessionConfig, str(path))
     base = path.resolve().parent
 
     def resolved(relative: Path, key: str) -> Path:
@@ -316,11 +306,6 @@ def load_scenario(name: str | Path) -> Scenario:
         If the file is missing or wrong; names file, key and expected value.
     """
     return _load(config_path(name, listed=("scenarios",)), Scenario)
-
-
-@cache
-def _warn_once(message: str) -> None:
-    log.warning(message)
 
 
 def _load(path: Path, kind: type[T]) -> T:

@@ -27,9 +27,9 @@ from armident.configs.blanks import listed, needed, pattern
 from armident.configs.loading import is_session
 from armident.configs.schema.session import Bus
 from armident.daq.capture.clock import clock_state
-from armident.daq.capture.files import chunk_duration_ns
+from armident.daq.capture.recording_files import chunk_duration_ns
 from armident.daq.matching.streams import captured_streams, unknown_phase
-from armident.daq.streaming.session import configuration, endpoints, unreadable_files
+from armident.daq.streaming.zenoh_session import configuration, endpoints, unreadable_files
 from armident.drivers.can.socketcan import RECEIVE_BUFFER, RawSocket
 from armident.drivers.can.timestamps import has_hardware_timestamps
 from armident.drivers.canopen.bus_load import check_fits
@@ -52,14 +52,8 @@ _CHUNKS = 20
 class Check:
     """Result of one check.
 
-    Parameters
-    ----------
-    name
-        Name of the check.
-    verdict
-        ``ok``, ``warning`` or ``failed``: a capture would not run.
-    message
-        Findings, and the remedy if there are any.
+    ``verdict``: ``ok``, ``warning`` or ``failed``: a capture would not run; ``message``: findings, and the remedy if
+    there are any.
     """
 
     name: str
@@ -70,12 +64,8 @@ class Check:
 def checks_for(config: str | Path, command: Command) -> list[Check]:
     """Check everything that a command needs of a configuration.
 
-    Parameters
-    ----------
-    config
-        Robot or session configuration.
-    command
-        The command; for ``capture`` as `run_checks`, which needs a session.
+    ``config``: robot or session configuration. ``command``: the command; for ``capture`` as `run_checks`, which needs a
+    session.
     """
     if command == "capture":
         return run_checks(config)
@@ -106,10 +96,7 @@ def run_checks(config: str | Path) -> list[Check]:
     Nothing is sent to the buses, and only a probe file is written. If the configuration is invalid, the checks are
     that, the data sheets of the drives if the session could be read, and the clock.
 
-    Parameters
-    ----------
-    config
-        Session configuration.
+    ``config``: session configuration.
     """
     try:
         session = load_session(config, "")
@@ -196,7 +183,7 @@ def _interface(bus: Bus) -> Iterator[Check]:
         timing = details.get(key)
         actual = timing.get("bitrate") if isinstance(timing, dict) else None
         if wanted is not None and actual is not None and actual != wanted:
-            yield Check("bus", "failed", f"{name} runs at {actual} bit/s ({key}), the configuration says {wanted}")
+            yield Check("bus", "failed", f"{name} runs at {actual} bit/s ({key}), the configuration has {wanted}")
             return
     state = details.get("state")
     if state not in (None, "ERROR-ACTIVE"):
@@ -357,19 +344,8 @@ def _zenoh(session: SessionConfig) -> Check:
 def doctor(config: str, as_json: bool, command: Command = "capture") -> None:
     """Run ``armident doctor``: print the checks.
 
-    Parameters
-    ----------
-    config
-        Session configuration; for other commands than ``capture`` also a robot configuration.
-    as_json
-        Print JSON.
-    command
-        Command in mind.
-
-    Raises
-    ------
-    ConfigError
-        If a check failed: the command would not run.
+    ``config``: session configuration; for other commands than ``capture`` also a robot configuration. ``command``:
+    command in mind. Raises ConfigError if a check failed: the command would not run.
     """
     checks = checks_for(config, command)
     if as_json:

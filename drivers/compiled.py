@@ -29,13 +29,7 @@ MODE: Literal["ahead of time", "by numba", "interpreted"] = (
 
 
 def kernel_name(function: Callable[..., Any]) -> str:
-    """Return the name of a function in the extension module.
-
-    Parameters
-    ----------
-    function
-        The function, or numba's dispatcher of it.
-    """
+    """Return the name of a function in the extension module. ``function``: or numba's dispatcher of it."""
     return f"{function.__module__.rpartition('.')[2]}_{function.__name__.lstrip('_')}"
 
 
@@ -45,10 +39,7 @@ def compiled(function: F) -> F:
     Ahead of time, this gives the compiled function for those that ``setup.py`` lists. The others are parts of them and
     stay interpreted.
 
-    Parameters
-    ----------
-    function
-        Function of numbers, arrays and named tuples of arrays.
+    ``function``: function of numbers, arrays and named tuples of arrays.
     """
     if _NUMBA is not None:
         found: F = _NUMBA.njit(cache=True, nogil=True)(function)
@@ -58,13 +49,7 @@ def compiled(function: F) -> F:
 
 
 def require_compiled() -> None:
-    """Check that the loops are compiled.
-
-    Raises
-    ------
-    ConfigError
-        If they are interpreted.
-    """
+    """Check that the loops are compiled. Raises ConfigError if they are interpreted."""
     if MODE == "interpreted":
         raise ConfigError(
             "this installation has no compiled code for the bus, because there was no C compiler when its wheel was "

@@ -5,6 +5,11 @@ from typing import Annotated
 
 import typer
 
+from armident.identify.command_options import with_options
+from armident.identify.diagnosis.diagnosis_options import DiagnosisOptions
+from armident.identify.excitation.trajectory_options import TrajectoryOptions
+from armident.identify.identification.options import Options
+
 Json = Annotated[bool, typer.Option("--json", help="Print only the result document on stdout.")]
 OutDirectory = Annotated[
     Path | None, typer.Option("--out", help="Folder for the results. [default: RECORDING without .mcap, plus a suffix]")
@@ -14,33 +19,11 @@ Robot = Annotated[
 ]
 
 
+@with_options
 def identify(
     recording: Annotated[Path, typer.Argument(help="Recording (.mcap).")],
+    options: Options,
     config: Robot = None,
-    method: Annotated[str, typer.Option(help="idim-piv, idim-iv, idim-ls, didim, clie, cloe or sep-pem.")] = "idim-piv",
-    derivatives: Annotated[
-        str | None, typer.Option(help="irwsm, irwsm2 or bandpass. [default: irwsm, or the published filters]")
-    ] = None,
-    nvr: Annotated[
-        str | None,
-        typer.Option(help="Noise-variance ratio: a number, automatic, cross-validation, likelihood or tracking-error."),
-    ] = None,
-    controller: Annotated[
-        str, typer.Option(help="crc (impulse response), parametric (cascade or PID) or known (configured).")
-    ] = "crc",
-    noise_model: Annotated[str, typer.Option(help="Noise model of idim-piv: black-box or grey-box.")] = "black-box",
-    max_ar_order: Annotated[int, typer.Option(min=0, help="Highest order of the noise models.")] = 60,
-    bandwidth: Annotated[
-        float | None, typer.Option(help="Closed-loop bandwidth, Hz. [default: as configured, or estimated]")
-    ] = None,
-    decimation: Annotated[
-        str | None,
-        typer.Option(help="Decimation factor, or noise: from the memory of the noise. [default: from the bandwidth]"),
-    ] = None,
-    weighted: Annotated[bool, typer.Option(help="Weight each joint by its noise in idim-ls.")] = True,
-    physical: Annotated[
-        bool, typer.Option("--physical", help="Also compute the nearest physically consistent parameters.")
-    ] = False,
     out: OutDirectory = None,
     json: Json = False,
 ) -> None:
@@ -52,19 +35,7 @@ def identify(
     """
     from armident.identify.commands import identify_command
 
-    chosen = {
-        "method": method,
-        "derivatives": derivatives,
-        "nvr": nvr,
-        "controller": controller,
-        "noise_model": noise_model,
-        "max_ar_order": max_ar_order,
-        "bandwidth_hz": bandwidth,
-        "decimation": decimation,
-        "weighted": weighted,
-        "physical": physical,
-    }
-    code = identify_command(recording, config, chosen, out, as_json=json)
+    code = identify_command(recording, config, options, out, as_json=json)
     if code:
         raise typer.Exit(code)
 
@@ -106,32 +77,16 @@ def worker(
         raise typer.Exit(code)
 
 
+@with_options
 def diagnose(
     recordings: Annotated[list[Path], typer.Argument(help="Recordings to fit.")],
+    options: DiagnosisOptions,
     config: Robot = None,
     validate: Annotated[
         Path | None, typer.Option(help="Held-out recording. [default: the last part of the data]")
     ] = None,
     baseline: Annotated[
         Path | None, typer.Option(help="identification.json whose parameters are tested for change.")
-    ] = None,
-    false_alarms: Annotated[
-        float, typer.Option(min=1e-6, max=0.5, help="Probability of a finding with a complete model.")
-    ] = 0.01,
-    material: Annotated[
-        float,
-        typer.Option(
-            min=0.0,
-            max=100.0,
-            metavar="PCT",
-            help="Least change of a joint's torque by a finding, percent; smaller effects are listed as negligible.",
-        ),
-    ] = 0.2,
-    time_limit: Annotated[
-        float | None,
-        typer.Option(
-            min=0.0, metavar="S", help="End the search for effects after this time, s, with what it has found."
-        ),
     ] = None,
     out: OutDirectory = None,
     json: Json = False,
@@ -144,8 +99,7 @@ def diagnose(
     """
     from armident.identify.commands import diagnose_command
 
-    chosen = {"false_alarm_rate": false_alarms, "material": material, "time_limit_s": time_limit}
-    code = diagnose_command(recordings, config, validate, baseline, chosen, out, as_json=json)
+    code = diagnose_command(recordings, config, validate, baseline, options, out, as_json=json)
     if code:
         raise typer.Exit(code)
 
@@ -248,45 +202,10 @@ def history(
         raise typer.Exit(code)
 
 
+@with_options
 def trajectory(
-    config: Annotated[Path, typer.Option("--config", help="Robot configuration.")],
-    out: Annotated[
-        Path | None, typer.Option("--out", help="Trajectory file to write (.yaml). [required without --look-at]")
-    ] = None,
-    duration: Annotated[float, typer.Option(min=1.0, help="Length, s.")] = 7.5,
-    seed: Annotated[int, typer.Option(help="Seed of the random search.")] = 0,
-    known: Annotated[
-        Path | None,
-        typer.Option(
-            help="identification.json of the robot: keeps torques within limits, predicts standard deviations. "
-            "[default: --masses, else masses of the URDF]"
-        ),
-    ] = None,
-    evaluations: Annotated[int, typer.Option(min=1, help="Number of candidates to try.")] = 2000,
-    wanted: Annotated[str | None, typer.Option("--for", help="Effect of the catalogue to make visible.")] = None,
-    joint: Annotated[str | None, typer.Option(help="Joint of that effect. [default: all]")] = None,
-    against: Annotated[str | None, typer.Option(help="Another effect to separate it from.")] = None,
-    shape: Annotated[
-        str, typer.Option(help="moves (point to point, trapezoidal velocities) or fourier (finite Fourier series).")
-    ] = "moves",
-    harmonics: Annotated[
-        int | None, typer.Option(min=2, help="Number of harmonics of fourier. [default: up to 1.6 Hz, at least five]")
-    ] = None,
-    picture: Annotated[
-        Path | None, typer.Option(help="Plot against the limits (.png, .svg, .pdf). [default: beside --out]")
-    ] = None,
-    look_at: Annotated[
-        Path | None,
-        typer.Option(help="Check and plot an existing trajectory instead, and predict its standard deviations."),
-    ] = None,
+    options: TrajectoryOptions,
     report: Annotated[Path | None, typer.Option(help="Report (.html). [default: beside the trajectory]")] = None,
-    masses: Annotated[
-        Path | None,
-        typer.Option(
-            help="JSON file of standard parameters (m1, mx1, ...), as armident robot --truth writes it: keeps torques "
-            "within limits. [default: masses of the URDF]"
-        ),
-    ] = None,
 ) -> None:
     """Design an exciting trajectory inside the limits of a robot, for the base parameters or for one effect.
 
@@ -297,27 +216,10 @@ def trajectory(
     Example: armident trajectory --config configs/tx40.yaml --out excitation.yaml --known identification.json
     """
     from armident.identify.documents.files import write_atomically
-    from armident.identify.excitation.cli import TrajectoryOptions, trajectory_command
+    from armident.identify.excitation.trajectory_command import trajectory_command
     from armident.identify.report.trajectory import trajectory_report
 
-    found = trajectory_command(
-        TrajectoryOptions(
-            config=config,
-            out=out,
-            duration=duration,
-            seed=seed,
-            known=known,
-            evaluations=evaluations,
-            wanted=wanted,
-            joint=joint,
-            against=against,
-            shape=shape,
-            harmonics=harmonics,
-            picture=picture,
-            look_at=look_at,
-            masses=masses,
-        )
-    )
+    found = trajectory_command(options)
     page = report or (found.path or Path(f"{found.robot.name}_trajectory")).with_suffix(".html")
     write_atomically(page, trajectory_report(found))
     print(f"report: {page}")

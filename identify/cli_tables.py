@@ -51,15 +51,7 @@ def progress(what: str) -> Iterator[Report]:
 
     The first run on a machine also prints that it compiles kernels.
 
-    Parameters
-    ----------
-    what
-        Command and its argument, the beginning of each line.
-
-    Yields
-    ------
-    callable
-        Takes a stage and the share done, 0 to 1.
+    ``what``: command and its argument, the beginning of each line. The result takes a stage and the share done, 0 to 1.
     """
     begin = time.monotonic()
     with event.install_listener("numba:compile", _Compilation(what)), _stages(what, begin) as report:
@@ -96,7 +88,7 @@ def warn(lines: list[str]) -> None:
 
 
 def setup_table(result: SetupCheck) -> None:
-    """Print the findings of a set-up check, one below the other, and its hypotheses where a joint is not understood."""
+    """Print the findings of a set-up check, one below the other, and its hypotheses where it explains no joint."""
     before = ", ".join(f"{error:.1f}" for error in result.relative_error_pct)
     after = ", ".join(f"{error:.1f}" for error in result.corrected_error_pct)
     if not result.findings:
@@ -111,21 +103,15 @@ def setup_table(result: SetupCheck) -> None:
         print(f"torque error of the rigid model by joint: {before} %{corrected}{' %' if corrected else ''}")
     if result.joints_not_understood:
         names = ", ".join(result.joints_not_understood)
-        print(f"not understood: the rigid model leaves more than a third of the torque of {names}")
+        print(f"not explained: the rigid model leaves more than a third of the torque of {names}")
         print(f"  tried: {'; '.join(result.tried)}")
 
 
 def design_table(robot: RobotConfig, theta: NDArray[np.float64] | None, std: NDArray[np.float64]) -> None:
     """Print base parameters, if known, and their predicted standard deviations.
 
-    Parameters
-    ----------
-    robot
-        For the names of the parameters.
-    theta
-        Base parameters (b,), or ``None``.
-    std
-        Predicted standard deviations (b,).
+    ``robot``: for the names of the parameters; ``theta``: base parameters (b,), or ``None``; ``std``: predicted
+    standard deviations (b,).
     """
     table = Table(title=f"{robot.name}: predicted precision, base parameters", title_justify="left")
     names = arm_model(robot).base.names
@@ -246,12 +232,7 @@ def diagnosis_table(document: DiagnosisDocument) -> None:
 def time_left(elapsed_s: float, share: float) -> str:
     """Return the time left at a constant rate, in words.
 
-    Parameters
-    ----------
-    elapsed_s
-        Time since the beginning, s.
-    share
-        Share done, above 0 to 1.
+    ``elapsed_s``: time since the beginning, s; ``share``: share done, above 0 to 1.
     """
     seconds = round(elapsed_s * (1.0 - share) / share)
     return f"{seconds} s" if seconds < 120 else f"{seconds // 60} min"

@@ -2,16 +2,16 @@
 
 import json
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 from armident.configs import ConfigError, DataError
+from armident.identify.diagnosis.diagnosis_options import DiagnosisOptions
 from armident.identify.documents.files import load_document, to_json, write_atomically
 from armident.identify.documents.identification import IdentificationDocument
-from armident.identify.identification.options import parse_decimation, parse_nvr
+from armident.identify.identification.options import Options
 
 UNUSABLE = DataError.exit_code
 """Exit code: the data cannot support the request as they are configured, and the result says why."""
@@ -20,40 +20,13 @@ FOUND = 4
 """Exit code: done, with findings, a change, or an unexplained residual."""
 
 
-def identify_command(
-    path: Path, config: Path | None, chosen: Mapping[str, Any], out: Path | None, *, as_json: bool
-) -> int:
-    """Carry out ``armident identify``.
-
-    Parameters
-    ----------
-    path
-        Recording.
-    config
-        Robot configuration; ``None``: that of the recording.
-    chosen
-        Options of `armident.identify.api.identify` as the user wrote them.
-    out
-        Folder of the results; ``None``: beside the recording.
-    as_json
-        Print the document on stdout instead of a table.
-
-    Returns
-    -------
-    int
-        Exit code: `UNUSABLE` if the verdict says so, otherwise 0.
-
-    Raises
-    ------
-    ConfigError, DataError
-        If an option or a file is wrong, or the recording cannot be identified.
-    """
+def identify_command(path: Path, config: Path | None, options: Options, out: Path | None, *, as_json: bool) -> int:
+    """Carry out ``armident identify``; the exit code is `UNUSABLE` if the verdict says so, otherwise 0."""
     from armident.identify.api import identify
     from armident.identify.cli_tables import identification_table, progress, verdict_lines, warn
 
-    as_written = {"nvr": parse_nvr(chosen.get("nvr")), "decimation": parse_decimation(chosen.get("decimation"))}
     with progress(f"identify {path.name}") as report:
-        result = identify(path, config, **{**chosen, **as_written}, progress=report)
+        result = identify(path, config, **asdict(options), progress=report)
     folder = out or _beside(path, "identification")
     with _writing(folder):
         document, html = result.save(folder)
@@ -70,24 +43,9 @@ def identify_command(
 def check_command(paths: Sequence[Path], config: Path | None, *, as_json: bool) -> int:
     """Carry out ``armident check``.
 
-    Parameters
-    ----------
-    paths
-        Recordings.
-    config
-        Robot configuration; ``None``: that of the first recording.
-    as_json
-        Print the result as JSON on stdout instead of a table.
-
-    Returns
-    -------
-    int
-        Exit code: `UNUSABLE` with a decisive finding or a joint that is not understood, otherwise 0.
-
-    Raises
-    ------
-    ConfigError, DataError
-        If a file is wrong, or the recordings cannot be checked.
+    ``config``: robot configuration; ``None``: that of the first recording. ``as_json``: print the result as JSON on
+    stdout instead of a table. Returns the exit code: `UNUSABLE` with a decisive finding or a joint that is not
+    understood, otherwise 0. Raises ConfigError or DataError if a file is wrong, or the recordings cannot be checked.
     """
     from armident.identify.api import check
     from armident.identify.cli_tables import progress, setup_table
@@ -111,46 +69,17 @@ def diagnose_command(
     config: Path | None,
     validate: Path | None,
     baseline: Path | None,
-    chosen: Mapping[str, Any],
+    options: DiagnosisOptions,
     out: Path | None,
     *,
     as_json: bool,
 ) -> int:
-    """Carry out ``armident diagnose``.
-
-    Parameters
-    ----------
-    paths
-        Recordings to fit.
-    config
-        Robot configuration; ``None``: that of the first recording.
-    validate
-        Held-out recording; ``None``: the last part of the data.
-    baseline
-        Identification whose parameters are tested for change.
-    chosen
-        ``false_alarm_rate``, ``material`` and ``time_limit_s``, as `armident.identify.api.diagnose` takes them; those
-        left out have its defaults.
-    out
-        Folder of the results; ``None``: beside the first recording.
-    as_json
-        Print the document on stdout instead of a table.
-
-    Returns
-    -------
-    int
-        Exit code: 0 if the verdict is ``no_gap``, otherwise `FOUND`.
-
-    Raises
-    ------
-    ConfigError, DataError
-        If an option or a file is wrong, or the recordings cannot support a diagnosis.
-    """
+    """Carry out ``armident diagnose``; the exit code is 0 if the verdict is ``no_gap``, otherwise `FOUND`."""
     from armident.identify.api import diagnose
     from armident.identify.cli_tables import diagnosis_table, progress, warn
 
     with progress("diagnose") as report:
-        found = diagnose(list(paths), config, validate=validate, baseline=baseline, progress=report, **chosen)
+        found = diagnose(list(paths), config, validate=validate, baseline=baseline, progress=report, **asdict(options))
     folder = out or _beside(paths[0], "diagnosis")
     with _writing(folder):
         document = found.save(folder)
@@ -168,28 +97,11 @@ def diagnose_command(
 def predict_command(paths: Sequence[Path], model: Path, config: Path | None, out: Path | None, *, as_json: bool) -> int:
     """Carry out ``armident predict``.
 
-    Parameters
-    ----------
-    paths
-        Recordings.
-    model
-        Result with the identified parameters.
-    config
-        Robot configuration; ``None``: that of the model.
-    out
-        Folder of the results, of several recordings with a folder for each; ``None``: beside each recording.
-    as_json
-        Print the document on stdout instead of a table.
-
-    Returns
-    -------
-    int
-        Exit code: `FOUND` if the model explains the torques of a recording no better than none, otherwise 0.
-
-    Raises
-    ------
-    ConfigError, DataError
-        If a file is wrong, the model is unusable, or a recording cannot be used.
+    ``model``: result with the identified parameters. ``config``: robot configuration; ``None``: that of the model.
+    ``out``: folder of the results, of several recordings with a folder for each; ``None``: beside each recording.
+    ``as_json``: print the document on stdout instead of a table. Returns the exit code: `FOUND` if the model explains
+    the torques of a recording no better than none, otherwise 0. Raises ConfigError or DataError if a file is wrong, the
+    model is unusable, or a recording cannot be used.
     """
     from armident.configs import load_robot
     from armident.daq.recording import read_recording
@@ -253,6 +165,9 @@ def compare_command(
 ) -> int:
     """Carry out ``armident compare``.
 
+    Returns the exit code: `FOUND` if the parameters differ significantly, otherwise 0. Raises ConfigError or DataError
+    if a file is wrong, or the two cannot be compared.
+
     Parameters
     ----------
     baseline, now
@@ -265,16 +180,6 @@ def compare_command(
         Compare only the parameters that both have.
     as_json
         Print the document on stdout instead of a table.
-
-    Returns
-    -------
-    int
-        Exit code: `FOUND` if the parameters differ significantly, otherwise 0.
-
-    Raises
-    ------
-    ConfigError, DataError
-        If a file is wrong, or the two cannot be compared.
     """
     from armident.identify.cli_tables import warn
     from armident.identify.monitoring.comparison import compare_models, comparison_table

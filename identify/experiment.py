@@ -23,8 +23,6 @@ class Experiment:
         over ``[k, k + 1)`` sampling periods, as a digital drive applies it.
     q_ref
         Reference positions, shape (N, n), or ``None`` where none was recorded.
-    dt
-        Sampling period, s.
     start
         Time of the first sample since the recordings began, s, for friction that depends on temperature.
     torque_shift
@@ -50,15 +48,7 @@ RATE_TOLERANCE = 1e-6
 def check_one_rate(experiments: Sequence[Experiment]) -> None:
     """Refuse experiments of different sampling rates, with the commands that resample their recordings.
 
-    Parameters
-    ----------
-    experiments
-        Experiments to use together.
-
-    Raises
-    ------
-    DataError
-        If the sampling rates differ.
+    ``experiments``: experiments to use together. Raises DataError if the sampling rates differ.
     """
     lowest = max(e.dt for e in experiments)
     if all(lowest - e.dt <= RATE_TOLERANCE * lowest for e in experiments):

@@ -16,9 +16,10 @@ from armident.identify.documents.base import reference, versions
 from armident.identify.documents.prediction import PredictionDocument
 from armident.identify.effects.recorded import put_right
 from armident.identify.experiment import Experiment
-from armident.identify.identification.api import experiments_of
 from armident.identify.identification.equations import equations, least_rows, published_equations
 from armident.identify.identification.from_recording import NO_REFERENCE
+from armident.identify.identification.identification_result import relative_torque_errors
+from armident.identify.identification.identify_recording import experiments_of
 from armident.identify.identification.judgement import Notes
 from armident.identify.identification.options import Options
 from armident.identify.identification.pipeline import (
@@ -27,7 +28,6 @@ from armident.identify.identification.pipeline import (
     smoothed_derivatives,
 )
 from armident.identify.identification.residual_statistics import SPEED_QUANTILE
-from armident.identify.identification.result import relative_errors
 from armident.identify.identification.solvers import decimation_of
 from armident.identify.regression.equations import ExperimentEquations
 from armident.identify.saved_model import SavedModel
@@ -84,19 +84,8 @@ def predict_recording(
     Positions are differentiated, and torques aligned, by the steps of `armident.identify`, so that the recording of the
     identification has the error that its document states.
 
-    Parameters
-    ----------
-    recording
-        The recording, of the same robot.
-    model
-        The model.
-    progress
-        Called with the name of a stage and the share done, 0 to 1.
-
-    Raises
-    ------
-    DataError
-        If the recording is of another robot, or too short.
+    ``recording``: of the same robot; ``progress``: called with the name of a stage and the share done, 0 to 1. Raises
+    DataError if the recording is of another robot, or too short.
     """
     show = progress or (lambda stage, share: None)
     robot, notes = model.robot, Notes()
@@ -160,7 +149,7 @@ def _document(
     recording: Recording, model: SavedModel, blocks: Sequence[ExperimentEquations], warnings: Sequence[str]
 ) -> PredictionDocument:
     names = [joint.name for joint in model.robot.joints]
-    overall, by_joint = relative_errors(blocks, model.theta)
+    overall, by_joint = relative_torque_errors(blocks, model.theta)
     torque = np.concatenate([np.where(block.keep, block.y, 0.0) for block in blocks])
     kept = np.maximum(np.concatenate([block.keep for block in blocks]).sum(axis=0), 1)
     torque_rms = np.sqrt(np.sum(torque**2, axis=0) / kept)

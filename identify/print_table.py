@@ -18,12 +18,7 @@ def print_table(table: Table, console: Console | None = None) -> None:
 
     A file or a pipe has no width: there it stays a table.
 
-    Parameters
-    ----------
-    table
-        Table of text cells.
-    console
-        Console to print on; by default stdout.
+    ``table``: table of text cells. ``console``: console to print on; by default stdout.
     """
     console = console or Console()
     columns = [[_plain(cell) for cell in (column.header, *column.cells)] for column in table.columns]

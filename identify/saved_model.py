@@ -14,7 +14,7 @@ from armident.identify.documents.diagnosis import DiagnosisDocument
 from armident.identify.documents.files import load_document, read_json
 from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.effects.terms import arm_model
-from armident.identify.identification.api import identify_recording
+from armident.identify.identification.identify_recording import identify_recording
 from armident.identify.identification.options import Options
 from armident.identify.identification.sign_smoothing import with_numbers
 from armident.identify.robot.arm import ArmModel
@@ -29,14 +29,8 @@ REFIT: Options = Options(method="idim-iv")
 class SavedModel:
     """A robot configuration with identified parameters.
 
-    Parameters
-    ----------
-    robot
-        Configuration that the parameters belong to, with its effects and with numbers for the smoothing of the sign.
-    document
-        The identification.
-    path
-        File that it was read from.
+    ``robot``: configuration that the parameters belong to, with its effects and with numbers for the smoothing of the
+    sign; ``path``: file that it was read from.
     """
 
     robot: RobotConfig
@@ -76,23 +70,11 @@ def load_model(
 
     The structure that a diagnosis found is identified by IDIM-IV from the recordings of the diagnosis.
 
-    Parameters
-    ----------
-    path
-        ``identification.json``, ``diagnosis.json``, or the folder of one of them.
-    robot
-        Configuration to use; ``None``: that of the document.
-    default
-        Configuration to use if the document, written by a former version, has none.
-    progress
-        Called with the name of a stage and the share done, 0 to 1.
-
-    Raises
-    ------
-    ConfigError
-        If there is no such file, or no configuration for it.
-    DataError
-        If the file is no result, is judged unusable, or belongs to another configuration.
+    ``path``: ``identification.json``, ``diagnosis.json``, or the folder of one of them. ``robot``: configuration to
+    use; ``None``: that of the document. ``default``: configuration to use if the document, written by a former version,
+    has none. ``progress``: called with the name of a stage and the share done, 0 to 1. Raises ConfigError if there is
+    no such file, or no configuration for it; DataError if the file is no result, is judged unusable, or belongs to
+    another configuration.
     """
     path = _file(path)
     if str(read_json(path).get("schema", "")).startswith("armident/diagnosis/"):
@@ -109,21 +91,8 @@ def model_of(
 ) -> SavedModel:
     """Return the model of an identification.
 
-    Parameters
-    ----------
-    document
-        The identification.
-    path
-        Its file, for messages.
-    robot, default
-        As for `load_model`.
-
-    Raises
-    ------
-    ConfigError
-        If there is no configuration.
-    DataError
-        If the document is judged unusable, or belongs to another configuration.
+    ``path``: its file, for messages; ``robot``, ``default``: as for `load_model`. Raises ConfigError if there is no
+    configuration; DataError if the document is judged unusable, or belongs to another configuration.
     """
     if document.verdict == "unusable":
         reason = document.reasons[0]
@@ -166,17 +135,7 @@ def _file(path: Path) -> Path:
 def configuration_of(document: IdentificationDocument, path: Path) -> RobotConfig | None:
     """Return the robot configuration that an identification keeps; ``None`` in documents of former versions.
 
-    Parameters
-    ----------
-    document
-        The identification.
-    path
-        Its file, for messages.
-
-    Raises
-    ------
-    DataError
-        If it is no robot configuration.
+    ``path``: its file, for messages. Raises DataError if it is no robot configuration.
     """
     if document.configuration is None:
         return None

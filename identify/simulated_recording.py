@@ -18,26 +18,10 @@ def simulate_model(model: SavedModel, trajectory: Trajectory, rate_hz: float | N
     The dynamics are those of the identification (thesis section B.3), not those of the virtual arm. The controller is
     that of the configuration, otherwise a critically damped PD for the closed-loop bandwidth.
 
-    Parameters
-    ----------
-    model
-        The model.
-    trajectory
-        Reference positions.
-    rate_hz
-        Sampling rate, Hz; ``None``: that of the recording that the model was identified from.
-
-    Returns
-    -------
-    Recording
-        Positions, velocities and torques of the joints, and the reference, in SI units.
-
-    Raises
-    ------
-    ConfigError
-        If the trajectory leaves the limits of the robot.
-    DataError
-        If the closed loop diverges: the parameters are not physical, or the controller does not suit them.
+    ``trajectory``: reference positions. ``rate_hz``: sampling rate, Hz; ``None``: that of the recording that the model
+    was identified from. Returns positions, velocities and torques of the joints, and the reference, in SI units. Raises
+    ConfigError if the trajectory leaves the limits of the robot; DataError if the closed loop diverges: the parameters
+    are not physical, or the controller does not suit them.
     """
     robot, arm = model.robot, model.arm
     trajectory.check(robot)

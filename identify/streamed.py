@@ -35,15 +35,8 @@ class Streamed(Sequence[T]):
 class OnDisk(Streamed[T]):
     """Items in a file without a name, which disappears with the sequence or the process.
 
-    Parameters
-    ----------
-    items
-        The items; one after the other is written, and may then be freed.
-
-    Raises
-    ------
-    ConfigError
-        If the file cannot be written.
+    ``items``: the items; one after the other is written, and may then be freed. Raises ConfigError if the file cannot
+    be written.
     """
 
     def __init__(self, items: Iterable[T]) -> None:
@@ -86,12 +79,7 @@ class OnDisk(Streamed[T]):
 class Mapped(Streamed[T]):
     """Results of a function of the items of other sequences, computed whenever they are asked for.
 
-    Parameters
-    ----------
-    function
-        Function of one item of each sequence.
-    sequences
-        Sequences of the same length.
+    ``sequences``: sequences of the same length.
     """
 
     def __init__(self, function: Callable[..., T], *sequences: Sequence[Any]) -> None:
@@ -107,17 +95,8 @@ class Mapped(Streamed[T]):
 def kept(items: Iterable[T], like: Sequence[Any]) -> Sequence[T]:
     """Return the items as a list, or on disk where they belong to streamed ones.
 
-    Parameters
-    ----------
-    items
-        The items, consumed at once.
-    like
-        Sequence that they belong to, such as the experiments.
-
-    Raises
-    ------
-    ConfigError
-        If the file cannot be written.
+    ``items``: consumed at once; ``like``: sequence that they belong to, such as the experiments. Raises ConfigError if
+    the file cannot be written.
     """
     return OnDisk(items) if isinstance(like, Streamed) else list(items)
 
@@ -125,12 +104,7 @@ def kept(items: Iterable[T], like: Sequence[Any]) -> Sequence[T]:
 def mapped(function: Callable[..., T], *sequences: Sequence[Any]) -> Sequence[T]:
     """Return the results of a function as a list, or computed again at every use where a sequence is streamed.
 
-    Parameters
-    ----------
-    function
-        Function of one item of each sequence.
-    sequences
-        Sequences of the same length.
+    ``function``: function of one item of each sequence; ``sequences``: sequences of the same length.
     """
     if any(isinstance(sequence, Streamed) for sequence in sequences):
         return Mapped(function, *sequences)
@@ -140,12 +114,7 @@ def mapped(function: Callable[..., T], *sequences: Sequence[Any]) -> Sequence[T]
 def chosen(items: Sequence[T], numbers: Sequence[int]) -> Sequence[T]:
     """Return some of the items as a list, or read again at every use where the sequence is streamed.
 
-    Parameters
-    ----------
-    items
-        The items.
-    numbers
-        Numbers of those to choose, from 0.
+    ``numbers``: numbers of those to choose, from 0.
     """
     if isinstance(items, Streamed):
         return Mapped(items.__getitem__, numbers)

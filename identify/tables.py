@@ -15,14 +15,7 @@ if TYPE_CHECKING:
 class Table(Sequence[Mapping[str, Any]]):
     """Rows with named columns that print, show themselves in a notebook and convert to pandas.
 
-    Parameters
-    ----------
-    columns
-        Names of the columns.
-    rows
-        One tuple of values per row, as long as ``columns``.
-    title
-        Heading, may be empty.
+    ``rows``: one tuple of values per row, as long as ``columns``; ``title``: heading, may be empty.
     """
 
     def __init__(self, columns: Sequence[str], rows: Sequence[Sequence[Any]], title: str = "") -> None:
@@ -45,10 +38,7 @@ class Table(Sequence[Mapping[str, Any]]):
     def to_pandas(self) -> "pd.DataFrame":
         """Return the table as a pandas DataFrame, indexed by its first column.
 
-        Raises
-        ------
-        ConfigError
-            If pandas is not installed.
+        Raises ConfigError if pandas is not installed.
         """
         try:
             import pandas
@@ -84,12 +74,7 @@ class Table(Sequence[Mapping[str, Any]]):
 class ParameterTable(Table):
     """Estimated base parameters: a table that is also indexed by the name of a parameter.
 
-    Parameters
-    ----------
-    parameters
-        The parameters, in the order of ``theta``.
-    title
-        Heading.
+    ``parameters``: in the order of ``theta``.
     """
 
     def __init__(self, parameters: Sequence[Parameter], title: str = "") -> None:

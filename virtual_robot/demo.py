@@ -89,12 +89,7 @@ class _ElapsedTime(logging.LoggerAdapter[logging.Logger]):
     def process(self, msg: Any, kwargs: MutableMapping[str, Any]) -> tuple[Any, MutableMapping[str, Any]]:
         """Add the elapsed time to a message.
 
-        Parameters
-        ----------
-        msg
-            The message.
-        kwargs
-            Keyword arguments of the logging call, which are returned unchanged.
+        ``kwargs``: keyword arguments of the logging call, which are returned unchanged.
         """
         return f"[{time.monotonic() - self.begin:5.1f} s] {msg}", kwargs
 
@@ -144,16 +139,8 @@ class DemoOptions:
 class Subject:
     """The arm of the demo.
 
-    Parameters
-    ----------
-    session, robot
-        Its session and robot.
-    scenario
-        Scenario of the second part.
-    robot_options
-        Further options of ``armident robot``.
-    repeats
-        Number of runs of the trajectory in the second part.
+    ``scenario``: scenario of the second part; ``robot_options``: further options of ``armident robot``; ``repeats``:
+    number of runs of the trajectory in the second part.
     """
 
     session: SessionConfig
@@ -163,30 +150,15 @@ class Subject:
     repeats: int = REPEATS
 
     def at(self, session: SessionConfig) -> "Subject":
-        """Return the same arm in another session.
-
-        Parameters
-        ----------
-        session
-            The session.
-        """
+        """Return the same arm in another session."""
         return replace(self, session=session)
 
 
 def demo(options: DemoOptions) -> None:
     """Run both parts and write the report.
 
-    Parameters
-    ----------
-    options
-        Options of the command.
-
-    Raises
-    ------
-    ConfigError
-        If a configuration is wrong, or the bus cannot be set up.
-    ArmidentError
-        If a process fails; contains its name and the end of its output.
+    Raises ConfigError if a configuration is wrong, or the bus cannot be set up. Raises ArmidentError if a process
+    fails; contains its name and the end of its output.
     """
     out = options.out.resolve()
     subject = _subject(options, out)
@@ -237,10 +209,7 @@ def _subject(options: DemoOptions, out: Path) -> Subject:
 def worn(twin: Twin) -> Scenario:
     """Scenario of a worn bearing: viscous friction depends on the direction, in the joint where there is most of it.
 
-    Parameters
-    ----------
-    twin
-        The virtual arm.
+    ``twin``: the virtual arm.
     """
     robot, standard = twin.robot, twin.parameters.standard
     scale = torque_scale(robot, standard).torque
@@ -253,15 +222,7 @@ def worn(twin: Twin) -> Scenario:
 
 @dataclass(frozen=True)
 class Recorded:
-    """Result of a capture.
-
-    Parameters
-    ----------
-    path
-        The recording.
-    lost, lost_share
-        Number and fraction of the samples in gaps.
-    """
+    """Result of a capture. ``lost``, ``lost_share``: number and fraction of the samples in gaps."""
 
     path: Path
     lost: int
@@ -417,17 +378,8 @@ class _DemoProcess(CommandProcess):
     def wait(self, seconds: float, accepted: Sequence[int] = (0,)) -> None:
         """Wait for the end and log the lines that the process prints in the meantime.
 
-        Parameters
-        ----------
-        seconds
-            Longest time to wait, s.
-        accepted
-            Exit codes of success.
-
-        Raises
-        ------
-        ArmidentError
-            If it takes longer, or ends with another exit code.
+        ``seconds``: longest time to wait, s; ``accepted``: exit codes of success. Raises ArmidentError if it takes
+        longer, or ends with another exit code.
         """
         until = time.monotonic() + seconds
         while True:

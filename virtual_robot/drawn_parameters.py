@@ -41,14 +41,9 @@ DRY, VISCOUS = (0.05, 0.6), (0.05, 0.8)
 class TorqueScale:
     """Typical loads of the joints, joint side.
 
-    Parameters
-    ----------
-    inertia
-        Diagonal of the mass matrix, rotors included, averaged over postures, kg m^2 or kg, shape (n,).
-    gravity
-        Root mean square torque of gravity over postures, N m or N, shape (n,).
-    torque
-        Typical torque of acceleration and gravity, N m or N, shape (n,).
+    ``inertia``: diagonal of the mass matrix, rotors included, averaged over postures, kg m^2 or kg, shape (n,);
+    ``gravity``: root mean square torque of gravity over postures, N m or N, shape (n,); ``torque``: typical torque of
+    acceleration and gravity, N m or N, shape (n,).
     """
 
     inertia: Floats
@@ -74,17 +69,8 @@ def random_body(rng: np.random.Generator, size: float, mass: float) -> tuple[Flo
 def draw_bodies(robot: RobotConfig, seed: int) -> dict[str, float]:
     """Draw the inertial parameters of all links.
 
-    Parameters
-    ----------
-    robot
-        Robot with limits of position, velocity and acceleration.
-    seed
-        Seed.
-
-    Returns
-    -------
-    dict
-        Parameters by name (``xx1`` ... ``m6``), SI.
+    ``robot``: robot with limits of position, velocity and acceleration. Returns parameters by name (``xx1`` ...
+    ``m6``), SI.
     """
     rng, n = np.random.default_rng([seed, 1]), robot.n
     mass = log_uniform(rng, MASS) * np.cumprod(np.concatenate([[1.0], rng.uniform(*DECAY, n - 1)]))
@@ -105,12 +91,8 @@ def draw_bodies(robot: RobotConfig, seed: int) -> dict[str, float]:
 def needed_torque(robot: RobotConfig, standard: Mapping[str, float]) -> Floats:
     """Torque for gravity and a large acceleration, N m or N, shape (n,).
 
-    Parameters
-    ----------
-    robot
-        Robot with limits of position, velocity and acceleration.
-    standard
-        Inertial parameters of the links by name; others do not count.
+    ``robot``: robot with limits of position, velocity and acceleration. ``standard``: inertial parameters of the links
+    by name; others do not count.
     """
     load = torque_scale(robot, {name: value for name, value in standard.items() if not name.startswith("ia")})
     rise = np.array([min(j.limits.acceleration, RISE_PER_S * j.limits.velocity) for j in robot.joints])
@@ -137,17 +119,8 @@ def _standard(link: int, mass: float, com: Floats, second: Floats) -> dict[str, 
 def torque_scale(robot: RobotConfig, standard: Mapping[str, float]) -> TorqueScale:
     """Typical loads of the joints over postures within their limits.
 
-    Parameters
-    ----------
-    robot
-        Robot with limits of position and velocity.
-    standard
-        Inertial parameters by name, and rotor inertias where there are any.
-
-    Raises
-    ------
-    ConfigError
-        If a joint moves no inertia.
+    ``robot``: robot with limits of position and velocity; ``standard``: inertial parameters by name, and rotor inertias
+    where there are any. Raises ConfigError if a joint moves no inertia.
     """
     n = robot.n
     model = build_model(robot, standard)
@@ -174,14 +147,7 @@ def torque_scale(robot: RobotConfig, standard: Mapping[str, float]) -> TorqueSca
 def draw_rotors(robot: RobotConfig, standard: Mapping[str, float], seed: int) -> dict[str, float]:
     """Draw the rotor inertias, joint side; zero at joints without ``rotor_inertia``.
 
-    Parameters
-    ----------
-    robot
-        Robot with limits of position and velocity.
-    standard
-        Inertial parameters of the links by name.
-    seed
-        Seed.
+    ``robot``: robot with limits of position and velocity; ``standard``: inertial parameters of the links by name.
     """
     factors = log_uniform(np.random.default_rng([seed, 2]), ROTOR, robot.n)
     links = torque_scale(robot, standard).inertia
@@ -194,14 +160,7 @@ def draw_rotors(robot: RobotConfig, standard: Mapping[str, float], seed: int) ->
 def draw_friction(robot: RobotConfig, scale: TorqueScale, seed: int) -> dict[str, float]:
     """Draw viscous and Coulomb friction and offset of each joint, and the parameters of couplings.
 
-    Parameters
-    ----------
-    robot
-        The robot.
-    scale
-        Typical loads of its joints.
-    seed
-        Seed.
+    ``scale``: typical loads of its joints.
     """
     rng, n = np.random.default_rng([seed, 3]), robot.n
     speed = np.array([joint.limits.velocity for joint in robot.joints])

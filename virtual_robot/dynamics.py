@@ -32,8 +32,6 @@ def friction_torques(q, qd, t, friction, smoothing, pairs, ratio, table, load, o
     ----------
     q, qd
         Coordinates and velocities, shape (N,).
-    t
-        Time, s.
     friction
         fv, fc, offset and viscous coefficient of the brake by joint, shape (n, 4).
     smoothing
@@ -86,16 +84,9 @@ def friction_torques(q, qd, t, friction, smoothing, pairs, ratio, table, load, o
 def gear_torques(q, qd, gears, out, slope, stiff):  # type: ignore[no-untyped-def]
     """Add the torques of elastic gears and their slopes.
 
-    Parameters
-    ----------
-    q, qd
-        Coordinates and velocities, shape (N,).
-    gears
-        Elastic gears (`gear_rows`), shape (G, 6).
-    out
-        Torques, shape (N,), changed in place.
-    slope, stiff
-        Slopes over velocities and coordinates, shape (N, N), changed in place.
+    ``q``, ``qd``: coordinates and velocities, shape (N,); ``gears``: elastic gears (`gear_rows`), shape (G, 6);
+    ``out``: torques, shape (N,), changed in place; ``slope``, ``stiff``: slopes over velocities and coordinates, shape
+    (N, N), changed in place.
     """
     for e in range(gears.shape[0]):
         a, b = int(gears[e, 0]), int(gears[e, 1])

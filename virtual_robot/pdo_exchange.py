@@ -129,14 +129,8 @@ def _exchange(  # type: ignore[no-untyped-def]
 class Exchange:
     """PDO exchange at every SYNC by the present mapping of the drives.
 
-    Parameters
-    ----------
-    drives
-        The drives, in any order.
-    motion
-        Plant or recording behind the drives.
-    period
-        SYNC period, s; velocity actual (606Ch) is the difference of positions over it.
+    ``drives``: in any order. ``motion``: plant or recording behind the drives. ``period``: SYNC period, s; velocity
+    actual (606Ch) is the difference of positions over it.
     """
 
     def __init__(self, drives: Sequence[Drive], motion: DriveBackend, period: float) -> None:
@@ -228,19 +222,9 @@ class Exchange:
     def take(self, ids: Any, lengths: Any, data: Any, start: int, stop: int, sequence: int) -> int:
         """Process frames up to the next SYNC; afterwards `out` holds its answers, and `act` applies its set points.
 
-        Parameters
-        ----------
-        ids, lengths, data
-            Fields of an array of frames, shape (N,), (N,) and (N, 8) or (N, 64).
-        start, stop
-            Range of the frames to process.
-        sequence
-            Counter of a SYNC that carries none.
-
-        Returns
-        -------
-        int
-            Index of the SYNC, or ``stop`` if there is none.
+        ``ids``, ``lengths``, ``data``: fields of an array of frames, shape (N,), (N,) and (N, 8) or (N, 64); ``start``,
+        ``stop``: range of the frames to process; ``sequence``: counter of a SYNC that carries none. Returns the index
+        of the SYNC, or ``stop`` if there is none.
         """
         at = int(_exchange(ids, lengths, data, start, stop, sequence, *self._arguments))
         self.out = self._out[: self._result[0]]

@@ -157,24 +157,16 @@ def count_sync(
 
     Parameters
     ----------
-    count
-        Number of frames.
     can_id, length, t_ns
         COB-IDs, data lengths and receive times (ns UTC) of the frames, (count,) or longer.
     data
         Data of the frames as 64-bit words, (count, words).
     sync_id
         COB-ID of SYNC.
-    period_ns
-        SYNC period, ns.
     overflow
         Synchronous counter overflow value (CiA 301, 1019h); 0: SYNC has no counter.
-    bus
-        Number of the bus.
     longest
         Largest advance with whole counter turns, SYNCs.
-    m
-        State of the matcher.
     """
     total, bus_state = 0, m.bus_state.copy()
     for i in range(count):
@@ -193,24 +185,16 @@ def match(
 
     Parameters
     ----------
-    count
-        Number of frames.
     can_id, length, t_ns
         COB-IDs, data lengths and receive times (ns UTC) of the frames, (count,) or longer.
     data
         Data of the frames as 64-bit words, (count, words).
     sync_id
         COB-ID of SYNC.
-    period_ns
-        SYNC period, ns.
     overflow
         Synchronous counter overflow value (CiA 301, 1019h); 0: SYNC has no counter.
-    bus
-        Number of the bus.
     longest
         Largest advance with whole counter turns, SYNCs.
-    m
-        State of the matcher.
     out
         Output of decided samples.
     """
@@ -272,14 +256,7 @@ def match(
 def finish(total: int, m: MatcherState, out: MatchedSamples) -> None:
     """Settle all rows after the last frame: unanswered SYNCs are lost.
 
-    Parameters
-    ----------
-    total
-        Number of SYNCs that were sent.
-    m
-        State of the matcher.
-    out
-        Output of decided samples.
+    ``total``: number of SYNCs that were sent; ``out``: output of decided samples.
     """
     for bus in range(m.bus_state.shape[0]):
         last = m.bus_state[bus, SYNC]

@@ -40,17 +40,7 @@ from armident.drivers.compiled import compiled
 
 @compiled
 def slot_of(m: MatcherState, s: int, u: int) -> int:
-    """Return the ring slot of a row.
-
-    Parameters
-    ----------
-    m
-        State of the matcher.
-    s
-        Number of the stream.
-    u
-        Ordinal of the row.
-    """
+    """Return the ring slot of a row. ``s``: number of the stream; ``u``: ordinal of the row."""
     return int((u - m.watermark[s, BASE]) % m.row_sync.shape[1])
 
 
@@ -348,18 +338,7 @@ def _emit(m: MatcherState, s: int, end: int, out: MatchedSamples) -> None:
 def settle_all(m: MatcherState, bus: int, s: int, final: bool, out: MatchedSamples) -> None:
     """Decide the open rows of the drives on one bus, and output the rows that all drives have settled.
 
-    Parameters
-    ----------
-    m
-        State of the matcher.
-    bus
-        Number of the bus.
-    s
-        Number of the stream.
-    final
-        No more answers follow.
-    out
-        Output of decided samples.
+    ``s``: number of the stream; ``final``: no more answers follow.
     """
     n = m.settled.shape[1]
     head = m.head[bus, s]

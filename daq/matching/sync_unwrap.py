@@ -37,12 +37,7 @@ def turns_in(periods: float, overflow: int) -> int:
 
     SYNCs may be late, when their master was delayed, but at most a quarter of a turn early.
 
-    Parameters
-    ----------
-    periods
-        Time in SYNC periods.
-    overflow
-        Synchronous counter overflow value (CiA 301, 1019h).
+    ``overflow``: synchronous counter overflow value (CiA 301, 1019h).
     """
     return int(np.floor(periods / overflow + _EARLY))
 
@@ -64,16 +59,9 @@ def sync_step(counter: int, previous: int, elapsed: float, overflow: int, longes
 
     The counter gives it modulo ``overflow``, the time the whole turns.
 
-    Parameters
-    ----------
-    counter, previous
-        Counters of this SYNC and the last one.
-    elapsed
-        Time between them, SYNC periods.
-    overflow
-        Synchronous counter overflow value (CiA 301, 1019h).
-    longest
-        Largest advance with whole turns, SYNCs.
+    ``counter``, ``previous``: counters of this SYNC and the last one; ``elapsed``: time between them, SYNC periods;
+    ``overflow``: synchronous counter overflow value (CiA 301, 1019h); ``longest``: largest advance with whole turns,
+    SYNCs.
     """
     step = (counter - previous) % overflow
     turns = turns_in(elapsed - step, overflow)
@@ -218,24 +206,9 @@ def advance(buses: Any, m: Any, bus: int, counter: int, t_ns: int, period_ns: in
 
     With zero or less, nothing changes: the SYNC is repeated, or the buses do not agree.
 
-    Parameters
-    ----------
-    buses
-        ``MatcherState.bus_state`` of ``m``, or a copy.
-    m
-        State of the matcher.
-    bus
-        Number of the bus.
-    counter
-        Counter of the SYNC; -1 if it has none.
-    t_ns
-        Receive time, ns UTC.
-    period_ns
-        SYNC period, ns.
-    overflow
-        Synchronous counter overflow value (CiA 301, 1019h).
-    longest
-        Largest advance with whole counter turns, SYNCs.
+    ``buses``: ``MatcherState.bus_state`` of ``m``, or a copy. ``m``: state of the matcher. ``counter``: counter of the
+    SYNC; -1 if it has none. ``t_ns``: receive time, ns UTC. ``overflow``: synchronous counter overflow value
+    (CiA 301, 1019h). ``longest``: largest advance with whole counter turns, SYNCs.
     """
     if buses[bus, SYNC] < 0 and buses[bus, COUNTER] < 0:
         step = _first_step(buses, m.sync_times, bus, counter, t_ns, period_ns, overflow)

@@ -13,6 +13,7 @@ from armident.configs.schema.scenario import Scenario
 from armident.configs.schema.session import SessionConfig
 from armident.configs.schema.trajectory import Trajectory
 from armident.daq.cli import GROUP, application
+from armident.daq.interchange.readers import table_of_formats
 from armident.identify.documents.diagnosis import DiagnosisDocument
 from armident.identify.documents.identification import IdentificationDocument
 
@@ -42,7 +43,7 @@ def setup(app: Sphinx) -> dict[str, Any]:
 
 
 def write_reference(app: Sphinx) -> None:
-    """Write `reference/commands.md` and `reference/files.md` into the source folder, if their text has changed.
+    """Write `reference/commands.md`, `files.md` and `formats.md` into the source folder, if their text has changed.
 
     Parameters
     ----------
@@ -50,7 +51,7 @@ def write_reference(app: Sphinx) -> None:
         The Sphinx application.
     """
     folder = Path(app.srcdir) / "reference"
-    for name, text in (("commands.md", commands_page()), ("files.md", files_page())):
+    for name, text in (("commands.md", commands_page()), ("files.md", files_page()), ("formats.md", formats_page())):
         path = folder / name
         if not path.is_file() or path.read_text(encoding="utf-8") != text:
             path.write_text(text, encoding="utf-8")
@@ -67,6 +68,11 @@ def commands_page() -> str:
         help_text = command.get_help(type(context)(command, parent=context, info_name=name, terminal_width=100))
         sections.append(f"## {name}\n\n```text\n{help_text.strip()}\n```")
     return "\n\n".join(sections) + "\n"
+
+
+def formats_page() -> str:
+    """Return the reference of the files of other tools, from their readers."""
+    return f"# Formats\n\n`armident import` reads, and `armident export` writes:\n\n{table_of_formats()}\n"
 
 
 def files_page() -> str:

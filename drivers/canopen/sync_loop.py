@@ -52,12 +52,7 @@ if MODE == "by numba":
 def is_knot(k: int, every: int) -> bool:
     """Return True if set points become targets at a SYNC: its counter is a multiple of ``every``.
 
-    Parameters
-    ----------
-    k
-        Number of the SYNC, from 0.
-    every
-        Number of SYNCs between two set points.
+    ``k``: number of the SYNC, from 0; ``every``: number of SYNCs between two set points.
     """
     return (k + 1) % every == 0
 
@@ -104,14 +99,8 @@ class Loop:
     ) -> None:
         """Send SYNCs and set points until ``state[STOP]``, ``state[RETURN]`` or ``state[WANTED]``.
 
-        Parameters
-        ----------
-        rows
-            Set points, counts, shape (M, n); sent from row ``state[ROW]`` on.
-        cob_ids, bus_of
-            Identifier and bus number of each drive's set point frame, shape (n,).
-        every
-            Number of SYNCs between two rows.
+        ``rows``: set points, counts, shape (M, n); sent from row ``state[ROW]`` on. ``cob_ids``, ``bus_of``: identifier
+        and bus number of each drive's set point frame, shape (n,). ``every``: number of SYNCs between two rows.
         """
         self._call(self._state, rows, cob_ids, bus_of, every)
 
@@ -140,13 +129,7 @@ class Loop:
 
 @compiled
 def monotonic_ns(spec: NDArray[np.int64]) -> int:
-    """Read CLOCK_MONOTONIC, ns.
-
-    Parameters
-    ----------
-    spec
-        Memory of a ``struct timespec``, int64, shape (2,).
-    """
+    """Read CLOCK_MONOTONIC, ns. ``spec``: memory of a ``struct timespec``, int64, shape (2,)."""
     _clock_gettime(_MONOTONIC, spec.ctypes.data)
     return int(spec[0] * 1_000_000_000 + spec[1])
 
@@ -155,10 +138,7 @@ def monotonic_ns(spec: NDArray[np.int64]) -> int:
 def utc_ns(spec: NDArray[np.int64]) -> int:
     """Read CLOCK_REALTIME, ns: the clock of the kernel's frame stamps.
 
-    Parameters
-    ----------
-    spec
-        Memory of a ``struct timespec``, int64, shape (2,).
+    ``spec``: memory of a ``struct timespec``, int64, shape (2,).
     """
     _clock_gettime(_REALTIME, spec.ctypes.data)
     return int(spec[0] * 1_000_000_000 + spec[1])
@@ -166,15 +146,7 @@ def utc_ns(spec: NDArray[np.int64]) -> int:
 
 @compiled
 def sleep_until(deadline: int, spec: NDArray[np.int64]) -> None:
-    """Sleep until CLOCK_MONOTONIC reaches a deadline.
-
-    Parameters
-    ----------
-    deadline
-        Time, ns.
-    spec
-        Memory of a ``struct timespec``, int64, shape (2,).
-    """
+    """Sleep until CLOCK_MONOTONIC reaches a deadline. ``spec``: memory of a ``struct timespec``, int64, shape (2,)."""
     spec[0], spec[1] = deadline // 1_000_000_000, deadline % 1_000_000_000
     while _clock_nanosleep(_MONOTONIC, _ABSOLUTE, spec.ctypes.data, 0) == _EINTR:
         pass
@@ -184,18 +156,8 @@ def sleep_until(deadline: int, spec: NDArray[np.int64]) -> None:
 def send_messages(descriptor: int, address: int, count: int, attempts: int, spec: NDArray[np.int64]) -> int:
     """Send messages by ``sendmmsg``; return 0, or errno if the kernel refuses them.
 
-    Parameters
-    ----------
-    descriptor
-        Socket.
-    address
-        Address of the first ``struct mmsghdr``.
-    count
-        Number of messages.
-    attempts
-        Maximum number of system calls.
-    spec
-        Memory of a ``struct timespec``, int64, shape (2,).
+    ``address``: address of the first ``struct mmsghdr``; ``attempts``: maximum number of system calls; ``spec``: memory
+    of a ``struct timespec``, int64, shape (2,).
     """
     sent, code = 0, 0
     for _ in range(attempts):

@@ -16,8 +16,8 @@ from armident.identify.documents.files import to_json, write_atomically
 from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.effects.registry import catalogue
 from armident.identify.experiment import Experiment
-from armident.identify.identification.api import experiments_of
 from armident.identify.identification.from_recording import rest_notes
+from armident.identify.identification.identify_recording import experiments_of
 from armident.identify.report.files import robot_yaml
 from armident.identify.tables import EffectTable, Table
 

@@ -14,21 +14,16 @@ from armident.identify.api.arguments import Progress, Recorded, Robot, recording
 from armident.identify.api.result import Result
 from armident.identify.documents.files import load_document, to_json, write_atomically
 from armident.identify.documents.identification import IdentificationDocument
-from armident.identify.identification.api import experiments_of, identify_recording
-from armident.identify.identification.options import (
-    ControllerName,
-    DerivativesName,
-    Method,
-    NoiseModelName,
-    Options,
-)
-from armident.identify.identification.result import Identification as Estimation
-from armident.identify.identification.verdict import Reason
-from armident.identify.regression.equations import MAX_AR_ORDER
+from armident.identify.estimators.methods import Method
+from armident.identify.estimators.reason import Reason
+from armident.identify.identification.identification_result import IdentificationResult as Estimation
+from armident.identify.identification.identify_recording import experiments_of, identify_recording
+from armident.identify.identification.options import ControllerName, NoiseModelName, Options
+from armident.identify.regression.orders import MAX_AR_ORDER
 from armident.identify.saved_model import model_of
 from armident.identify.setup.check import check_setup
 from armident.identify.setup.result import SetupCheck
-from armident.identify.signals.differentiate import NvrRule
+from armident.identify.signals.choices import DerivativesName, NvrRule
 from armident.identify.tables import ParameterTable, Table
 
 Array = NDArray[np.float64]

@@ -26,12 +26,7 @@ ESTIMABLE = 0.999
 class Change:
     """Candidate change of the plant.
 
-    Parameters
-    ----------
-    effect, place
-        Effect and its place.
-    directions
-        Change of the known parameters (k,) per unit of the parameters of the effect, shape (k, m).
+    ``directions``: change of the known parameters (k,) per unit of the parameters of the effect, shape (k, m).
     """
 
     effect: Effect
@@ -81,16 +76,8 @@ class Comparison:
     def solved(self, changes: Sequence[Change]) -> tuple[Array, Array, Array, float, int]:
         """Parameters of changes by generalised least squares.
 
-        Parameters
-        ----------
-        changes
-            Changes of the plant.
-
-        Returns
-        -------
-        tuple
-            Parameters (of `absorbed` first), covariance, mask of the parameters that are estimable one by one, the
-            remaining chi-square and its degrees of freedom.
+        ``changes``: changes of the plant. Returns parameters (of `absorbed` first), covariance, mask of the parameters
+        that are estimable one by one, the remaining chi-square and its degrees of freedom.
         """
         stack = np.column_stack([self.absorbed, *(c.directions for c in changes)])
         target = self.whitened(self.difference)
@@ -129,17 +116,8 @@ class Comparison:
 def compared(fit: Fit, baseline: IdentificationDocument) -> Comparison:
     """Comparison of a fit with a baseline.
 
-    Parameters
-    ----------
-    fit
-        Fit of the present recording.
-    baseline
-        Document of an earlier identification.
-
-    Raises
-    ------
-    DataError
-        If the baseline is of another model, or its covariance has another size.
+    ``fit``: fit of the present recording; ``baseline``: document of an earlier identification. Raises DataError if the
+    baseline is of another model, or its covariance has another size.
     """
     names = fit.study.model.base.names
     rigid = names[: len(names) - fit.study.model.e]

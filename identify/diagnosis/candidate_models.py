@@ -17,16 +17,9 @@ CORRECTIONS = 3
 def model_with(state: ModelState, candidate: Candidate, shapes: Shapes, starts: Starts, fitter: Fitter) -> Made | None:
     """Return a candidate in the model; ``None`` if the motion does not determine the parameters.
 
-    Parameters
-    ----------
-    state
-        Model without it.
-    candidate, shapes
-        The effect with its place, and its nonlinear parameters.
-    starts
-        Values from which the correction of a recorded torque starts; empty for a term of the model.
-    fitter
-        Fits a model.
+    ``state``: model without it. ``candidate``, ``shapes``: the effect with its place, and its nonlinear parameters.
+    ``starts``: values from which the correction of a recorded torque starts; empty for a term of the model. ``fitter``:
+    fits a model.
     """
     effect, whole = candidate.effect, known(candidate.effect.key)
     spared = (*(p.name for p in whole.linear if p not in effect.linear), *candidate.without)
@@ -51,18 +44,8 @@ def _corrected(state: ModelState, candidate: Candidate, entry: Entry, starts: St
     The first-order expansion beside the corrected torque refines the value, until what remains is within its
     standard deviation. Where that does not come about, the value with the largest gain is chosen.
 
-    Parameters
-    ----------
-    state
-        Model without the effect.
-    candidate
-        The effect.
-    entry
-        Its entry without a value: the first-order expansion.
-    starts
-        Values to start from.
-    fitter
-        Fits a model.
+    ``state``: model without the effect; ``entry``: its entry without a value: the first-order expansion; ``fitter``:
+    fits a model.
     """
     name = candidate.effect.linear[0].name
     found: list[Made] = []

@@ -29,14 +29,8 @@ Kept = tuple[Array, bool]
 class Candidate:
     """An effect at a place, with the grid of its nonlinear parameters.
 
-    Parameters
-    ----------
-    effect, place
-        Effect and its place.
-    grid
-        Combinations of nonlinear parameters to try, as pairs of name and value.
-    without
-        Linear parameters that it leaves out, because the model has others with the same torque.
+    ``grid``: combinations of nonlinear parameters to try, as pairs of name and value; ``without``: linear parameters
+    that it leaves out, because the model has others with the same torque.
     """
 
     effect: Effect
@@ -54,14 +48,8 @@ class Candidate:
 class ColumnCache:
     """Cache of the columns of candidates.
 
-    Parameters
-    ----------
-    study
-        The stretches.
-    theta
-        Parameters (b,) that predict the torques on which effects depend.
-    kept
-        Columns computed so far, by effect, place, nonlinear parameters, part and signals.
+    ``theta``: parameters (b,) that predict the torques on which effects depend; ``kept``: columns computed so far, by
+    effect, place, nonlinear parameters, part and signals.
     """
 
     study: Study
@@ -74,40 +62,20 @@ class ColumnCache:
     ) -> Array:
         """Whitened columns (R, k) at the simulated signals of the training data, as the search uses them.
 
-        Parameters
-        ----------
-        effect, place, shapes
-            Effect, its place and nonlinear parameters.
-        noise
-            Noise model of each joint.
-        keep
-            True to keep the columns in the cache.
+        ``effect``, ``place``, ``shapes``: effect, its place and nonlinear parameters; ``noise``: noise model of each
+        joint.
         """
         return whitened(self.band(effect, place, shapes, "train", "simulated", keep=keep), noise)
 
     def motion(self, stretch: Stretch, kind: str) -> Motion:
-        """Signals of a stretch on which the columns of effects depend.
-
-        Parameters
-        ----------
-        stretch
-            A stretch of the study.
-        kind
-            ``measured`` or ``simulated``.
-        """
+        """Signals of a stretch on which the columns of effects depend. ``kind``: ``measured`` or ``simulated``."""
         key = (id(stretch), kind)
         if key not in self._motions:
             self._motions[key] = self.study.motion(stretch, kind, self.theta)
         return self._motions[key]
 
     def joints(self, candidate: Candidate) -> list[int]:
-        """Joints on whose torques a candidate acts.
-
-        Parameters
-        ----------
-        candidate
-            The candidate.
-        """
+        """Joints on whose torques a candidate acts."""
         effect, place = candidate.effect, candidate.place
         if not candidate.grid:
             return [place.joint]
@@ -121,14 +89,8 @@ class ColumnCache:
     ) -> tuple[Array, ...]:
         """Columns in the band of the comparison, (M, n, k) of every stretch.
 
-        Parameters
-        ----------
-        effect, place, shapes
-            Effect, its place and nonlinear parameters.
-        part, kind
-            ``train`` or ``held``; ``measured`` or ``simulated``.
-        keep
-            True to keep the columns in the cache.
+        ``effect``, ``place``, ``shapes``: effect, its place and nonlinear parameters. ``part``, ``kind``: ``train`` or
+        ``held``; ``measured`` or ``simulated``.
         """
         (made,) = self._bands(effect, place, (shapes,), part, kind, keep=keep)
         return tuple(self._of_all_joints(columns, place) for columns in made)
@@ -140,16 +102,7 @@ class ColumnCache:
 
         Whitened columns at the simulated signals of the training data, one combination of the grid after the other.
 
-        Parameters
-        ----------
-        effect, place
-            Effect and its place.
-        grid
-            Combinations of nonlinear parameters, G of them.
-        noise
-            Noise model of each joint.
-        keep
-            True to keep the columns in the cache.
+        ``grid``: combinations of nonlinear parameters, G of them.
         """
         made = self._bands(effect, place, grid, "train", "simulated", keep=keep)
         stretches = range(len(self.study.train))

@@ -22,14 +22,8 @@ joint is nearly all friction, more friction and another torque constant are ambi
 class Standing:
     """Score of a candidate among others.
 
-    Parameters
-    ----------
-    change
-        The candidate.
-    p_value
-        Probability that a candidate without merit reduces the chi-square as much.
-    score
-        Gain in log-likelihood, less the number of its parameters (Akaike), plus the logarithm of its prior odds.
+    ``p_value``: probability that a candidate without merit reduces the chi-square as much; ``score``: gain in
+    log-likelihood, less the number of its parameters (Akaike), plus the logarithm of its prior odds.
     """
 
     change: Change
@@ -40,12 +34,7 @@ class Standing:
 def changes(comparison: Comparison, column_cache: ColumnCache) -> Iterator[Change]:
     """All effects that change parameters of the model, at all their places.
 
-    Parameters
-    ----------
-    comparison
-        Fit and baseline.
-    column_cache
-        Cache of the columns of the same study.
+    ``comparison``: fit and baseline; ``column_cache``: cache of the columns of the same study.
     """
     fit = comparison.fit
     motion = column_cache.motion(fit.study.train[0], "measured")
@@ -69,14 +58,7 @@ def changes(comparison: Comparison, column_cache: ColumnCache) -> Iterator[Chang
 def p_value(comparison: Comparison, others: Sequence[Change], change: Change) -> float:
     """Probability that a change without merit, added to others, reduces the chi-square as much.
 
-    Parameters
-    ----------
-    comparison
-        Fit and baseline.
-    others
-        Changes already present.
-    change
-        The tested change.
+    ``comparison``: fit and baseline; ``others``: changes already present; ``change``: the tested change.
     """
     _, _, _, before, free_before = comparison.solved(others)
     _, _, _, after, free_after = comparison.solved([*others, change])
@@ -86,17 +68,7 @@ def p_value(comparison: Comparison, others: Sequence[Change], change: Change) ->
 
 
 def ranked(comparison: Comparison, found: Sequence[Change], pool: Sequence[Change]) -> list[Standing]:
-    """Candidates by score, the best first.
-
-    Parameters
-    ----------
-    comparison
-        Fit and baseline.
-    found
-        Changes already present.
-    pool
-        Candidates.
-    """
+    """Candidates by score, the best first. ``comparison``: fit and baseline; ``found``: changes already present."""
     _, _, _, before, free_before = comparison.solved(found)
     standings = []
     for change in pool:

@@ -18,16 +18,9 @@ from armident.identify.regression.ar_noise import ArModel
 class Made:
     """A candidate in the model, before it is compared with others.
 
-    Parameters
-    ----------
-    candidate, shapes
-        The effect with its place, and its nonlinear parameters.
-    entry
-        Entry of the effect in the configuration.
-    state
-        Model with the effect.
-    allowed
-        False if a linear parameter has a sign or a size that physics does not allow.
+    ``candidate``, ``shapes``: the effect with its place, and its nonlinear parameters; ``entry``: entry of the effect
+    in the configuration; ``state``: model with the effect; ``allowed``: False if a linear parameter has a sign or a
+    size that physics does not allow.
     """
 
     candidate: Candidate
@@ -130,13 +123,7 @@ class Step:
     tests: int
 
     def rivals(self, one: Addition) -> tuple[Addition, ...]:
-        """Physically possible explanations in place of an addition: others that pass, and others of the same joint.
-
-        Parameters
-        ----------
-        one
-            The addition.
-        """
+        """Physically possible explanations in place of an addition: others that pass, and others of the same joint."""
         joint = one.candidate.place.joint
         return tuple(
             a
@@ -152,16 +139,9 @@ def compared(state: ModelState, made: Sequence[Made], tests: int, passes: Callab
     smooth functions of the motion. Noise models of the model without the missing effect would take the effect for
     noise, and so would those of a whole residual while other effects are missing.
 
-    Parameters
-    ----------
-    state
-        Model without the candidates.
-    made
-        Candidates in the model.
-    tests
-        Number of candidates and nonlinear parameters from which they were selected.
-    passes
-        ``(addition, tests)`` to True if an addition is significant, material and physically possible.
+    ``state``: model without the candidates; ``made``: candidates in the model; ``tests``: number of candidates and
+    nonlinear parameters from which they were selected; ``passes``: ``(addition, tests)`` to True if an addition is
+    significant, material and physically possible.
     """
     noise = _noise_of_best([state, *(m.state for m in made if m.allowed)])
     alike = state.under(noise)
@@ -170,13 +150,7 @@ def compared(state: ModelState, made: Sequence[Made], tests: int, passes: Callab
 
 
 def advantage(one: ModelState, other: ModelState) -> float:
-    """Log-likelihood of a model less that of another one, under the noise models of the more likely of both, nats.
-
-    Parameters
-    ----------
-    one, other
-        The models.
-    """
+    """Log-likelihood of a model less that of another one, under the noise models of the more likely of both, nats."""
     noise = _noise_of_best([one, other])
     first, second = (model.under(noise).score.log_likelihood_under(noise) for model in (one, other))
     return first - second
@@ -201,10 +175,7 @@ def gain(with_it: ModelState, without: ModelState) -> float:
 
     Both models are estimated with the same weights.
 
-    Parameters
-    ----------
-    with_it, without
-        Models with and without the effect.
+    ``with_it``, ``without``: models with and without the effect.
     """
     return with_it.score.gain_over(without.under(with_it.fit.noise).score, with_it.score.own_noise)
 
@@ -214,10 +185,7 @@ def materiality(without: ModelState, with_it: ModelState) -> tuple[float, float]
 
     Errors of joints on which the effect does not act may change, too, with the other parameters. They do not count.
 
-    Parameters
-    ----------
-    without, with_it
-        Models without and with the effect.
+    ``without``, ``with_it``: models without and with the effect.
     """
     before, after = without.score.rms, with_it.score.rms
     removed = np.where(acted_on(with_it, without), np.maximum(before**2 - after**2, 0.0), 0.0)

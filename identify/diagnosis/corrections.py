@@ -32,14 +32,8 @@ def screened_correction(fit: Fit, candidate: Candidate, column_cache: ColumnCach
     therefore no evidence of an effect. It gives the second value, for effects that are so large that the predicted
     torque is far from the true one.
 
-    Parameters
-    ----------
-    fit
-        Fit of the model without the effect.
-    candidate
-        Effect on a recorded torque, and its motor.
-    column_cache
-        Cache of the columns of the same fit.
+    ``fit``: fit of the model without the effect; ``candidate``: effect on a recorded torque, and its motor;
+    ``column_cache``: cache of the columns of the same fit.
     """
     study, effect, motor = fit.study, candidate.effect, candidate.place.joint
     assert isinstance(effect, Correction)
@@ -66,7 +60,7 @@ def _at_simulated(
         changes.append(at_joints * s.moving[:, joints, None])
     series = whitened_series(changes, [fit.noise[j] for j in joints])
     columns = [(int(j), np.concatenate(parts)) for j, parts in zip(joints, series, strict=True)]
-    gram, score = fit.regression.products_beside(columns, len(values))
+    gram, score = fit.regression.orthogonal_products(columns, len(values))
     return np.asarray(2.0 * score[:, 0] - gram[:, 0, 0])
 
 

@@ -29,14 +29,7 @@ def detection_limits(state: ModelState, step: Step | None, criteria: Criteria) -
     log-likelihood reaches the threshold of the selection with probability `POWER`. The error of the joint falls by the
     share that a finding requires.
 
-    Parameters
-    ----------
-    state
-        Model with all findings.
-    step
-        Comparison of all effects in that model; ``None`` if it was not made.
-    criteria
-        Thresholds.
+    ``state``: model with all findings. ``step``: comparison of all effects in that model; ``None`` if it was not made.
     """
     column_cache = ColumnCache(state.study, state.fit.theta)
     shapes = {} if step is None else {a.candidate.key: a.shapes for a in reversed(step.ranked)}

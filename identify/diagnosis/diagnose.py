@@ -101,14 +101,15 @@ def diagnose(
 ) -> Diagnosis:
     """Find the effects that a model lacks by stepwise selection.
 
+    Returns the document, configuration with the findings, and curves. Raises DataError if the recordings cannot support
+    a diagnosis.
+
     Parameters
     ----------
     training
         Experiments to fit and to select effects by.
     validation
         Experiments of the report part; without them the last part of the training experiments is the report part.
-    robot
-        Configuration of the model to diagnose.
     recordings
         References to the recordings of the experiments, for the document.
     baseline
@@ -121,16 +122,6 @@ def diagnose(
         Thresholds; ``None``: the defaults.
     time_limit_s
         Wall-clock time after which the selection ends with what it has found, s; ``None``: without limit.
-
-    Returns
-    -------
-    Diagnosis
-        Document, configuration with the findings, and curves.
-
-    Raises
-    ------
-    DataError
-        If the recordings cannot support a diagnosis.
     """
     deadline = float("inf") if time_limit_s is None else time.monotonic() + time_limit_s
     # Threads gain little on tall and narrow matrices, and round otherwise.

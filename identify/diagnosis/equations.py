@@ -26,12 +26,7 @@ offset and all functions of a table over a predicted torque may do, it belongs t
 class Equations:
     """Equations in the band of the comparison, computed when they are first used.
 
-    Parameters
-    ----------
-    study
-        Data with the model.
-    theta
-        Parameters (b,) that predict the torques on which terms depend; ``None`` if no term does.
+    ``theta``: parameters (b,) that predict the torques on which terms depend; ``None`` if no term does.
     """
 
     study: Study
@@ -66,10 +61,7 @@ class Equations:
     def with_held(self, study: Study) -> "Equations":
         """Equations of the same training part with another held-out part.
 
-        Parameters
-        ----------
-        study
-            Data with the same training stretches.
+        ``study``: data with the same training stretches.
         """
         other = Equations(study, self.theta)
         other.__dict__.update({name: self.__dict__[name] for name in ("train", "joints") if name in self.__dict__})
@@ -91,14 +83,7 @@ def regressors(study: Study, stretch: Stretch, theta: Array | None) -> tuple[Arr
     Effects that depend on accelerations or torques are computed at simulated signals in both. Effects with jumps, which
     a simulation does not reproduce to the sample, are computed at measured signals in both.
 
-    Parameters
-    ----------
-    study
-        Data with the model.
-    stretch
-        A stretch of the study.
-    theta
-        Parameters (b,) that predict the torques on which terms depend; ``None`` if no term does.
+    ``theta``: parameters (b,) that predict the torques on which terms depend; ``None`` if no term does.
     """
     model = study.model
     terms = effect_terms(model)
@@ -124,16 +109,8 @@ def regressors(study: Study, stretch: Stretch, theta: Array | None) -> tuple[Arr
 class _Signals:
     """One kind of signals of a stretch, with the regressors computed from them.
 
-    Parameters
-    ----------
-    study
-        Data with the model.
-    stretch
-        A stretch of the study.
-    kind
-        ``measured`` or ``simulated``.
-    theta
-        Parameters of the rigid model that predict the torques on which terms depend; ``None`` if no term does.
+    ``kind``: ``measured`` or ``simulated``. ``theta``: parameters of the rigid model that predict the torques on which
+    terms depend; ``None`` if no term does.
     """
 
     study: Study
@@ -163,12 +140,7 @@ class _Signals:
     def fill(self, term: Term, out: Array) -> None:
         """Write the columns of a term in the band of the comparison; those of one joint are filtered alone.
 
-        Parameters
-        ----------
-        term
-            Term of the model.
-        out
-            Output array, (M, n, k).
+        ``term``: term of the model; ``out``: output array, (M, n, k).
         """
         signals, model = self._signals, self.study.model
         torques = (model.base.names[: -model.e or None], self._theta_bytes) if term.depends_on_torque else None

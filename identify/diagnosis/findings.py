@@ -32,15 +32,7 @@ DOUBTFUL = 0.6
 
 
 def findings_of(final: ModelState, selected: Sequence[Selected]) -> list[Finding]:
-    """Return the findings of a selection, in its order.
-
-    Parameters
-    ----------
-    final
-        Model with all of them.
-    selected
-        Effects of the selection.
-    """
+    """Return the findings of a selection, in its order. ``selected``: effects of the selection."""
     deviations = standard_deviations(final)
     entries = list(final.robot.effects)
     values = final.with_values().effects
@@ -100,12 +92,7 @@ def less_certain(findings: Sequence[Finding], left: Sequence[Unexplained]) -> li
     effect, of which a finding has taken a part. Of the power of its joint's error that is known not to be noise, the
     finding explains a share. That share limits the probability of its name; a term without a name claims no cause.
 
-    Parameters
-    ----------
-    findings
-        Findings of the selection.
-    left
-        Unexplained dependences of the residual of the final model.
+    ``findings``: findings of the selection; ``left``: unexplained dependences of the residual of the final model.
     """
     known_shares = _known_shares(left)
     found = []
@@ -132,12 +119,7 @@ def tempered_odds(step: Step, one: Addition) -> dict[Key, float]:
     Differences of log-likelihood are reduced by the serial correlation that the noise models leave: the gain of the
     effect with it over that without it.
 
-    Parameters
-    ----------
-    step
-        Step of the selection.
-    one
-        The effect.
+    ``step``: step of the selection.
     """
     factor = float(np.clip(one.gain / one.raw_gain, 0.0, 1.0)) if one.raw_gain > 0.0 else 1.0
     odds: dict[Key, float] = {}
@@ -167,18 +149,8 @@ def negligible(
 ) -> list[Negligible]:
     """Return the effects that are significant, and no cause: too small, or within the sampling convention of drives.
 
-    Parameters
-    ----------
-    final
-        Model with the findings.
-    conventional
-        Effects of the selection within the sampling convention.
-    step
-        Comparison of all effects in it; ``None`` if it was not made.
-    criteria
-        Thresholds.
-    immaterial
-        Effects that change too little of the report part.
+    ``conventional``: effects of the selection within the sampling convention. ``step``: comparison of all effects in
+    it; ``None`` if it was not made. ``immaterial``: effects that change too little of the report part.
     """
     found: dict[Key, Negligible] = {}
     small = [*(one.addition for one in conventional), *immaterial]
@@ -199,15 +171,7 @@ def negligible(
 
 
 def gap_of(state: ModelState, *, held: bool) -> Gap:
-    """Relative torque errors of a model.
-
-    Parameters
-    ----------
-    state
-        The model.
-    held
-        True for the held-out data, false for the training data.
-    """
+    """Relative torque errors of a model. ``held``: True for the held-out data, false for the training data."""
     overall, each = relative_errors(state.fit, held=held)
     errors = np.concatenate(state.fit.errors(state.fit.theta, held=held))
     rms = np.sqrt(np.mean(errors**2, axis=0))
@@ -222,12 +186,7 @@ def gap_of(state: ModelState, *, held: bool) -> Gap:
 def noise_floor(final: ModelState, left: Sequence[Unexplained]) -> Gap:
     """Return the remaining error on the held-out data, less the shares that are known not to be noise.
 
-    Parameters
-    ----------
-    final
-        Model with the findings.
-    left
-        Dependences of its residual.
+    ``left``: dependences of its residual.
     """
     gap = gap_of(final, held=True)
     known_shares = {name: 0.0 for name in gap.by_joint} | _known_shares(left)
@@ -241,12 +200,8 @@ def noise_floor(final: ModelState, left: Sequence[Unexplained]) -> Gap:
 def undetectable(state: ModelState, hidden: frozenset[Key]) -> list[NotVisible]:
     """Return the effects of the catalogue that this motion cannot show at some joint, with the reason.
 
-    Parameters
-    ----------
-    state
-        Model as configured.
-    hidden
-        Effects and places that the model contains or the motion does not excite.
+    ``state``: model as configured; ``hidden``: effects and places that the model contains or the motion does not
+    excite.
     """
     study = state.study
     motion = ColumnCache(study, state.fit.theta).motion(study.train[0], "measured")
@@ -268,13 +223,7 @@ def undetectable(state: ModelState, hidden: frozenset[Key]) -> list[NotVisible]:
 
 
 def changed_parameters(numbers: Sequence[NumbersFinding]) -> list[Finding]:
-    """Return the changed parameters of a baseline as findings.
-
-    Parameters
-    ----------
-    numbers
-        Changes against the baseline.
-    """
+    """Return the changed parameters of a baseline as findings. ``numbers``: changes against the baseline."""
     return [
         Finding(
             effect=n.effect,
@@ -301,15 +250,7 @@ def changed_parameters(numbers: Sequence[NumbersFinding]) -> list[Finding]:
 def experiment_to_separate(findings: Sequence[Finding]) -> str | None:
     """Return the experiment that separates a finding from a close rival or raises a low confidence.
 
-    Parameters
-    ----------
-    findings
-        Findings of a diagnosis.
-
-    Returns
-    -------
-    str or None
-        ``None`` if none is needed.
+    ``findings``: findings of a diagnosis. Returns ``None`` if none is needed.
     """
     named = [f for f in findings if f.effect in catalogue()]
     for finding in named:

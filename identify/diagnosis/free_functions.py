@@ -41,18 +41,9 @@ POINTS = 121
 class FreeFunction:
     """Set of basis functions of one variable, for the residual of one joint (thesis 7.3.2).
 
-    Parameters
-    ----------
-    joint
-        Number of the joint of the residual.
-    kind
-        Kind of the variable.
-    other
-        Joint or motor to which the variable belongs, if it is another one.
-    knots
-        Knots of the hat functions, increasing; for an angle the wave numbers; for the time the time constant, s.
-    low, high
-        Range of the curve.
+    ``other``: joint or motor to which the variable belongs, if it is another one. ``knots``: knots of the hat
+    functions, increasing; for an angle the wave numbers; for the time the time constant, s. ``low``, ``high``: range of
+    the curve.
     """
 
     joint: int
@@ -77,13 +68,7 @@ class FreeFunction:
         return self.kind.removesuffix(" of another joint"), at, side, self.knots
 
     def variable(self, motion: Motion) -> Array:
-        """Values of the variable, (N,).
-
-        Parameters
-        ----------
-        motion
-            Motion of the arm, N samples.
-        """
+        """Values of the variable, (N,). ``motion``: motion of the arm, N samples."""
         at = self.joint if self.other is None else self.other
         match self.kind:
             case "velocity" | "velocity of another joint":
@@ -104,12 +89,7 @@ class FreeFunction:
     def basis(self, x: Array, side: Array) -> Array:
         """Basis functions, (N, k).
 
-        Parameters
-        ----------
-        x
-            Values of the variable, (N,).
-        side
-            Smoothed sign of the velocity of the joint, (N,).
+        ``x``: values of the variable, (N,); ``side``: smoothed sign of the velocity of the joint, (N,).
         """
         if self.kind == "velocity":
             speed = hats(np.abs(x), self.knots)
@@ -125,13 +105,7 @@ class FreeFunction:
         return functions * side[:, None] if self.directed else functions
 
     def columns(self, motion: Motion) -> Array:
-        """Basis functions along a motion, without its lead, (N, k).
-
-        Parameters
-        ----------
-        motion
-            Motion of the arm.
-        """
+        """Basis functions along a motion, without its lead, (N, k). ``motion``: motion of the arm."""
         return self.basis(self.variable(motion), motion.sign[:, self.joint])[motion.lead :]
 
     def on_grid(self) -> tuple[Array, Array, list[Array]]:
@@ -148,12 +122,7 @@ class FreeFunction:
 def hats(x: Array, knots: Sequence[float] | Array) -> Array:
     """Piecewise linear functions (N, k), one at each knot, constant beyond the outermost.
 
-    Parameters
-    ----------
-    x
-        Values, (N,).
-    knots
-        Increasing knots, (k,).
+    ``x``: values, (N,); ``knots``: increasing knots, (k,).
     """
     at = np.asarray(knots, dtype=np.float64)
     left = np.clip(np.searchsorted(at, x, side="right") - 1, 0, at.size - 2)
@@ -167,14 +136,7 @@ def hats(x: Array, knots: Sequence[float] | Array) -> Array:
 def free_functions(study: Study, motions: Sequence[Motion], joint: int) -> Iterator[FreeFunction]:
     """All sets of functions for the residual of one joint.
 
-    Parameters
-    ----------
-    study
-        Data with the robot.
-    motions
-        The training stretches at simulated signals.
-    joint
-        Number of the joint.
+    ``study``: data with the robot; ``motions``: the training stretches at simulated signals.
     """
     top = max(float(np.abs(m.qd[:, joint]).max()) for m in motions)
     if top > 0:
@@ -229,14 +191,8 @@ def _of_angle(study: Study, joint: int, motor: int, motions: Sequence[Motion]) -
 def in_band(study: Study, motion: Motion, functions: Sequence[FreeFunction]) -> dict[tuple[object, ...], Array]:
     """Basis functions along a motion in the band of the comparison, (M, k) of every key.
 
-    Parameters
-    ----------
-    study
-        Data with the filter.
-    motion
-        Motion of the arm, at the working rate.
-    functions
-        Sets of functions of all joints.
+    ``study``: data with the filter; ``motion``: motion of the arm, at the working rate; ``functions``: sets of
+    functions of all joints.
     """
     unique = {f.key: f for f in functions}
     made = [f.columns(motion) for f in unique.values()]

@@ -74,29 +74,15 @@ HINTS: dict[Kind, str] = {
 def hint_of(kind: Kind, joint: str, other: str | None, at: str) -> str:
     """Hint as a sentence.
 
-    Parameters
-    ----------
-    kind
-        Kind of dependence.
-    joint, other
-        Names of the joint, and of the joint or motor to which the variable belongs.
-    at
-        Value of the variable at the largest error, with its unit.
+    ``kind``: kind of dependence; ``joint``, ``other``: names of the joint, and of the joint or motor to which the
+    variable belongs; ``at``: value of the variable at the largest error, with its unit.
     """
     text = HINTS[kind].format(joint=joint, other=other, at=at)
     return f"{text[0].upper()}{text[1:]}."
 
 
 def unit_of(kind: Kind, joint: str) -> str:
-    """Unit of a variable.
-
-    Parameters
-    ----------
-    kind
-        Kind of dependence.
-    joint
-        Type of the joint, ``revolute`` or ``prismatic``.
-    """
+    """Unit of a variable. ``kind``: kind of dependence; ``joint``: type of the joint, ``revolute`` or ``prismatic``."""
     length = "rad" if joint == "revolute" else "m"
     match kind:
         case "velocity" | "velocity of another joint":

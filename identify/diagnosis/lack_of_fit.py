@@ -65,14 +65,8 @@ class Fitted(Protocol):
 class Curve:
     """A shape with its uncertainty.
 
-    Parameters
-    ----------
-    x
-        Values of the variable, (G,).
-    value
-        Missing torque of the model there, N m or N, (G,).
-    band
-        Two standard deviations, (G,).
+    ``x``: values of the variable, (G,); ``value``: missing torque of the model there, N m or N, (G,); ``band``: two
+    standard deviations, (G,).
     """
 
     x: Array
@@ -86,12 +80,8 @@ class Dependence:
 
     Parameters
     ----------
-    joint
-        Its name.
     kind, other
         Variable; the joint or motor to which it belongs, if it is another one.
-    unit
-        Unit of the variable.
     share
         Share of the power of the joint's held-out residual that the dependence, fitted on the training data, predicts.
         For a frequency: share of the residual at the working rate.
@@ -137,12 +127,7 @@ class Dependence:
 def dependences(state: Fitted, criteria: Criteria | None = None) -> tuple[Dependence, ...]:
     """Significant dependences of the residual, at most one for each joint and variable, largest share first.
 
-    Parameters
-    ----------
-    state
-        Fitted model.
-    criteria
-        Thresholds.
+    ``state``: fitted model.
     """
     return LackOfFit(state.fit, criteria or Criteria()).dependences
 
@@ -152,27 +137,14 @@ def unexplained(state: Fitted, criteria: Criteria | None = None) -> tuple[Depend
 
     A variable that is merely correlated with a stronger one (speed with torque, for example) is not listed again.
 
-    Parameters
-    ----------
-    state
-        Fitted model.
-    criteria
-        Thresholds.
+    ``state``: fitted model.
     """
     return LackOfFit(state.fit, criteria or Criteria()).unexplained
 
 
 @dataclass(frozen=True, eq=False)
 class LackOfFit:
-    """All tests of the residual of one fit.
-
-    Parameters
-    ----------
-    fit
-        Fit of the model.
-    criteria
-        Thresholds.
-    """
+    """All tests of the residual of one fit. ``fit``: fit of the model."""
 
     fit: Fit
     criteria: Criteria
@@ -342,7 +314,7 @@ class LackOfFit:
             band = np.concatenate([c - e.z[:, j] @ away for c, e in zip(unseen, blocks, strict=True)])
             out.append(
                 JointResidual(
-                    j, rows[j], held_rows[j], d, fit.regression.beside(full), change, residual, held_residual,
+                    j, rows[j], held_rows[j], d, fit.regression.orthogonalized(full), change, residual, held_residual,
                     band, np.concatenate([e[:, j] for e in errors]), held_rows, regressor, fit.covariance,
                 )
             )  # fmt: skip
@@ -389,12 +361,7 @@ def limited(residual: Array, joints: Sequence[slice]) -> Array:
     About a reversal the sign of a measured velocity is uncertain, and with it the whole dry friction. A few samples
     there would outweigh all others.
 
-    Parameters
-    ----------
-    residual
-        Whitened residuals of all joints, (R,).
-    joints
-        Rows of each joint.
+    ``residual``: whitened residuals of all joints, (R,); ``joints``: rows of each joint.
     """
     found = residual.copy()
     for rows in joints:

@@ -29,12 +29,8 @@ def noise_beyond(errors: Sequence[Array], functions: Sequence[Array]) -> ArModel
     Least squares removes noise in the directions of the functions, which are those of low frequency. The expected
     autocovariances of this part, by the noise model itself, are added.
 
-    Parameters
-    ----------
-    errors
-        Residual, (M,) of every stretch, zero where the joint stands still.
-    functions
-        Instruments of the model and functions of the effects, (M, k) of every stretch.
+    ``errors``: residual, (M,) of every stretch, zero where the joint stands still; ``functions``: instruments of the
+    model and functions of the effects, (M, k) of every stretch.
     """
     span = _orthonormal(functions)
     inside = sum(q.T @ e for q, e in zip(span, errors, strict=True))

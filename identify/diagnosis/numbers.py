@@ -75,21 +75,9 @@ def stale_numbers(
 ) -> list[NumbersFinding]:
     """Changes of the plant since a baseline was identified.
 
-    Parameters
-    ----------
-    fit
-        Fit of the model with all findings in structure.
-    column_cache
-        Cache of the columns of the same study.
-    baseline
-        Result of an earlier identification of the same robot.
-    alpha
-        Probability of a false alarm.
-
-    Raises
-    ------
-    DataError
-        If the baseline is of another model, or has no covariance.
+    ``fit``: fit of the model with all findings in structure; ``column_cache``: cache of the columns of the same study;
+    ``baseline``: result of an earlier identification of the same robot; ``alpha``: probability of a false alarm. Raises
+    DataError if the baseline is of another model, or has no covariance.
     """
     comparison = compared(cautious(fit), baseline)
     if not _stale(comparison, alpha):

@@ -35,11 +35,6 @@ def standard_deviations(state: ModelState) -> dict[int, dict[str, float]]:
     first-order term. Parameters from a set of whole numbers count as known. The residual
     is no white noise where an effect is only approximately right. The variances are then those of the residual along
     the influence of each parameter, if they are larger (Newey, West 1987, Econometrica 55(3)).
-
-    Parameters
-    ----------
-    state
-        The model.
     """
     fit, terms = state.fit, _terms(state)
     slopes, owners = _further_columns(state)
@@ -60,12 +55,7 @@ def p_value(state: ModelState, entry: Entry) -> float:
     it, they mean nothing. The nonlinear parameters of all others are free. The likelihood of a model can rise without
     such evidence: corrected torques have other noise, and the time at which dry friction reverses is uncertain.
 
-    Parameters
-    ----------
-    state
-        Model with the effect.
-    entry
-        Its entry in the configuration.
+    ``entry``: its entry in the configuration.
     """
     number = list(state.robot.effects).index(entry)
     every, owners = _further_columns(state)
@@ -174,9 +164,6 @@ def _covariances(fit: Fit, slopes: list[Array], own: list[int]) -> tuple[Array, 
 def variance_of_sum(products: Array) -> float:
     """Variance of the sum of serially correlated terms (R,), their mean removed.
 
-    Parameters
-    ----------
-    products
-        Terms of the sum, (R,).
+    ``products``: terms of the sum, (R,).
     """
     return float(newey_west([products - products.mean()], NEWEY_WEST_LAGS))

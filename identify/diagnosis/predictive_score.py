@@ -45,13 +45,7 @@ LEAST_ROWS = 10 * (2 * LAGS + 1)
 
 @dataclass(frozen=True, eq=False)
 class PredictiveScore:
-    """Cross-validated errors of a fitted model.
-
-    Parameters
-    ----------
-    fit
-        The fit of all training data, with its noise models.
-    """
+    """Cross-validated errors of a fitted model. ``fit``: the fit of all training data, with its noise models."""
 
     fit: Fit
 
@@ -130,13 +124,7 @@ class PredictiveScore:
         return [None if r is None or r.size != rigid else self.folds[:, :rigid] - r for r in references]
 
     def innovations(self, noise: Sequence[ArModel]) -> Array:
-        """Mean squares of the innovations of each joint under noise models, (N m)^2 or N^2, (n,).
-
-        Parameters
-        ----------
-        noise
-            Noise model of each joint.
-        """
+        """Mean squares of the innovations of each joint under noise models, (N m)^2 or N^2, (n,)."""
         return np.array(
             [
                 ar.variance * float(np.mean(np.concatenate([ar.whiten(part) for part in parts]) ** 2))
@@ -174,24 +162,12 @@ class PredictiveScore:
         return self.fit.study.volume
 
     def log_likelihoods_under(self, noise: Sequence[ArModel]) -> Array:
-        """Log-likelihood of the data of each joint under noise models, without constants of these data, (n,).
-
-        Parameters
-        ----------
-        noise
-            Noise model of each joint.
-        """
+        """Log-likelihood of the data of each joint under noise models, without constants of these data, (n,)."""
         own = np.maximum(self.innovations(noise), 1e-300)
         return np.asarray(self.rows * (self.volume - 0.5 * np.log(own)))
 
     def log_likelihood_under(self, noise: Sequence[ArModel]) -> float:
-        """Log-likelihood of the data of all joints, see `log_likelihoods_under`.
-
-        Parameters
-        ----------
-        noise
-            Noise model of each joint.
-        """
+        """Log-likelihood of the data of all joints, see `log_likelihoods_under`."""
         return float(self.log_likelihoods_under(noise).sum())
 
     def inflation_over(self, other: "PredictiveScore", noise: Sequence[ArModel]) -> Array:
@@ -200,12 +176,7 @@ class PredictiveScore:
         Noise that changes slowly leaves correlation in the innovations which an autoregressive model of limited order
         does not take. Block sums contain it, whatever its form (Kuensch 1989, Annals of Statistics 17(3)). At least 1.
 
-        Parameters
-        ----------
-        other
-            Score of the model without the effect in question.
-        noise
-            Noise model of each joint.
+        ``other``: score of the model without the effect in question.
         """
         found = []
         for ar, own, less in zip(noise, self._parts, other._parts, strict=True):
@@ -219,13 +190,8 @@ class PredictiveScore:
     def gain_over(self, other: "PredictiveScore", noise: Sequence[ArModel]) -> float:
         """Gain of log-likelihood over another model, both under the same noise models.
 
-        Parameters
-        ----------
-        other
-            Score of the model without the effect in question.
-        noise
-            Noise model of each joint: of a model in which nothing is missing, as far as known. Others would take what
-            is missing for noise.
+        ``other``: score of the model without the effect in question. ``noise``: noise model of each joint: of a model
+        in which nothing is missing, as far as known. Others would take what is missing for noise.
         """
         own, less = self.innovations(noise), other.innovations(noise)
         rows = self.rows
@@ -235,13 +201,7 @@ class PredictiveScore:
 
 
 def fold_of(rows: int) -> NDArray[np.int64]:
-    """Return the fold of each row, (R,).
-
-    Parameters
-    ----------
-    rows
-        Number of rows, R.
-    """
+    """Return the fold of each row, (R,)."""
     return np.arange(rows) * BLOCKS // max(rows, 1) % FOLDS
 
 
@@ -252,10 +212,7 @@ def references_of(fit: Fit) -> tuple[Array | None, ...]:
     appears in the errors of a fit with the opposite sign. Real motion does not appear there (errors in variables:
     Fuller 1987, section 1.2).
 
-    Parameters
-    ----------
-    fit
-        Fit of the model to which nothing is added yet.
+    ``fit``: fit of the model to which nothing is added yet.
     """
     theta = fit.theta[: fit.theta.size - fit.study.model.e]
     found: list[Array | None] = []
@@ -276,14 +233,7 @@ def noise_of_motion(joint: JointEquations, rows: Array, theta: Array) -> Array:
     Simulated torques follow the measured ones through a short filter, as simulated and real loop differ a little. What
     that filter does not give is noise of the measured motion, or motion that disturbances caused.
 
-    Parameters
-    ----------
-    joint
-        Equations of the joint.
-    rows
-        Their rows in one stretch, (M, x + z + 1).
-    theta
-        Sets of rigid parameters, (k, b - e).
+    ``rows``: their rows in one stretch, (M, x + z + 1); ``theta``: sets of rigid parameters, (k, b - e).
     """
     if rows.shape[0] < LEAST_ROWS:
         return np.zeros((rows.shape[0], theta.shape[0]))

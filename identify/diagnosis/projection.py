@@ -39,8 +39,6 @@ class Projection:
     ----------
     function, columns
         Set of functions, ``None`` for all functions of the motion together; numbers of the columns.
-    joint
-        Number of the joint.
     p_train
         Probability of so large a projection of the training residual on all directions of the set, from noise alone.
     p_held
@@ -79,8 +77,6 @@ class JointResidual:
 
     Parameters
     ----------
-    joint
-        Number of the joint.
     rows, held_rows
         Its rows among those of all joints.
     d
@@ -118,10 +114,7 @@ class JointResidual:
     def directions(self, columns: NDArray[np.int64]) -> tuple[Array, Array, Array] | None:
         """Orthonormal directions (R, r) of some functions beyond the model, their coefficients (k, r), and powers (r,).
 
-        Parameters
-        ----------
-        columns
-            Numbers of the functions, (k,).
+        ``columns``: numbers of the functions, (k,).
         """
         d, z = self.d[:, columns], self.z[:, columns]
         scale = np.linalg.norm(d, axis=0)
@@ -139,10 +132,7 @@ class JointResidual:
     def beyond(self, columns: NDArray[np.int64]) -> "JointResidual":
         """Residual and functions orthogonal to some of the functions, too.
 
-        Parameters
-        ----------
-        columns
-            Numbers of the functions that the model takes in, (k,).
+        ``columns``: numbers of the functions that the model takes in, (k,).
         """
         found = self.directions(columns)
         if found is None:
@@ -166,12 +156,8 @@ class JointResidual:
     def projection(self, function: FreeFunction | None, columns: NDArray[np.int64]) -> Projection | None:
         """Projection of the residual on one set of functions; ``None`` if the model contains it.
 
-        Parameters
-        ----------
-        function
-            Set of functions; ``None`` for all functions of the motion together.
-        columns
-            Numbers of its columns, (k,).
+        ``function``: set of functions; ``None`` for all functions of the motion together. ``columns``: numbers of its
+        columns, (k,).
         """
         found = self.directions(columns) if columns.size else None
         if found is None:
@@ -214,14 +200,8 @@ def significance(u: Array, e: Array, estimate: Array) -> tuple[float, float]:
     The power of correlated normal variables is approximated by a scaled chi-square (Box 1954, Annals of Mathematical
     Statistics 25(2)) whose scale comes from block sums.
 
-    Parameters
-    ----------
-    u
-        Directions, (R, r).
-    e
-        Whitened residual, (R,).
-    estimate
-        Projection of the residual on the directions, (r,).
+    ``u``: directions, (R, r); ``e``: whitened residual, (R,); ``estimate``: projection of the residual on the
+    directions, (r,).
     """
     edges = np.arange(BLOCKS + 1) * e.size // BLOCKS
     sums, white = [], 0.0
@@ -244,12 +224,7 @@ def significance(u: Array, e: Array, estimate: Array) -> tuple[float, float]:
 def inflation_of_sums(change: Array, e: Array) -> float:
     """Variance of block sums of ``change * e`` over that of white noise.
 
-    Parameters
-    ----------
-    change
-        Change of prediction, (R,).
-    e
-        Whitened residual orthogonal to it, (R,).
+    ``change``: change of prediction, (R,); ``e``: whitened residual orthogonal to it, (R,).
     """
     edges = np.arange(BLOCKS) * e.size // BLOCKS
     sums, weights = np.add.reduceat(change * e, edges), np.add.reduceat(change**2, edges)
@@ -270,16 +245,9 @@ def smoothing(estimate: Array, through: Array, power: Array, function: FreeFunct
     likelihood (thesis section 7.3.2; Young, McKenna, Bruun 2001, Int. J. Control 74(18)). That is a spline penalised on
     its second differences. All functions together are penalised on the size of their coefficients.
 
-    Parameters
-    ----------
-    estimate
-        Estimate of unit variance in every direction, (r,).
-    through
-        Coefficients of the directions, (k, r).
-    power
-        Power of each direction beyond the model over that of the functions, (r,).
-    function
-        Set of functions; ``None`` for all functions of the motion together.
+    ``estimate``: estimate of unit variance in every direction, (r,). ``through``: coefficients of the directions,
+    (k, r). ``power``: power of each direction beyond the model over that of the functions, (r,). ``function``: set of
+    functions; ``None`` for all functions of the motion together.
     """
     if function is None:
         roughness, axes = 1.0 / power, np.eye(power.size)

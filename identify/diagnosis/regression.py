@@ -35,14 +35,7 @@ PASSES = 3
 class Fit:
     """Parameters, noise models, and the whitened rows of both parts of the data.
 
-    Parameters
-    ----------
-    study
-        Data with the model.
-    equations
-        Rows before whitening.
-    regression
-        Regression of the training rows.
+    ``equations``: rows before whitening; ``regression``: regression of the training rows.
     """
 
     study: Study
@@ -74,27 +67,14 @@ class Fit:
     def renoised(self, noise: Sequence[ArModel]) -> "Fit":
         """The fit with other noise models.
 
-        Parameters
-        ----------
-        noise
-            Noise model of each joint.
-
-        Raises
-        ------
-        DataError
-            If the equations are singular with them.
+        ``noise``: noise model of each joint. Raises DataError if the equations are singular with them.
         """
         return solved(self.study, self.equations, noise, self.regression)
 
     def errors(self, theta: Array, *, held: bool) -> list[Array]:
         """``y - X theta`` at measured signals in the band of the comparison, (M, n) of every stretch, N m or N.
 
-        Parameters
-        ----------
-        theta
-            Parameters, (b,).
-        held
-            True for the held-out data, false for the training data.
+        ``theta``: parameters, (b,); ``held``: True for the held-out data, false for the training data.
         """
         return residuals(self.equations.held if held else self.equations.train, theta)
 
@@ -104,13 +84,7 @@ class Fit:
         return self.errors(self.theta, held=False)
 
     def own_noise(self, max_order: int) -> tuple[ArModel, ...]:
-        """Noise models of the residual of the training rows, one for each joint.
-
-        Parameters
-        ----------
-        max_order
-            Highest order tried.
-        """
+        """Noise models of the residual of the training rows, one for each joint. ``max_order``: highest order tried."""
         return tuple(ar_models(self.left, max_order, parameters=self.theta.size))
 
     @cached_property
@@ -139,19 +113,9 @@ class Fit:
 def fit(study: Study, theta0: Array | None = None, noise: Sequence[ArModel] | None = None) -> Fit:
     """Alternate instrumental variables and AR noise models (thesis sections 2.3.3 and 6.1.3).
 
-    Parameters
-    ----------
-    study
-        Data with the model.
-    theta0
-        Parameters (b,) that predict the torques on which terms depend; ``None`` if no term does.
-    noise
-        Noise models; ``None``: start with white noise, and alternate.
-
-    Raises
-    ------
-    DataError
-        If the training motion leaves parameters undetermined.
+    ``theta0``: parameters (b,) that predict the torques on which terms depend; ``None`` if no term does. ``noise``:
+    noise models; ``None``: start with white noise, and alternate. Raises DataError if the training motion leaves
+    parameters undetermined.
     """
     equations = Equations(study, theta0)
     if noise is None:
@@ -173,11 +137,6 @@ def safe(found: Fit) -> Fit:
 
     Weights of a strongly coloured noise emphasise frequencies at which the simulated and the measured motion may have
     little in common. The instruments are weak there, and the estimate is far from any that fits the data.
-
-    Parameters
-    ----------
-    found
-        The fit.
     """
     white = found.renoised([ArModel(np.empty(0), ar.variance, 0.0) for ar in found.noise])
     most = MOST_WEIGHTED * _rms(white)
@@ -196,15 +155,7 @@ def _rms(found: Fit) -> Array:
 def require_solution(found: Fit) -> None:
     """Refuse a model whose parameters the motion leaves undetermined.
 
-    Parameters
-    ----------
-    found
-        Fit of the model.
-
-    Raises
-    ------
-    DataError
-        If the instruments do not determine all parameters.
+    Raises DataError if the instruments do not determine all parameters.
     """
     values = np.linalg.svd(found.regression.solution.cross, compute_uv=False)
     if not np.isfinite(found.theta).all() or values[-1] < SINGULAR * values[0]:
@@ -214,21 +165,9 @@ def require_solution(found: Fit) -> None:
 def solved(study: Study, equations: Equations, noise: Sequence[ArModel], known: IvRegression | None = None) -> Fit:
     """Parameters by instrumental variables under given noise models.
 
-    Parameters
-    ----------
-    study
-        Data with the model.
-    equations
-        Equations of all stretches.
-    noise
-        Noise model of each joint.
-    known
-        Regression of the same equations under other noise models.
-
-    Raises
-    ------
-    DataError
-        If the equations are singular: a parameter has no effect on the torques, for example.
+    ``equations``: equations of all stretches; ``noise``: noise model of each joint; ``known``: regression of the same
+    equations under other noise models. Raises DataError if the equations are singular: a parameter has no effect on the
+    torques, for example.
     """
     found = Fit(study, equations, IvRegression.of(equations, noise, known))
     try:
@@ -241,14 +180,8 @@ def solved(study: Study, equations: Equations, noise: Sequence[ArModel], known: 
 def relative_errors(fit: Fit, theta: Array | None = None, *, held: bool) -> tuple[float, Array]:
     """``|y - X theta| / |y|`` in percent in the band of the comparison, overall and of each joint (n,).
 
-    Parameters
-    ----------
-    fit
-        Fit with data and model.
-    theta
-        Parameters (b,); ``None``: those of the fit.
-    held
-        True for the held-out data, false for the training data.
+    ``fit``: fit with data and model. ``theta``: parameters (b,); ``None``: those of the fit. ``held``: True for the
+    held-out data, false for the training data.
     """
     y = np.concatenate([s.y for s in (fit.study.held if held else fit.study.train)])
     error = np.concatenate(fit.errors(fit.theta if theta is None else theta, held=held))

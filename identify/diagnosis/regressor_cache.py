@@ -14,13 +14,7 @@ MOST_BYTES = 2**28
 
 @dataclass
 class RegressorCache:
-    """Arrays computed from signals, the most recently used ones.
-
-    Parameters
-    ----------
-    most_bytes
-        Memory for the arrays, bytes.
-    """
+    """Arrays computed from signals, the most recently used ones. ``most_bytes``: memory for the arrays, bytes."""
 
     most_bytes: int = MOST_BYTES
     _kept: dict[Hashable, tuple[object, Arrays]] = field(default_factory=dict)
@@ -29,14 +23,8 @@ class RegressorCache:
     def get(self, key: Hashable, signals: object, made: Callable[[], Arrays]) -> Arrays:
         """Return the arrays of a key; computed where the cache does not have them.
 
-        Parameters
-        ----------
-        key
-            All that the arrays depend on, with the identity of the signals.
-        signals
-            The signals. The cache keeps them: their identity is theirs only while they exist.
-        made
-            Computes the arrays.
+        ``key``: all that the arrays depend on, with the identity of the signals. ``signals``: the signals. The cache
+        keeps them: their identity is theirs only while they exist.
         """
         kept = self._kept.pop(key, None)
         if kept is None:

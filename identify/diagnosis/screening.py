@@ -32,14 +32,7 @@ REFINEMENTS = 12
 def screened(fit: Fit, candidate: Candidate, column_cache: ColumnCache) -> tuple[float, Shapes] | None:
     """Best score statistic of a candidate on its grid, by the training data, and the nonlinear parameters there.
 
-    Parameters
-    ----------
-    fit
-        Fit of the model.
-    candidate
-        Candidate with its grid.
-    column_cache
-        Cache of the columns of the same fit.
+    ``fit``: fit of the model; ``column_cache``: cache of the columns of the same fit.
     """
     if not candidate.grid:
         return None
@@ -56,21 +49,9 @@ def screened(fit: Fit, candidate: Candidate, column_cache: ColumnCache) -> tuple
 def score_statistics(fit: Fit, columns: Sequence[tuple[int, Array]], count: int, sign: int = 0) -> Array:
     """Power of the training residual along groups of instruments orthogonal to the model's own, (G,).
 
-    Parameters
-    ----------
-    fit
-        Fit of the model.
-    columns
-        Whitened instruments (R, G k) of each joint on which they act, with its number, group after group.
-    count
-        Number of groups, G.
-    sign
-        +1 or -1: sign of the parameter of a group of one, which physics determines; 0: none.
-
-    Returns
-    -------
-    ndarray
-        Zero where the parameter would have the wrong sign. Not a number where the model contains a group.
+    ``columns``: whitened instruments (R, G k) of each joint on which they act, with its number, group after group.
+    ``sign``: +1 or -1: sign of the parameter of a group of one, which physics determines; 0: none. Returns zero where
+    the parameter would have the wrong sign. Not a number where the model contains a group.
     """
     if not columns:
         return np.full(count, np.nan)
@@ -78,7 +59,7 @@ def score_statistics(fit: Fit, columns: Sequence[tuple[int, Array]], count: int,
     able = np.isfinite(size) & (size > 0.0)
     scale = np.where(able, size, np.inf)
     scaled = [(j, np.where(able, own, 0.0) / scale) for j, own in columns]
-    gram, score = fit.regression.products_beside(scaled, count)
+    gram, score = fit.regression.orthogonal_products(scaled, count)
     power, right = np.linalg.eigh(gram)
     kept = power > RANK_TOLERANCE**2
     along = np.einsum("gij,gi->gj", right, score)
@@ -92,14 +73,8 @@ def score_statistics(fit: Fit, columns: Sequence[tuple[int, Array]], count: int,
 def score_statistic(fit: Fit, columns: Sequence[tuple[int, Array]], sign: int = 0) -> float | None:
     """Score statistic of one group of instruments; ``None`` if the model contains it.
 
-    Parameters
-    ----------
-    fit
-        Fit of the model.
-    columns
-        Whitened instruments (R, k) of each joint on which they act, with its number.
-    sign
-        See `score_statistics`.
+    ``columns``: whitened instruments (R, k) of each joint on which they act, with its number; ``sign``: see
+    `score_statistics`.
     """
     found = float(score_statistics(fit, columns, 1, sign)[0])
     return None if np.isnan(found) else found
@@ -110,21 +85,12 @@ def contained(fit: Fit, candidate: Candidate, column_cache: ColumnCache, shapes:
 
     None if these are all: an effect keeps one parameter, which is then zero.
 
-    Parameters
-    ----------
-    fit
-        Fit of the model.
-    candidate
-        The candidate.
-    column_cache
-        Cache of the columns of the same fit.
-    shapes
-        Nonlinear parameters of the candidate.
+    ``column_cache``: cache of the columns of the same fit; ``shapes``: nonlinear parameters of the candidate.
     """
     columns = column_cache.grid(candidate.effect, candidate.place, (shapes,), fit.noise, keep=False)
     size = np.sqrt(np.sum([np.einsum("ij,ij->j", own, own) for _, own in columns], axis=0))
     size = np.where(size > 0.0, size, 1.0)
-    gram = fit.regression.products_beside([(j, own / size) for j, own in columns], 1)[0][0]
+    gram = fit.regression.orthogonal_products([(j, own / size) for j, own in columns], 1)[0][0]
     kept: list[int] = []
     present = candidate.effect.present(dict(shapes))
     for k in present:
@@ -137,17 +103,12 @@ def contained(fit: Fit, candidate: Candidate, column_cache: ColumnCache, shapes:
 def directions_beside(fit: Fit, instruments: Array) -> tuple[Array, Array, Array] | None:
     """Orthonormal directions (R, r) of instruments orthogonal to the model's, and their map (k, r) with scales (k,).
 
-    Parameters
-    ----------
-    fit
-        Fit of the model.
-    instruments
-        Whitened instruments, (R, k).
+    ``instruments``: whitened instruments, (R, k).
     """
     scale = np.linalg.norm(instruments, axis=0)
     if np.any(scale == 0) or not np.isfinite(scale).all():
         return None
-    beside = fit.regression.beside(instruments / scale)
+    beside = fit.regression.orthogonalized(instruments / scale)
     # Through the small Gram matrix: candidates have a few columns and many rows.
     power, right = np.linalg.eigh(beside.T @ beside)
     kept = power > RANK_TOLERANCE**2
@@ -160,16 +121,8 @@ def directions_beside(fit: Fit, instruments: Array) -> tuple[Array, Array, Array
 def refined(fit: Fit, candidate: Candidate, column_cache: ColumnCache, best: tuple[float, Shapes]) -> Shapes:
     """Nonlinear parameters between those of the grid, one continuous parameter after the other, on a logarithmic scale.
 
-    Parameters
-    ----------
-    fit
-        Fit of the model.
-    candidate
-        Candidate with its grid.
-    column_cache
-        Cache of the columns of the same fit.
-    best
-        Score statistic and nonlinear parameters of the grid, the start.
+    ``fit``: fit of the model; ``column_cache``: cache of the columns of the same fit; ``best``: score statistic and
+    nonlinear parameters of the grid, the start.
     """
     found = best
     for k, free in enumerate(candidate.effect.refinable(fit.study.robot, candidate.place)):
@@ -198,12 +151,7 @@ def refined(fit: Fit, candidate: Candidate, column_cache: ColumnCache, best: tup
 def replaced(shapes: Shapes, k: int, value: float) -> Shapes:
     """Nonlinear parameters with another value of the k-th.
 
-    Parameters
-    ----------
-    shapes
-        Pairs of name and value.
-    k, value
-        Number of the parameter, and its new value.
+    ``shapes``: pairs of name and value; ``k``, ``value``: number of the parameter, and its new value.
     """
     return (*shapes[:k], (shapes[k][0], value), *shapes[k + 1 :])
 
@@ -211,12 +159,7 @@ def replaced(shapes: Shapes, k: int, value: float) -> Shapes:
 def noise_beyond_shapes(fit: Fit, column_cache: ColumnCache) -> list[ArModel]:
     """Noise models of the residual without smooth functions of each joint's own motion.
 
-    Parameters
-    ----------
-    fit
-        Fit of the model.
-    column_cache
-        Cache of the columns of the same fit.
+    ``column_cache``: cache of the columns of the same fit.
     """
     errors = fit.errors(fit.theta, held=False)
     columns = [

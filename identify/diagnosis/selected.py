@@ -41,12 +41,7 @@ class Selected:
     def conventional(self, state: ModelState, uncertain: float) -> bool:
         """True if the effect is a part of every model, or within the sampling convention of drives: no finding.
 
-        Parameters
-        ----------
-        state
-            Final model.
-        uncertain
-            Time by which the common instant of all torques is uncertain, s.
+        ``state``: final model; ``uncertain``: time by which the common instant of all torques is uncertain, s.
         """
         effect = self.addition.candidate.effect
         if of_recording(self.entry):

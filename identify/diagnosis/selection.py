@@ -57,8 +57,6 @@ class StepwiseSelection:
     ----------
     study
         Data with the model as configured.
-    criteria
-        Thresholds.
     progress
         Called with the name of each step.
     deadline
@@ -85,10 +83,7 @@ class StepwiseSelection:
     def start(self) -> ModelState:
         """Model as configured, with the transition of dry friction at reversals where the configuration leaves it free.
 
-        Raises
-        ------
-        DataError
-            If the motion does not determine the parameters of the model.
+        Raises DataError if the motion does not determine the parameters of the model.
         """
         state = self._aligned(fitted(self.study, self.study.robot, None))
         self.study = state.study
@@ -102,15 +97,8 @@ class StepwiseSelection:
     def run(self, first: ModelState) -> tuple[ModelState, tuple[Selected, ...]]:
         """Select effects.
 
-        Parameters
-        ----------
-        first
-            Model to start from, of `start`.
-
-        Returns
-        -------
-        tuple
-            Model with the effects, and the effects: those with a name first, then by reduction of the errors.
+        ``first``: model to start from, of `start`. Returns the model with the effects, and the effects: those with a
+        name first, then by reduction of the errors.
         """
         state = first
         found: tuple[Selected, ...] = ()
@@ -149,13 +137,8 @@ class StepwiseSelection:
     def step(self, state: ModelState, contested: Contested | None = None) -> Step:
         """Compare all candidates in a model.
 
-        Parameters
-        ----------
-        state
-            Model without them.
-        contested
-            Finding that the model is without, if only effects that could take its place are compared: those that act
-            on a joint on which it acts, and do not promise much less.
+        ``state``: model without them; ``contested``: finding that the model is without, if only effects that could take
+        its place are compared: those that act on a joint on which it acts, and do not promise much less.
         """
         key = _key(state.robot)
         if key in self._steps:
@@ -188,13 +171,7 @@ class StepwiseSelection:
         return len(self._steps)
 
     def last(self, state: ModelState) -> Step | None:
-        """Comparison of all candidates in a model, if it has been made.
-
-        Parameters
-        ----------
-        state
-            The model.
-        """
+        """Comparison of all candidates in a model, if it has been made."""
         return self._steps.get(_key(state.robot))
 
     def passes(self, addition: Addition, tests: int) -> bool:
@@ -204,12 +181,7 @@ class StepwiseSelection:
         no null distribution is needed. The parameters of the effect differ from zero at the same level by their own
         standard deviations.
 
-        Parameters
-        ----------
-        addition
-            The addition.
-        tests
-            Number of candidates among which it was found.
+        ``tests``: number of candidates among which it was found.
         """
         return (
             addition.allowed
@@ -226,11 +198,6 @@ class StepwiseSelection:
         that is too small to be a finding counts. A term without a name claims no cause. An effect with a name comes
         first if it explains most of what the best term without a name does. Of the laws of one effect that predict as
         well, that with the fewest parameters comes first, and a free shape last.
-
-        Parameters
-        ----------
-        step
-            The step.
         """
         able = [a for a in step.passing if not (a.named and self._superseded(a, step))]
         if not able:
@@ -309,12 +276,7 @@ class StepwiseSelection:
     def _superfluous(self, state: ModelState, less: ModelState, tests: int) -> bool:
         """True if a finding is insignificant or immaterial beside the others of a model.
 
-        Parameters
-        ----------
-        state, less
-            Models with and without it.
-        tests
-            Number of candidates among which it was found.
+        ``state``, ``less``: models with and without it; ``tests``: number of candidates among which it was found.
         """
         share, changed = materiality(less, state)
         material = share >= self.criteria.least_share and changed >= self.criteria.material_pct
@@ -328,12 +290,7 @@ class StepwiseSelection:
         A rival makes the finding superfluous; an effect beside which it stays explains something else. No exchange
         returns to an earlier model: each could prefer its own noise models.
 
-        Parameters
-        ----------
-        state, found
-            Model with the findings, and the findings.
-        changed
-            Joints whose models changed since the findings last competed, (n,); ``None`` for all.
+        ``changed``: joints whose models changed since the findings last competed, (n,); ``None`` for all.
         """
         self._visited.add(_key(state.robot))
         for one in found:

@@ -55,10 +55,7 @@ class SetupStage:
     def as_configured(self, gap: Gap) -> Gap:
         """Gap of the model in the set-up as configured, from that in the corrected one.
 
-        Parameters
-        ----------
-        gap
-            Relative errors of the model in the corrected set-up.
+        ``gap``: relative errors of the model in the corrected set-up.
         """
         if not self.findings:
             return gap
@@ -76,22 +73,14 @@ class SetupStage:
     def doubtful(self, gap: Gap) -> list[Unexplained]:
         """Entries of the joints that are not understood with the effects found, either.
 
-        Parameters
-        ----------
-        gap
-            Held-out errors of the model with the effects found.
+        ``gap``: held-out errors of the model with the effects found.
         """
         return [entry for entry in self.unexplained if gap.by_joint[entry.joint] > 100 * NOT_UNDERSTOOD]
 
     def named(self, findings: Sequence[Finding], gap: Gap) -> list[Finding]:
         """Findings of the set-up, then those at joints that are understood.
 
-        Parameters
-        ----------
-        findings
-            Effects found in the corrected set-up.
-        gap
-            Held-out errors of the model with them.
+        ``findings``: effects found in the corrected set-up; ``gap``: held-out errors of the model with them.
         """
         joints = {entry.joint for entry in self.doubtful(gap)}
         return [*self.findings, *(f for f in findings if f.joint not in joints)]
@@ -99,12 +88,8 @@ class SetupStage:
     def left(self, unexplained: Sequence[Unexplained], gap: Gap) -> list[Unexplained]:
         """Joints that are not understood, then the dependences at the others.
 
-        Parameters
-        ----------
-        unexplained
-            Remaining dependences of the residual.
-        gap
-            Held-out errors of the model with the effects found.
+        ``unexplained``: remaining dependences of the residual; ``gap``: held-out errors of the model with the effects
+        found.
         """
         doubtful = self.doubtful(gap)
         joints = {entry.joint for entry in doubtful}
@@ -114,17 +99,8 @@ class SetupStage:
 def set_up(training: Sequence[Experiment], validation: Sequence[Experiment], robot: RobotConfig) -> SetupStage:
     """Check the set-up and correct its mistakes.
 
-    Parameters
-    ----------
-    training, validation
-        Experiments of a diagnosis.
-    robot
-        The configuration.
-
-    Raises
-    ------
-    DataError
-        If nothing moves, or the recordings do not fit together.
+    ``training``, ``validation``: experiments of a diagnosis. Raises DataError if nothing moves, or the recordings do
+    not fit together.
     """
     check = check_setup([*training, *validation], robot)
     shift = check.torque_shift

@@ -29,16 +29,8 @@ def both_ends(fit: Fit, candidate: Candidate, column_cache: ColumnCache, shapes:
 
     Simulated signals are those of a loop without the effect, and measured ones contain noise that it amplifies.
 
-    Parameters
-    ----------
-    fit
-        Fit of the model.
-    candidate
-        Candidate with its grid.
-    column_cache
-        Cache of the columns of the same fit.
-    shapes
-        Nonlinear parameters by simulated signals.
+    ``fit``: fit of the model; ``candidate``: candidate with its grid; ``column_cache``: cache of the columns of the
+    same fit; ``shapes``: nonlinear parameters by simulated signals.
     """
     found = instrumented(fit, candidate, column_cache, shapes)
     return (shapes,) if found == shapes else (found, shapes)
@@ -50,16 +42,8 @@ def instrumented(fit: Fit, candidate: Candidate, column_cache: ColumnCache, shap
     Those of effects that depend on the motion alone stay. That motion is simulated well, and measured velocities are
     least accurate around standstill, where friction changes most.
 
-    Parameters
-    ----------
-    fit
-        Fit of the model.
-    candidate
-        Candidate with its grid.
-    column_cache
-        Cache of the columns of the same fit.
-    shapes
-        Start: the best values at simulated signals.
+    ``fit``: fit of the model; ``column_cache``: cache of the columns of the same fit; ``shapes``: start: the best
+    values at simulated signals.
     """
     found = shapes
     if not candidate.effect.depends_on_torque:

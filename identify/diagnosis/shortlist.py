@@ -24,12 +24,8 @@ Starts = tuple[float, ...]
 class Contested:
     """A finding with which other effects compete.
 
-    Parameters
-    ----------
-    gain
-        Its gain of log-likelihood beside the other findings, nats.
-    joints
-        Joints on whose torques it acts, (n,). An effect that acts on none of them cannot take its place.
+    ``gain``: its gain of log-likelihood beside the other findings, nats. ``joints``: joints on whose torques it acts,
+    (n,). An effect that acts on none of them cannot take its place.
     """
 
     gain: float
@@ -40,15 +36,8 @@ class Contested:
 class Shortlist:
     """Candidates of a step that are tested in their own closed loops.
 
-    Parameters
-    ----------
-    chosen
-        The candidates, each with its nonlinear parameters, or with the values from which its correction of recorded
-        torques starts.
-    tests
-        Number of all candidates.
-    hidden
-        Candidates that the motion does not show.
+    ``chosen``: the candidates, each with its nonlinear parameters, or with the values from which its correction of
+    recorded torques starts; ``hidden``: candidates that the motion does not show.
     """
 
     chosen: list[tuple[Candidate, Shapes, Starts]]
@@ -59,14 +48,8 @@ class Shortlist:
 def shortlist(state: ModelState, criteria: Criteria, contested: Contested | None) -> Shortlist:
     """Return the candidates with the highest statistics less their numbers of parameters.
 
-    Parameters
-    ----------
-    state
-        Model without them.
-    criteria
-        Thresholds.
-    contested
-        Finding that the model is without, if only effects that could take its place are compared.
+    ``state``: model without them; ``contested``: finding that the model is without, if only effects that could take its
+    place are compared.
     """
     column_cache = ColumnCache(state.study, state.fit.theta)
     noise = state.fit.renoised(state.weights)

@@ -38,8 +38,6 @@ class Line:
 
     Parameters
     ----------
-    frequency
-        Frequency, Hz.
     p_train, p_held
         Probability of such a line in the training residual at any frequency, and in the held-out one at this frequency,
         without a line.
@@ -70,14 +68,7 @@ class Line:
 def residuals(study: Study, stretches: Sequence[Stretch], theta: Array) -> list[Array]:
     """Torques less those of the model at the working rate, (N, n) each, N m or N.
 
-    Parameters
-    ----------
-    study
-        Data with the model.
-    stretches
-        Stretches of the study.
-    theta
-        Parameters of the model, (b,).
+    ``stretches``: stretches of the study; ``theta``: parameters of the model, (b,).
     """
     return [s.torque - study.torques(s, "measured", theta) for s in stretches]
 
@@ -85,10 +76,7 @@ def residuals(study: Study, stretches: Sequence[Stretch], theta: Array) -> list[
 def bandwidth_of_motion(study: Study) -> float:
     """Bandwidth of the motion, Hz; below it the repeatable part of the residual has lines, too.
 
-    Parameters
-    ----------
-    study
-        Data with the filter of the comparison.
+    ``study``: data with the filter of the comparison.
     """
     return 0.5 / (study.dt * study.decimation.factor * BAND)
 
@@ -96,12 +84,7 @@ def bandwidth_of_motion(study: Study) -> float:
 def lines_of_joints(study: Study, theta: Array) -> Iterator[tuple[int, Line]]:
     """Strongest line of each joint above the frequencies of the motion that the references do not contain.
 
-    Parameters
-    ----------
-    study
-        Data with the model.
-    theta
-        Parameters of the model, (b,).
+    ``theta``: parameters of the model, (b,).
     """
     train, held = (residuals(study, part, theta) for part in (study.train, study.held))
     lowest = bandwidth_of_motion(study)
@@ -117,14 +100,7 @@ def strongest_line(train: Sequence[Array], held: Sequence[Array], dt: float, low
     Without a line, the power at a frequency over that of its surroundings has an F-distribution. Its phase may differ
     from one stretch to the next.
 
-    Parameters
-    ----------
-    train, held
-        Residuals, (N,) each.
-    dt
-        Sampling period, s.
-    lowest
-        Lowest frequency of the search, Hz.
+    ``train``, ``held``: residuals, (N,) each; ``lowest``: lowest frequency of the search, Hz.
     """
     spectra = [_Spectrum.of(e, dt) for e in train]
     size = max(s.power.size for s in spectra)
@@ -159,12 +135,7 @@ def of_references(study: Study, frequency: float) -> bool:
     Set points have a rate of their own, and the arm follows them. The motion modulates the line, so its width is a
     share of the bandwidth of the motion.
 
-    Parameters
-    ----------
-    study
-        Data with the references.
-    frequency
-        Frequency of the line, Hz.
+    ``study``: data with the references.
     """
     wide = MODULATED * bandwidth_of_motion(study)
     for reference in study.auxiliary.references:
@@ -194,15 +165,7 @@ class _Spectrum:
 
     @classmethod
     def of(cls, e: Array, dt: float) -> "_Spectrum":
-        """Return the spectrum of a series with a Hann window.
-
-        Parameters
-        ----------
-        e
-            Series, (N,).
-        dt
-            Sampling period, s.
-        """
+        """Return the spectrum of a series with a Hann window. ``e``: series, (N,)."""
         window = hann_window(e.size)
         windowed = window * (e - e.mean())
         power = periodogram(windowed, PADDING)
@@ -213,12 +176,6 @@ class _Spectrum:
         return cls(f, power, background, 2.0 / float(window.sum()) ** 2, windowed, dt)
 
     def at(self, frequency: float) -> tuple[float, float]:
-        """Return power and background at any frequency.
-
-        Parameters
-        ----------
-        frequency
-            Frequency, Hz.
-        """
+        """Return power and background at any frequency."""
         turning = np.exp(-2j * np.pi * frequency * self.dt * np.arange(self.windowed.size))
         return float(np.abs(self.windowed @ turning) ** 2), float(np.interp(frequency, self.f, self.background))

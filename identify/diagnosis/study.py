@@ -67,18 +67,12 @@ class Study:
 
     Parameters
     ----------
-    robot
-        The robot as configured.
-    model
-        Its model.
     decimation
         Filter and decimation from the working rate to the rate of the comparison.
     dt
         Sampling period of the working rate, s.
     duration
         Duration of all recordings, s.
-    train, held
-        Training and held-out stretches.
     loop
         Kind of controller of the closed loop that gives the instruments.
     auxiliary
@@ -131,12 +125,7 @@ class Study:
         """The same recordings for another model, corrected again where its effect entries require other corrections.
 
         Other corrections of torques leave the controller and the simulated motion as they are: instruments need not be
-        exact. Other wiring is another arm.
-
-        Raises
-        ------
-        DataError
-            If no closed loop can be simulated with other wiring.
+        exact. Other wiring is another arm. Raises DataError if no closed loop can be simulated with other wiring.
         """
         changed = replace(self, robot=robot, model=self.model.with_effects_of(robot, terms_of(robot)))
         if changed.recorded == self.recorded:
@@ -147,10 +136,7 @@ class Study:
     def with_torque_shift(self, samples: float) -> "Study":
         """The study with torques that are late by another time.
 
-        Parameters
-        ----------
-        samples
-            Shift of all torques, see `armident.identify.experiment.Experiment`.
+        ``samples``: shift of all torques, see `armident.identify.experiment.Experiment`.
         """
         training, validation = ([replace(e, torque_shift=samples) for e in part] for part in self.sources)
         return self._with_torques((training, validation))
@@ -158,10 +144,7 @@ class Study:
     def with_own_controller(self) -> "Study":
         """The study with the controller that its corrected torques identify, and the loop that this makes.
 
-        Raises
-        ------
-        DataError
-            If no closed loop can be simulated with it.
+        Raises DataError if no closed loop can be simulated with it.
         """
         return build_study(*self.sources, self.robot, self.signals)
 
@@ -192,14 +175,8 @@ class Study:
     def motion(self, stretch: Stretch, kind: str, theta: Array | None) -> Motion:
         """Signals of a stretch on which effects depend, with the motion before it.
 
-        Parameters
-        ----------
-        stretch
-            A stretch of the study.
-        kind
-            ``measured`` or ``simulated``.
-        theta
-            Parameters (b,) that predict the torques on which terms depend; ``None`` if no term does.
+        ``kind``: ``measured`` or ``simulated``. ``theta``: parameters (b,) that predict the torques on which terms
+        depend; ``None`` if no term does.
         """
         parts: list[Derivatives] = [getattr(stretch, kind)]
         if stretch.before is not None:
@@ -211,14 +188,8 @@ class Study:
     def terms(self, stretch: Stretch, kind: str, theta: Array | None) -> Array:
         """Columns (N, n, e) of the model's terms along a stretch.
 
-        Parameters
-        ----------
-        stretch
-            A stretch of the study.
-        kind
-            ``measured`` or ``simulated``.
-        theta
-            Parameters (b,) that predict the torques on which terms depend; ``None`` if no term does.
+        ``kind``: ``measured`` or ``simulated``. ``theta``: parameters (b,) that predict the torques on which terms
+        depend; ``None`` if no term does.
         """
         motion = self.motion(stretch, kind, theta)
         return self.model.term_regressor(motion)[motion.lead :]
@@ -226,14 +197,7 @@ class Study:
     def torques(self, stretch: Stretch, kind: str, theta: Array) -> Array:
         """Torques (N, n) of the model along a stretch, terms included, N m or N.
 
-        Parameters
-        ----------
-        stretch
-            A stretch of the study.
-        kind
-            ``measured`` or ``simulated``.
-        theta
-            Parameters of the model, (b,).
+        ``kind``: ``measured`` or ``simulated``; ``theta``: parameters of the model, (b,).
         """
         signals: Derivatives = getattr(stretch, kind)
         rigid = self.model.inverse_dynamics(theta, signals.q, signals.qd, signals.qdd)
@@ -244,16 +208,8 @@ class Study:
 
         Experiments that are held out altogether keep their motion, see `with_report_part`.
 
-        Parameters
-        ----------
-        theta
-            (b,).
-
-        Returns
-        -------
-        Study
-            The same where that loop diverges, or follows the arm less closely than the one there is: large additions to
-            the compiled loop may be too stiff for it (see `armident.identify.robot.relaxation`).
+        ``theta``: (b,). Returns the same where that loop diverges, or follows the arm less closely than the one there
+        is: large additions to the compiled loop may be too stiff for it (see `armident.identify.robot.relaxation`).
         """
         motions = self._simulated(theta, sorted({s.experiment for s in self.train}))
         if motions is None:
@@ -270,10 +226,7 @@ class Study:
 
         Loops of models with one more or one less effect then take one simulation instead of several.
 
-        Parameters
-        ----------
-        theta
-            Parameters of the loop, (b,).
+        ``theta``: parameters of the loop, (b,).
         """
         if self.auxiliary.first_motions is None or not self.model.e:
             return self
@@ -289,10 +242,7 @@ class Study:
     def with_report_part(self, theta: Array) -> "Study":
         """The study with the motion of its loop for the experiments that are held out altogether.
 
-        Parameters
-        ----------
-        theta
-            Parameters of the loop, (b,).
+        ``theta``: parameters of the loop, (b,).
         """
         trained = {s.experiment for s in self.train}
         numbers = sorted({s.experiment for s in self.held} - trained)
@@ -333,21 +283,10 @@ def build_study(
 ) -> Study:
     """Differentiate, simulate, split and filter the experiments.
 
-    Parameters
-    ----------
-    training
-        Experiments to fit; without ``validation`` their last part is held out.
-    validation
-        Experiments for the tests, or none.
-    robot
-        Configuration, with effect entries that correct recordings.
-    known_signals
-        Derivatives of the positions of both, if they were computed before.
-
-    Raises
-    ------
-    DataError
-        If rates differ, or the motion is too short or does not determine the parameters of the model.
+    ``training``: experiments to fit; without ``validation`` their last part is held out. ``validation``: experiments
+    for the tests, or none. ``robot``: configuration, with effect entries that correct recordings. ``known_signals``:
+    derivatives of the positions of both, if they were computed before. Raises DataError if rates differ, or the motion
+    is too short or does not determine the parameters of the model.
     """
     experiments = put_right([*training, *validation], robot)
     check_one_rate(experiments)
@@ -402,14 +341,8 @@ def log_volume(experiments: Sequence[Experiment], robot: RobotConfig, band: Call
     low-pass filter makes noise smaller, and no model better. By the theorem of Szegoe it is the logarithm of the ratio
     of the innovations of white noise with and without the correction.
 
-    Parameters
-    ----------
-    experiments
-        Recordings without corrections.
-    robot
-        Configuration, with effect entries that correct recordings.
-    band
-        Filter and decimation to the rows of the comparison.
+    ``experiments``: recordings without corrections; ``robot``: configuration, with effect entries that correct
+    recordings; ``band``: filter and decimation to the rows of the comparison.
     """
     if not any(of_recording(e) and isinstance(known(e.effect), Correction) for e in robot.effects):
         return np.zeros(robot.n)

@@ -32,12 +32,7 @@ def with_transitions(state: ModelState, model: Fitter) -> ModelState:
     1961, J. ACM 8(2)): the likelihood of a smooth reversal is narrow in its velocity, that of a joint that sticks in
     its lead.
 
-    Parameters
-    ----------
-    state
-        Model to start from.
-    model
-        Fits a model.
+    ``state``: model to start from; ``model``: fits a model.
     """
     search = _Search(state)
     for number in range(search.count):
@@ -57,13 +52,7 @@ def with_transitions(state: ModelState, model: Fitter) -> ModelState:
 
 
 class _Search:
-    """Best transition of each joint so far, in the loop of the model without them.
-
-    Parameters
-    ----------
-    state
-        Model without them.
-    """
+    """Best transition of each joint so far, in the loop of the model without them. ``state``: model without them."""
 
     def __init__(self, state: ModelState) -> None:
         self.state, self.effect = state, known(TRANSITION)
@@ -81,24 +70,13 @@ class _Search:
         return {place: shapes for place, (_, shapes) in self.best.items()}
 
     def entries(self, shapes: dict[Place, Shapes]) -> dict[Place, Entry]:
-        """Entries of transitions.
-
-        Parameters
-        ----------
-        shapes
-            Nonlinear parameters of the transition at each place.
-        """
+        """Entries of transitions. ``shapes``: nonlinear parameters of the transition at each place."""
         return {place: entry_of(self.effect, place, self.state.robot, dict(one)) for place, one in shapes.items()}
 
     def tried(self, shapes: dict[Place, Shapes], before: ModelState) -> ModelState | None:
         """Model with transitions; each that predicts the torque of its joint better becomes the best one.
 
-        Parameters
-        ----------
-        shapes
-            Nonlinear parameters of the transition at each place.
-        before
-            Model that gives the noise models.
+        ``shapes``: nonlinear parameters of the transition at each place; ``before``: model that gives the noise models.
         """
         entries = self.entries(shapes)
         made = fitted_in_loop_of(before, with_entries(self.state.robot, list(entries.values())))
@@ -114,10 +92,7 @@ class _Search:
     def converged(self, state: ModelState) -> ModelState | None:
         """Model with the transitions that a pattern search finds from the best ones so far.
 
-        Parameters
-        ----------
-        state
-            Model that gives the noise models.
+        ``state``: model that gives the noise models.
         """
         made = self.tried(self.chosen, state)
         for step in STEPS if made else ():

@@ -28,12 +28,7 @@ NOMINAL_TORQUE = 100.0
 def motor_limit(robot: RobotConfig, motor: int) -> float:
     """Return the largest torque of a motor at its shaft, N m or N; that of `NOMINAL_TORQUE` if no limit is known.
 
-    Parameters
-    ----------
-    robot
-        Configuration with the limits of the joints and the transmission.
-    motor
-        Index of the motor, from 0.
+    ``robot``: configuration with the limits of the joints and the transmission; ``motor``: index of the motor, from 0.
     """
     limit = robot.joints[motor].limits.torque
     torque = limit if math.isfinite(limit) else NOMINAL_TORQUE
@@ -53,55 +48,28 @@ class Correction(TorqueDependent):
     def shaft_column(self, torque: Array, motion: Motion, motor: int) -> Array:
         """Return the torque (N,) at the shaft of a motor per unit of the parameter.
 
-        Parameters
-        ----------
-        torque
-            Predicted torque at the shaft, N m or N, (N,).
-        motion
-            The motion, N samples.
-        motor
-            Index of the motor, from 0.
+        ``torque``: predicted torque at the shaft, N m or N, (N,); ``motion``: the motion, N samples; ``motor``: index
+        of the motor, from 0.
         """
 
     @abstractmethod
     def true_torque(self, recorded: Array, value: float, dt: float, limit: float) -> Array:
         """Return the true torque (N,) of a motor.
 
-        Parameters
-        ----------
-        recorded
-            Recorded torque, N m or N, (N,).
-        value
-            Value of the parameter.
-        dt
-            Sampling period, s.
-        limit
-            Largest torque of the motor, N m or N.
+        ``recorded``: recorded torque, N m or N, (N,); ``limit``: largest torque of the motor, N m or N.
         """
 
     @abstractmethod
     def values_to_test(self, recorded: Array, dt: float, limit: float) -> Array:
         """Return the values at which a diagnosis tests the correction, increasing in size for each sign.
 
-        Parameters
-        ----------
-        recorded
-            Recorded torque, N m or N, (N,).
-        dt
-            Sampling period, s.
-        limit
-            Largest torque of the motor, N m or N.
+        ``recorded``: recorded torque, N m or N, (N,); ``limit``: largest torque of the motor, N m or N.
         """
 
     def relative_slope(self, value: float) -> float:
         """Return the change of the true torque by a change of the value, over that by a further small correction.
 
         One for corrections that add up, such as delays.
-
-        Parameters
-        ----------
-        value
-            Value of the parameter.
         """
         return 1.0
 
@@ -114,17 +82,7 @@ class Correction(TorqueDependent):
         return bool(entry.parameters.get(self.linear[0].name))
 
     def put_right(self, experiment: Experiment, robot: RobotConfig, entry: Entry) -> Experiment:
-        """Return an experiment with corrected torques.
-
-        Parameters
-        ----------
-        experiment
-            As recorded.
-        robot
-            Configuration.
-        entry
-            Entry of this effect with the value.
-        """
+        """Return an experiment with corrected torques. ``entry``: entry of this effect with the value."""
         motor = [joint.name for joint in robot.joints].index(entry.joint)
         at_motors = experiment.tau @ np.linalg.inv(robot.transmission_matrix)
         value, limit = entry.parameters[self.linear[0].name], motor_limit(robot, motor)

@@ -33,12 +33,7 @@ SLOWEST = 0.03
 def speeds(motion: Motion, place: Place) -> Sequence[float]:
     """Return characteristic speeds from those of the reversal to a third of the joint's top speed, rad/s or m/s.
 
-    Parameters
-    ----------
-    motion
-        Motion of the arm.
-    place
-        Location with the joint.
+    ``motion``: motion of the arm; ``place``: location with the joint.
     """
     return [float(v) for v in float(motion.top_speed[place.joint]) * np.geomspace(SLOWEST, 0.35, 7)]
 
@@ -290,12 +285,7 @@ def dahl(q: Array, displacement: float) -> Array:
 
     ``dz/dq = (1 - z sign(qd)) / displacement``: after a reversal it approaches its level exponentially in the distance.
 
-    Parameters
-    ----------
-    q
-        Positions, rad or m, shape (N,).
-    displacement
-        Constant of the exponential, in the unit of ``q``.
+    ``q``: positions, rad or m, shape (N,); ``displacement``: constant of the exponential, in the unit of ``q``.
     """
     z = np.empty(q.size)
     state = 0.0

@@ -53,17 +53,8 @@ def described(effect: Effect) -> dict[str, Any]:
 def effects_command(name: str | None, *, as_json: bool) -> None:
     """Print the effects of the catalogue.
 
-    Parameters
-    ----------
-    name
-        Name of one effect; ``None``: all.
-    as_json
-        Print JSON instead of a table.
-
-    Raises
-    ------
-    ConfigError
-        If there is no such effect.
+    ``name``: name of one effect; ``None``: all. ``as_json``: print JSON instead of a table. Raises ConfigError if there
+    is no such effect.
     """
     chosen = list(catalogue().values()) if name is None else [known(name)]
     if as_json:

@@ -17,25 +17,12 @@ class ParameterChange(Effect):
 
     @abstractmethod
     def parameters(self, place: Place, n: int) -> list[str]:
-        """Return the names of the standard parameters that the linear ones change, (k,).
-
-        Parameters
-        ----------
-        place
-            Location of the effect.
-        n
-            Number of joints.
-        """
+        """Return the names of the standard parameters that the linear ones change, (k,)."""
 
     def change(self, motion: Motion, place: Place) -> Array:
         """Return the Jacobian (b, k) of the base parameters with respect to the linear ones.
 
-        Parameters
-        ----------
-        motion
-            Motion of the model.
-        place
-            Location of the effect.
+        ``motion``: motion of the model.
         """
         model = motion.model
         chosen = [model.names.index(name) for name in self.parameters(place, motion.n)]

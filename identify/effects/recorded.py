@@ -23,17 +23,8 @@ def of_recording(entry: Entry) -> bool:
 def put_right(experiments: Sequence[Experiment], robot: RobotConfig) -> Sequence[Experiment]:
     """Return the experiments corrected for the effects on signals of a robot's configuration.
 
-    Parameters
-    ----------
-    experiments
-        As recorded.
-    robot
-        Configuration with the effect entries.
-
-    Raises
-    ------
-    ConfigError
-        If the entry of a wiring error does not name the signal or the other joint.
+    ``robot``: configuration with the effect entries. Raises ConfigError if the entry of a wiring error does not name
+    the signal or the other joint.
     """
     experiments = rewired(experiments, robot)
     for entry in robot.effects:

@@ -19,10 +19,7 @@ REQUIRED = ("name", "title", "says", "reference", "needs", "linear")
 def catalogue() -> dict[str, Effect]:
     """Return all effects by name, those of this package first.
 
-    Raises
-    ------
-    ConfigError
-        If an entry point cannot be loaded, is not an effect, or repeats a name.
+    Raises ConfigError if an entry point cannot be loaded, is not an effect, or repeats a name.
     """
     modules = (friction, link, transmission, drive, numbers, wiring, unnamed)
     found = {e.key: e for e in (effect() for module in modules for effect in module.EFFECTS)}
@@ -57,15 +54,7 @@ def _instance(one: object, where: str) -> Effect:
 def known(name: str) -> Effect:
     """Return the effect of a name.
 
-    Parameters
-    ----------
-    name
-        Name in the catalogue.
-
-    Raises
-    ------
-    ConfigError
-        If there is no such effect; the message lists all.
+    ``name``: name in the catalogue. Raises ConfigError if there is no such effect; the message lists all.
     """
     effects = catalogue()
     if name not in effects:
@@ -76,14 +65,7 @@ def known(name: str) -> Effect:
 def of_entry(entry: Entry) -> Effect:
     """Return the effect of an entry of a robot configuration, with the law that the entry names.
 
-    Parameters
-    ----------
-    entry
-        Entry of the ``effects`` of the configuration.
-
-    Raises
-    ------
-    ConfigError
-        If there is no such effect, or no such law of it; the message lists all.
+    ``entry``: entry of the ``effects`` of the configuration. Raises ConfigError if there is no such effect, or no such
+    law of it; the message lists all.
     """
     return known(f"{entry.effect}/{entry.law}" if entry.law else entry.effect)

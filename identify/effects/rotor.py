@@ -23,12 +23,7 @@ def rotors(motion: Motion, joint: int) -> Sequence[float]:
     The base parameters of joints with a constant axis, and of models without rotors, contain the rotor in the link. It
     matters for load-dependent friction, elasticity and backlash, unless all load is proportional to the acceleration.
 
-    Parameters
-    ----------
-    motion
-        Motion of the arm.
-    joint
-        Index of the joint, from 0.
+    ``motion``: motion of the arm; ``joint``: index of the joint, from 0.
     """
     if f"ia{joint + 1}" in motion.model.base.names:
         return (0.0,)

@@ -17,12 +17,7 @@ KNOTS = 9
 def hats(x: Array, knots: Sequence[float] | Array) -> Array:
     """Return piecewise linear functions (N, k), one at each knot, constant beyond the outermost.
 
-    Parameters
-    ----------
-    x
-        Values, (N,).
-    knots
-        Increasing knots, (k,).
+    ``x``: values, (N,); ``knots``: increasing knots, (k,).
     """
     at = np.asarray(knots, dtype=np.float64)
     if x.dtype == object:
@@ -39,12 +34,7 @@ def hats(x: Array, knots: Sequence[float] | Array) -> Array:
 def table(x: Array, low: float, high: float) -> Array:
     """Return the functions (N, `KNOTS` - 1) of a table, whose value is zero at the first knot.
 
-    Parameters
-    ----------
-    x
-        Values, (N,).
-    low, high
-        First and last knot.
+    ``x``: values, (N,); ``low``, ``high``: first and last knot.
     """
     return hats(x, np.linspace(low, high, KNOTS))[:, 1:]
 
@@ -52,12 +42,7 @@ def table(x: Array, low: float, high: float) -> Array:
 def values(prefix: str, unit: tuple[str, str]) -> tuple[Linear, ...]:
     """Return the linear parameters of a table: its values at the knots after the first one.
 
-    Parameters
-    ----------
-    prefix
-        Beginning of their names.
-    unit
-        Units at a revolute and at a prismatic joint.
+    ``prefix``: beginning of their names; ``unit``: units at a revolute and at a prismatic joint.
     """
     return tuple(Linear(f"{prefix}{k}", unit) for k in range(1, KNOTS))
 

@@ -98,19 +98,9 @@ def swinging(pull: Array, share: Array, w: float, damping: float, dt: float) -> 
 
     Trapezoidal rule (Newmark 1959), which is stable at any frequency.
 
-    Parameters
-    ----------
-    pull
-        Position at equilibrium, shape (N,). The results have its unit (per s, per s^2); for a gear it is minus the
-        transmitted torque, N m or N: the position per unit of compliance.
-    share
-        Inertia over its mean, shape (N,).
-    w
-        Angular frequency of the resonance at mean inertia, rad/s.
-    damping
-        Damping ratio.
-    dt
-        Sampling period, s.
+    ``pull``: position at equilibrium, shape (N,). The results have its unit (per s, per s^2); for a gear it is minus
+    the transmitted torque, N m or N: the position per unit of compliance. ``share``: inertia over its mean, shape (N,).
+    ``w``: angular frequency of the resonance at mean inertia, rad/s. ``damping``: damping ratio.
     """
     way, rate, acceleration = np.empty(pull.size), np.zeros(pull.size), np.zeros(pull.size)
     way[0] = pull[0]
@@ -160,14 +150,8 @@ class Backlash(TorqueDependent):
 def falls(motion: Motion, joint: int, rotor: float = 0.0) -> Array:
     """Return the acceleration (N,) of a link relative to its motor without contact of the teeth, rad/s^2 or m/s^2.
 
-    Parameters
-    ----------
-    motion
-        Motion of the arm, N samples.
-    joint
-        Index of the joint, from 0.
-    rotor
-        Rotor inertia that the model contains in the link, kg m^2 or kg.
+    ``motion``: motion of the arm, N samples; ``joint``: index of the joint, from 0; ``rotor``: rotor inertia that the
+    model contains in the link, kg m^2 or kg.
     """
     inertia = inertias(motion, joint, rotor)
     if inertia.max() <= 0.0:
@@ -183,14 +167,7 @@ def crossing(pull: Array, gap: float, dt: float) -> tuple[Array, Array, Array]:
     Leapfrog integration with plastic impacts at half a gap to either side. Velocity and acceleration are central
     differences of the position, so that they have no delay.
 
-    Parameters
-    ----------
-    pull
-        Free acceleration of the link, rad/s^2 or m/s^2, shape (N,).
-    gap
-        Width of the gap, rad or m.
-    dt
-        Sampling period, s.
+    ``pull``: free acceleration of the link, rad/s^2 or m/s^2, shape (N,); ``gap``: width of the gap, rad or m.
     """
     way, rate, acceleration = np.zeros(pull.size), np.zeros(pull.size), np.zeros(pull.size)
     way[0] = 0.5 * gap if pull[0] > 0.0 else -0.5 * gap
@@ -213,14 +190,8 @@ def inertias(motion: Motion, joint: int, rotor: float) -> Array:
 
     It has a lower bound, `LEAST_INERTIA`, and is zero where the fit has no inertia.
 
-    Parameters
-    ----------
-    motion
-        Motion of the arm, N samples.
-    joint
-        Index of the joint, from 0.
-    rotor
-        Rotor inertia that the model contains in the link, kg m^2 or kg.
+    ``motion``: motion of the arm, N samples; ``joint``: index of the joint, from 0; ``rotor``: rotor inertia that the
+    model contains in the link, kg m^2 or kg.
     """
     inertia = motion.slopes(joint, links=True)[2][:, joint] - rotor
     believed: Array = np.maximum(inertia, LEAST_INERTIA * inertia.max())

@@ -112,17 +112,8 @@ BY_NAME = {effect.name: effect() for effect in EFFECTS}
 def rewired(experiments: Sequence[Experiment], robot: RobotConfig) -> Sequence[Experiment]:
     """Return the experiments corrected for the wiring errors of a robot's configuration.
 
-    Parameters
-    ----------
-    experiments
-        As recorded.
-    robot
-        Configuration with the effect entries.
-
-    Raises
-    ------
-    ConfigError
-        If an entry does not name the signal or the other joint.
+    ``robot``: configuration with the effect entries. Raises ConfigError if an entry does not name the signal or the
+    other joint.
     """
     position, torque = exchanges(robot)
     if np.array_equal(position, np.eye(robot.n)) and np.array_equal(torque, np.eye(robot.n)):
@@ -147,14 +138,9 @@ def exchanges(robot: RobotConfig) -> tuple[Array, Array]:
 
     Raw values (counts, shares of the rated signal) are exchanged, while the scaling belongs to the drive. So these are
     signed permutations, scaled where two drives differ in resolution, gain or rating. With ``joint_side: 1`` columns in
-    SI units on the joint side are concerned, as they are after an import; `signal_scale` always acts on these, and
-    with an ``other`` joint adds a multiple of its signal. Several entries act one after the other: exchanges express
-    any permutation.
-
-    Raises
-    ------
-    ConfigError
-        If an entry does not name the signal or the other joint.
+    SI units on the joint side are concerned, as they are after an import; `signal_scale` always acts on these, and with
+    an ``other`` joint adds a multiple of its signal. Several entries act one after the other: exchanges express any
+    permutation. Raises ConfigError if an entry does not name the signal or the other joint.
     """
     names = [joint.name for joint in robot.joints]
     worth = {"position": _per_count(robot), "torque": _per_share(robot)}

@@ -11,7 +11,7 @@ from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.effects.recorded import of_recording
 from armident.identify.effects.registry import of_entry
 from armident.identify.effects.terms import effect_terms
-from armident.identify.identification.excitation_check import workspace_postures
+from armident.identify.identification.checks.excitation import workspace_postures
 from armident.identify.model_export.link_frames import LinkFrames, mdh_link_frames
 from armident.identify.model_export.source_urdf import SourceUrdf, known_bodies, source_for, source_frames, source_of
 from armident.identify.robot.arm import ArmModel
@@ -72,7 +72,7 @@ class LinkBody:
 
 
 @dataclass(frozen=True)
-class JointFriction:
+class ExportedFriction:
     """Rotor inertia and friction of a joint, joint side.
 
     Parameters
@@ -183,7 +183,7 @@ class ExportedModel:
     consistent: ConsistentParameters
     frames: LinkFrames
     links: tuple[LinkBody, ...]
-    joints: tuple[JointFriction, ...]
+    joints: tuple[ExportedFriction, ...]
     couplings: tuple[JointCoupling, ...]
     effects: tuple[ExportedEffect, ...]
     source_urdf: SourceUrdf | None = None
@@ -345,12 +345,12 @@ def _refuse_negative_inertia(arm: ArmModel, theta: Floats, source: Path) -> None
         )
 
 
-def _joints(arm: ArmModel, theta: Floats, frames: LinkFrames) -> tuple[JointFriction, ...]:
+def _joints(arm: ArmModel, theta: Floats, frames: LinkFrames) -> tuple[ExportedFriction, ...]:
     """Return rotor inertias and friction of the joints, with their names in the file."""
     values = arm.values(theta)
     rows = np.stack([values.ia, values.fv, values.fc, values.off], axis=1).tolist()
     types = [joint.type for joint in arm.robot.joints]
-    return tuple(JointFriction(name, kind, *row) for name, kind, row in zip(frames.joints, types, rows, strict=True))
+    return tuple(ExportedFriction(name, kind, *row) for name, kind, row in zip(frames.joints, types, rows, strict=True))
 
 
 def _couplings(arm: ArmModel, theta: Floats) -> tuple[JointCoupling, ...]:

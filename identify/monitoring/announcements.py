@@ -1,7 +1,7 @@
 """Announcements of a worker: each result and failure in the ledger is announced once, also if workers are killed."""
 
 from armident.daq.streaming import Keys
-from armident.identify.monitoring.ledger import Entry, Ledger
+from armident.identify.monitoring.ledger import Ledger, LedgerEntry
 from armident.identify.monitoring.status_messages import failure_status, status
 from armident.identify.monitoring.worker_link import LinkDown, WorkerLink
 from armident.identify.monitoring.worker_receiver import content_hash
@@ -17,12 +17,7 @@ class Announcements:
     end of the transaction leaves an entry that counts as not announced. Other workers have heard the announcement,
     and enter it.
 
-    Parameters
-    ----------
-    keys
-        Keys of the robot.
-    link
-        Zenoh session of the worker.
+    ``keys``: keys of the robot; ``link``: Zenoh session of the worker.
     """
 
     def __init__(self, keys: Keys, link: WorkerLink) -> None:
@@ -33,19 +28,9 @@ class Announcements:
     def make(self, ledger: Ledger, sha256: str) -> bytes | None:
         """Announce the result or the failure of a recording, and return the document that was announced.
 
-        Parameters
-        ----------
-        ledger
-            Ledger of the worker, which has a claim on the recording.
-        sha256
-            The recording.
-
-        Raises
-        ------
-        LinkDown
-            If the session is missing, too new, or fails.
-        LedgerError
-            If the ledger cannot be written; the announcement is not repeated when this is called again.
+        ``ledger``: ledger of the worker, which has a claim on the recording. Raises LinkDown if the session is missing,
+        too new, or fails. Raises LedgerError if the ledger cannot be written; the announcement is not repeated when
+        this is called again.
         """
         entry = ledger.entry(sha256)
         if entry is None or entry.announced or entry.state == "waiting":
@@ -69,15 +54,8 @@ class Announcements:
     def enter_heard(self, ledger: Ledger) -> None:
         """Enter the announcements that other workers have made, but not entered.
 
-        Parameters
-        ----------
-        ledger
-            Ledger that the workers share.
-
-        Raises
-        ------
-        LedgerError
-            If the ledger cannot be read or written; what was heard is kept for the next call.
+        ``ledger``: ledger that the workers share. Raises LedgerError if the ledger cannot be read or written; what was
+        heard is kept for the next call.
         """
         self._heard |= self._link.receiver.take_heard()
         if not self._heard:
@@ -88,7 +66,7 @@ class Announcements:
         self._heard.clear()
 
 
-def _outcome(entry: Entry) -> tuple[bytes | None, str]:
+def _outcome(entry: LedgerEntry) -> tuple[bytes | None, str]:
     """Return the document of a result and its verdict; ``None`` and the reason if there is none."""
     if entry.result is None:
         return None, entry.message or ""
@@ -98,7 +76,7 @@ def _outcome(entry: Entry) -> tuple[bytes | None, str]:
         return None, f"{entry.result}: the result was removed before it was announced"
 
 
-def _contents(entry: Entry) -> list[bytes]:
+def _contents(entry: LedgerEntry) -> list[bytes]:
     """Return the messages that announce an entry, by whichever program."""
     document, message = _outcome(entry)
     if document is not None:

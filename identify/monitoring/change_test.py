@@ -24,7 +24,8 @@ RANK_TOLERANCE = 1e-9
 
 
 MUCH_WORSE = 10.0
-"""Median ratio of standard deviations of the two identifications above which the test is inconclusive."""
+"""Median ratio of standard deviations of the two identifications above which the test is inconclusive: a change by the
+three standard deviations that the better one would show is a third of a standard deviation of the worse one."""
 
 
 class Inconclusive(DataError):
@@ -47,8 +48,6 @@ class Group:
         ``friction`` or ``masses``.
     place
         End of their names: number of the joint, or name of the coupling.
-    members
-        Their names.
     chi_square, degrees
         Chi-square statistic of their differences with all other parameters free, and its degrees of freedom.
     p_value
@@ -178,24 +177,10 @@ def compare(
     The runs are independent, so the covariance of the difference is the sum of both. All base parameters are tested;
     those that are not essential have little weight due to their large standard deviations.
 
-    Parameters
-    ----------
-    baseline, now
-        Two identifications of one robot with the same model.
-    false_alarms
-        Probability of the result "changed" without a change.
-
-    Returns
-    -------
-    ParameterChangeTest
-        Differences, p-values corrected by Holm's method, the joint test, and the test of the residuals.
-
-    Raises
-    ------
-    DataError
-        If they are of different robots or models.
-    Inconclusive
-        If one of them is unusable or did not converge, or is far less precise than the other.
+    ``baseline``, ``now``: two identifications of one robot with the same model; ``false_alarms``: probability of the
+    result "changed" without a change. Returns differences, p-values corrected by Holm's method, the joint test, and the
+    test of the residuals. Raises DataError if they are of different robots or models; Inconclusive if one of them is
+    unusable or did not converge, or is far less precise than the other.
     """
     for name, document in (("the baseline", baseline), ("the identification", now)):
         if not document.converged:

@@ -25,19 +25,9 @@ def compare_models(
 ) -> ComparisonDocument:
     """Test two identifications of a robot for a change.
 
-    Parameters
-    ----------
-    baseline, now
-        The identifications and their files.
-    common
-        Compare only the parameters that both have, instead of refusing different base parameters.
-    false_alarms
-        Probability of the verdict ``changed`` without a change.
-
-    Raises
-    ------
-    DataError
-        If they are of different robots or models, or cannot confirm or exclude a change.
+    ``common``: compare only the parameters that both have, instead of refusing different base parameters;
+    ``false_alarms``: probability of the verdict ``changed`` without a change. Raises DataError if they are of different
+    robots or models, or cannot confirm or exclude a change.
     """
     (first, first_path), (second, second_path) = baseline, now
     left_out = _different(baseline, now)
@@ -163,12 +153,8 @@ def _compared(
 def joint_of(parameter: str, joints: Sequence[str], couplings: Sequence[str] = ()) -> str:
     """Return the joint or coupling of a parameter by the end of its name; the name itself if that is neither.
 
-    Parameters
-    ----------
-    parameter
-        Name of a base parameter or of a parameter of an effect, for example ``zz1r``, ``iam6`` or ``fva2_2``.
-    joints, couplings
-        Names of the joints in order, and of the couplings.
+    ``parameter``: name of a base parameter or of a parameter of an effect, for example ``zz1r``, ``iam6`` or
+    ``fva2_2``; ``joints``, ``couplings``: names of the joints in order, and of the couplings.
     """
     name = re.sub(r"_\d+$", "", parameter)
     for coupling in couplings:

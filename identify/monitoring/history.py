@@ -34,7 +34,7 @@ _STAMP = re.compile(r"(\d{8}T\d{6})-\d{3}Z")
 
 
 @dataclass(frozen=True)
-class Run:
+class HistoryRun:
     """Identification in the history; ``recorded`` is the time of its recording (UTC)."""
 
     number: int
@@ -45,15 +45,9 @@ class Run:
 class History:
     """Identifications in a database; missing tables are created, and those of a former version upgraded.
 
-    Parameters
-    ----------
-    url
-        SQLAlchemy URL, for example ``sqlite:///history.sqlite``, ``postgresql://USER:PASSWORD@HOST/NAME``.
-
-    Raises
-    ------
-    ConfigError
-        If there is no such database, its driver is not installed, or it is locked, damaged or of a newer version.
+    ``url``: SQLAlchemy URL, for example ``sqlite:///history.sqlite``, ``postgresql://USER:PASSWORD@HOST/NAME``. Raises
+    ConfigError if there is no such database, its driver is not installed, or it is locked, damaged or of a newer
+    version.
     """
 
     def __init__(self, url: str = DEFAULT) -> None:
@@ -69,22 +63,8 @@ class History:
     def add(self, document: IdentificationDocument, recorded: datetime.datetime) -> bool:
         """Add an identification.
 
-        Parameters
-        ----------
-        document
-            The result.
-        recorded
-            Time of its recording; see `recorded_at`.
-
-        Returns
-        -------
-        bool
-            False if the history has an identification of this recording already, which stays.
-
-        Raises
-        ------
-        ConfigError
-            If the database cannot be written.
+        ``recorded``: time of its recording; see `recorded_at`. Returns False if the history has an identification of
+        this recording already, which stays. Raises ConfigError if the database cannot be written.
         """
         text = to_json(document)
         digest = _digest(document)
@@ -141,12 +121,8 @@ class History:
     def began(facts: Mapping[str, Any], document: IdentificationDocument, file: Path) -> datetime.datetime:
         """Return the start of a recording.
 
-        Parameters
-        ----------
-        facts
-            Metadata of the recording; its start is there unless it was imported.
-        document, file
-            Identification and its file, otherwise see `recorded_at`.
+        ``facts``: metadata of the recording; its start is there unless it was imported. ``document``, ``file``:
+        identification and its file, otherwise see `recorded_at`.
         """
         started = facts["facts"].get("started_utc")
         return recorded_at(document, file) if started is None else datetime.datetime.fromisoformat(started)
@@ -160,14 +136,8 @@ class History:
     ) -> None:
         """Add the result of a comparison.
 
-        Parameters
-        ----------
-        document
-            Identification of a recording that was added before.
-        baseline
-            Identification that it was compared with.
-        drift
-            Result of the test.
+        ``document``: identification of a recording that was added before; ``baseline``: identification that it was
+        compared with.
         """
         same = (runs.c.robot == document.robot) & (runs.c.sha256 == document.recording.sha256) & (repeated == 0)
         number = sa.select(runs.c.id).where(same).scalar_subquery()
@@ -193,29 +163,19 @@ class History:
         except sa.exc.SQLAlchemyError as error:
             raise ConfigError(f"{self.url}: the history cannot be written: {reason(error)}") from error
 
-    def first(self, robot: str, cell: str | None = None) -> Run | None:
+    def first(self, robot: str, cell: str | None = None) -> HistoryRun | None:
         """Return the oldest converged identification of an arm, or ``None``.
 
-        Parameters
-        ----------
-        robot
-            Name of the robot.
-        cell
-            Cell of the robot; ``None``: all. Runs whose cell the history does not know are included.
+        ``cell``: cell of the robot; ``None``: all. Runs whose cell the history does not know are included.
         """
         found = self._read(_of(robot, cell).where(runs.c.converged).limit(1))
         return found[0] if found else None
 
-    def runs(self, robot: str | None = None, cell: str | None = None) -> list[Run]:
+    def runs(self, robot: str | None = None, cell: str | None = None) -> list[HistoryRun]:
         """Return identifications in the order of their recordings.
 
-        Parameters
-        ----------
-        robot
-            Name of the robot; ``None``: all.
-        cell
-            Cell of the robot, as arms of one type often share a name; ``None``: all. Runs whose cell the history does
-            not know are included.
+        ``robot``: name of the robot; ``None``: all. ``cell``: cell of the robot, as arms of one type often share a
+        name; ``None``: all. Runs whose cell the history does not know are included.
         """
         return self._read(_of(robot, cell))
 
@@ -238,9 +198,11 @@ class History:
         except sa.exc.SQLAlchemyError as error:
             raise ConfigError(f"{self.url}: the history cannot be read: {reason(error)}") from error
 
-    def _read(self, query: sa.Select[Any]) -> list[Run]:
+    def _read(self, query: sa.Select[Any]) -> list[HistoryRun]:
         return [
-            Run(number, recorded.replace(tzinfo=datetime.UTC), from_json(text, IdentificationDocument, f"run {number}"))
+            HistoryRun(
+                number, recorded.replace(tzinfo=datetime.UTC), from_json(text, IdentificationDocument, f"run {number}")
+            )
             for number, recorded, text in self._rows(query)
         ]
 
@@ -265,12 +227,7 @@ def _digest(document: IdentificationDocument) -> str:
 def recorded_at(document: IdentificationDocument, file: Path) -> datetime.datetime:
     """Return the time of a recording: from its name, otherwise that of the result's file.
 
-    Parameters
-    ----------
-    document
-        Identification, with the name of its recording.
-    file
-        File of the document.
+    ``file``: file of the document.
     """
     found = _STAMP.search(document.recording.path or "")
     if found is not None:

@@ -10,7 +10,7 @@ from armident.configs import ConfigError
 from armident.identify.documents.files import load_document
 from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.monitoring.change_test import Inconclusive, ParameterChangeTest, compare
-from armident.identify.monitoring.history import History, Run, recorded_at
+from armident.identify.monitoring.history import History, HistoryRun, recorded_at
 
 DRIFTED = 4
 """Exit code: done, and the last run differs significantly from the first."""
@@ -29,6 +29,9 @@ def history_command(
 ) -> int:
     """Carry out ``armident history``: add documents, compare runs with the first one, plot parameters.
 
+    Returns the exit code: 0, or `DRIFTED`. Raises ConfigError if the database, robot, cell, a parameter or the plot is
+    wrong; DataError if a document is wrong, or the runs are of different models.
+
     Parameters
     ----------
     documents
@@ -45,18 +48,6 @@ def history_command(
         Probability of a false alarm per run.
     as_json
         Print JSON instead of a table.
-
-    Returns
-    -------
-    int
-        Exit code: 0, or `DRIFTED`.
-
-    Raises
-    ------
-    ConfigError
-        If the database, robot, cell, a parameter or the plot is wrong.
-    DataError
-        If a document is wrong, or the runs are of different models.
     """
     loaded = [(load_document(path, IdentificationDocument), path) for path in documents]
     history = History(database)
@@ -79,7 +70,7 @@ def history_command(
     return DRIFTED if last is not None and last.drifted else 0
 
 
-def _compared(first: Run, run: Run, false_alarms: float) -> ParameterChangeTest | None:
+def _compared(first: HistoryRun, run: HistoryRun, false_alarms: float) -> ParameterChangeTest | None:
     try:
         return compare(first.document, run.document, false_alarms)
     except Inconclusive:
@@ -110,14 +101,14 @@ def _cell(history: History, robot: str, wanted: str | None, added: Sequence[Iden
     return cells.pop() if cells else None
 
 
-def _check(parameters: Sequence[str], runs: Sequence[Run]) -> None:
+def _check(parameters: Sequence[str], runs: Sequence[HistoryRun]) -> None:
     known = [p.name for p in runs[0].document.parameters]
     for name in parameters:
         if name not in known:
             raise ConfigError(f"--parameter: no {name!r} of {runs[0].document.robot}; there are {', '.join(known)}")
 
 
-def _most_changed(drifts: Sequence[ParameterChangeTest | None], runs: Sequence[Run], most: int = 6) -> list[str]:
+def _most_changed(drifts: Sequence[ParameterChangeTest | None], runs: Sequence[HistoryRun], most: int = 6) -> list[str]:
     """Return the parameters with the largest difference from the first run, in standard deviations."""
     names = [p.name for p in runs[0].document.parameters if p.essential]
     compared = [drift for drift in drifts if drift is not None]
@@ -131,7 +122,7 @@ def _most_changed(drifts: Sequence[ParameterChangeTest | None], runs: Sequence[R
     return sorted(names, key=lambda name: -far[name])[:most]
 
 
-def _entry(run: Run, drift: ParameterChangeTest | None) -> dict[str, object]:
+def _entry(run: HistoryRun, drift: ParameterChangeTest | None) -> dict[str, object]:
     document = run.document
     return {
         "recorded": run.recorded.isoformat(),
@@ -144,7 +135,7 @@ def _entry(run: Run, drift: ParameterChangeTest | None) -> dict[str, object]:
 
 
 def _table(
-    title: str, runs: Sequence[Run], drifts: Sequence[ParameterChangeTest | None], parameters: Sequence[str]
+    title: str, runs: Sequence[HistoryRun], drifts: Sequence[ParameterChangeTest | None], parameters: Sequence[str]
 ) -> None:
     from rich.table import Table
 
@@ -166,7 +157,7 @@ def _table(
     print_table(table)
 
 
-def _plot(path: Path, title: str, runs: Sequence[Run], parameters: Sequence[str]) -> None:
+def _plot(path: Path, title: str, runs: Sequence[HistoryRun], parameters: Sequence[str]) -> None:
     """Plot parameters over the time of the recordings, one row each, with two standard deviations."""
     import matplotlib.pyplot as plt
 

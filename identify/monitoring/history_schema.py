@@ -13,7 +13,7 @@ from typing import Any
 import sqlalchemy as sa
 
 from armident.configs import ConfigError
-from armident.identify.monitoring.sqlite_reason import sqlite_reason
+from armident.configs.reasons import reason_of
 
 BUSY_S = 15.0
 """Longest wait for another process that writes to the database, s."""
@@ -109,10 +109,7 @@ MIGRATIONS: tuple[Callable[[sa.Connection], None], ...] = (_create_tables, _one_
 def engine_for(url: str) -> sa.Engine:
     """Return the engine of a database, whose transactions on SQLite wait for other processes.
 
-    Parameters
-    ----------
-    url
-        SQLAlchemy URL.
+    ``url``: SQLAlchemy URL.
     """
     if not url.startswith("sqlite"):
         try:
@@ -155,10 +152,7 @@ def _begin(connection: sa.Connection) -> None:
 def writing(engine: sa.Engine) -> Iterator[sa.Connection]:
     """Yield a connection in a transaction that writes; it is committed at the end of the block.
 
-    Parameters
-    ----------
-    engine
-        Engine of the database.
+    ``engine``: engine of the database.
     """
     with engine.connect().execution_options(writes=True) as connection, connection.begin():
         yield connection
@@ -167,15 +161,8 @@ def writing(engine: sa.Engine) -> Iterator[sa.Connection]:
 def upgrade(engine: sa.Engine) -> None:
     """Create the tables, or bring those of a former version to the present one.
 
-    Parameters
-    ----------
-    engine
-        Engine of the database. Any number of processes may upgrade it at once.
-
-    Raises
-    ------
-    ConfigError
-        If the database is of a newer version.
+    ``engine``: engine of the database. Any number of processes may upgrade it at once. Raises ConfigError if the
+    database is of a newer version.
     """
     with engine.connect() as connection:
         if _version(connection) == len(MIGRATIONS):
@@ -215,10 +202,7 @@ def _set_version(connection: sa.Connection, version: int) -> None:
 def reason(error: Exception) -> str:
     """Return one line that says why a database cannot be used, without the words of the library for known causes.
 
-    Parameters
-    ----------
-    error
-        Error of SQLAlchemy or of the file system.
+    ``error``: error of SQLAlchemy or of the file system.
     """
     cause = getattr(error, "orig", None) or error
     if isinstance(cause, ImportError):
@@ -232,7 +216,7 @@ def reason(error: Exception) -> str:
         text = text.removeprefix("connection failed: ")
         return f"no connection to the server ({text}); check that it runs, and host, port, user and database of the URL"
     if isinstance(cause, sqlite3.Error):
-        text = sqlite_reason(cause, BUSY_S)
+        text = reason_of(cause, BUSY_S)
         damaged = "; restore a copy, or begin a new history and add the results to it"
         return text + damaged if text.startswith("damaged") else text
     return text
@@ -241,14 +225,8 @@ def reason(error: Exception) -> str:
 def wait_and_try(action: Callable[[], None], seconds: float, say: Callable[[str], None]) -> bool:
     """Try an action again while the database refuses it; return False if the time is over.
 
-    Parameters
-    ----------
-    action
-        Writes to the history.
-    seconds
-        Time after which it is not tried again, s.
-    say
-        Takes a line for each reason of a failure.
+    ``action``: writes to the history; ``seconds``: time after which it is not tried again, s; ``say``: takes a line for
+    each reason of a failure.
     """
     until, wait, said = time.monotonic() + seconds, 1.0, ""
     while True:

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from armident.configs import ArmidentError, DataError
+from armident.configs.reasons import reason_of
 from armident.daq.recording import Recording
 from armident.identify.monitoring.ledger import Ledger
 from armident.identify.monitoring.recorded import Captured, captured_as, is_of, result_of
@@ -17,16 +18,9 @@ log = logging.getLogger(__name__)
 class Intake:
     """Enters recordings that have ended in the ledger, each once.
 
-    Parameters
-    ----------
-    cell, robot
-        Names of the cell and of its robot.
-    folder_of
-        Gives the folder of the result of a recording by its name.
-    buffer, lock
-        Streams of the captures under way, and the lock that protects them.
-    refused
-        Takes a stream that cannot be used: name of the capture, message and exit code.
+    ``folder_of``: gives the folder of the result of a recording by its name; ``buffer``, ``lock``: streams of the
+    captures under way, and the lock that protects them; ``refused``: takes a stream that cannot be used: name of the
+    capture, message and exit code.
     """
 
     def __init__(
@@ -47,12 +41,7 @@ class Intake:
     def take_stream(self, ledger: Ledger, assembly: Assembly) -> None:
         """Enter the files of a capture that has ended; without them the stream itself.
 
-        Parameters
-        ----------
-        ledger
-            Ledger of the worker.
-        assembly
-            Events and blocks of the capture.
+        ``ledger``: ledger of the worker; ``assembly``: events and blocks of the capture.
         """
         found = captured_as(assembly.files)
         if any(not captured.finished for captured in found):
@@ -85,16 +74,8 @@ class Intake:
     ) -> None:
         """Enter finished recordings of this cell that the ledger does not know.
 
-        Parameters
-        ----------
-        ledger
-            Ledger of the worker.
-        found
-            The recordings.
-        streamed
-            Hash of the stream of these files, if it was received.
-        announced
-            True for files that were announced on the keys of this cell.
+        ``ledger``: ledger of the worker; ``streamed``: hash of the stream of these files, if it was received;
+        ``announced``: True for files that were announced on the keys of this cell.
         """
         for captured in found:
             try:
@@ -149,9 +130,3 @@ class Intake:
         message = f"{error}, and {where}"
         log.error("%s", message)
         self._refused(assembly.capture, message, error.exit_code)
-
-
-def reason_of(error: OSError) -> str:
-    """Return the file and the reason of an error of the operating system."""
-    where = f"{error.filename}: " if error.filename else ""
-    return f"{where}{error.strerror or type(error).__name__}"

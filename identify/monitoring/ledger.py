@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Literal
 
 from armident.configs import ArmidentError
-from armident.identify.monitoring.sqlite_reason import sqlite_reason
+from armident.configs.reasons import reason_of
 
 FILE = "worker.sqlite"
 """Name of the ledger in the folder of the results."""
@@ -68,7 +68,7 @@ class LedgerUnusable(ArmidentError):
 
 
 @dataclass(frozen=True)
-class Entry:
+class LedgerEntry:
     """Recording in the ledger.
 
     Parameters
@@ -83,8 +83,6 @@ class Entry:
         ``waiting`` for a result, ``done`` or ``failed``.
     attempts
         Number of claims for its identification, this one included.
-    result
-        File of its result, if there is one.
     message
         Verdict of the result, or reason of the failure.
     announced
@@ -110,23 +108,10 @@ _FREE = "(owner IS NULL OR boot IS NOT :boot OR lease_until < :now OR owner = :o
 class Ledger:
     """Ledger in a file, shared by all processes that work on the recordings of a folder.
 
-    Parameters
-    ----------
-    path
-        The file; created if it is missing. It must be on a local disk (SQLite's write-ahead log).
-    owner
-        Name of this process in its claims.
-    lease_s
-        Time after which a claim ends that is not renewed, s.
-    clock
-        Clock of the leases, s; the default is not set by anyone and counts from the start of the machine.
-
-    Raises
-    ------
-    LedgerError
-        If the file is locked or the disk is full.
-    LedgerUnusable
-        If the file is damaged or of a newer version.
+    ``path``: the file; created if it is missing. It must be on a local disk (SQLite's write-ahead log). ``owner``: name
+    of this process in its claims. ``lease_s``: time after which a claim ends that is not renewed, s. ``clock``: clock
+    of the leases, s; the default is not set by anyone and counts from the start of the machine. Raises LedgerError if
+    the file is locked or the disk is full; LedgerUnusable if the file is damaged or of a newer version.
     """
 
     def __init__(
@@ -152,14 +137,8 @@ class Ledger:
     def add(self, sha256: str, name: str, paths: Sequence[Path]) -> bool:
         """Enter a recording, and return True if the ledger did not know it.
 
-        Parameters
-        ----------
-        sha256
-            Hash of its samples.
-        name
-            Name of the recording.
-        paths
-            Its files; empty if it exists in the stream only. They complete an entry that has none.
+        ``sha256``: hash of its samples. ``paths``: its files; empty if it exists in the stream only. They complete an
+        entry that has none.
         """
         row = {"sha256": sha256, "name": name, "paths": _texts(paths), "added": time.time()}
         with self._transaction() as db:
@@ -179,12 +158,7 @@ class Ledger:
     def adopt(self, sha256: str, name: str, paths: Sequence[Path], result: Path, message: str) -> bool:
         """Enter a recording whose result was announced before this ledger existed; return True if it is new.
 
-        Parameters
-        ----------
-        sha256, name, paths
-            As of `add`.
-        result, message
-            File of the result, and its verdict.
+        ``sha256``, ``name``, ``paths``: as of `add`; ``result``, ``message``: file of the result, and its verdict.
         """
         with self._transaction() as db:
             done = db.execute(
@@ -196,19 +170,15 @@ class Ledger:
             )
             return bool(done.rowcount)
 
-    def claim(self, sha256: str | None = None, held: Sequence[str] = (), *, announce: bool = True) -> Entry | None:
+    def claim(
+        self, sha256: str | None = None, held: Sequence[str] = (), *, announce: bool = True
+    ) -> LedgerEntry | None:
         """Claim a recording without a result or announcement, and return it; ``None`` if there is none.
 
         The one with the fewest attempts comes first, so that a recording that ends its workers does not hold up others.
 
-        Parameters
-        ----------
-        sha256
-            Claim this one, and no other.
-        held
-            Recordings without files whose samples this process has in memory.
-        announce
-            Claim recordings that only lack the announcement, too.
+        ``sha256``: claim this one, and no other; ``held``: recordings without files whose samples this process has in
+        memory; ``announce``: claim recordings that only lack the announcement, too.
         """
         names = {f"h{k}": value for k, value in enumerate(held)}
         here = ", ".join(f":{name}" for name in names)
@@ -242,16 +212,8 @@ class Ledger:
     def finish(self, sha256: str, state: State, result: Path | None, message: str) -> bool:
         """Enter a result; return False if the claim was lost to another worker, whose result counts.
 
-        Parameters
-        ----------
-        sha256
-            The recording.
-        state
-            ``done`` or ``failed``.
-        result
-            File of the result, which is complete.
-        message
-            Verdict of the result, or reason of the failure.
+        ``state``: ``done`` or ``failed``; ``result``: file of the result, which is complete; ``message``: verdict of
+        the result, or reason of the failure.
         """
         values = {"sha256": sha256, "state": state, "result": None if result is None else str(result)}
         with self._transaction() as db:
@@ -267,11 +229,6 @@ class Ledger:
         """Enter an announcement that is made inside the block; yield False if it must not be made.
 
         The entry counts if the block ends without an exception. The claim ends with it.
-
-        Parameters
-        ----------
-        sha256
-            The recording.
         """
         with self._transaction() as db:
             done = db.execute(
@@ -281,32 +238,26 @@ class Ledger:
             )
             yield bool(done.rowcount)
 
-    def unannounced(self) -> list[Entry]:
+    def unannounced(self) -> list[LedgerEntry]:
         """Return the entries with a result or a failure that has not been announced."""
         query = f"SELECT {_COLUMNS} FROM experiments WHERE announced = 0 AND state != 'waiting'"
         with self._transaction() as db:
             return [_entry(row) for row in db.execute(query)]
 
     def enter_announced(self, sha256: str) -> None:
-        """Enter an announcement that another process has made, and end the claim.
-
-        Parameters
-        ----------
-        sha256
-            The recording.
-        """
+        """Enter an announcement that another process has made, and end the claim."""
         with self._transaction() as db:
             db.execute(
                 "UPDATE experiments SET announced = 1, owner = NULL WHERE sha256 = ? AND state != 'waiting'", (sha256,)
             )
 
-    def entry(self, sha256: str) -> Entry | None:
+    def entry(self, sha256: str) -> LedgerEntry | None:
         """Return the entry of a recording, or ``None``."""
         with self._transaction() as db:
             row = db.execute(f"SELECT {_COLUMNS} FROM experiments WHERE sha256 = ?", (sha256,)).fetchone()
         return None if row is None else _entry(row)
 
-    def entries(self) -> list[Entry]:
+    def entries(self) -> list[LedgerEntry]:
         """Return all entries in the order in which they were added."""
         with self._transaction() as db:
             return [_entry(row) for row in db.execute(f"SELECT {_COLUMNS} FROM experiments ORDER BY added, name")]
@@ -322,12 +273,7 @@ class Ledger:
     def file_hash(self, path: Path, stamp: str) -> tuple[str | None] | None:
         """Return the hash that was entered for a file with this stamp; ``None`` if it was not entered.
 
-        Parameters
-        ----------
-        path
-            The file.
-        stamp
-            Its size and time of change.
+        ``stamp``: its size and time of change.
         """
         with self._transaction() as db:
             row = db.execute("SELECT sha256 FROM files WHERE path = ? AND stamp = ?", (str(path), stamp)).fetchone()
@@ -336,12 +282,7 @@ class Ledger:
     def enter_file(self, path: Path, stamp: str, sha256: str | None) -> None:
         """Enter a file that was read.
 
-        Parameters
-        ----------
-        path, stamp
-            As of `file_hash`.
-        sha256
-            Hash of its recording; ``None`` if it is none of this cell.
+        ``path``, ``stamp``: as of `file_hash`. ``sha256``: hash of its recording; ``None`` if it is none of this cell.
         """
         with self._transaction() as db:
             db.execute("INSERT OR REPLACE INTO files VALUES (?, ?, ?)", (str(path), stamp, sha256))
@@ -373,7 +314,7 @@ class Ledger:
         try:
             yield
         except (sqlite3.OperationalError, OSError) as error:
-            raise LedgerError(f"{self.path}: {_reason(error)}") from error
+            raise LedgerError(f"{self.path}: {reason_of(error, BUSY_S, named=False)}") from error
         except sqlite3.DatabaseError as error:
             raise LedgerUnusable(
                 f"{self.path}: the ledger is damaged ({error}); move it away and start again, results are found"
@@ -400,17 +341,11 @@ def _use_write_ahead_log(db: sqlite3.Connection) -> None:
             time.sleep(0.02)
 
 
-def _reason(error: OSError | sqlite3.Error) -> str:
-    if isinstance(error, OSError):
-        return error.strerror or str(error)
-    return sqlite_reason(error, BUSY_S)
-
-
-def _entry(row: tuple[str, str, str, State, int, str | None, str | None, int]) -> Entry:
+def _entry(row: tuple[str, str, str, State, int, str | None, str | None, int]) -> LedgerEntry:
     sha256, name, paths, state, attempts, result, message, announced = row
     files = tuple(Path(path) for path in json.loads(paths))
     found = None if result is None else Path(result)
-    return Entry(sha256, name, files, state, attempts, found, message, bool(announced))
+    return LedgerEntry(sha256, name, files, state, attempts, found, message, bool(announced))
 
 
 def _texts(paths: Sequence[Path]) -> str:

@@ -24,12 +24,7 @@ def model_differences(
 ) -> list[str]:
     """Return one line for each kind of difference between two models of a robot that may look like a change.
 
-    Parameters
-    ----------
-    baseline, now
-        The identifications.
-    std
-        Standard deviation of the difference of each parameter that is compared.
+    ``std``: standard deviation of the difference of each parameter that is compared.
     """
     lines = [_smoothing(baseline, now, std)]
     if baseline.configuration is not None and now.configuration is not None:

@@ -19,12 +19,7 @@ _PART = re.compile(r"(?P<name>.+?)(?:\.\d{4,})?\.mcap")
 class Captured:
     """Files of one capture.
 
-    Parameters
-    ----------
-    name
-        Name without suffix and number of the part.
-    paths
-        The files in their order.
+    ``name``: name without suffix and number of the part; ``paths``: the files in their order.
     """
 
     name: str
@@ -44,34 +39,21 @@ class Captured:
     def stamp(self) -> str:
         """Sizes and times of change of the files, by which a change of their contents is noticed.
 
-        Raises
-        ------
-        OSError
-            If a file has vanished.
+        Raises OSError if a file has vanished.
         """
         stats = [path.stat() for path in self.paths]
         return ";".join(f"{path.name}:{s.st_size}:{s.st_mtime_ns}" for path, s in zip(self.paths, stats, strict=True))
 
     def read(self) -> Recording:
-        """Return the recording, joined of its files.
-
-        Raises
-        ------
-        ArmidentError
-            If a file cannot be read.
-        """
+        """Return the recording, joined of its files. Raises ArmidentError if a file cannot be read."""
         return join_parts([read_recording(path) for path in self.paths])
 
 
 def captured_in(folders: Sequence[Path], robot: str) -> list[Captured]:
     """Return the captures of a robot in folders, in the order of their names.
 
-    Parameters
-    ----------
-    folders
-        Folders; those that do not exist hold nothing. Their subfolders are not searched.
-    robot
-        Name of the robot, with which the names of its recordings begin.
+    ``folders``: folders; those that do not exist hold nothing. Their subfolders are not searched. ``robot``: name of
+    the robot, with which the names of its recordings begin.
     """
     found: dict[tuple[Path, str], list[Path]] = {}
     for folder in {folder.resolve(): None for folder in folders}:
@@ -86,10 +68,7 @@ def captured_in(folders: Sequence[Path], robot: str) -> list[Captured]:
 def captured_as(paths: Sequence[Path]) -> list[Captured]:
     """Return the captures of these files, which are parts of one capture or of one event each.
 
-    Parameters
-    ----------
-    paths
-        Files of recordings; others are left out.
+    ``paths``: files of recordings; others are left out.
     """
     found: dict[str, list[Path]] = {}
     for path in paths:
@@ -102,19 +81,7 @@ def captured_as(paths: Sequence[Path]) -> list[Captured]:
 def is_of(recording: Recording, cell: str | None, robot: str) -> bool:
     """Return True if a recording is of a robot in a cell.
 
-    Parameters
-    ----------
-    recording
-        The recording.
-    cell
-        Name of the cell; ``None``: any.
-    robot
-        Name of the robot.
-
-    Raises
-    ------
-    DataError
-        If it is of this robot, and empty.
+    ``cell``: name of the cell; ``None``: any. Raises DataError if it is of this robot, and empty.
     """
     session = None if recording.session is None else recording.session.cell
     found = recording.metadata.get("cell", session)
@@ -128,12 +95,7 @@ def is_of(recording: Recording, cell: str | None, robot: str) -> bool:
 def result_of(sha256: str, folder: Path) -> tuple[Path, IdentificationDocument] | None:
     """Return the result of a recording in a folder, ``None`` if there is none or it is of another recording.
 
-    Parameters
-    ----------
-    sha256
-        Hash of the recording.
-    folder
-        Folder of the result.
+    ``sha256``: hash of the recording.
     """
     path = folder / "identification.json"
     if not path.is_file():

@@ -38,8 +38,6 @@ class ResidualChange:
 
     Parameters
     ----------
-    joint
-        Name of the joint.
     kind
         ``position`` (and direction), ``velocity``, or ``power`` in a frequency band.
     statistic, degrees
@@ -77,35 +75,21 @@ class ResidualChange:
 class ResidualTest:
     """Result of the test; without tests, ``reason`` says why.
 
-    Parameters
-    ----------
-    tests
-        All joints and kinds.
-    reason
-        Why structure is not compared, for all joints or some; empty: compared.
+    ``tests``: all joints and kinds. ``reason``: why structure is not compared, for all joints or some; empty: compared.
     """
 
     tests: tuple[ResidualChange, ...] = ()
     reason: str = ""
 
     def changed(self, level: float) -> tuple[ResidualChange, ...]:
-        """Return the significant changes, the most significant first.
-
-        Parameters
-        ----------
-        level
-            False-alarm rate of the whole test.
-        """
+        """Return the significant changes, the most significant first. ``level``: False-alarm rate of the whole test."""
         return tuple(sorted((t for t in self.tests if t.p_value < level), key=lambda t: t.p_value))
 
 
 def compare_residuals(baseline: IdentificationDocument, now: IdentificationDocument) -> ResidualTest:
     """Test the residuals of two identifications of an arm for a change.
 
-    Parameters
-    ----------
-    baseline, now
-        Identifications with the same motion.
+    ``baseline``, ``now``: identifications with the same motion.
     """
     if baseline.residual_statistics is None:
         return ResidualTest(reason=NOT_COMPARED)

@@ -6,12 +6,7 @@ import json
 def status(component: str, state: str, **more: object) -> bytes:
     """Return a message for the key of the status.
 
-    Parameters
-    ----------
-    component, state
-        Name of the program and of its state.
-    more
-        Further entries.
+    ``component``, ``state``: name of the program and of its state; ``more``: further entries.
     """
     return json.dumps({"component": component, "state": state, **more}).encode()
 
@@ -19,13 +14,6 @@ def status(component: str, state: str, **more: object) -> bytes:
 def failure_status(component: str, message: str, name: str, sha256: str) -> bytes:
     """Return the announcement that a recording cannot be identified.
 
-    Parameters
-    ----------
-    component
-        Name of the program.
-    message
-        The reason.
-    name, sha256
-        Name of the recording and its hash.
+    ``component``: name of the program; ``name``, ``sha256``: name of the recording and its hash.
     """
     return status(component, "failed", message=message, capture=name, sha256=sha256)

@@ -40,20 +40,8 @@ LARGEST_EVENT = 16 << 20
 class Assembly:
     """Events and blocks of one capture, in any order of arrival.
 
-    Parameters
-    ----------
-    capture
-        Name of the capture.
-    start, end
-        Start and end event, when received.
-    blocks
-        Blocks by number.
-    nbytes
-        Memory of the blocks, bytes.
-    touched
-        Time of the last event or block, s.
-    too_long
-        True if blocks were given up for lack of memory.
+    ``start``, ``end``: start and end event, when received; ``nbytes``: memory of the blocks, bytes; ``touched``: time
+    of the last event or block, s; ``too_long``: True if blocks were given up for lack of memory.
     """
 
     capture: str
@@ -87,13 +75,7 @@ class Assembly:
         return isinstance(recording, dict) and recording.get("trigger") is not None
 
     def recording(self) -> Recording:
-        """Return the recording of the stream.
-
-        Raises
-        ------
-        DataError
-            If an event or blocks are missing.
-        """
+        """Return the recording of the stream. Raises DataError if an event or blocks are missing."""
         if self.start is None or self.end is None:
             missing = "start" if self.start is None else "end"
             raise DataError(f"capture {self.capture}: its {missing} event was not received")
@@ -111,12 +93,7 @@ class StreamBuffer:
     Anybody may publish on the keys of a cell. Messages that are not of armident are counted and reported; the number of
     captures and the memory of their blocks are bounded. A capture that was given up is read from its file.
 
-    Parameters
-    ----------
-    most_bytes
-        Largest size of all blocks, bytes.
-    clock
-        Monotonic clock, s.
+    ``most_bytes``: largest size of all blocks, bytes; ``clock``: monotonic clock, s.
     """
 
     def __init__(self, most_bytes: int | None = None, clock: Callable[[], float] = time.monotonic) -> None:
@@ -133,12 +110,7 @@ class StreamBuffer:
     def take_event(self, data: bytes | None, size: int) -> Mapping[str, Any] | None:
         """Take an encoded event; return it if it is the start or the end of a capture that is not finished.
 
-        Parameters
-        ----------
-        data
-            The event; ``None`` if it is too large to be decoded.
-        size
-            Its size, bytes.
+        ``data``: the event; ``None`` if it is too large to be decoded.
         """
         try:
             if data is None:
@@ -157,15 +129,7 @@ class StreamBuffer:
         return event
 
     def take_block(self, data: bytes | None, size: int) -> None:
-        """Take an encoded block.
-
-        Parameters
-        ----------
-        data
-            The block; ``None`` if it is too large to be decoded.
-        size
-            Its size, bytes.
-        """
+        """Take an encoded block. ``data``: the block; ``None`` if it is too large to be decoded."""
         try:
             if data is None:
                 raise DataError(f"a block of {size} bytes, more than {LARGEST_BLOCK}")
@@ -210,10 +174,7 @@ class StreamBuffer:
     def keep(self, assembly: Assembly) -> None:
         """Keep a capture for another `MAX_WAITING_S`: its end was announced, but its file is still being written.
 
-        Parameters
-        ----------
-        assembly
-            The capture, as `take_ended` returned it.
+        ``assembly``: the capture, as `take_ended` returned it.
         """
         self._finished.pop(assembly.capture, None)
         assembly.end, assembly.ended = None, math.inf
@@ -222,12 +183,7 @@ class StreamBuffer:
     def refuse(self, kind: str, message: str) -> None:
         """Report a message that cannot be used: the first one, the tenth, the hundredth of a kind, and so on.
 
-        Parameters
-        ----------
-        kind
-            Kind of messages that are counted together.
-        message
-            Text of the report.
+        ``kind``: kind of messages that are counted together.
         """
         number = self._reported[kind] = self._reported.get(kind, 0) + 1
         if math.log10(number).is_integer():
@@ -262,10 +218,7 @@ class StreamBuffer:
 def drop_oldest(streams: dict[str, Recording]) -> None:
     """Remove the oldest streams while there are more than `MOST_STREAMS`, or several with more than `MOST_BYTES`.
 
-    Parameters
-    ----------
-    streams
-        Captures without a file that wait for a worker, in the order in which they came.
+    ``streams``: captures without a file that wait for a worker, in the order in which they came.
     """
     sizes = {digest: _samples_nbytes(recording) for digest, recording in streams.items()}
     while len(sizes) > MOST_STREAMS or (len(sizes) > 1 and sum(sizes.values()) > MOST_BYTES):

@@ -11,13 +11,24 @@ from pathlib import Path
 from types import FrameType
 from typing import TypeVar
 
-from armident.configs import ArmidentError, DataError, RobotConfig, SessionConfig, load_robot, load_session
+from pydantic import TypeAdapter, ValidationError
+
+from armident.configs import ArmidentError, ConfigError, DataError, RobotConfig, SessionConfig, load_robot, load_session
+from armident.configs.reasons import reason_of
 from armident.daq.streaming import Keys
-from armident.identify.identification.api import identify_recording
+from armident.identify.identification.identify_recording import identify_recording
 from armident.identify.identification.options import Options
 from armident.identify.monitoring.announcements import Announcements
-from armident.identify.monitoring.intake import Intake, reason_of
-from armident.identify.monitoring.ledger import FILE, MOST_ATTEMPTS, Entry, Ledger, LedgerError, State, unique_owner
+from armident.identify.monitoring.intake import Intake
+from armident.identify.monitoring.ledger import (
+    FILE,
+    MOST_ATTEMPTS,
+    Ledger,
+    LedgerEntry,
+    LedgerError,
+    State,
+    unique_owner,
+)
 from armident.identify.monitoring.recorded import (
     Captured,
     captured_in,
@@ -46,27 +57,27 @@ class _Closing(Exception):
     """The worker is being closed while it waits."""
 
 
+def options_of(session: SessionConfig) -> Options:
+    """Options of the worker of a cell; a ConfigError names the key that is wrong."""
+    # The filters of a published fit are for a comparison with it, not for a cell.
+    given = {"derivatives": "irwsm"} | session.identification
+    try:
+        return TypeAdapter(Options).validate_python(given)
+    except ValidationError as error:
+        problem = error.errors()[0]
+        keys = ".".join(str(key) for key in ("identification", *problem["loc"]))
+        raise ConfigError(f"session of cell {session.cell}: {keys}: {problem['msg']}") from error
+
+
 class Worker:
     """Identifies every recording of one robot in one cell.
 
     It finds recordings by the events on Zenoh and in the folders of the cell. A ledger in the folder of the results
     says which have a result: a worker that was absent or killed continues there, and several workers share the work.
 
-    Parameters
-    ----------
-    session
-        Configuration of the cell.
-    robot
-        Configuration of its robot.
-    out
-        Folder of the results; each recording has a subfolder. The ledger is there.
-    progress
-        Called every second with the state, as long as the work advances; resets a watchdog.
-
-    Raises
-    ------
-    ConfigError
-        If Zenoh's configuration is wrong.
+    ``out``: folder of the results; each recording has a subfolder. The ledger is there. ``progress``: called every
+    second with the state, as long as the work advances; resets a watchdog. Raises ConfigError if Zenoh's configuration
+    is wrong.
     """
 
     def __init__(
@@ -74,7 +85,7 @@ class Worker:
     ) -> None:
         self._robot, self._cell, self._out = robot, session.cell, out
         self._folders = (session.recording.directory, out)
-        self._options = Options(**session.identification.model_dump())
+        self._options = options_of(session)
         self._keys = Keys(session.cell, robot.name)
         self._owner = unique_owner()
         self._results: queue.SimpleQueue[int] = queue.SimpleQueue()
@@ -204,13 +215,13 @@ class Worker:
     def _folder(self, name: str) -> Path:
         return self._out / f"{name}.identification"
 
-    def _folder_of(self, entry: Entry) -> Path:
+    def _folder_of(self, entry: LedgerEntry) -> Path:
         """Return the folder of a result; another one if a recording of the same name has a result there."""
         plain = self._folder(entry.name)
         taken = (plain / "identification.json").is_file() and result_of(entry.sha256, plain) is None
         return self._folder(f"{entry.name}.{entry.sha256[:8]}") if taken else plain
 
-    def _process(self, ledger: Ledger, entry: Entry) -> None:
+    def _process(self, ledger: Ledger, entry: LedgerEntry) -> None:
         """Identify a recording, enter and announce the result; what was done before is not repeated."""
         code = _exit_code(entry.state, entry.message)
         if entry.state == "waiting":
@@ -237,17 +248,17 @@ class Worker:
             self._until_possible("announcement", lambda: self._announce(ledger, entry.sha256))
             self._results.put(code)
 
-    def _fail(self, ledger: Ledger, entry: Entry, message: str) -> None:
+    def _fail(self, ledger: Ledger, entry: LedgerEntry, message: str) -> None:
         log.error("%s", message)
         self._enter(ledger, entry, "failed", None, message)
 
-    def _enter(self, ledger: Ledger, entry: Entry, state: State, path: Path | None, message: str) -> bool:
+    def _enter(self, ledger: Ledger, entry: LedgerEntry, state: State, path: Path | None, message: str) -> bool:
         mine = self._until_possible("ledger", lambda: ledger.finish(entry.sha256, state, path, message))
         if not mine:
-            log.warning("%s: another worker took over after this one was held up; its result counts", entry.name)
+            log.warning("%s: lease expired: the result of the other worker is used", entry.name)
         return mine
 
-    def _identify(self, entry: Entry) -> tuple[Path, str]:
+    def _identify(self, entry: LedgerEntry) -> tuple[Path, str]:
         """Return the file of the result and its verdict; a result that a killed worker has written is used."""
         folder = self._folder_of(entry)
         found = result_of(entry.sha256, folder)
@@ -310,24 +321,8 @@ def _exit_code(state: State, message: str | None) -> int:
 def run_worker(config: Path, *, once: bool, out: Path | None) -> int:
     """Carry out ``armident worker`` until SIGTERM or SIGINT.
 
-    Parameters
-    ----------
-    config
-        Session configuration.
-    once
-        End after one recording with its exit code.
-    out
-        Folder of the results; ``None``: the recording directory of the session.
-
-    Returns
-    -------
-    int
-        Exit code.
-
-    Raises
-    ------
-    ConfigError
-        If the configuration is wrong.
+    ``config``: session configuration. ``once``: end after one recording with its exit code. ``out``: folder of the
+    results; ``None``: the recording directory of the session. Returns the exit code.
     """
     session = load_session(config, "identify")
     robot = load_robot(session.robot, "identify")

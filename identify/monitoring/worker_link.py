@@ -10,7 +10,7 @@ import zenoh
 from armident.configs import ArmidentError, ConfigError, SessionConfig
 from armident.daq.streaming import Announcer, Keys, open_session
 from armident.daq.streaming.announcer import longest_retry_s
-from armident.daq.streaming.session import configuration
+from armident.daq.streaming.zenoh_session import configuration
 from armident.identify.monitoring.status_messages import status
 from armident.identify.monitoring.worker_receiver import Take, WorkerReceiver
 
@@ -27,23 +27,9 @@ class WorkerLink:
     The first worker of a cell listens on the port of its role. Others listen on a free port, and one of them takes the
     port of the role when it is free again. Without a session the worker continues with the files.
 
-    Parameters
-    ----------
-    session
-        Configuration of the cell.
-    keys
-        Keys of its robot.
-    on_event, on_block
-        Take an encoded message (``None`` if it is larger than the limit) and its size, bytes.
-    limits
-        Largest event and block that are passed on, bytes.
-    answer
-        Returns the last result, or ``None``.
-
-    Raises
-    ------
-    ConfigError
-        If Zenoh's configuration is wrong.
+    ``keys``: keys of its robot; ``on_event``, ``on_block``: take an encoded message (``None`` if it is larger than the
+    limit) and its size, bytes; ``limits``: largest event and block that are passed on, bytes; ``answer``: returns the
+    last result, or ``None``. Raises ConfigError if Zenoh's configuration is wrong.
     """
 
     def __init__(
@@ -61,7 +47,7 @@ class WorkerLink:
         """Subscriptions, in a session of their own."""
         self._session: zenoh.Session | None = None
         self._announcer: Announcer | None = None
-        self._beside = False
+        self._shared = False
         self._problem: str | None = None
         self._lock = threading.Lock()
 
@@ -74,15 +60,15 @@ class WorkerLink:
     def check(self) -> None:
         """Open sessions that are missing, and take the port of the role if another worker has left it."""
         self.receiver.check()
-        if self._session is not None and not self._beside:
+        if self._session is not None and not self._shared:
             return
         try:
-            self._use(open_session(self._config, "worker"), beside=False)
+            self._use(open_session(self._config, "worker"), shared=False)
         except ConfigError as error:
             if self._session is not None:
                 return
             try:
-                self._use(open_session(self._config, "worker", any_port=True), beside=True)
+                self._use(open_session(self._config, "worker", any_port=True), shared=True)
                 log.info(
                     "the worker port of cell %s is taken, as by another worker; workers share the recordings",
                     self._config.cell,
@@ -95,15 +81,7 @@ class WorkerLink:
     def announce(self, *messages: tuple[str, bytes]) -> None:
         """Publish a result or a failure; it has left the process when this returns.
 
-        Parameters
-        ----------
-        messages
-            Key expressions and contents.
-
-        Raises
-        ------
-        LinkDown
-            If there is no session, it is too new, or it fails.
+        ``messages``: key expressions and contents. Raises LinkDown if there is no session, it is too new, or it fails.
         """
         with self._lock:
             if self._announcer is None or not self.can_announce:
@@ -114,15 +92,7 @@ class WorkerLink:
                 raise LinkDown("zenoh: the session failed") from error
 
     def status(self, state: str, **more: Any) -> None:
-        """Publish the state of the worker if there is a session.
-
-        Parameters
-        ----------
-        state
-            Name of the state.
-        more
-            Further entries.
-        """
+        """Publish the state of the worker if there is a session. ``more``: further entries."""
         content = status("worker", state, **more)
         with self._lock:
             if self._session is None:
@@ -140,7 +110,7 @@ class WorkerLink:
         if session is not None:
             session.close()
 
-    def _use(self, session: zenoh.Session, *, beside: bool) -> None:
+    def _use(self, session: zenoh.Session, *, shared: bool) -> None:
         """Replace the session; the new one answers before the old one is closed."""
         try:
             kept: list[Any] = [
@@ -153,7 +123,7 @@ class WorkerLink:
         with self._lock:
             old, self._session = self._session, session
             self._announcer = Announcer(session, self._keys, self._retry_s)
-            self._declared, self._beside, self._problem = kept, beside, None
+            self._declared, self._shared, self._problem = kept, shared, None
         if old is not None:
             old.close()
 

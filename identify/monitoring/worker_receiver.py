@@ -31,16 +31,7 @@ class WorkerReceiver:
 
     The announcements of other workers are noted by the hash of their content.
 
-    Parameters
-    ----------
-    session
-        Configuration of the cell.
-    keys
-        Keys of its robot.
-    on_event, on_block
-        Take events and blocks.
-    limits
-        Largest event and block that are passed on, bytes.
+    ``keys``: keys of its robot; ``limits``: largest event and block that are passed on, bytes.
     """
 
     def __init__(
@@ -98,13 +89,7 @@ class WorkerReceiver:
 
 
 def content_hash(content: bytes) -> bytes:
-    """Return the hash by which an announcement is known.
-
-    Parameters
-    ----------
-    content
-        The message.
-    """
+    """Return the hash by which an announcement is known."""
     return hashlib.sha256(content).digest()
 
 

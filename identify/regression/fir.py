@@ -26,22 +26,8 @@ _PIECE = 2048
 def filter_columns(taps: NDArray[np.float64], x: NDArray[np.float64]) -> NDArray[np.float64]:
     """``sum_i taps[i] x(t - i)`` for every t whose samples are all there.
 
-    Parameters
-    ----------
-    taps
-        Impulse response, shape (l + 1,).
-    x
-        Columns, shape (M, b), at least l + 1 rows.
-
-    Returns
-    -------
-    ndarray
-        Shape (M - l, b).
-
-    Raises
-    ------
-    ValueError
-        If there are fewer rows than taps.
+    ``taps``: impulse response, shape (l + 1,); ``x``: columns, shape (M, b), at least l + 1 rows. Result: shape
+    (M - l, b). Raises ValueError if there are fewer rows than taps.
     """
     span, count = taps.size - 1, x.shape[0] - taps.size + 1
     if count < 1:

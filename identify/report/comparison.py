@@ -14,12 +14,7 @@ from armident.identify.report.plots import Plot, Series, plots_html
 def comparison_report(document: ComparisonDocument, glossary_of: IdentificationDocument) -> str:
     """Return the HTML page of a comparison, complete in one file.
 
-    Parameters
-    ----------
-    document
-        The comparison.
-    glossary_of
-        The later identification, whose parameters the glossary explains.
+    ``glossary_of``: the later identification, whose parameters the glossary explains.
     """
     return render(
         "comparison.html",
@@ -62,5 +57,5 @@ def _reading(p: ComparedParameter) -> str:
     """Return both values of a parameter with 95 % intervals, in words and with its unit."""
     words = in_words(p.name)
     values = (("before", p.before, p.before_std), ("now", p.now, p.now_std))
-    told = ", ".join(f"{when} {value:.4g} ± {LEVEL_95 * std:.2g}" for when, value, std in values)
-    return f"{p.name}{f' ({words})' if words else ''}: {told} {p.unit}"
+    estimates = ", ".join(f"{when} {value:.4g} ± {LEVEL_95 * std:.2g}" for when, value, std in values)
+    return f"{p.name}{f' ({words})' if words else ''}: {estimates} {p.unit}"

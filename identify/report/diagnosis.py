@@ -23,8 +23,8 @@ VERDICTS = {
 }
 LEVELS = {"no_gap": "trustworthy", "explained": "doubtful", "partly_explained": "unusable", "unexplained": "unusable"}
 """Colours of the verdicts, by the levels of an identification."""
-CERTAIN, LIKELY = 0.95, 0.6
-"""Confidence from which a finding is called certain, and likely."""
+LIKELY = 0.6
+"""Posterior probability below which a finding may be another effect: odds of 3 to 2 against all others together."""
 BINS, FILLED = 14, 5
 """Bins of a variable, and the fewest samples of one that is drawn."""
 SHOWN = 700
@@ -36,12 +36,7 @@ FOLLOWS = 0.6
 def diagnosis_report(diagnosis: Diagnosis, document: DiagnosisDocument) -> str:
     """Return the HTML page of a diagnosis, complete in one file.
 
-    Parameters
-    ----------
-    diagnosis
-        Curves and configuration with the findings.
-    document
-        ``diagnosis.json``.
+    ``diagnosis``: curves and configuration with the findings; ``document``: ``diagnosis.json``.
     """
     joints = [joint.name for joint in diagnosis.robot.joints]
     hidden: dict[str, list[str]] = {}
@@ -62,7 +57,7 @@ def diagnosis_report(diagnosis: Diagnosis, document: DiagnosisDocument) -> str:
                 "f": finding,
                 "title": finding.evidence.get("title", finding.effect.replace("_", " ")),
                 "where": finding.joint if finding.other is None else f"{finding.joint} and {finding.other}",
-                "sure": certainty(finding),
+                "probability": posterior_probability(finding),
                 "closed": closed_share(finding, document),
                 "rows": _rows(finding),
                 "picture": _finding_figure(diagnosis, joints.index(finding.joint), lacking, own),
@@ -89,32 +84,20 @@ def _detection_limits(document: DiagnosisDocument) -> list[dict[str, str]]:
     ]
 
 
-def certainty(finding: Finding) -> str:
-    """Return the confidence of a finding in words."""
+def posterior_probability(finding: Finding) -> str:
+    """Return the posterior probability of a finding in words, with the effects that it is ambiguous with."""
+    shown = "> 99.9 %" if finding.confidence > 0.999 else f"{100 * finding.confidence:.0f} %"
     rivals = finding.evidence.get("ambiguous_with", [])
     if rivals:
-        return "ambiguous with " + ", ".join(name.replace("_", " ") for name in rivals)
-    if finding.confidence >= CERTAIN:
-        return "certain"
-    return "likely" if finding.confidence >= LIKELY else "uncertain: a similar effect, perhaps outside the catalogue"
+        return f"{shown}, ambiguous with {', '.join(name.replace('_', ' ') for name in rivals)}"
+    return shown if finding.confidence >= LIKELY else f"{shown}, perhaps a similar effect outside the catalogue"
 
 
 def closed_share(finding: Finding, document: DiagnosisDocument) -> float | None:
     """Return the share of the joint's held-out gap above the noise floor that a finding closes, 0 to 1.
 
-    The gap after is that without derivative noise where this is smaller.
-
-    Parameters
-    ----------
-    finding
-        A finding.
-    document
-        Its document, for the noise floor.
-
-    Returns
-    -------
-    float or None
-        ``None`` if there is no gap above the noise floor.
+    The gap after is that without derivative noise where this is smaller. Returns ``None`` if there is no gap above the
+    noise floor.
     """
     noiseless = finding.evidence.get("gap_without_derivative_noise")
     after = finding.gap_after if noiseless is None else min(finding.gap_after, noiseless)
@@ -156,17 +139,9 @@ def _gap_figure(document: DiagnosisDocument) -> str:
 def _finding_figure(diagnosis: Diagnosis, joint: int, lacking: Array | None, own: Array | None) -> str:
     """Return a figure of the joint's held-out residual without and with a finding, over time and over its variable.
 
-    Parameters
-    ----------
-    diagnosis
-        Curves.
-    joint
-        Index of the joint.
-    lacking
-        Torques (M, n) of the model without the finding; ``None`` compares the model as configured with that of all
-        findings.
-    own
-        Torques (M, n) of the finding itself, which depend on its variable alone; ``None`` if it is no term.
+    ``joint``: index of the joint. ``lacking``: torques (M, n) of the model without the finding; ``None`` compares the
+    model as configured with that of all findings. ``own``: torques (M, n) of the finding itself, which depend on its
+    variable alone; ``None`` if it is no term.
     """
     name, unit = diagnosis.robot.joints[joint].name, _unit(diagnosis, joint)
     seen = [d for d in diagnosis.where if d.joint == name]
@@ -207,14 +182,7 @@ def followed_variable(diagnosis: Diagnosis, joint: int, added: Array) -> tuple[s
 
     Speed, position or time, the first whose means have the share `FOLLOWS` of its power; otherwise its own torque.
 
-    Parameters
-    ----------
-    diagnosis
-        Curves.
-    joint
-        Index of the joint.
-    added
-        Torque (M,) of the finding, N m or N.
+    ``joint``: index of the joint; ``added``: torque (M,) of the finding, N m or N.
     """
     way = "m" if diagnosis.robot.joints[joint].type == "prismatic" else "rad"
     for name, unit, x in (

@@ -6,23 +6,14 @@ import yaml
 
 from armident.configs import RobotConfig
 from armident.identify.documents.files import to_json, write_atomically
-from armident.identify.identification.api import IdentificationOutcome
+from armident.identify.identification.identify_recording import IdentificationOutcome
 
 
 def write_identification(outcome: IdentificationOutcome, out: Path) -> tuple[Path, Path]:
     """Write ``identification.json`` and ``report.html`` into a folder.
 
-    Parameters
-    ----------
-    outcome
-        Result with its document.
-    out
-        Folder; created if it is missing.
-
-    Returns
-    -------
-    tuple of Path
-        Paths of document and report.
+    ``outcome``: result with its document. ``out``: folder; created if it is missing. Returns paths of document and
+    report.
     """
     from armident.identify.report.identification import identification_report
 

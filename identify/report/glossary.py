@@ -19,14 +19,8 @@ from armident.identify.effects.wiring import Wiring
 class Entry:
     """One entry of the glossary.
 
-    Parameters
-    ----------
-    name
-        Parameter or term.
-    text
-        Explanation, one or two sentences.
-    units
-        Units at a revolute and at a prismatic joint; empty strings for a number without unit.
+    ``name``: parameter or term. ``text``: explanation, one or two sentences. ``units``: units at a revolute and at a
+    prismatic joint; empty strings for a number without unit.
     """
 
     name: str
@@ -349,15 +343,8 @@ _NAME = re.compile(r"([a-z_]+?)(m?\d+)(r?)((?:_\d+)?)$")
 def effect_entries(effect: Effect) -> list[Entry]:
     """Return the entries of all linear and nonlinear parameters of an effect.
 
-    Parameters
-    ----------
-    effect
-        Entry of the catalogue. Parameters of a plug-in are explained by its description.
-
-    Returns
-    -------
-    list of Entry
-        In the order of the effect: linear, nonlinear; of a wiring error the signals.
+    ``effect``: entry of the catalogue. Parameters of a plug-in are explained by its description. Result: in the order
+    of the effect: linear, nonlinear; of a wiring error the signals.
     """
     texts = EFFECT_PARAMETERS.get(effect.key, {})
     units = {name: ("", "") for name in texts} if isinstance(effect, Wiring) else effect.units
@@ -367,10 +354,7 @@ def effect_entries(effect: Effect) -> list[Entry]:
 def base_entry(name: str) -> Entry | None:
     """Return the entry of the kind of a base parameter, for example of ``zz`` for ``zz1r``; ``None`` if unknown.
 
-    Parameters
-    ----------
-    name
-        As in ``identification.json``; of terms of effects, too.
+    ``name``: as in ``identification.json``; of terms of effects, too.
     """
     match = _NAME.match(name)
     kind = name if match is None else match[1]
@@ -386,10 +370,7 @@ def base_entry(name: str) -> Entry | None:
 def in_words(name: str) -> str:
     """Return the meaning of a base parameter in a few words, with its link, joint or coupling; empty if unknown.
 
-    Parameters
-    ----------
-    name
-        As in ``identification.json``.
+    ``name``: as in ``identification.json``.
 
     Examples
     --------
@@ -416,12 +397,7 @@ def in_words(name: str) -> str:
 def meaning_of(name: str, finding: Finding) -> str:
     """Return the meaning of a parameter of a finding, as a sentence; empty if unknown.
 
-    Parameters
-    ----------
-    name
-        Parameter of the finding.
-    finding
-        A finding of a diagnosis.
+    ``name``: parameter of the finding; ``finding``: a finding of a diagnosis.
     """
     effects = catalogue()
     effect = effects.get(f"{finding.effect}/{finding.law}" if finding.law else finding.effect)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from armident.configs import RobotConfig
 from armident.daq.recording import Recording
 from armident.identify.documents.identification import IdentificationDocument
-from armident.identify.identification.result import Identification
+from armident.identify.identification.identification_result import IdentificationResult
 from armident.identify.report.glossary import identification_entries
 from armident.identify.report.page import BAND, CONFIGURED, INK, MEASURED, MODEL, MUTED, RESIDUAL, figure, render
 from armident.identify.report.plots import Plot, Series, plots_html
@@ -24,20 +24,11 @@ FAIR_PCT = 20.0
 
 
 def identification_report(
-    recordings: Sequence[Recording], robot: RobotConfig, result: Identification, document: IdentificationDocument
+    recordings: Sequence[Recording], robot: RobotConfig, result: IdentificationResult, document: IdentificationDocument
 ) -> str:
     """Return the HTML page of an identification, complete in one file.
 
-    Parameters
-    ----------
-    recordings
-        Recordings that were used.
-    robot
-        Their robot.
-    result
-        Estimates and curves.
-    document
-        ``identification.json``.
+    ``recordings``: recordings that were used; ``result``: estimates and curves; ``document``: ``identification.json``.
     """
     joints = [joint.name for joint in robot.joints]
     return render(
@@ -50,7 +41,7 @@ def identification_report(
         torques=torque_plots(result.t, result.tau_measured, result.tau_predicted, joints, _units(robot)),
         autocorrelation=_autocorrelation_figure(result.residual_autocorrelation, result.autocorrelation_bound, joints),
         controller=_controller_figure(document.controller),
-        beside={} if document.comparison is None else {p.name: p.value for p in document.comparison.parameters},
+        least_squares={} if document.comparison is None else {p.name: p.value for p in document.comparison.parameters},
         residuals=_residual_words(document),
         glossary=identification_entries(document),
     )
@@ -88,16 +79,8 @@ def torque_plots(
 ) -> Markup:
     """Return plots of measured and predicted torque and their difference, one per joint, with common zoom.
 
-    Parameters
-    ----------
-    t
-        Instants (M,), s; a step back begins another experiment.
-    measured, predicted
-        Torques (M, n), N m or N.
-    joints, units
-        Name and unit of each joint.
-    before
-        Torques (M, n) of another model for comparison, the one as configured.
+    ``t``: instants (M,), s; a step back begins another experiment. ``measured``, ``predicted``: torques (M, n),
+    N m or N. ``before``: torques (M, n) of another model for comparison, the one as configured.
     """
     breaks = np.flatnonzero(np.diff(t) <= 0)
     measured = measured.copy()

@@ -60,12 +60,7 @@ _TEMPLATES.filters["fixed"] = lambda value, digits=2: "" if value is None else f
 def render(template: str, **content: Any) -> str:
     """Return the HTML page of a template; it needs no other file.
 
-    Parameters
-    ----------
-    template
-        Name in ``templates``.
-    **content
-        Variables of the template.
+    ``template``: name in ``templates``; ``**content``: variables of the template.
     """
     return _TEMPLATES.get_template(template).render(**content)
 
@@ -74,17 +69,8 @@ def render(template: str, **content: Any) -> str:
 def figure(rows: int, columns: int, height: float) -> Iterator[tuple["Figure", Any, list[str]]]:
     """Draw on a grid of axes; at the end of the block the list receives the picture as a ``data:`` URL.
 
-    Parameters
-    ----------
-    rows, columns
-        Size of the grid.
-    height
-        Height of one row, inches.
-
-    Yields
-    ------
-    tuple of Figure, ndarray and list of str
-        Figure, its axes (rows, columns), and the list for the picture.
+    ``rows``, ``columns``: size of the grid; ``height``: height of one row, inches. Yields the figure, its axes
+    (rows, columns), and the list for the picture.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure

@@ -11,14 +11,8 @@ from armident.identify.report.page import render
 def prediction_report(prediction: TorquePrediction, robot: RobotConfig, identified: IdentificationDocument) -> str:
     """Return the HTML page of a prediction, complete in one file.
 
-    Parameters
-    ----------
-    prediction
-        Torques and errors.
-    robot
-        Configuration of the model.
-    identified
-        Identification of the model, whose parameters the glossary explains.
+    ``prediction``: torques and errors; ``robot``: configuration of the model; ``identified``: identification of the
+    model, whose parameters the glossary explains.
     """
     document = prediction.document
     joints, units = list(document.units), list(document.units.values())

@@ -12,7 +12,7 @@ from armident.identify.excitation.design import ASSUMED_NOISE, PERIOD, Design
 from armident.identify.excitation.plot import limits_of
 from armident.identify.excitation.point_to_point import sample_trajectory
 from armident.identify.excitation.safety import CheckedTrajectory
-from armident.identify.identification.result import units
+from armident.identify.identification.identification_result import units
 from armident.identify.report.glossary import CONVENTIONS, base_entries
 from armident.identify.report.identification import FAIR_PCT, GOOD_PCT
 from armident.identify.report.page import MODEL, RESIDUAL, render
@@ -25,13 +25,7 @@ MOTION_EVERY, DISTANCE_EVERY = 5, 20
 
 
 def trajectory_report(found: CheckedTrajectory) -> str:
-    """Return the HTML page of a trajectory, complete in one file.
-
-    Parameters
-    ----------
-    found
-        The trajectory and its checks.
-    """
+    """Return the HTML page of a trajectory, complete in one file."""
     robot, design = found.robot, found.design
     names = arm_model(robot).base.names
     torque = None

@@ -19,14 +19,14 @@ STEP = 1e-6
 """Step of the finite differences, rad and rad/s or m and m/s."""
 
 
-POSTURES = 64
+WORKSPACE_POSTURES = 64
 """Number P of postures for mean values over the workspace."""
 
 
 @cache
 def _spread(revolute: tuple[bool, ...]) -> Array:
     """Points (P, n) of the Halton sequence over a turn of each revolute joint, rad; prismatic joints are at zero."""
-    points = qmc.Halton(len(revolute), scramble=False).random(POSTURES)
+    points = qmc.Halton(len(revolute), scramble=False).random(WORKSPACE_POSTURES)
     return np.ascontiguousarray(np.where(revolute, np.pi * (2.0 * points - 1.0), 0.0))
 
 
@@ -40,8 +40,6 @@ class Motion:
         Arm model; effects use its geometry, transmission and smoothing of the sign.
     q, qd, qdd
         Positions, velocities, accelerations, (N, n) each; rad or m, s.
-    dt
-        Sampling period, s.
     start
         Time of the first sample since the beginning of the first recording, s.
     theta
@@ -129,10 +127,7 @@ class Motion:
     def torque(self) -> Array:
         """Joint torques that the model predicts, with friction, N m or N, (N, n).
 
-        Raises
-        ------
-        ValueError
-            If ``theta`` is missing.
+        Raises ValueError if ``theta`` is missing.
         """
         return self._predicted(self._theta)
 
@@ -144,17 +139,8 @@ class Motion:
     def handed_on(self, joint: int, rotor: float) -> Array:
         """Torque that the gear of a joint transmits if part of the link's inertia belongs to the motor.
 
-        Parameters
-        ----------
-        joint
-            Index of the joint, from 0.
-        rotor
-            Part of the link's inertia that belongs to the motor, kg m^2 or kg.
-
-        Returns
-        -------
-        ndarray
-            Torque, N m or N, shape (N,).
+        ``joint``: index of the joint, from 0; ``rotor``: part of the link's inertia that belongs to the motor, kg m^2
+        or kg. Returns the torque, N m or N, shape (N,).
         """
         load: Array = self.transmitted[:, joint] - rotor * self.qdd[:, joint]
         return load
@@ -180,17 +166,8 @@ class Motion:
     def of_motor(self, motor: int, torque: Array) -> Array:
         """Joint torques caused by a torque at the shaft of one motor.
 
-        Parameters
-        ----------
-        motor
-            Index of the motor, from 0.
-        torque
-            Torque at its shaft (N,), N m or N.
-
-        Returns
-        -------
-        ndarray
-            Shape (N, n, 1), N m or N.
+        ``motor``: index of the motor, from 0; ``torque``: torque at its shaft (N,), N m or N. Result: shape (N, n, 1),
+        N m or N.
         """
         joints: Array = (torque[:, None] * self.model.robot.transmission_matrix[motor])[:, :, None]
         return joints
@@ -200,16 +177,9 @@ class Motion:
     ) -> Array:
         """First-order change (N, n) of the predicted torques when the motion of one joint changes.
 
-        Parameters
-        ----------
-        joint
-            Index of the joint, from 0.
-        shift, rate, acceleration
-            Changes of the joint's position, velocity and acceleration, (N,) each; rad or m, s.
-        links
-            Torques of the links alone, without friction and rotors.
-        rotor
-            Part of the link's inertia that belongs to the motor, kg m^2 or kg.
+        ``joint``: index of the joint, from 0. ``shift``, ``rate``, ``acceleration``: changes of the joint's position,
+        velocity and acceleration, (N,) each; rad or m, s. ``links``: torques of the links alone, without friction and
+        rotors. ``rotor``: part of the link's inertia that belongs to the motor, kg m^2 or kg.
         """
         change: Array = _first_order(*self.slopes(joint, links=links), shift, rate, acceleration, joint, rotor)
         return change
@@ -217,17 +187,8 @@ class Motion:
     def slopes(self, joint: int, *, links: bool = False) -> tuple[Array, Array, Array]:
         """Derivatives of the predicted torques with respect to position, velocity and acceleration of one joint.
 
-        Parameters
-        ----------
-        joint
-            Index of the joint, from 0.
-        links
-            Torques of the links alone, without friction and rotors.
-
-        Returns
-        -------
-        tuple of ndarray
-            Three arrays (N, n), in N m or N per rad or m, s.
+        ``joint``: index of the joint, from 0; ``links``: torques of the links alone, without friction and rotors.
+        Returns three arrays (N, n), in N m or N per rad or m, s.
         """
         key = (joint, links)
         if key not in self._slopes:

@@ -49,22 +49,9 @@ TRIED = {
 def check_setup(experiments: Sequence[Experiment], robot: RobotConfig) -> SetupCheck:
     """Compare the set-up as configured with its possible mistakes, each with everything refitted.
 
-    Parameters
-    ----------
-    experiments
-        SI, joint side, of one robot at one sampling rate.
-    robot
-        The configuration; mistakes that its ``effects`` correct are corrected first.
-
-    Returns
-    -------
-    SetupCheck
-        The mistakes with their probability and remedy.
-
-    Raises
-    ------
-    DataError
-        If the recordings do not fit together or are too short.
+    ``experiments``: SI, joint side, of one robot at one sampling rate. ``robot``: the configuration; mistakes that its
+    ``effects`` correct are corrected first. Returns the mistakes with their probability and remedy. Raises DataError if
+    the recordings do not fit together or are too short.
     """
     _validate(experiments, robot)
     # The matrices are small: threads delay each other.

@@ -67,8 +67,6 @@ class TorqueShift:
     ----------
     samples, std
         Common estimate and its standard deviation, samples; negative: early.
-    dt
-        Sampling period, s.
     by_joint
         Estimate and standard deviation of every joint that moves, samples.
     odds
@@ -188,12 +186,7 @@ class SetupCheck:
 def with_torque_shift(experiments: Sequence[Experiment], shift: TorqueShift | None) -> Sequence[Experiment]:
     """Return the experiments with a shift of their torques that the equations of motion allow for.
 
-    Parameters
-    ----------
-    experiments
-        As recorded.
-    shift
-        Common shift; ``None``, or one that is not applied: no change.
+    ``shift``: common shift; ``None``, or one that is not applied: no change.
     """
     if shift is None or not shift.applied:
         return experiments

@@ -52,7 +52,7 @@ WHITE = 0.05
 """Least correlation of neighbouring residuals that counts as structure: below it, estimates are noise."""
 
 NOT_UNDERSTOOD = 1.0 / 3.0
-"""Largest relative error of a joint that the rigid model explains (DIAGNOSIS.md, principle 1)."""
+"""Largest relative error of a joint that the rigid model explains (a third is more than friction or a load takes)."""
 
 WELL_UNDERSTOOD = 0.2
 """Largest relative error of a joint for which no whole orders and no mistakes of several joints are tried."""
@@ -93,8 +93,6 @@ class Step:
 
     Parameters
     ----------
-    h
-        The hypothesis.
     families, words
         Kind and description of each mistake.
     made
@@ -126,12 +124,7 @@ class Step:
 class Search:
     """Search over the hypotheses of one set of recordings.
 
-    Parameters
-    ----------
-    bench
-        Signals.
-    tried
-        Families of hypotheses that were tried, in words, filled by the search.
+    ``tried``: families of hypotheses that were tried, in words, filled by the search.
     """
 
     bench: Bench
@@ -142,13 +135,7 @@ class Search:
         return _rank(self.bench, h)
 
     def run(self, start: Hypothesis) -> Step:
-        """Return the corrected set-up.
-
-        Parameters
-        ----------
-        start
-            The set-up as configured.
-        """
+        """Return the corrected set-up. ``start``: the set-up as configured."""
         first = Step(start, rank=self.rank(start))
         best = self._greedy(first)
         understood = self._understood(best.h)
@@ -414,10 +401,7 @@ def independent_rows(residual: Array) -> Array:
 
     ``M (1 - r) / (1 + r)`` for the correlation r of neighbouring rows (Bartlett 1946), at least 4.
 
-    Parameters
-    ----------
-    residual
-        Residuals (M, n).
+    ``residual`` (M, n).
     """
     power = np.maximum((residual**2).sum(axis=0), 1e-300)
     r = np.clip((residual[1:] * residual[:-1]).sum(axis=0) / power, 0.0, 0.99)

@@ -68,6 +68,8 @@ def start_command(
 ) -> "subprocess.Popen[bytes]":
     """Start ``python -m module words...`` with this interpreter.
 
+    Returns the started process.
+
     Parameters
     ----------
     words
@@ -84,11 +86,6 @@ def start_command(
         Send SIGTERM to the process when the thread that started it ends, also by SIGKILL (Linux).
     environment
         Variables added to the environment of this process.
-
-    Returns
-    -------
-    subprocess.Popen
-        The started process.
     """
     nice = ["nice", "-n", str(niceness)] if niceness else []
     parent = {PARENT_VARIABLE: str(os.getpid())} if with_parent else {}
@@ -162,13 +159,7 @@ class CommandProcess:
         self._final = (b"", b"")
 
     def start(self) -> Self:
-        """Start the process and return this object.
-
-        Raises
-        ------
-        ArmidentError
-            If the process is running already.
-        """
+        """Start the process and return this object. Raises ArmidentError if the process is running already."""
         if self.running:
             raise ArmidentError(f"{self.name} is running already")
         if self.log is None:
@@ -198,13 +189,7 @@ class CommandProcess:
 
     @property
     def process(self) -> Process:
-        """The started process.
-
-        Raises
-        ------
-        ArmidentError
-            Before `start`.
-        """
+        """The started process. Raises ArmidentError: before `start`."""
         if self._process is None:
             raise ArmidentError(f"{self.name} has not been started")
         return self._process
@@ -230,10 +215,7 @@ class CommandProcess:
     def tail(self, lines: int = TAIL_LINES) -> str:
         """Return the last lines of standard error, joined by ``" | "``.
 
-        Parameters
-        ----------
-        lines
-            Largest number of lines; empty lines do not count.
+        ``lines``: largest number of lines; empty lines do not count.
         """
         text = [line.strip() for line in self.errors().splitlines() if line.strip()]
         return " | ".join(text[-lines:]) or "it printed nothing"
@@ -247,10 +229,7 @@ class CommandProcess:
     def failure(self, problem: str) -> ArmidentError:
         """Return an error with the name, the problem, the log file and the end of standard error.
 
-        Parameters
-        ----------
-        problem
-            Rest of the sentence that begins with the name, for example ``"ended with exit code 1"``.
+        ``problem``: rest of the sentence that begins with the name, for example ``"ended with exit code 1"``.
         """
         return ArmidentError(self._message(problem))
 
@@ -259,19 +238,9 @@ class CommandProcess:
 
         Lines up to the returned one are consumed: the next call begins after it.
 
-        Parameters
-        ----------
-        text
-            Beginning of the line; ``""`` for any line.
-        timeout
-            Longest time to wait, s.
-
-        Raises
-        ------
-        ProcessEnded
-            If the process ends before it prints such a line.
-        ProcessTimeout
-            If ``timeout`` passes before it prints such a line.
+        ``text``: beginning of the line; ``""`` for any line. ``timeout``: longest time to wait, s. Raises ProcessEnded
+        if the process ends before it prints such a line; ProcessTimeout if ``timeout`` passes before it prints such a
+        line.
         """
         until = time.monotonic() + timeout
         expected = f"before it printed {text!r}" if text else "before it printed a line"
@@ -291,25 +260,14 @@ class CommandProcess:
             time.sleep(POLL_S)
 
     def send_signal(self, number: signal.Signals) -> None:
-        """Send a signal; does nothing after the end of the process.
-
-        Parameters
-        ----------
-        number
-            The signal.
-        """
+        """Send a signal; does nothing after the end of the process."""
         if self.running:
             self.process.send_signal(number)
 
     def stop(self, timeout: float = STOP_S, number: signal.Signals = signal.SIGTERM) -> None:
         """End the process: send a signal, wait, and kill it if it still runs.
 
-        Parameters
-        ----------
-        timeout
-            Time between the signal and the kill, s.
-        number
-            The signal.
+        ``timeout``: time between the signal and the kill, s.
         """
         if self._process is None:
             return

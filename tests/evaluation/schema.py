@@ -161,10 +161,7 @@ class SuiteConfig(FrozenModel):
     def effect(self, name: str) -> SuiteEffect | None:
         """First entry of a name among the effects of the catalogue; ``None`` if there is none.
 
-        Parameters
-        ----------
-        name
-            Name of the effect in the virtual arm.
+        ``name``: name of the effect in the virtual arm.
         """
         return next((e for e in self.effects if e.effect == name), None)
 

@@ -95,7 +95,7 @@ def diagnose_file(task: DiagnosisTask) -> TimedDiagnosis:
 
 def identify_file(task: IdentificationTask) -> None:
     """Identify a recording and write the identification document."""
-    from armident.identify.identification.api import identify_recording
+    from armident.identify.identification.identify_recording import identify_recording
 
     document = identify_recording(read_recording(task.recording), load_robot(task.robot)).document
     write_atomically(task.out, to_json(document))

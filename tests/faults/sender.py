@@ -62,16 +62,8 @@ def _send(descriptors, address, body, first, joints, period, count, lossy, contr
 class Sender:
     """Sends SYNC and TPDOs (position, current, status) of six drives, nodes 1 to 6, on some buses.
 
-    Parameters
-    ----------
-    channels
-        The buses; the drives are distributed evenly.
-    period_us
-        SYNC period, us.
-    count
-        Number of SYNCs.
-    lossy
-        Interval in SYNCs at which the last drive omits an answer; 0 for never.
+    ``channels``: the buses; the drives are distributed evenly. ``lossy``: interval in SYNCs at which the last drive
+    omits an answer; 0 for never.
     """
 
     def __init__(self, channels: Sequence[str], period_us: int, count: int = 2**40, lossy: int = 0) -> None:

@@ -64,14 +64,7 @@ REFUSED = 3
 class Service:
     """Commands of a cell with an arm on a bus, and the number of their kills.
 
-    Parameters
-    ----------
-    folder
-        Folder of the cell, whose recordings and results are in it.
-    bus
-        Name of the interface.
-    rng
-        Source of the random moments.
+    ``folder``: folder of the cell, whose recordings and results are in it; ``rng``: source of the random moments.
     """
 
     folder: Path

@@ -14,13 +14,12 @@ import numpy as np
 import pytest
 
 from armident.configs import SessionConfig
-from armident.configs.schema.session import IdentificationOptions
 from armident.daq.recording import Recording, RecordingWriter, StreamLayout, read_recording, write_recording
 from armident.daq.streaming import Keys, encode_block, encode_event, open_session
 from armident.daq.streaming.codec import end_content, start_content
 from armident.identify.documents.files import load_document
 from armident.identify.documents.identification import IdentificationDocument
-from armident.identify.identification.api import identify_recording
+from armident.identify.identification.identify_recording import identify_recording
 from armident.identify.monitoring import worker as module
 from armident.identify.monitoring.ledger import FILE, Ledger
 from armident.identify.monitoring.recorded import Captured
@@ -43,7 +42,7 @@ pytestmark = pytest.mark.slow
 @pytest.fixture
 def session(request: pytest.FixtureRequest, tmp_path: Path) -> SessionConfig:
     """A cell whose recordings are in the folder of the test."""
-    session = in_a_cell("emps", request.node.name, IdentificationOptions(method="idim-ls"))
+    session = in_a_cell("emps", request.node.name, {"method": "idim-ls"})
     recording = session.recording.model_copy(update={"directory": tmp_path})
     return session.model_copy(update={"recording": recording})
 

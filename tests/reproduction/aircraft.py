@@ -39,15 +39,7 @@ rate the largest singular value of CLOE is that of the thesis."""
 
 @dataclass(frozen=True)
 class AircraftSensitivity:
-    """Singular values (6,) in descending order.
-
-    Parameters
-    ----------
-    clie
-        Of the elevator angle.
-    cloe
-        Of w and q together.
-    """
+    """Singular values (6,) in descending order. ``clie``: of the elevator angle; ``cloe``: of w and q together."""
 
     clie: Array
     cloe: Array
@@ -59,12 +51,7 @@ def aircraft_sensitivity(sampling_hz: float = SAMPLING_HZ, duration: float = DUR
     The sensitivities are additional states, ``ds/dt = A_c s + (dA_c/dtheta) x + (db/dtheta) delta_pilot``, without
     finite differences. The doublet switches at samples; the discretisation is exact.
 
-    Parameters
-    ----------
-    sampling_hz
-        Sampling rate, Hz.
-    duration
-        Duration, s.
+    ``sampling_hz``: sampling rate, Hz.
     """
     gain = np.zeros(4)
     gain[PITCH] = RATE_GAIN

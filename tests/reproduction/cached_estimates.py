@@ -22,14 +22,16 @@ from armident.identify.estimators.idim_piv import idim_piv
 from armident.identify.estimators.sep_pem import sep_pem
 from armident.identify.identification.auxiliary_loop import RUNAWAY, initial_parameters
 from armident.identify.identification.equations import equations
-from armident.identify.identification.result import relative_errors
-from armident.identify.regression.equations import MAX_AR_ORDER, Estimate, ExperimentEquations
+from armident.identify.identification.identification_result import relative_torque_errors
+from armident.identify.regression.equations import Estimate, ExperimentEquations
+from armident.identify.regression.orders import MAX_AR_ORDER
 from armident.identify.robot.arm import ArmModel
 from armident.identify.robot.controller import DiscreteController
 from armident.identify.robot.simulation import Simulation
 from armident.identify.signals.bandpass import butterworth, central_difference
+from armident.identify.signals.choices import NvrRule
 from armident.identify.signals.decimate import Decimation, design
-from armident.identify.signals.differentiate import Derivatives, NvrRule, differentiate, encoder_resolution
+from armident.identify.signals.differentiate import Derivatives, differentiate, encoder_resolution
 from tests.reproduction.recordings import Recorded
 from tests.reproduction.reference import essential_names
 from tests.reproduction.subset import restricted_to
@@ -97,14 +99,8 @@ class Case:
 class Run:
     """An estimate with its error and cost.
 
-    Parameters
-    ----------
-    error_pct
-        Relative torque error on the equations of the estimate, percent: ``|y - X theta| / |y|``.
-    seconds
-        Computing time of the estimator without filters, s.
-    simulations
-        Number of closed-loop simulations.
+    ``error_pct``: relative torque error on the equations of the estimate, percent: ``|y - X theta| / |y|``;
+    ``seconds``: computing time of the estimator without filters, s; ``simulations``: number of closed-loop simulations.
     """
 
     estimate: Estimate
@@ -128,12 +124,8 @@ class CountingModel(AuxiliaryModel):
     def simulate(self, theta: Array, disturbances: Sequence[Array] | None = None) -> Sequence[Simulation] | None:
         """Simulate the closed loop and count the simulation; ``None`` if it diverges.
 
-        Parameters
-        ----------
-        theta
-            Base parameters (b,), SI.
-        disturbances
-            Additional motor torques, N m or N, one (N, n) array per experiment.
+        ``theta``: base parameters (b,), SI; ``disturbances``: additional motor torques, N m or N, one (N, n) array per
+        experiment.
         """
         self.asked.append(1)
         return super().simulate(theta, disturbances)
@@ -144,10 +136,7 @@ class Laboratory:
 
     The model has only the 28 essential parameters of the thesis, so that standard deviations are comparable.
 
-    Parameters
-    ----------
-    recorded
-        Function that returns the recording; called at first use.
+    ``recorded``: function that returns the recording; called at first use.
     """
 
     def __init__(self, recorded: Callable[[], Recorded]) -> None:
@@ -157,12 +146,7 @@ class Laboratory:
     def once(self, key: Hashable, make: Callable[[], T]) -> T:
         """Return the value of ``make``, computed at the first call with this key.
 
-        Parameters
-        ----------
-        key
-            Key of the cache.
-        make
-            Function without arguments that computes the value.
+        ``make``: function without arguments that computes the value.
         """
         if key not in self._kept:
             self._kept[key] = make()
@@ -255,12 +239,7 @@ class Laboratory:
     def run(self, method: Method, case: Case) -> Run:
         """Return the estimate of a method in a case.
 
-        Parameters
-        ----------
-        method
-            Identification method.
-        case
-            Filters and auxiliary simulation.
+        ``method``: identification method; ``case``: filters and auxiliary simulation.
         """
         return self.once((method, case), lambda: self._run(method, case))
 
@@ -273,7 +252,7 @@ class Laboratory:
         simulations = 0 if auxiliary is None else len(auxiliary.asked)
         if auxiliary is not None and method in SIMULATED:
             blocks = auxiliary.equations(blocks, estimate.theta)
-        return Run(estimate, relative_errors(blocks, estimate.theta)[0], seconds, simulations)
+        return Run(estimate, relative_torque_errors(blocks, estimate.theta)[0], seconds, simulations)
 
     def _iterate(
         self, method: Method, case: Case, blocks: Sequence[ExperimentEquations], auxiliary: AuxiliaryModel
@@ -302,12 +281,7 @@ class Laboratory:
     def simulated(self, run: Run, case: Case) -> Sequence[ExperimentEquations]:
         """Return the equations of a case with the regressor simulated with the parameters of a run.
 
-        Parameters
-        ----------
-        run
-            Estimate whose parameters are used.
-        case
-            Filters and auxiliary simulation.
+        ``run``: estimate whose parameters are used; ``case``: filters and auxiliary simulation.
         """
         return self.auxiliary(case).equations(self.equations(case), run.estimate.theta)
 
@@ -320,27 +294,12 @@ class Laboratory:
 
         An unbiased estimate with these standard deviations has about 1.
 
-        Parameters
-        ----------
-        theta
-            Parameters (b,), SI units.
-        std
-            Standard deviations (b,) in the same units.
+        ``theta``: parameters (b,), SI units; ``std``: standard deviations (b,) in the same units.
         """
         return float(np.sqrt(np.mean(((theta - self.truth) / std) ** 2)))
 
     def column(self, name: str, run: Run, source: Source = "virtual") -> Column:
-        """Return the estimates of a run as a column of a table.
-
-        Parameters
-        ----------
-        name
-            Name of the column.
-        run
-            Estimate.
-        source
-            Origin of the column.
-        """
+        """Return the estimates of a run as a column of a table. ``source``: origin of the column."""
         return Column(source, name, estimate_cells(self.names, run.estimate))
 
     def own(self) -> Column:
@@ -356,12 +315,7 @@ def between(x: Array) -> Array:
 def estimate_cells(names: Sequence[str], estimate: Estimate) -> dict[str, Cell]:
     """Return value and relative standard deviation (percent) of every parameter.
 
-    Parameters
-    ----------
-    names
-        Names of the parameters, b of them.
-    estimate
-        Estimate of the b parameters.
+    ``names``: names of the parameters, b of them; ``estimate``: estimate of the b parameters.
     """
     percent = 100 * estimate.std / np.maximum(np.abs(estimate.theta), np.finfo(np.float64).tiny)
     return {n: Cell(float(v), float(p)) for n, v, p in zip(names, estimate.theta, percent, strict=True)}
@@ -370,12 +324,7 @@ def estimate_cells(names: Sequence[str], estimate: Estimate) -> dict[str, Cell]:
 def derive(recording: Recorded, case: Case) -> Derivatives:
     """Return derivatives of the measured positions by the method of a case.
 
-    Parameters
-    ----------
-    recording
-        Recording with the positions.
-    case
-        Method (``derivatives``) and its settings (``bandpass_hz``, ``nvr``).
+    ``case``: method (``derivatives``) and its settings (``bandpass_hz``, ``nvr``).
     """
     experiment = recording.experiment
     q, dt = experiment.q, experiment.dt
@@ -390,12 +339,7 @@ def derive(recording: Recorded, case: Case) -> Derivatives:
 def identify_controller(recording: Recorded, kind: str) -> IdentifiedController:
     """Identify the controller from reference, position and torque of each motor (thesis sections 5.2.2, 5.2.3).
 
-    Parameters
-    ----------
-    recording
-        Recording with reference.
-    kind
-        ``parametric``, ``crc`` or ``cra``, see `Case`.
+    ``kind``: ``parametric``, ``crc`` or ``cra``, see `Case`.
     """
     robot, experiment = recording.robot, recording.experiment
     assert experiment.q_ref is not None

@@ -105,12 +105,7 @@ def table_4_8(_: Bench) -> Table:
 def singular_values(lab: Laboratory, case: Case) -> Sensitivity:
     """Return singular values of the Jacobians of CLIE, CLOE and DIDIM at the estimate of DIDIM.
 
-    Parameters
-    ----------
-    lab
-        Arm with its cached estimates.
-    case
-        Filters and auxiliary simulation.
+    ``lab``: arm with its cached estimates; ``case``: filters and auxiliary simulation.
     """
     theta = lab.run("didim", case).estimate.theta
     return lab.once(("singular values", case), lambda: sensitivity(lab.auxiliary(case), theta))
@@ -119,14 +114,8 @@ def singular_values(lab: Laboratory, case: Case) -> Sensitivity:
 def spread(bench: Bench, case: Case, *, with_didim: bool = False) -> dict[str, list[float | None]]:
     """Return the largest and smallest singular value and their ratio, one column per method.
 
-    Parameters
-    ----------
-    bench
-        Arms with their cached estimates; the virtual one is used.
-    case
-        Filters and auxiliary simulation.
-    with_didim
-        Add a column for DIDIM to those of CLIE and CLOE.
+    ``bench``: arms with their cached estimates; the virtual one is used. ``case``: filters and auxiliary simulation.
+    ``with_didim``: add a column for DIDIM to those of CLIE and CLOE.
     """
     values = singular_values(bench.virtual, case)
     chosen = [values.clie, values.cloe, *([values.didim] if with_didim else [])]
@@ -140,12 +129,7 @@ def spread(bench: Bench, case: Case, *, with_didim: bool = False) -> dict[str, l
 def simulation_errors(lab: Laboratory, run: Run) -> tuple[float, float]:
     """Return the relative errors of simulated positions and torques, percent.
 
-    Parameters
-    ----------
-    lab
-        Arm with its cached estimates.
-    run
-        Estimate, whose parameters are simulated without decimation.
+    ``lab``: arm with its cached estimates; ``run``: estimate, whose parameters are simulated without decimation.
     """
     experiment = lab.recording(UNDECIMATED).experiment
     runs = lab.auxiliary(UNDECIMATED).simulate(run.estimate.theta)
@@ -156,10 +140,7 @@ def simulation_errors(lab: Laboratory, run: Run) -> tuple[float, float]:
 def relative(measured: Array, simulated: Array) -> float:
     """Return ``|measured - simulated| / |measured|`` over all joints, percent.
 
-    Parameters
-    ----------
-    measured, simulated
-        Signals of the same unit, shape (N, n).
+    ``measured``, ``simulated``: signals of the same unit, shape (N, n).
     """
     return 100 * float(np.linalg.norm(measured - simulated) / np.linalg.norm(measured))
 

@@ -5,7 +5,7 @@ from typing import Literal
 
 from armident.configs import DataError
 from armident.identify.controller.crc import PREWHITENING_ORDER
-from armident.identify.signals.differentiate import NvrRule
+from armident.identify.signals.choices import NvrRule
 from tests.reproduction.cached_estimates import Case, Method
 from tests.reproduction.context import Bench, TableFunction, estimates, figures, iterations
 from tests.reproduction.emps_protocol import evidence, inferred_rows

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import signal
 
-from armident.identify.identification.result import relative_errors
+from armident.identify.identification.identification_result import relative_torque_errors
 from armident.identify.regression.ar_noise import ArModel
 from tests.reproduction.cached_estimates import PIV_CUTOFF_HZ, Case, Laboratory, Run
 from tests.reproduction.chapter5 import GOOD, POOR_IV
@@ -140,17 +140,9 @@ def table_6_7(bench: Bench) -> Table:
 class Degraded:
     """IDIM-LS with degraded encoders and one parallel filter, compared with the published column.
 
-    Parameters
-    ----------
-    case
-        Filters of the estimate.
-    run
-        Estimate of IDIM-LS.
-    distance
-        RMS difference between our errors and the published ones (against table B.4), in standard deviations of IDIM-LS
-        with good encoders.
-    correlation
-        Correlation of both over the parameters.
+    ``case``: filters of the estimate; ``run``: estimate of IDIM-LS; ``distance``: RMS difference between our errors and
+    the published ones (against table B.4), in standard deviations of IDIM-LS with good encoders; ``correlation``:
+    correlation of both over the parameters.
     """
 
     case: Case
@@ -207,44 +199,23 @@ def process_variance(ar: ArModel) -> float:
 def inverse_error(lab: Laboratory, run: Run, case: Case) -> float:
     """Return the relative error of a run on the equations of another case, percent.
 
-    Parameters
-    ----------
-    lab
-        Arm with its cached estimates.
-    run
-        Estimate.
-    case
-        Filters of the equations.
+    ``lab``: arm with its cached estimates; ``case``: filters of the equations.
     """
-    return relative_errors(lab.equations(case), run.estimate.theta)[0]
+    return relative_torque_errors(lab.equations(case), run.estimate.theta)[0]
 
 
 def simulated_error(lab: Laboratory, run: Run, case: Case) -> float:
     """Return the relative error of a run with the simulated regressor of a case, percent.
 
-    Parameters
-    ----------
-    lab
-        Arm with its cached estimates.
-    run
-        Estimate.
-    case
-        Filters and auxiliary simulation.
+    ``lab``: arm with its cached estimates; ``case``: filters and auxiliary simulation.
     """
-    return relative_errors(lab.simulated(run, case), run.estimate.theta)[0]
+    return relative_torque_errors(lab.simulated(run, case), run.estimate.theta)[0]
 
 
 def simulated_variances(lab: Laboratory, run: Run, case: Case) -> list[float]:
     """Return the variance of measured minus simulated torque of each joint, (N m)^2.
 
-    Parameters
-    ----------
-    lab
-        Arm with its cached estimates.
-    run
-        Estimate.
-    case
-        Filters and auxiliary simulation.
+    ``lab``: arm with its cached estimates; ``case``: filters and auxiliary simulation.
     """
     (block,) = lab.simulated(run, case)
     return [float(v) for v in np.var(block.y - block.x @ run.estimate.theta, axis=0)]

@@ -57,14 +57,8 @@ class Finding:
 class Claim:
     """A claim of the thesis.
 
-    Parameters
-    ----------
-    number, text
-        Number and wording.
-    findings
-        Its parts; it holds if all of them do.
-    remark
-        Explanation of a part that does not hold.
+    ``number``, ``text``: number and wording. ``findings``: its parts; it holds if all of them do. ``remark``:
+    explanation of a part that does not hold.
     """
 
     number: int
@@ -286,16 +280,7 @@ class Farthest:
 def farthest(names: Sequence[str], run: Run, wanted: Array, std: Array) -> Farthest:
     """Return the parameter with the largest error in given standard deviations.
 
-    Parameters
-    ----------
-    names
-        Names of the parameters.
-    run
-        Estimate.
-    wanted
-        Correct parameters (b,).
-    std
-        Standard deviations (b,).
+    ``wanted``: correct parameters (b,); ``std``: standard deviations (b,).
     """
     score = np.abs(run.estimate.theta - wanted) / std
     k = int(np.argmax(score))
@@ -305,12 +290,7 @@ def farthest(names: Sequence[str], run: Run, wanted: Array, std: Array) -> Farth
 def apart(theta: Array, other: Estimate) -> float:
     """Return the RMS difference of parameters from another estimate in its standard deviations.
 
-    Parameters
-    ----------
-    theta
-        Parameters (b,), SI units.
-    other
-        The other estimate of the same parameters.
+    ``theta``: parameters (b,), SI units.
     """
     return float(np.sqrt(np.mean(((theta - other.theta) / other.std) ** 2)))
 
@@ -340,16 +320,8 @@ def _white(name: str, run: Run, plain: Estimate, other: str) -> Finding:
 class Judgement:
     """Test of a claim.
 
-    Parameters
-    ----------
-    number, text
-        Number and wording of the claim.
-    tables
-        Numbers of the tables that the test needs.
-    look
-        Function that tests the claim.
-    remark
-        Explanation, printed if the claim does not hold.
+    ``number``, ``text``: number and wording of the claim; ``tables``: numbers of the tables that the test needs;
+    ``remark``: explanation, printed if the claim does not hold.
     """
 
     number: int
@@ -412,12 +384,7 @@ JUDGEMENTS = (
 def judged(bench: Bench, numbers: Sequence[str]) -> list[Claim]:
     """Test the claims whose tables are all among ``numbers``.
 
-    Parameters
-    ----------
-    bench
-        Arms with their cached estimates.
-    numbers
-        Numbers of the reproduced tables.
+    ``bench``: arms with their cached estimates; ``numbers``: numbers of the reproduced tables.
     """
     return [
         Claim(j.number, j.text, tuple(j.look(bench)), j.remark) for j in JUDGEMENTS if set(j.tables) <= set(numbers)

@@ -54,17 +54,8 @@ def reproduce(
 def chosen_tables(tables: str | None, *, quick: bool) -> list[str]:
     """Return the chosen table numbers in the order of the thesis.
 
-    Parameters
-    ----------
-    tables
-        Numbers separated by commas; ``None``: all.
-    quick
-        Without the slow tables, if all are chosen.
-
-    Raises
-    ------
-    ConfigError
-        If there is no such table.
+    ``tables``: numbers separated by commas; ``None``: all. ``quick``: without the slow tables, if all are chosen.
+    Raises ConfigError if there is no such table.
     """
     if tables is None:
         return [number for number in TABLES if not (quick and number in SLOW)]
@@ -78,14 +69,8 @@ def chosen_tables(tables: str | None, *, quick: bool) -> list[str]:
 def make_bench(folder: Path, measured: Path | None = None, *, quick: bool = False) -> Bench:
     """Return the arms of the tables; recordings are made when they are needed, measured files are read at once.
 
-    Parameters
-    ----------
-    folder
-        Folder of the virtual recordings.
-    measured
-        Folder of measured data, or ``None``.
-    quick
-        Fewer simulations.
+    ``folder``: folder of the virtual recordings; ``measured``: folder of measured data, or ``None``; ``quick``: fewer
+    simulations.
     """
     real = None
     if measured is not None:
@@ -106,14 +91,7 @@ def computed(
 ) -> tuple[list[Table], list[Claim]]:
     """Return the tables of the given numbers, and the claims that depend only on them.
 
-    Parameters
-    ----------
-    bench
-        Arms with their cached estimates.
-    numbers
-        Table numbers.
-    report
-        Called with a stage and the share done.
+    ``bench``: arms with their cached estimates; ``report``: called with a stage and the share done.
     """
     found = []
     for k, number in enumerate(numbers):

@@ -60,16 +60,7 @@ def estimates(
 ) -> Table:
     """Return a table of estimates: columns of the thesis, ours, and the true parameters of the virtual arm.
 
-    Parameters
-    ----------
-    bench
-        Arms with their cached estimates.
-    number
-        Number of the table.
-    columns
-        Name, method and case of each of our columns.
-    notes
-        Notes below the table.
+    ``bench``: arms with their cached estimates; ``notes``: notes below the table.
     """
     printed = reference_tables()[number]
     ours = [
@@ -90,18 +81,8 @@ def figures(
 ) -> Table:
     """Return a table of figures.
 
-    Parameters
-    ----------
-    number
-        Number of the table.
-    values
-        Our figures by row label, one per column.
-    notes
-        Notes below the table.
-    names
-        Names of our columns; by default those of the thesis.
-    measured
-        Figures from the measured arm, like ``values``.
+    ``values``: our figures by row label, one per column. ``notes``: notes below the table. ``names``: names of our
+    columns; by default those of the thesis. ``measured``: figures from the measured arm, like ``values``.
     """
     printed = reference_tables()[number]
     columns = list(printed.printed())

@@ -58,14 +58,8 @@ THESIS: dict[str, Errors] = {
 class Row:
     """Relative errors of position, velocity and acceleration of one method, percent.
 
-    Parameters
-    ----------
-    label
-        Name of the method, as in the thesis if it is there.
-    thesis
-        Published figures; ``None`` if the table has no such method.
-    ours
-        Means over the simulations.
+    ``label``: name of the method, as in the thesis if it is there. ``thesis``: published figures; ``None`` if the table
+    has no such method. ``ours``: means over the simulations.
     """
 
     label: str
@@ -77,14 +71,8 @@ class Row:
 class EmpsRun:
     """Noise-free simulation of the axis.
 
-    Parameters
-    ----------
-    q_ref, q
-        Reference and position, m, shape (N,).
-    qd, qdd
-        Velocity, m/s, and acceleration, m/s^2, shape (N,).
-    dt
-        Sampling period, s.
+    ``q_ref``, ``q``: reference and position, m, shape (N,); ``qd``, ``qdd``: velocity, m/s, and acceleration, m/s^2,
+    shape (N,).
     """
 
     q_ref: Array
@@ -100,19 +88,8 @@ def table_5_2(simulations: int = 100, sampling_hz: float = 5000.0, seed: int = 0
     IRWSM 1 and 2 use the default rule for the noise-variance ratio. Further rows show the other rules of the thesis,
     and the bandpass with forward differences without compensation of their delay.
 
-    Parameters
-    ----------
-    simulations
-        Number of noise realisations.
-    sampling_hz
-        Sampling rate of the simulated position, Hz.
-    seed
-        Seed of the noise.
-
-    Raises
-    ------
-    DataError
-        If there is no simulation, or the sampling rate is too low for the Butterworth filter.
+    ``simulations``: number of noise realisations; ``sampling_hz``: sampling rate of the simulated position, Hz. Raises
+    DataError if there is no simulation, or the sampling rate is too low for the Butterworth filter.
     """
     if simulations < 1:
         raise DataError(f"table 5.2 needs at least one simulation, got {simulations}")
@@ -143,12 +120,7 @@ def simulate_emps(dt: float) -> EmpsRun:
 def follow(q_ref_dd: Array, dt: float) -> EmpsRun:
     """Simulate the closed loop of equations 5.28 and 5.29 from rest along a reference.
 
-    Parameters
-    ----------
-    q_ref_dd
-        Acceleration of the reference, constant over each sample, m/s^2, shape (N,).
-    dt
-        Sampling period, s.
+    ``q_ref_dd``: acceleration of the reference, constant over each sample, m/s^2, shape (N,).
     """
     signals = np.empty((4, q_ref_dd.size))
     parameters = np.array([MASS, VISCOUS, COULOMB, SIGN_SMOOTHING, GAIN * KV, KP])
@@ -162,12 +134,7 @@ def polynomial_moves(durations: Sequence[float], dt: float) -> Array:
 
     They are constant over each sample.
 
-    Parameters
-    ----------
-    durations
-        Duration of each move in one direction, s.
-    dt
-        Sampling period, s.
+    ``durations``: duration of each move in one direction, s.
     """
     moves = []
     for duration in durations:
@@ -199,12 +166,7 @@ def _methods(run: EmpsRun, measured: Array, deviation: float) -> dict[str, Deriv
 def forward(smooth: Array, dt: float) -> Derivatives:
     """Return forward differences: velocities half a sample late, accelerations one sample late.
 
-    Parameters
-    ----------
-    smooth
-        Smoothed positions, m, shape (N, 1).
-    dt
-        Sampling period, s.
+    ``smooth``: smoothed positions, m, shape (N, 1).
     """
     qd = np.diff(smooth, axis=0, append=smooth[-1:]) / dt
     return Derivatives(smooth, qd, np.diff(qd, axis=0, append=qd[-1:]) / dt, None)
@@ -213,14 +175,8 @@ def forward(smooth: Array, dt: float) -> Derivatives:
 def relative_errors(run: EmpsRun, found: Derivatives, border: int = 0) -> Errors:
     """Return the relative errors of position, velocity and acceleration, percent.
 
-    Parameters
-    ----------
-    run
-        Noise-free motion.
-    found
-        Estimated signals, shape (N, 1) each.
-    border
-        Number of samples omitted at either end.
+    ``run``: noise-free motion; ``found``: estimated signals, shape (N, 1) each; ``border``: number of samples omitted
+    at either end.
     """
     inner = slice(border, run.q.size - border)
 

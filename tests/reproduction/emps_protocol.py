@@ -30,7 +30,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armident.identify.signals.bandpass import butterworth, central_difference
-from armident.identify.signals.differentiate import Derivatives, NvrRule, differentiate
+from armident.identify.signals.choices import NvrRule
+from armident.identify.signals.differentiate import Derivatives, differentiate
 from armident.identify.signals.irwsm import irwsm
 from tests.reproduction.emps_derivatives import (
     CUTOFF_HZ,
@@ -108,14 +109,7 @@ VARIANTS: Mapping[str, Protocol] = {
 def inferred_rows(simulations: int, protocol: Protocol = INFERRED, seed: int = 0) -> list[Row]:
     """Return mean relative errors of the three methods of the table with a protocol.
 
-    Parameters
-    ----------
-    simulations
-        Number of noise realisations.
-    protocol
-        Conditions.
-    seed
-        Seed of the noise.
+    ``simulations``: number of noise realisations.
     """
     run = motion(protocol)
     random = np.random.default_rng(seed)

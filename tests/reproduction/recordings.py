@@ -37,14 +37,8 @@ EMPS_FILE, EMPS_PERIOD = "DATA_EMPS.mat", 1e-3
 class Recorded:
     """Recording of an arm, with the true parameters of a virtual one.
 
-    Parameters
-    ----------
-    robot
-        Configuration in the recording.
-    experiment
-        Positions, torques, and the reference of the virtual arm.
-    truth
-        Standard and base parameters of the virtual arm by name, and gains of its drives; empty for a measured one.
+    ``experiment``: positions, torques, and the reference of the virtual arm. ``truth``: standard and base parameters of
+    the virtual arm by name, and gains of its drives; empty for a measured one.
     """
 
     robot: RobotConfig
@@ -87,23 +81,10 @@ class Recorded:
 def virtual_recording(folder: Path, seed: int = 0, velocity_feedback: bool = False, session: str = SESSION) -> Recorded:
     """Record the virtual arm of a session in a separate process, or read the recording from ``folder``.
 
-    Parameters
-    ----------
-    folder
-        Folder of recordings, named by a digest of their inputs.
-    seed
-        Seed of the noise, which has the measured size (TX40: table 6.3).
-    velocity_feedback
-        True: the drives feed back the velocity. False: their velocity loop acts on the tracking error.
-    session
-        Session of the virtual cell.
-
-    Raises
-    ------
-    ConfigError
-        If the folder cannot be written.
-    ArmidentError
-        If the virtual arm fails.
+    ``folder``: folder of recordings, named by a digest of their inputs. ``seed``: seed of the noise, which has the
+    measured size (TX40: table 6.3). ``velocity_feedback``: True: the drives feed back the velocity. False: their
+    velocity loop acts on the tracking error. ``session``: session of the virtual cell. Raises ConfigError if the folder
+    cannot be written; ArmidentError if the virtual arm fails.
     """
     arguments = ["--config", session, "--seed", str(seed)]
     arguments.append("--velocity-feedback" if velocity_feedback else "--velocity-error")
@@ -146,16 +127,8 @@ def _record(arguments: list[str], recording: Path, truth: Path) -> None:
 def measured_recording(folder: Path) -> Recorded:
     """Read the measured TX40: motor positions and torques at 5 kHz, no reference.
 
-    Parameters
-    ----------
-    folder
-        Folder with ``pos_read_data.csv`` (rad at the motors) and ``curr_data.csv`` (N m at the motors), or its parent,
-        where they are in ``tx40``.
-
-    Raises
-    ------
-    DataError
-        If a file is missing or has no numbers, or the lengths differ.
+    ``folder``: folder with ``pos_read_data.csv`` (rad at the motors) and ``curr_data.csv`` (N m at the motors), or its
+    parent, where they are in ``tx40``. Raises DataError if a file is missing or has no numbers, or the lengths differ.
     """
     folder = folder / "tx40" if (folder / "tx40").is_dir() else folder
     robot = load_robot("tx40")

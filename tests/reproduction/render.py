@@ -31,15 +31,7 @@ def text_of(cell: Cell | None) -> str:
 
 
 def markdown(tables: Sequence[Table], claims: Sequence[Claim]) -> str:
-    """Return tables and claims as a Markdown page.
-
-    Parameters
-    ----------
-    tables
-        Reproduced tables.
-    claims
-        Tested claims.
-    """
+    """Return tables and claims as a Markdown page. ``tables``: reproduced tables; ``claims``: tested claims."""
     lines = ["# Tables of the thesis and their reproduction", ""]
     lines += ["Estimates: value (relative standard deviation); SI, joint side.", ""]
     if claims:
@@ -66,14 +58,8 @@ def markdown(tables: Sequence[Table], claims: Sequence[Claim]) -> str:
 def document(tables: Sequence[Table], claims: Sequence[Claim], *, quick: bool) -> str:
     """Return tables and claims as JSON; figures that are not finite become null.
 
-    Parameters
-    ----------
-    tables
-        Reproduced tables.
-    claims
-        Tested claims.
-    quick
-        Recorded in the document: True if fewer simulations were made, without the slow tables.
+    ``tables``: reproduced tables; ``claims``: tested claims; ``quick``: recorded in the document: True if fewer
+    simulations were made, without the slow tables.
     """
     content: dict[str, Any] = {
         "schema": SCHEMA,

@@ -14,17 +14,8 @@ def restricted_to(model: ArmModel, names: Collection[str]) -> ArmModel:
     Regressor, dynamics and simulation of the result use these parameters alone, in the order of the full model. The
     result has no additional terms.
 
-    Parameters
-    ----------
-    model
-        The full model.
-    names
-        Names of the base parameters to keep.
-
-    Raises
-    ------
-    ConfigError
-        If ``names`` contains a name that is not a base parameter of the model.
+    ``model``: the full model; ``names``: names of the base parameters to keep. Raises ConfigError if ``names`` contains
+    a name that is not a base parameter of the model.
     """
     model = model.without_terms()
     base = model.base

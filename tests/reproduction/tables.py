@@ -33,16 +33,8 @@ class Column:
 class Table:
     """A table with the columns of the thesis and ours.
 
-    Parameters
-    ----------
-    number, title
-        Number in the thesis; title.
-    labels
-        Rows, in order.
-    columns
-        Columns of the thesis first.
-    notes
-        Conditions of the comparison, one line each.
+    ``labels``: rows, in order; ``columns``: columns of the thesis first; ``notes``: conditions of the comparison, one
+    line each.
     """
 
     number: str

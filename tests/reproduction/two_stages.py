@@ -13,7 +13,7 @@ from armident.identify.controller.nominal import saturation
 from armident.identify.controller.parametric import ControlLaw, identify_parametric
 from armident.identify.estimators.idim_iv import idim_iv
 from armident.identify.identification.auxiliary_loop import initial_parameters
-from armident.identify.identification.result import relative_errors
+from armident.identify.identification.identification_result import relative_torque_errors
 from tests.reproduction.cached_estimates import Case, Laboratory, Run
 
 
@@ -45,14 +45,7 @@ class TwoStages:
 def two_stages(lab: Laboratory, method: Literal["idim-iv", "didim"], case: Case) -> TwoStages | None:
     """Identify the controller of a case, then the arm; ``None`` if the second stage does not converge.
 
-    Parameters
-    ----------
-    lab
-        Arm with its cached estimates.
-    method
-        Method of the second stage.
-    case
-        Filters and auxiliary simulation, with the kind of controller.
+    ``lab``: arm with its cached estimates; ``case``: filters and auxiliary simulation, with the kind of controller.
     """
     identified, took = lab.first_stage(case)
     try:
@@ -84,7 +77,9 @@ def structure_given(lab: Laboratory) -> TwoStages:
     estimate = idim_iv(blocks, auxiliary, initial_parameters(lab.model))
     run = Run(estimate, np.nan, time.perf_counter() - begin, len(auxiliary.asked))
     found = _in_figures(lab, identified, took, Case(), run)
-    return replace(found, loop_pct=relative_errors(auxiliary.equations(blocks, estimate.theta), estimate.theta)[0])
+    return replace(
+        found, loop_pct=relative_torque_errors(auxiliary.equations(blocks, estimate.theta), estimate.theta)[0]
+    )
 
 
 def actual_structure(lab: Laboratory) -> Structure:
@@ -96,12 +91,7 @@ def actual_structure(lab: Laboratory) -> Structure:
 def gain_error(lab: Laboratory, identified: IdentifiedController) -> float | None:
     """Return the largest relative error of position and velocity gains, percent; ``None`` for impulse responses.
 
-    Parameters
-    ----------
-    lab
-        Virtual arm, with the true gains.
-    identified
-        Identified controller of all motors.
+    ``lab``: virtual arm, with the true gains; ``identified``: identified controller of all motors.
     """
     recording = lab.recording(Case())
     errors = []
@@ -116,7 +106,7 @@ def gain_error(lab: Laboratory, identified: IdentifiedController) -> float | Non
 
 def _in_figures(lab: Laboratory, identified: IdentifiedController, took: float, case: Case, run: Run) -> TwoStages:
     try:
-        loop = relative_errors(lab.simulated(run, case), run.estimate.theta)[0]
+        loop = relative_torque_errors(lab.simulated(run, case), run.estimate.theta)[0]
     except DataError:
         loop = None
     std = lab.run("idim-iv", Case()).estimate.std

@@ -63,18 +63,9 @@ def recorded(
 ) -> Experiment:
     """A recording of random moves, the same for every seed; the noise differs.
 
-    Parameters
-    ----------
-    seed
-        Seed of the noise.
-    torque, pole
-        Standard deviation of the noise of the recorded force, N, and its pole: AR(1).
-    position
-        Standard deviation of the white noise of the encoder, m; it passes through the controller.
-    count
-        Encoder resolution, m; 0: none.
-    moves
-        Number of moves.
+    ``torque``, ``pole``: standard deviation of the noise of the recorded force, N, and its pole: AR(1). ``position``:
+    standard deviation of the white noise of the encoder, m; it passes through the controller. ``count``: encoder
+    resolution, m; 0: none.
     """
     rng = np.random.default_rng(seed)
     reference = _reference(moves)

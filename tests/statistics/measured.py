@@ -31,7 +31,7 @@ from tests.reproduction.recordings import measured_emps, measured_recording
 from tests.tools.markdown import table as markdown_table
 
 MOST_CPU_S = 60.0
-"""Most CPU time of a diagnosis, s: design page of the diagnosis, principle 9."""
+"""Most CPU time of a diagnosis, s: one that takes longer is not repeated while a person waits."""
 MOST_MEMORY_GB = 2.0
 """Most memory of a diagnosis, GB: the same."""
 CERTAIN = 0.9
@@ -170,20 +170,9 @@ def _each(values: NDArray[np.float64]) -> str:
 class Row:
     """Result of one machine.
 
-    Parameters
-    ----------
-    name, title
-        Name and title of the machine.
-    cpu_s
-        CPU time of user and system, all of the process, s.
-    memory_gb
-        Largest resident memory of the process, GB.
-    before, after
-        Held-out error of all joints without and with the findings, percent.
-    flags
-        Limits that it exceeds.
-    lines
-        Lines that tell the diagnosis.
+    ``cpu_s``: CPU time of user and system, all of the process, s; ``memory_gb``: largest resident memory of the
+    process, GB; ``before``, ``after``: held-out error of all joints without and with the findings, percent; ``flags``:
+    limits that it exceeds; ``lines``: lines that tell the diagnosis.
     """
 
     name: str
@@ -197,17 +186,7 @@ class Row:
 
 
 def flags_of(found: Diagnosis, cpu_s: float, memory_gb: float) -> tuple[str, ...]:
-    """Limits that a diagnosis exceeds.
-
-    Parameters
-    ----------
-    found
-        The diagnosis.
-    cpu_s
-        Its CPU time, s.
-    memory_gb
-        Its largest memory, GB.
-    """
+    """Limits that a diagnosis exceeds. ``cpu_s``: its CPU time, s; ``memory_gb``: its largest memory, GB."""
     flags = []
     if cpu_s > MOST_CPU_S:
         flags.append(f"over {MOST_CPU_S:.0f} s")
@@ -223,15 +202,7 @@ def flags_of(found: Diagnosis, cpu_s: float, memory_gb: float) -> tuple[str, ...
 
 
 def measured(name: str, data: Path) -> Row:
-    """Diagnose one machine; meant for a process of its own.
-
-    Parameters
-    ----------
-    name
-        Name of the machine.
-    data
-        Folder of the recordings.
-    """
+    """Diagnose one machine; meant for a process of its own. ``data``: folder of the recordings."""
     title, load = MACHINES[name]
     found = load(data).diagnosed()
     used = resource.getrusage(resource.RUSAGE_SELF)
@@ -244,12 +215,7 @@ def measured(name: str, data: Path) -> Row:
 def alone(name: str, data: Path) -> Row:
     """Diagnose one machine in a new process, so that memory and time are its own.
 
-    Parameters
-    ----------
-    name
-        Name of the machine.
-    data
-        Folder of the recordings.
+    ``data``: folder of the recordings.
     """
     with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
         return pool.submit(measured, name, data).result()

@@ -121,14 +121,7 @@ def healthy_signals(config: Path) -> Signals:
 def change(config: Path, effect: str, joint: int, other: int) -> tuple[float, float]:
     """Return the largest change of a signal by an effect, and the largest signal, over those of the healthy arm.
 
-    Parameters
-    ----------
-    config
-        Robot.
-    effect
-        Key of the effect.
-    joint, other
-        Joint of the effect, from 0, and the other joint of an effect between two.
+    ``joint``, ``other``: joint of the effect, from 0, and the other joint of an effect between two.
     """
     joints, spec = twin(config).robot.joints, EFFECTS[effect]
     place = joints[0 if spec.first_joint else joint]

@@ -39,10 +39,7 @@ def main() -> None:
 def matched(seed: int) -> list[bytes]:
     """Return rows, gaps and counters of a stream with lost, late, repeated and short frames.
 
-    Parameters
-    ----------
-    seed
-        Seed of the faults; it also chooses packed samples, two buses and a foreign SYNC master.
+    ``seed``: seed of the faults; it also chooses packed samples, two buses and a foreign SYNC master.
     """
     random = np.random.default_rng(seed)
     pack, buses, foreign = (4 if seed % 3 == 2 else 1), 1 + seed % 2, seed % 4 == 3
@@ -62,13 +59,7 @@ def matched(seed: int) -> list[bytes]:
 
 
 def content(batch: Batch) -> list[bytes]:
-    """Return what a batch holds.
-
-    Parameters
-    ----------
-    batch
-        Result of the matcher.
-    """
+    """Return what a batch holds. ``batch``: result of the matcher."""
     arrays = [array for rows in batch.rows.values() for array in (rows.sync, rows.t_ns, rows.data)]
     return [*(np.ascontiguousarray(array).tobytes() for array in arrays), repr(batch.gaps).encode()]
 
@@ -76,16 +67,7 @@ def content(batch: Batch) -> list[bytes]:
 def faulty_frames(random: np.random.Generator, start: int, joints: list[int], pack: int) -> Frames:
     """Return the frames of a bus during `BATCH` SYNCs.
 
-    Parameters
-    ----------
-    random
-        Source of the faults.
-    start
-        Number of the first SYNC.
-    joints
-        Joints whose drives are on this bus.
-    pack
-        Samples in a TPDO.
+    ``start``: number of the first SYNC; ``joints``: joints whose drives are on this bus; ``pack``: samples in a TPDO.
     """
     found: list[tuple[int, int, int, int]] = []
     for k in range(start, start + BATCH):
@@ -109,10 +91,7 @@ def faulty_frames(random: np.random.Generator, start: int, joints: list[int], pa
 def cost_us(joints: int = 6, batches: int = 40) -> float:
     """Return the processor time per frame of a stream without faults, us.
 
-    Parameters
-    ----------
-    joints, batches
-        Number of drives, and of batches of `BATCH` SYNCs.
+    ``joints``, ``batches``: number of drives, and of batches of `BATCH` SYNCs.
     """
     stream = TpdoStream("samples", 1, tuple(range(0x181, 0x181 + joints)), 8)
     assembler = Assembler((stream,), [str(joint) for joint in range(joints)], PERIOD_NS)

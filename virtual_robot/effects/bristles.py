@@ -18,12 +18,7 @@ COLUMNS = 7
 def sliding_level(row, qd):  # type: ignore[no-untyped-def]
     """Magnitude of the friction (N m) when sliding, and its slope over ``abs(qd)``.
 
-    Parameters
-    ----------
-    row
-        Row of `bristle_table`, shape (COLUMNS,).
-    qd
-        Velocity of the joint, rad/s or m/s.
+    ``row``: row of `bristle_table`, shape (COLUMNS,); ``qd``: velocity of the joint, rad/s or m/s.
     """
     speed = abs(qd)
     ratio = (speed / row[3]) ** row[4]
@@ -35,14 +30,8 @@ def sliding_level(row, qd):  # type: ignore[no-untyped-def]
 def bristle_rate(row, z, qd):  # type: ignore[no-untyped-def]
     """Rate of a bristle's deflection, ``qd - abs(qd) z stiffness / g(qd)``, and its slopes over ``z`` and ``qd``.
 
-    Parameters
-    ----------
-    row
-        Row of `bristle_table`, shape (COLUMNS,).
-    z
-        Deflection, rad or m.
-    qd
-        Velocity of the joint, rad/s or m/s.
+    ``row``: row of `bristle_table`, shape (COLUMNS,); ``z``: deflection, rad or m; ``qd``: velocity of the joint, rad/s
+    or m/s.
     """
     level, fall = sliding_level(row, qd)
     pull = row[5] / level
@@ -55,26 +44,10 @@ def bristle_table(
 ) -> NDArray[np.float64]:
     """Parameters of the bristles; Stribeck and presliding friction of one joint share a bristle.
 
-    Parameters
-    ----------
-    hidden
-        Hidden effects.
-    robot
-        The robot.
-    friction
-        fv, fc and offset of the healthy arm (further columns are ignored), shape (n, 3 or more).
-    inertia
-        Inertia about each joint at the start, for the critical damping, shape (n,).
-
-    Returns
-    -------
-    ndarray
-        One row per bristle, shape (B, COLUMNS).
-
-    Raises
-    ------
-    ConfigError
-        If a joint has no Coulomb friction for a bristle to replace.
+    ``hidden``: hidden effects; ``friction``: fv, fc and offset of the healthy arm (further columns are ignored), shape
+    (n, 3 or more); ``inertia``: inertia about each joint at the start, for the critical damping, shape (n,). Returns
+    one row per bristle, shape (B, COLUMNS). Raises ConfigError if a joint has no Coulomb friction for a bristle to
+    replace.
     """
     rows: list[NDArray[np.float64]] = []
     mine = [h for h in hidden if h.target == "bristle"]

@@ -15,20 +15,9 @@ Target = Literal["force", "bristle", "gear", "body", "drive", "report"]
 class ParameterSpec:
     """Parameter of an effect, joint side.
 
-    Parameters
-    ----------
-    unit
-        Unit at a revolute joint; at a prismatic joint N for N m, and m for rad.
-    meaning
-        Description.
-    default
-        ``None``: required; ``AUTO``: derived from the robot as described in ``meaning``.
-    low, high
-        Range of values.
-    above
-        ``True`` if ``low`` itself is excluded.
-    only
-        Type of joint that has the parameter; ``None``: both.
+    ``unit``: unit at a revolute joint; at a prismatic joint N for N m, and m for rad. ``default``: ``None``: required;
+    ``AUTO``: derived from the robot as described in ``meaning``. ``above``: ``True`` if ``low`` itself is excluded.
+    ``only``: type of joint that has the parameter; ``None``: both.
     """
 
     unit: str
@@ -44,18 +33,8 @@ class ParameterSpec:
 class EffectSpec:
     """Effect that can be hidden in the virtual arm.
 
-    Parameters
-    ----------
-    target
-        Target of the effect.
-    meaning
-        Description.
-    parameters
-        Parameters by name.
-    other
-        ``required``, ``optional`` or ``none``: second joint of the effect.
-    first_joint
-        ``True`` if the effect concerns the base and is given at the first joint.
+    ``other``: ``required``, ``optional`` or ``none``: second joint of the effect; ``first_joint``: ``True`` if the
+    effect concerns the base and is given at the first joint.
     """
 
     target: Target

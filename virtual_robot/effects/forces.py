@@ -49,8 +49,6 @@ def effect_torque(code, p, q, qd, motor, other, load, t, smoothing):  # type: ig
         Velocity of the other joint, rad/s or m/s.
     load
         Torque that the gear transmits to the links, N m.
-    t
-        Time, s.
     smoothing
         ``g`` in ``sign(qd) -> (2/pi) atan(g qd)``, s/rad or s/m.
     """
@@ -96,19 +94,8 @@ def effect_torque(code, p, q, qd, motor, other, load, t, smoothing):  # type: ig
 def force_table(hidden: Sequence[Hidden], robot: RobotConfig, friction: NDArray[np.float64]) -> NDArray[np.float64]:
     """Table of hidden torques for `effect_torque`.
 
-    Parameters
-    ----------
-    hidden
-        Hidden effects.
-    robot
-        The robot.
-    friction
-        fv, fc and offset of the healthy arm (further columns are ignored), shape (n, 3 or more).
-
-    Returns
-    -------
-    ndarray
-        Code, joint, other joint (-1: none) and parameters of each torque, shape (E, 3 + PARAMETERS).
+    ``friction``: fv, fc and offset of the healthy arm (further columns are ignored), shape (n, 3 or more). Returns the
+    code, joint, other joint (-1: none) and parameters of each torque, shape (E, 3 + PARAMETERS).
     """
     mine = [h for h in hidden if h.effect in CODES]
     table = np.zeros((len(mine), 3 + PARAMETERS))
@@ -157,12 +144,7 @@ def _row(h: Hidden, robot: RobotConfig, fv: float, fc: float) -> tuple[float, ..
 def waves(h: Hidden, joint: Joint) -> float:
     """Angular wave number (1/rad or 1/m) of an effect that is periodic in the joint position.
 
-    Parameters
-    ----------
-    h
-        Hidden effect with the parameter ``per_turn``.
-    joint
-        Its joint.
+    ``h``: hidden effect with the parameter ``per_turn``.
     """
     if joint.type == "revolute":
         return h.value_or("per_turn", 1.0)

@@ -34,12 +34,8 @@ def _press(way, rounding):  # type: ignore[no-untyped-def]
 def gear_torque(row, twist, rate):  # type: ignore[no-untyped-def]
     """Torque between motor and link (N m), and its slopes over twist and rate.
 
-    Parameters
-    ----------
-    row
-        Row of `gear_rows`, shape (COLUMNS,).
-    twist, rate
-        Position of the motor relative to the link (rad or m), and its rate.
+    ``row``: row of `gear_rows`, shape (COLUMNS,); ``twist``, ``rate``: position of the motor relative to the link
+    (rad or m), and its rate.
     """
     if row[4] == 0.0:
         return row[2] * twist + row[3] * rate, row[2], row[3]
@@ -52,12 +48,7 @@ def gear_torque(row, twist, rate):  # type: ignore[no-untyped-def]
 def twist_under(row: NDArray[np.float64], torque: float) -> float:
     """Twist (rad or m) of a gear at rest under a torque.
 
-    Parameters
-    ----------
-    row
-        Row of `gear_rows`, shape (COLUMNS,).
-    torque
-        Transmitted torque, N m or N.
+    ``row``: row of `gear_rows`, shape (COLUMNS,); ``torque``: transmitted torque, N m or N.
     """
     end = torque / float(row[2]) + math.copysign(float(row[4]), torque)
     low, high = min(0.0, end), max(0.0, end)
@@ -79,30 +70,11 @@ def gear_rows(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Parameters of the elastic gears; the link of gear e has coordinate n + e.
 
-    Parameters
-    ----------
-    hidden
-        Hidden effects.
-    robot
-        The robot.
-    rotor
-        Rotor inertias, joint side, shape (n, n).
-    mass
-        Mass matrix of the links alone at the start, shape (n, n).
-    least
-        Least inertia at each joint if all others are free, over the postures, shape (n,).
-
-    Returns
-    -------
-    rows
-        One row per elastic gear, shape (G, COLUMNS).
-    moved
-        Inertia of the links that is assigned to the motor, by gear, shape (G,).
-
-    Raises
-    ------
-    ConfigError
-        If the inertia of the motor exceeds that of motor and link together.
+    ``hidden``: hidden effects; ``rotor``: rotor inertias, joint side, shape (n, n); ``mass``: mass matrix of the links
+    alone at the start, shape (n, n); ``least``: least inertia at each joint if all others are free, over the postures,
+    shape (n,). Returns ``rows``: one row per elastic gear, shape (G, COLUMNS); ``moved``: inertia of the links that is
+    assigned to the motor, by gear, shape (G,). Raises ConfigError if the inertia of the motor exceeds that of motor and
+    link together.
     """
     rows, moved = [], []
     mine = [h for h in hidden if h.target == "gear"]

@@ -15,16 +15,8 @@ REPEATABLE = ("cogging_torque", "torque_bump", "position_dependent_friction", "e
 class Hidden:
     """Validated hidden effect.
 
-    Parameters
-    ----------
-    effect
-        Name of the effect.
-    joint, other
-        Numbers of its joints; ``other`` is -1 if there is none.
-    values
-        Parameters including defaults; ``AUTO`` (NaN): derived from the robot.
-    where
-        Name of the entry in messages.
+    ``joint``, ``other``: numbers of its joints; ``other`` is -1 if there is none. ``values``: parameters including
+    defaults; ``AUTO`` (NaN): derived from the robot.
     """
 
     effect: str
@@ -44,12 +36,7 @@ class Hidden:
     def value_or(self, name: str, otherwise: float) -> float:
         """Value of a parameter, or a default derived from the robot.
 
-        Parameters
-        ----------
-        name
-            Name of the parameter.
-        otherwise
-            Value if the parameter is ``AUTO``.
+        ``otherwise``: value if the parameter is ``AUTO``.
         """
         value = self.values[name]
         return otherwise if math.isnan(value) else value
@@ -58,19 +45,8 @@ class Hidden:
 def hidden_effects(scenario: Scenario | None, robot: RobotConfig, where: str = "scenario") -> tuple[Hidden, ...]:
     """Validate the effects of a scenario.
 
-    Parameters
-    ----------
-    scenario
-        The scenario; ``None``: no effects.
-    robot
-        The robot.
-    where
-        Name of the scenario in messages.
-
-    Raises
-    ------
-    ConfigError
-        If an entry is invalid; names the entry and the expected value.
+    ``scenario``: the scenario; ``None``: no effects. Raises ConfigError if an entry is invalid; names the entry and the
+    expected value.
     """
     out: list[Hidden] = []
     for k, entry in enumerate(() if scenario is None else scenario.effects):

@@ -90,14 +90,8 @@ def _rewired(own, origin, sign, low, high, out):  # type: ignore[no-untyped-def]
 class Signals:
     """Hidden errors of positions and signals, applied once per control period.
 
-    Parameters
-    ----------
-    hidden
-        Hidden effects; only those with target ``drive`` or ``report`` are used.
-    robot
-        Transmission and drives.
-    period
-        Control period, s.
+    ``hidden``: hidden effects; only those with target ``drive`` or ``report`` are used. ``robot``: transmission and
+    drives.
 
     Attributes
     ----------
@@ -163,13 +157,7 @@ class Signals:
                         origin[both], sign[both] = origin[turned], sign[turned]
 
     def measured(self, q: Vector) -> Vector:
-        """Joint positions as measured by the encoders, shape (n,).
-
-        Parameters
-        ----------
-        q
-            Joint positions, rad or m, shape (n,).
-        """
+        """Joint positions as measured by the encoders, shape (n,). ``q``: joint positions, rad or m, shape (n,)."""
         if not len(self._encoders):
             return q
         out: Vector = _measured(q, self._encoders, self._to_joints)
@@ -178,10 +166,7 @@ class Signals:
     def applied(self, signal: Vector) -> Vector:
         """Joint torques of the motors over the next period, N m or N, shape (n,).
 
-        Parameters
-        ----------
-        signal
-            Signals of the drives, A, V or N m, shape (n,).
+        ``signal``: signals of the drives, A, V or N m, shape (n,).
         """
         out: Vector = _applied(signal, self._level, self._knee, self._lag, self._lagging, self._period, self._torque)
         return out
@@ -189,10 +174,7 @@ class Signals:
     def reported(self, signal: Vector) -> Vector:
         """Reported signals at the present time, without noise, in the drives' own order, shape (n,).
 
-        Parameters
-        ----------
-        signal
-            Signals of the drives, A, V or N m, shape (n,).
+        ``signal``: signals of the drives, A, V or N m, shape (n,).
         """
         newest = -self._periods % len(self._past)
         out: Vector = _reported(
@@ -204,38 +186,22 @@ class Signals:
     def on_the_bus(self, signal: Vector, noise: Vector, permille: Vector, out: NDArray[np.int16]) -> None:
         """Write the reported signals with noise as numbers of the bus.
 
-        Parameters
-        ----------
-        signal, noise
-            Signals of the drives, and their noise, shape (n,).
-        permille
-            Numbers per unit of the signal, shape (n,).
-        out
-            Numbers of the bus, int16, shape (n,), written in place.
+        ``signal``, ``noise``: signals of the drives, and their noise, shape (n,); ``permille``: numbers per unit of the
+        signal, shape (n,); ``out``: numbers of the bus, int16, shape (n,), written in place.
         """
         _permille(self.reported(signal), noise, permille, out)
 
     def rewired_torque(self, own: NDArray[np.int16], out: NDArray[np.int16]) -> None:
         """Write the torque signals under the names and signs of the recording.
 
-        Parameters
-        ----------
-        own
-            Numbers in the drives' own order, shape (n,).
-        out
-            Recorded numbers, shape (n,), written in place.
+        ``own``: numbers in the drives' own order, shape (n,); ``out``: recorded numbers, shape (n,), written in place.
         """
         _rewired(own, self.torque_from, self.torque_sign, -32768, 32767, out)
 
     def rewired_position(self, own: NDArray[np.int32], out: NDArray[np.int32]) -> None:
         """Write positions or demands under the names and signs of the recording.
 
-        Parameters
-        ----------
-        own
-            Counts in the drives' own order, shape (n,).
-        out
-            Recorded counts, shape (n,), written in place.
+        ``own``: counts in the drives' own order, shape (n,); ``out``: recorded counts, shape (n,), written in place.
         """
         _rewired(own, self.position_from, self.position_sign, -(2**31), 2**31 - 1, out)
 

@@ -16,10 +16,7 @@ TOLERANCE = 1e-9
 def check_update() -> None:
     """Compare the compiled update with filterpy on a small case, once per process.
 
-    Raises
-    ------
-    ArmidentError
-        If they differ: the compiled code of this machine is wrong.
+    Raises ArmidentError if they differ: the compiled code of this machine is wrong.
     """
     from filterpy.kalman import KalmanFilter
 

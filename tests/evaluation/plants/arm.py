@@ -78,15 +78,7 @@ class Arm:
 
 
 def random_arm(rng: Generator, ranges: Ranges) -> Arm:
-    """Draw an arm.
-
-    Parameters
-    ----------
-    rng
-        Source of random numbers.
-    ranges
-        Ranges of the half.
-    """
+    """Draw an arm. ``ranges``: ranges of the half."""
     n = int(rng.integers(ranges.joints[0], ranges.joints[1] + 1))
     prismatic = (rng.random(n) < ranges.prismatic).astype(np.int64)
     mdh = _geometry(rng, ranges, n)

@@ -14,10 +14,7 @@ from numba import njit
 def cross(ax, ay, az, bx, by, bz):  # type: ignore[no-untyped-def]
     """Cross product of two vectors, as three numbers.
 
-    Parameters
-    ----------
-    ax, ay, az, bx, by, bz
-        Components of the vectors.
+    ``ax``, ``ay``, ``az``, ``bx``, ``by``, ``bz``: components of the vectors.
     """
     return ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
 
@@ -94,14 +91,8 @@ def place(q, mdh, prismatic, mass, com, inertia, axes, bodies):  # type: ignore[
 def momentum(body, v, out):  # type: ignore[no-untyped-def]
     """Product of a spatial inertia and a spatial vector, angular before linear.
 
-    Parameters
-    ----------
-    body
-        Row of ``bodies`` of `place`, shape (10,).
-    v
-        Velocity or acceleration, shape (6,).
-    out
-        Resulting momentum or force, shape (6,).
+    ``body``: row of ``bodies`` of `place`, shape (10,); ``v``: velocity or acceleration, shape (6,); ``out``: resulting
+    momentum or force, shape (6,).
     """
     m, hx, hy, hz = body[0], body[1], body[2], body[3]
     w0, w1, w2, u0, u1, u2 = v[0], v[1], v[2], v[3], v[4], v[5]
@@ -119,16 +110,9 @@ def momentum(body, v, out):  # type: ignore[no-untyped-def]
 def mass_and_bias(qd, gravity, axes, bodies, M, bias):  # type: ignore[no-untyped-def]
     """Mass matrix, and torques of gravity, Coriolis and centrifugal effects.
 
-    Parameters
-    ----------
-    qd
-        Velocities, shape (n,).
-    gravity
-        Acceleration of gravity in frame 0, m/s^2, shape (3,).
-    axes, bodies
-        Of `place`; ``bodies`` is replaced by the composite bodies.
-    M, bias
-        Resulting mass matrix, shape (n, n), and torques, shape (n,).
+    ``qd``: velocities, shape (n,). ``gravity``: acceleration of gravity in frame 0, m/s^2, shape (3,). ``axes``,
+    ``bodies``: of `place`; ``bodies`` is replaced by the composite bodies. ``M``, ``bias``: resulting mass matrix,
+    shape (n, n), and torques, shape (n,).
     """
     n = qd.size
     V = np.zeros(6)
@@ -184,14 +168,8 @@ def mass_and_bias(qd, gravity, axes, bodies, M, bias):  # type: ignore[no-untype
 def evaluate(q, qd, gravity, mdh, prismatic, mass, com, inertia):  # type: ignore[no-untyped-def]
     """Mass matrix, shape (n, n), and bias torques, shape (n,), at one state.
 
-    Parameters
-    ----------
-    q, qd
-        Positions and velocities, shape (n,).
-    gravity
-        Acceleration of gravity in frame 0, m/s^2, shape (3,).
-    mdh, prismatic, mass, com, inertia
-        Bodies, see `place`.
+    ``q``, ``qd``: positions and velocities, shape (n,); ``gravity``: acceleration of gravity in frame 0, m/s^2, shape
+    (3,); ``mdh``, ``prismatic``, ``mass``, ``com``, ``inertia``: bodies, see `place`.
     """
     n = q.size
     axes, bodies = np.empty((n, 6)), np.empty((n, 10))

@@ -37,8 +37,6 @@ class Truth:
 
     Parameters
     ----------
-    name
-        Name of the case.
     family, kind
         Family, and kind of the hidden effect or mistake.
     accepted
@@ -79,16 +77,8 @@ class Truth:
 class RandomCase:
     """A case: the robot as configured, two recordings, and the truth.
 
-    Parameters
-    ----------
-    robot
-        Robot as the user has configured it.
-    recordings
-        To learn from, and to judge by.
-    truth
-        The truth.
-    twin
-        The same arm without the hidden effect, same seeds; ``None`` where it was not asked for.
+    ``robot``: robot as the user has configured it. ``recordings``: to learn from, and to judge by. ``twin``: the same
+    arm without the hidden effect, same seeds; ``None`` where it was not asked for.
     """
 
     robot: RobotConfig
@@ -121,12 +111,7 @@ class _Hidden:
 def kind_of(half: Half, index: int) -> tuple[Family, str]:
     """Family and kind of a case: blocks with the shares of the suite, each in an order of its own.
 
-    Parameters
-    ----------
-    half
-        Half of the suite.
-    index
-        Number of the case, from 0.
+    ``index``: number of the case, from 0.
     """
     kinds = block()
     number, place = divmod(index, len(kinds))
@@ -137,19 +122,8 @@ def kind_of(half: Half, index: int) -> tuple[Family, str]:
 def make_case(half: Half, index: int, *, with_twin: bool = False) -> RandomCase:
     """Draw and simulate a case; the same numbers give the same case.
 
-    Parameters
-    ----------
-    half
-        Half of the suite.
-    index
-        Number of the case, from 0.
-    with_twin
-        Simulate the healthy twin of a case with an effect of the catalogue too.
-
-    Raises
-    ------
-    Diverged
-        If no drawn arm has a stable loop.
+    ``half``: half of the suite; ``index``: number of the case, from 0; ``with_twin``: simulate the healthy twin of a
+    case with an effect of the catalogue too. Raises Diverged if no drawn arm has a stable loop.
     """
     family, kind = kind_of(half, index)
     ranges = HALVES[half]

@@ -37,23 +37,8 @@ CHATTER = 0.03
 def random_controller(rng: Generator, arm: Arm, kind: ControllerKind, ranges: Ranges, step: float) -> Floats:
     """Draw the gains of one controller for each joint.
 
-    Parameters
-    ----------
-    rng
-        Source of random numbers.
-    arm
-        The arm.
-    kind
-        Family of the controller.
-    ranges
-        Ranges of the half.
-    step
-        Control period, s.
-
-    Returns
-    -------
-    ndarray
-        Table of `CONTROLLERS`, shape (n, .).
+    ``kind``: family of the controller; ``ranges``: ranges of the half. Returns the table of `CONTROLLERS`, shape
+    (n, .).
     """
     n = arm.n
     table = np.zeros((n, len(CONTROLLERS)))
@@ -81,11 +66,6 @@ def random_controller(rng: Generator, arm: Arm, kind: ControllerKind, ranges: Ra
 def finest_needed(arm: Arm, control: Floats) -> Floats:
     """Coarsest encoder step of each joint with which the velocity loop does not chatter, rad or m, shape (n,).
 
-    Parameters
-    ----------
-    arm
-        The arm.
-    control
-        Table of the controller.
+    ``control``: table of the controller.
     """
     return np.asarray(CHATTER * arm.scale * WINDOW_S / (control[:, KV] * control[:, FILTER]))

@@ -21,15 +21,7 @@ PARTS = ("a", "b")
 
 
 def write_case(case: RandomCase, out: Path) -> None:
-    """Write ``NAME.yaml``, ``NAME_a.npz``, ``NAME_b.npz`` and ``NAME.truth.json``.
-
-    Parameters
-    ----------
-    case
-        The case.
-    out
-        Folder of the files.
-    """
+    """Write ``NAME.yaml``, ``NAME_a.npz``, ``NAME_b.npz`` and ``NAME.truth.json``."""
     out.mkdir(parents=True, exist_ok=True)
     name = case.truth.name
     write_robot(case.robot, out / f"{name}.yaml")
@@ -39,15 +31,7 @@ def write_case(case: RandomCase, out: Path) -> None:
 
 
 def write_robot(robot: RobotConfig, path: Path) -> None:
-    """Write a robot configuration.
-
-    Parameters
-    ----------
-    robot
-        The configuration.
-    path
-        The file.
-    """
+    """Write a robot configuration."""
     content = robot.model_dump(mode="json", by_alias=True, exclude_defaults=True)
     path.write_text(yaml.safe_dump({"schema": robot.schema_} | content), encoding="utf-8")
 
@@ -55,12 +39,7 @@ def write_robot(robot: RobotConfig, path: Path) -> None:
 def as_recording(robot: RobotConfig, arrays: Arrays) -> Recording:
     """Recording with the arrays as ``armident import`` reads them, without its checks of units.
 
-    Parameters
-    ----------
-    robot
-        Robot as configured.
-    arrays
-        Arrays by name, SI as far as the case has no mistake of units, joint side.
+    ``arrays``: arrays by name, SI as far as the case has no mistake of units, joint side.
     """
     names = {"position": "q", "torque": "tau", "demand": "qr"}
     revolute = all(joint.type == "revolute" for joint in robot.joints)
@@ -81,19 +60,7 @@ def as_recording(robot: RobotConfig, arrays: Arrays) -> Recording:
 def write_recordings(case: RandomCase, out: Path, prefix: str) -> dict[str, str]:
     """Write configuration and recordings of a case as ``armident diagnose`` reads them.
 
-    Parameters
-    ----------
-    case
-        The case.
-    out
-        Folder of the files.
-    prefix
-        Beginning of the names of the files.
-
-    Returns
-    -------
-    dict
-        Paths by ``robot``, ``a`` and ``b``.
+    ``prefix``: beginning of the names of the files. Returns paths by ``robot``, ``a`` and ``b``.
     """
     paths = {"robot": out / f"{prefix}.yaml"} | {part: out / f"{prefix}_{part}.mcap" for part in PARTS}
     write_robot(case.robot, paths["robot"])

@@ -33,10 +33,6 @@ class Draft:
 
     Parameters
     ----------
-    seed
-        Seed of the case.
-    plant
-        The healthy plant.
     motions
         References of the recordings to learn from and to judge by.
     healthy
@@ -75,19 +71,7 @@ class Draft:
 def draw_draft(rng: Generator, ranges: Ranges, seed: tuple[int, ...]) -> Draft:
     """Draw a healthy arm with everything but a hidden effect.
 
-    Parameters
-    ----------
-    rng
-        Source of random numbers.
-    ranges
-        Ranges of the half.
-    seed
-        Seed of the case.
-
-    Raises
-    ------
-    Diverged
-        If the drawn loop is not stable.
+    ``ranges``: ranges of the half. Raises Diverged if the drawn loop is not stable.
     """
     arm = random_arm(rng, ranges)
     rate = float(rng.choice(ranges.rates))
@@ -111,14 +95,7 @@ def draw_draft(rng: Generator, ranges: Ranges, seed: tuple[int, ...]) -> Draft:
 def noisy(draft: Draft, part: int, run: Run) -> Run:
     """Recording with the torque noise of the case.
 
-    Parameters
-    ----------
-    draft
-        The case.
-    part
-        0 for the recording to learn from, 1 for the one to judge by.
-    run
-        The recording.
+    ``part``: 0 for the recording to learn from, 1 for the one to judge by.
     """
     rng = np.random.default_rng([*draft.seed, 3, part])
     noise = np.empty_like(run.torque)
@@ -131,28 +108,13 @@ def noisy(draft: Draft, part: int, run: Run) -> Run:
 def simulated(draft: Draft, plant: Plant, part: int) -> Run:
     """Simulate a motion of the case with another plant, and add the torque noise of the case.
 
-    Parameters
-    ----------
-    draft
-        The case.
-    plant
-        The plant.
-    part
-        0 for the recording to learn from, 1 for the one to judge by.
+    ``part``: 0 for the recording to learn from, 1 for the one to judge by.
     """
     return noisy(draft, part, simulate(plant, draft.motions[part], (*draft.seed, 10 + part)))
 
 
 def configuration(arm: Arm, name: str) -> RobotConfig:
-    """Robot configuration of a healthy arm.
-
-    Parameters
-    ----------
-    arm
-        The arm.
-    name
-        Name of the robot.
-    """
+    """Robot configuration of a healthy arm."""
     joints: list[dict[str, Any]] = []
     for j in range(arm.n):
         alpha, d, theta, r = (float(x) for x in arm.mdh[j])

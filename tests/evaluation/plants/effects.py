@@ -19,14 +19,8 @@ Range = tuple[float, float]
 class Place:
     """Joint of an effect, and the motion there.
 
-    Parameters
-    ----------
-    joint
-        Number of the joint.
-    motion
-        Reference of the recording to learn from.
-    peak
-        Largest torque of the healthy arm at each joint, N m or N, shape (n,).
+    ``motion``: reference of the recording to learn from; ``peak``: largest torque of the healthy arm at each joint,
+    N m or N, shape (n,).
     """
 
     joint: int
@@ -37,12 +31,7 @@ class Place:
 class Shapes:
     """Draws the numbers that shape a law; two objects of one seed draw the same.
 
-    Parameters
-    ----------
-    seed
-        Seed.
-    wider
-        Factor by which the ranges of the laws are extended at both ends.
+    ``wider``: factor by which the ranges of the laws are extended at both ends.
     """
 
     def __init__(self, seed: Sequence[int], wider: float) -> None:
@@ -51,10 +40,7 @@ class Shapes:
     def between(self, low: float, high: float) -> float:
         """Draw a number of the range, extended for this half of the suite.
 
-        Parameters
-        ----------
-        low, high
-            Ends of the range; a range about zero is extended in both directions.
+        ``low``, ``high``: ends of the range; a range about zero is extended in both directions.
         """
         wider = self._wider
         return float(self.generator.uniform(low / wider if low > 0.0 else low * wider, high * wider))
@@ -64,13 +50,7 @@ class Shapes:
         return float(self.generator.uniform(0.0, 2.0 * np.pi))
 
     def one_of(self, values: Sequence[float]) -> float:
-        """Draw one of some values.
-
-        Parameters
-        ----------
-        values
-            The values.
-        """
+        """Draw one of some values."""
         return float(self.generator.choice(values))
 
 
@@ -82,16 +62,9 @@ Apply = Callable[[Plant, Place, float, Shapes], Plant]
 class HiddenEffect:
     """A hidden effect.
 
-    Parameters
-    ----------
-    apply
-        Adds the effect to a plant.
-    strengths
-        Smallest and largest strength; 1 is typical.
-    pair
-        ``True`` if the effect is between the joint and the next one.
-    arm
-        ``True`` if the effect belongs to the whole arm.
+    ``apply``: adds the effect to a plant. ``strengths``: smallest and largest strength; 1 is typical. ``pair``:
+    ``True`` if the effect is between the joint and the next one. ``arm``: ``True`` if the effect belongs to the whole
+    arm.
     """
 
     apply: Apply
@@ -252,14 +225,7 @@ def _eccentric_encoder(plant: Plant, at: Place, s: float, draw: Shapes) -> Plant
 def rotated(gravity: Floats, axis: Floats, angle: float) -> Floats:
     """Vector rotated about a unit axis (Rodrigues).
 
-    Parameters
-    ----------
-    gravity
-        Vector, shape (3,).
-    axis
-        Unit axis, shape (3,).
-    angle
-        Angle, rad.
+    ``gravity``: vector, shape (3,); ``axis``: unit axis, shape (3,); ``angle``: rad.
     """
     return np.asarray(
         gravity * np.cos(angle)

@@ -46,14 +46,7 @@ COLDEST = 0.02
 def warmed(law, t, work):  # type: ignore[no-untyped-def]
     """Factor of friction after a time and an amount of dissipated work.
 
-    Parameters
-    ----------
-    law
-        Row of the law table.
-    t
-        Time, s.
-    work
-        Work dissipated at the joint, J.
+    ``law``: row of the law table; ``work``: work dissipated at the joint, J.
     """
     out = 1.0
     if law[WORK_SCALE] > 0.0:
@@ -67,18 +60,8 @@ def warmed(law, t, work):  # type: ignore[no-untyped-def]
 def dry_level(law, q, v, forward, faded, load):  # type: ignore[no-untyped-def]
     """Dry friction of a joint in one direction, N m or N.
 
-    Parameters
-    ----------
-    law
-        Row of the law table.
-    q, v
-        Position and velocity before the step.
-    forward
-        1 for the bound in positive direction.
-    faded
-        Factor of warming.
-    load
-        Torque that the gear transmits.
+    ``law``: row of the law table; ``q``, ``v``: position and velocity before the step; ``forward``: 1 for the bound in
+    positive direction; ``faded``: factor of warming; ``load``: torque that the gear transmits.
     """
     level = law[COULOMB] * faded
     if forward:
@@ -98,12 +81,7 @@ def dry_level(law, q, v, forward, faded, load):  # type: ignore[no-untyped-def]
 def smooth_torque(law, q, v):  # type: ignore[no-untyped-def]
     """Torque of the joint's springs, ripple, offset and curved friction against the motion, N m or N.
 
-    Parameters
-    ----------
-    law
-        Row of the law table.
-    q, v
-        Position and velocity before the step.
+    ``law``: row of the law table; ``q``, ``v``: position and velocity before the step.
     """
     out = law[OFFSET]
     if law[VISCOUS_FORWARD] != 0.0 and v > 0.0:
@@ -125,16 +103,9 @@ def one_impulse(speed, weight, forward, backward, smoothing):  # type: ignore[no
     With a smooth sign the equation is monotone and, from the start value of the piecewise linear sign, convex: Newton's
     method approaches the solution from one side.
 
-    Parameters
-    ----------
-    speed
-        Velocity without this impulse.
-    weight
-        Velocity change per unit impulse.
-    forward, backward
-        Largest impulses against positive and negative velocity.
-    smoothing
-        Velocity scale of the smooth sign; 0 for a sharp one, which sticks.
+    ``speed``: velocity without this impulse. ``weight``: velocity change per unit impulse. ``forward``, ``backward``:
+    largest impulses against positive and negative velocity. ``smoothing``: velocity scale of the smooth sign; 0 for a
+    sharp one, which sticks.
     """
     if smoothing <= 0.0:
         return min(max(speed / weight, -backward), forward)

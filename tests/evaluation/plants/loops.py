@@ -23,14 +23,7 @@ from tests.evaluation.plants.slots import (
 def read_encoder(law, x, resolution):  # type: ignore[no-untyped-def]
     """Position that an encoder reads, rad or m.
 
-    Parameters
-    ----------
-    law
-        Row of the law table.
-    x
-        Position.
-    resolution
-        Encoder step.
+    ``law``: row of the law table; ``x``: position; ``resolution``: encoder step.
     """
     if law[ECCENTRICITY] != 0.0:
         x += law[ECCENTRICITY] * math.sin(law[ECCENTRICITY_ORDER] * x + law[ECCENTRICITY_PHASE])
@@ -41,20 +34,9 @@ def read_encoder(law, x, resolution):  # type: ignore[no-untyped-def]
 def command(gains, k, j, step, reading, qr, qdr, speed, integral):  # type: ignore[no-untyped-def]
     """Torque that the controller of a joint demands, N m or N.
 
-    Parameters
-    ----------
-    gains
-        Row of the table of controllers.
-    k, j
-        Number of the step and of the joint.
-    step
-        Control period, s.
-    reading
-        Encoder readings up to step k, shape (K, n).
-    qr, qdr
-        Reference positions and velocities, shape (K, n).
-    speed, integral
-        Filtered velocity and integral of each joint, shape (n,); written in place.
+    ``gains``: row of the table of controllers. ``k``, ``j``: number of the step and of the joint. ``reading``: encoder
+    readings up to step k, shape (K, n). ``qr``, ``qdr``: reference positions and velocities, shape (K, n). ``speed``,
+    ``integral``: filtered velocity and integral of each joint, shape (n,); written in place.
     """
     back = max(k - int(gains[WINDOW]), 0)
     rate = (reading[k, j] - reading[back, j]) / ((k - back) * step) if k > back else 0.0

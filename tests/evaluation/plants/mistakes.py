@@ -18,16 +18,8 @@ Floats = NDArray[np.float64]
 class SetUp:
     """Changes by a set-up mistake: the plant's readings, the recording, and the joints concerned.
 
-    Parameters
-    ----------
-    joints
-        Numbers of the joints; empty for the whole arm.
-    plant
-        Changes the plant of the healthy arm and its largest torques (n,).
-    recorded
-        Changes the recording.
-    detail
-        Description with figures.
+    ``joints``: numbers of the joints; empty for the whole arm. ``plant``: changes the plant of the healthy arm and its
+    largest torques (n,). ``detail``: description with figures.
     """
 
     joints: tuple[int, ...]
@@ -43,12 +35,7 @@ Draw = Callable[[Generator, Arm], SetUp | None]
 def scaled(run: Run, position: Floats | float = 1.0, torque: Floats | float = 1.0, time: float = 1.0) -> Run:
     """Recording in other units.
 
-    Parameters
-    ----------
-    run
-        The recording.
-    position, torque, time
-        Factors of positions (n,), torques (n,) and times.
+    ``position``, ``torque``, ``time``: factors of positions (n,), torques (n,) and times.
     """
     return Run(
         run.t * time, run.q * position, run.qd * position / time, run.qdd * position / time**2, run.reading * position,

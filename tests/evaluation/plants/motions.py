@@ -21,10 +21,7 @@ SETTLE_S = 0.8
 class Motion:
     """Reference of a recording at every step.
 
-    Parameters
-    ----------
-    position, velocity
-        Joint side, rad or m, and rad/s or m/s, shape (K, n).
+    ``position``, ``velocity``: joint side, rad or m, and rad/s or m/s, shape (K, n).
     """
 
     position: Floats
@@ -32,21 +29,7 @@ class Motion:
 
 
 def random_motion(rng: Generator, arm: Arm, kind: MotionKind, duration: float, step: float) -> Motion:
-    """Draw a motion that uses the speed and the range of each joint.
-
-    Parameters
-    ----------
-    rng
-        Source of random numbers.
-    arm
-        The arm.
-    kind
-        Family of the motion.
-    duration
-        Length, s.
-    step
-        Step, s.
-    """
+    """Draw a motion that uses the speed and the range of each joint. ``kind``: family of the motion."""
     t = np.arange(round(duration / step), dtype=np.float64) * step
     make = _fourier if kind == "fourier" else _point_to_point
     position = np.column_stack(

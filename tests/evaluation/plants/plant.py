@@ -81,18 +81,9 @@ class Plant:
 class Run:
     """One simulated recording at its sampling instants; SI, joint side.
 
-    Parameters
-    ----------
-    t
-        Times, s, shape (M,).
-    q, qd, qdd
-        True motion as the encoders see it, without their steps, shape (M, n).
-    reading
-        Encoder readings, shape (M, n).
-    torque
-        Torque readings without noise, shape (M, n).
-    reference
-        Reference positions, shape (M, n).
+    ``t``: times, s, shape (M,); ``q``, ``qd``, ``qdd``: True motion as the encoders see it, without their steps, shape
+    (M, n); ``reading``: encoder readings, shape (M, n); ``torque``: torque readings without noise, shape (M, n);
+    ``reference``: reference positions, shape (M, n).
     """
 
     t: Floats
@@ -107,16 +98,7 @@ class Run:
 def healthy_plant(arm: Arm, control: Floats, step: float, every: int) -> Plant:
     """Plant of a healthy arm.
 
-    Parameters
-    ----------
-    arm
-        The arm.
-    control
-        Table of the controller.
-    step
-        Step of integration and control, s.
-    every
-        Steps per sample.
+    ``control``: table of the controller; ``step``: step of integration and control, s; ``every``: steps per sample.
     """
     n = arm.n
     never = np.full(n, np.inf)
@@ -129,19 +111,8 @@ def healthy_plant(arm: Arm, control: Floats, step: float, every: int) -> Plant:
 def simulate(plant: Plant, motion: Motion, seed: tuple[int, ...]) -> Run:
     """Simulate a recording.
 
-    Parameters
-    ----------
-    plant
-        The plant.
-    motion
-        Reference at every step.
-    seed
-        Seed of the torques from outside.
-
-    Raises
-    ------
-    Diverged
-        If the loop is not stable.
+    ``motion``: reference at every step; ``seed``: seed of the torques from outside. Raises Diverged if the loop is not
+    stable.
     """
     arm, K, n = plant.arm, motion.position.shape[0], plant.arm.n
     t = np.arange(K, dtype=np.float64) * plant.step
@@ -193,17 +164,7 @@ def _seen(laws: Floats, q: Floats, qd: Floats, qdd: Floats) -> tuple[Floats, Flo
 
 
 def with_law(plant: Plant, joint: int, **values: float) -> Plant:
-    """Plant with other values in the law table.
-
-    Parameters
-    ----------
-    plant
-        The plant.
-    joint
-        Number of the joint.
-    **values
-        Values by name of the column.
-    """
+    """Plant with other values in the law table. ``**values``: values by name of the column."""
     laws = plant.laws.copy()
     for name, value in values.items():
         laws[joint, LAWS.index(name)] = value
@@ -211,19 +172,7 @@ def with_law(plant: Plant, joint: int, **values: float) -> Plant:
 
 
 def with_entry(plant: Plant, name: str, joint: int, value: float) -> Plant:
-    """Plant with another value of one joint in one of its arrays (n,).
-
-    Parameters
-    ----------
-    plant
-        The plant.
-    name
-        Name of the array.
-    joint
-        Number of the joint.
-    value
-        Value.
-    """
+    """Plant with another value of one joint in one of its arrays (n,). ``name``: name of the array."""
     array = np.array(getattr(plant, name), np.float64)
     array[joint] = value
     changes: dict[str, Any] = {name: array}

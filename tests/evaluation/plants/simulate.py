@@ -34,12 +34,7 @@ FARTHEST = 1e3
 def invert(A, out):  # type: ignore[no-untyped-def]
     """Inverse of a symmetric positive definite matrix by Cholesky's method.
 
-    Parameters
-    ----------
-    A
-        The matrix, shape (N, N); overwritten.
-    out
-        Resulting inverse, shape (N, N).
+    ``A``: the matrix, shape (N, N); overwritten. ``out``: resulting inverse, shape (N, N).
     """
     n = A.shape[0]
     for j in range(n):
@@ -73,18 +68,8 @@ def invert(A, out):  # type: ignore[no-untyped-def]
 def presliding(law, level, step, speed, bristle):  # type: ignore[no-untyped-def]
     """Impulse of the bristles of a joint, and the stiffness of those that stick times half a squared step.
 
-    Parameters
-    ----------
-    law
-        Row of the law table.
-    level
-        Dry friction that the bristles carry together.
-    step
-        Step, s.
-    speed
-        Velocity before the step.
-    bristle
-        Deflections, shape (3,).
+    ``law``: row of the law table; ``level``: dry friction that the bristles carry together; ``speed``: velocity before
+    the step; ``bristle``: deflections, shape (3,).
     """
     impulse, stiff = 0.0, 0.0
     for e in range(3):
@@ -104,14 +89,7 @@ def presliding(law, level, step, speed, bristle):  # type: ignore[no-untyped-def
 def move_bristles(law, move, bristle):  # type: ignore[no-untyped-def]
     """Move the bristles of a joint by a distance; each slides beyond its reach.
 
-    Parameters
-    ----------
-    law
-        Row of the law table.
-    move
-        Distance, rad or m.
-    bristle
-        Deflections, shape (3,); written in place.
+    ``law``: row of the law table. ``move``: distance, rad or m. ``bristle``: deflections, shape (3,); written in place.
     """
     for e in range(3):
         reach = ELEMENTS[e, 1] * law[PRESLIDING]
@@ -122,16 +100,8 @@ def move_bristles(law, move, bristle):  # type: ignore[no-untyped-def]
 def slosh_impulse(law, step, acceleration, slosh):  # type: ignore[no-untyped-def]
     """Impulse of a mass on a spring on the link, and its motion.
 
-    Parameters
-    ----------
-    law
-        Row of the law table.
-    step
-        Step, s.
-    acceleration
-        Acceleration of the link in the step before.
-    slosh
-        Position and velocity relative to the link, shape (2,); written in place.
+    ``law``: row of the law table. ``acceleration``: acceleration of the link in the step before. ``slosh``: position
+    and velocity relative to the link, shape (2,); written in place.
     """
     w = 2.0 * math.pi * law[SLOSH_FREQUENCY]
     pull = -w * w * slosh[0] - 2.0 * law[SLOSH_DAMPING] * w * slosh[1]
@@ -144,18 +114,9 @@ def slosh_impulse(law, step, acceleration, slosh):  # type: ignore[no-untyped-de
 def add_gears(gears, motor, step, q, v, A, right):  # type: ignore[no-untyped-def]
     """Add the torques of flexible gears and of contacts with play.
 
-    Parameters
-    ----------
-    gears
-        Table of `GEARS`, shape (E, 5).
-    motor
-        Coordinate of each motor, shape (n,).
-    step
-        Step, s.
-    q, v
-        Coordinates and velocities before the step, shape (N,).
-    A, right
-        Matrix (N, N) and right-hand side (N,) of the step; written in place.
+    ``gears``: table of `GEARS`, shape (E, 5). ``motor``: coordinate of each motor, shape (n,). ``q``, ``v``:
+    coordinates and velocities before the step, shape (N,). ``A``, ``right``: matrix (N, N) and right-hand side (N,) of
+    the step; written in place.
     """
     for e in range(gears.shape[0]):
         j = int(gears[e, 0])
@@ -180,14 +141,9 @@ def add_gears(gears, motor, step, q, v, A, right):  # type: ignore[no-untyped-de
 def solve_step(A, right, rows, bounds, smoothing, impulses, new):  # type: ignore[no-untyped-def]
     """Velocities after a step.
 
-    Parameters
-    ----------
-    A, right
-        Matrix (N, N) and right-hand side (N,) without dry friction; ``A`` is overwritten.
-    rows, bounds, smoothing, impulses
-        Dry friction, see `friction_impulses`.
-    new
-        Resulting velocities, shape (N,).
+    ``A``, ``right``: matrix (N, N) and right-hand side (N,) without dry friction; ``A`` is overwritten. ``rows``,
+    ``bounds``, ``smoothing``, ``impulses``: dry friction, see `friction_impulses`. ``new``: resulting velocities, shape
+    (N,).
     """
     N, R = right.size, rows.shape[0]
     inverse, AJ = np.empty((N, N)), np.empty((N, R))
@@ -208,12 +164,7 @@ def solve_step(A, right, rows, bounds, smoothing, impulses, new):  # type: ignor
 def friction_rows(motor, pairs):  # type: ignore[no-untyped-def]
     """Coordinates of each row of dry friction, shape (R, 2): the motors, then the pairs.
 
-    Parameters
-    ----------
-    motor
-        Coordinate of each motor, shape (n,).
-    pairs
-        Table of `PAIRS`, shape (C, 4).
+    ``motor``: coordinate of each motor, shape (n,); ``pairs``: table of `PAIRS`, shape (C, 4).
     """
     n, C = motor.size, pairs.shape[0]
     rows = np.full((n + C, 2), -1, np.int64)
@@ -229,6 +180,8 @@ def run(  # type: ignore[no-untyped-def]
     qdr, position, velocity, acceleration, reading, torque,
 ):  # fmt: skip
     """Simulate the closed loop; the arrays of results are filled in place.
+
+    Returns the number of steps; less than K if the loop diverged.
 
     Parameters
     ----------
@@ -256,11 +209,6 @@ def run(  # type: ignore[no-untyped-def]
         Encoder readings, shape (K, n).
     torque
         Torque that the drive reports without errors of measurement, shape (K, n).
-
-    Returns
-    -------
-    int
-        Number of steps; less than K if the loop diverged.
     """
     K, n = qr.shape
     N = n + gears.shape[0]

@@ -23,21 +23,9 @@ def rigid_residual(robot: RobotConfig, q: Floats, qd: Floats, qdd: Floats, torqu
     The model has the inertial parameters of all links and, by joint, rotor inertia, viscous and dry friction and an
     offset. Each joint's equations are weighted by its residual of a first fit.
 
-    Parameters
-    ----------
-    robot
-        Robot as configured.
-    q, qd, qdd
-        Motion, shape (M, n).
-    torque
-        Recorded torque, N m or N, shape (M, n).
-    smoothing
-        Velocity scale of the sign of dry friction by joint; 0 for a sharp one, shape (n,).
-
-    Returns
-    -------
-    ndarray
-        Root mean square of the residual, N m or N, shape (n,).
+    ``q``, ``qd``, ``qdd``: motion, shape (M, n). ``torque``: recorded torque, N m or N, shape (M, n). ``smoothing``:
+    velocity scale of the sign of dry friction by joint; 0 for a sharp one, shape (n,). Returns the root mean square of
+    the residual, N m or N, shape (n,).
     """
     rows = np.unique(np.linspace(0, len(q) - 1, SAMPLES).astype(np.int64))
     q, qd, qdd, torque = q[rows], qd[rows], qdd[rows], torque[rows]
@@ -74,13 +62,7 @@ def _regressor(robot: RobotConfig, q: Floats, qd: Floats, qdd: Floats, direction
 
 
 def configured_model(robot: RobotConfig) -> Any:
-    """Pinocchio model of a robot configuration, with unit bodies.
-
-    Parameters
-    ----------
-    robot
-        Robot as configured.
-    """
+    """Pinocchio model of a robot configuration, with unit bodies."""
     model = pin.Model()
     parent = 0
     for joint in robot.joints:

@@ -304,7 +304,7 @@ def test_a_file_of_another_kind_is_named_for_what_it_is(
 @pytest.mark.parametrize(
     ("line", "expected"),
     [
-        ("bandwidth_hz: 5\nbandwidth_hz: 6", "the key 'bandwidth_hz' is there twice"),
+        ("bandwidth_hz: 5\nbandwidth_hz: 6", "duplicate key 'bandwidth_hz'"),
         ("bandwidth_hz: yes", "bandwidth_hz: expected a number or a word, found true"),
         ("bandwidth_hz: 1:30", "bandwidth_hz: input should be a valid number"),
         ("description: " + "[" * 5000, "not valid YAML: brackets or indentation too deep"),
@@ -344,14 +344,6 @@ def test_aliases_and_infinities_that_are_written_are_read() -> None:
 
 def test_numbers_are_those_of_yaml_1_2() -> None:
     assert read_yaml("[010, 0x1F, 1e-3, 1_000, .5, 2024-01-02]", "x") == ["010", 31, 0.001, 1000, 0.5, "2024-01-02"]
-
-
-def test_the_former_name_of_a_key_is_read_with_a_warning(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    session = load_session(session_with(tmp_path, recording={"look_hz": 20.0}))
-    assert session.recording.preview_hz == 20.0
-    assert "recording.look_hz is now recording.preview_hz" in caplog.text
-    with pytest.raises(ConfigError, match=r"recording\.look_hz: unknown key"):
-        load_session(session_with(tmp_path, recording={"look_hz": 20.0, "preview_hz": 10.0}))
 
 
 ODD_NUMBERS = [

@@ -14,7 +14,7 @@ from typer.testing import CliRunner, Result
 from armident.configs import ConfigError, load_robot, load_session
 from armident.configs.blanks import MARK, pattern
 from armident.daq.cli import GROUP, application
-from armident.daq.init.command import InitOptions, run_init
+from armident.daq.init.initialize import InitOptions, run_init
 from armident.daq.init.questionnaire import questionnaire
 from armident.daq.interchange.exporting import export_recording
 from armident.daq.recording import read_recording, write_recording
@@ -24,7 +24,7 @@ from tests.unit.configs.test_urdf import transform
 
 COMMANDS = {
     "doctor": "armident.daq.commands:doctor",
-    "init": "armident.daq.init.cli:init",
+    "init": "armident.daq.init.init_command:init",
     "import": "armident.daq.commands:import_",
     "identify": "armident.identify.cli:identify",
     "trajectory": "armident.identify.cli:trajectory",

@@ -9,7 +9,7 @@ from armident.configs.schema.scenario import HiddenEffect
 from armident.identify.effects.effect import Place
 from armident.identify.effects.registry import catalogue
 from armident.identify.effects.terms import arm_model, entry_of
-from armident.identify.identification.api import identify_recording
+from armident.identify.identification.identify_recording import identify_recording
 from armident.identify.identification.options import Options
 from armident.identify.report.files import robot_yaml
 from tests.fixtures.arms import FAST, recording

@@ -12,9 +12,10 @@ from armident.identify.controller.nominal import nominal_controller
 from armident.identify.effects.registry import catalogue
 from armident.identify.effects.terms import arm_model
 from armident.identify.effects.wiring import rewired
+from armident.identify.estimators.methods import Method
 from armident.identify.experiment import Experiment
-from armident.identify.identification.api import identify_recording
-from armident.identify.identification.options import Method, Options
+from armident.identify.identification.identify_recording import identify_recording
+from armident.identify.identification.options import Options
 from armident.identify.robot.relaxation import simulate_with_terms
 from armident.identify.robot.simulation import simulate
 from armident.identify.signals.bandpass import butterworth

@@ -9,6 +9,8 @@ from hypothesis import strategies as st
 
 from armident.configs import load_robot
 from armident.identify.effects.terms import arm_model
+from armident.identify.estimators.methods import Method
+from armident.identify.estimators.reason import Reason
 from armident.identify.experiment import Experiment
 from armident.identify.identification.equations import (
     EQUATIONS_PER_PARAMETER,
@@ -19,9 +21,7 @@ from armident.identify.identification.equations import (
     least_rows,
     sufficient,
 )
-from armident.identify.identification.options import Method
 from armident.identify.identification.solvers import decimation_of
-from armident.identify.identification.verdict import Reason
 from armident.identify.signals.decimate import design
 from armident.identify.signals.differentiate import differentiate
 

@@ -7,7 +7,7 @@ import yaml
 from armident.configs import config_path
 from armident.configs.schema.scenario import Scenario
 from armident.identify.documents.identification import IdentificationDocument
-from armident.identify.identification.api import identify_recording
+from armident.identify.identification.identify_recording import identify_recording
 from armident.identify.identification.residual_statistics import band_powers, motion_functions
 from armident.identify.monitoring.change_test import compare
 from armident.identify.monitoring.residual_test import compare_residuals
