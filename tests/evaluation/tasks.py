@@ -78,7 +78,7 @@ def diagnose_file(task: DiagnosisTask) -> TimedDiagnosis:
     """Diagnose a recording; a ConfigError or DataError if the model or the recording does not support it."""
     # Imported here: the process of the command line needs none of it.
     from armident.identify import api
-    from armident.identify.diagnosis.diagnose import diagnose
+    from armident.identify.diagnosis.diagnose import run_diagnosis
     from armident.identify.identification.from_recording import experiments_from_recording
 
     begin = time.perf_counter()
@@ -89,7 +89,7 @@ def diagnose_file(task: DiagnosisTask) -> TimedDiagnosis:
     recording = read_recording(task.recording)
     baseline = None if task.baseline is None else load_document(task.baseline, IdentificationDocument)
     experiments, notes = experiments_from_recording(recording, robot)
-    result = diagnose(experiments, [], robot, [reference(recording)], baseline, notes)
+    result = run_diagnosis(experiments, [], robot, [reference(recording)], baseline, notes)
     return TimedDiagnosis(result.document, time.perf_counter() - begin)
 
 
