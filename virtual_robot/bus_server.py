@@ -13,7 +13,7 @@ from armident.configs import ConfigError
 from armident.configs.schema.session import Bus
 from armident.drivers.can.frames import STANDARD_ID_MASK, BusDown, frames
 from armident.drivers.can.socketcan import RECEIVE_TIMEOUT, RawSocket
-from armident.drivers.can.udp import open_bus
+from armident.drivers.can.udp import open_bus, open_python_can
 from armident.drivers.canopen.objects import COB_HEARTBEAT, COB_NMT, COB_SDO_REQUEST, COB_SYNC
 from armident.virtual_robot.arm import DriveBackend
 from armident.virtual_robot.node import Drive
@@ -85,7 +85,8 @@ class DriveBus:
         network.NOTIFIER_CYCLE = NOTIFIER_CYCLE_S
         network.listeners.append(GuardingListener(self.drives))
         try:
-            network.connect(interface=self.config.interface, channel=self.config.channel, can_filters=filters)
+            network.bus = open_python_can(self.config, filters)
+            network.connect()
         except (OSError, can.CanError) as error:
             raise ConfigError(f"bus {self.config.channel}: cannot be opened: {error}") from error
         return network

@@ -170,8 +170,6 @@ def clock_of(times: Floats, rate_hz: float | None, repeated: float = 0.0) -> Clo
             f"--rate {rate_hz:g} contradicts the time column: steps of {median:.6g} s, {measured:.6g} Hz; "
             f"omit --rate, or give the rate of a conversion with --resample {rate_hz:g}"
         )
-    if not missing:
-        measured = steps.size / float(times[-1] - times[0])
     return Clock(rate_hz or measured, np.append(0, np.cumsum(advance)).astype(np.int64))
 
 

@@ -3,9 +3,11 @@
 UDP may lose frames, and does so above some thousand per second. It is suitable for trials, not for measurements.
 """
 
+import os
+import socket
 import time
 from collections.abc import Sequence
-from typing import Self
+from typing import Any, Self
 
 import can
 import numpy as np
@@ -20,6 +22,12 @@ UDP_WARNING = "udp_multicast carries the bus over UDP and may lose frames: use i
 
 EXTENDED_FLAG = 0x8000_0000
 """Bit of ``can_id`` that marks a 29-bit identifier (linux/can.h)."""
+
+RECEIVE_BUFFER = 4 << 20
+"""Receive buffer that the kernel is asked for, bytes; it gives ``net.core.rmem_max`` at most."""
+
+MULTICAST_ALL = {socket.AF_INET: (socket.IPPROTO_IP, 49), socket.AF_INET6: (socket.IPPROTO_IPV6, 29)}
+"""Option ``MULTICAST_ALL`` by address family (linux/in.h, linux/in6.h): receive also the groups of other sockets."""
 
 
 class UdpBus:
@@ -41,7 +49,7 @@ class UdpBus:
         """Always 0: UDP does not count lost frames."""
         self._filters = filters
         try:
-            self._bus = can.Bus(channel, interface="udp_multicast")
+            self._bus = open_python_can(Bus(interface="udp_multicast", channel=channel))
         except (can.CanError, OSError, ValueError) as error:
             cause = error.__cause__ or error
             raise ConfigError(f"bus {channel}: cannot join the multicast group: {cause}") from error
@@ -128,6 +136,16 @@ class UdpBus:
     def __exit__(self, *_: object) -> None:
         """Close the bus."""
         self.close()
+
+
+def open_python_can(bus: Bus, filters: Sequence[dict[str, Any]] | None = None) -> can.BusABC:
+    """Open a bus of a session with python-can; a multicast group receives the frames of no other group."""
+    opened = can.Bus(bus.channel, interface=bus.interface, can_filters=filters)
+    if bus.interface == "udp_multicast":
+        with socket.socket(fileno=os.dup(opened.fileno())) as same:
+            same.setsockopt(*MULTICAST_ALL[same.family], 0)
+            same.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER)
+    return opened
 
 
 def open_bus(

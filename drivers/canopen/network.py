@@ -17,6 +17,7 @@ from armident.configs.schema.session import Bus, DriveNode
 from armident.drivers.can.filtered_socket import FilteredSocket
 from armident.drivers.can.frames import STANDARD_ID_MASK, BusDown
 from armident.drivers.can.socketcan import RawSocket
+from armident.drivers.can.udp import open_python_can
 from armident.drivers.canopen import objects as od
 from armident.drivers.canopen.eds import read_objects
 from armident.drivers.canopen.emcy import Emergency, read_emergencies
@@ -69,7 +70,7 @@ class NodeNetwork:
             # Raises an error that names the administrator's command if the interface is not usable.
             RawSocket(bus.channel, filters=(), receive_buffer=4096).close()
         try:
-            return can.Bus(bus.channel, interface=bus.interface, can_filters=filters)
+            return open_python_can(bus, filters)
         except (can.CanError, OSError) as error:
             raise ConfigError(f"bus {bus.channel}: {error.__cause__ or error}") from error
 

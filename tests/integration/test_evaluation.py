@@ -148,7 +148,7 @@ LEAST = {
 """Limits for the quick subset (one run per effect): two binomial standard deviations below its results or more."""
 
 
-@pytest.mark.proof
+@pytest.mark.nightly
 def test_most_of_the_quick_subset_is_named_and_no_healthy_arm_is_blamed(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -41,6 +41,7 @@ def run_pytest(folder: Path, *words: str) -> "subprocess.CompletedProcess[str]":
     return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
 
 
+@pytest.mark.nightly
 def test_the_worked_example_runs_in_another_repository(tmp_path: Path) -> None:
     folder = tmp_path / "other_repository"
     shutil.copytree(EXAMPLE, folder, ignore=shutil.ignore_patterns("__pycache__"))

@@ -78,7 +78,7 @@ def test_the_rest_of_the_emps_is_unexplained_and_only_convincing_effects_are_sta
     assert document.noise_floor.all < 0.85 * document.gap.validation.after.all
 
 
-@pytest.mark.proof
+@pytest.mark.nightly
 def test_the_uncoupled_wrist_of_the_tx40_is_named_first(uncoupled_wrist: DiagnosisResult) -> None:
     finding = uncoupled_wrist.document.findings[0]
     assert (finding.effect, finding.joint, finding.other) == ("coupling_friction", "joint_5", "joint_6")
@@ -89,7 +89,7 @@ def test_the_uncoupled_wrist_of_the_tx40_is_named_first(uncoupled_wrist: Diagnos
     assert finding.parameters["fcc"] == pytest.approx(1.93, abs=3 * std["fcc"])
 
 
-@pytest.mark.proof
+@pytest.mark.nightly
 def test_the_wrist_coupling_closes_the_gap_of_joints_5_and_6(
     uncoupled_wrist: DiagnosisResult, coupled_wrist: tuple[Gap, Gap]
 ) -> None:

@@ -95,7 +95,7 @@ def test_a_recording_without_reference_still_gives_the_parameters() -> None:
 
 @pytest.mark.parametrize(
     "seeds",
-    [3, pytest.param(20, marks=[pytest.mark.proof, pytest.mark.timeout(1800)])],
+    [3, pytest.param(20, marks=[pytest.mark.nightly, pytest.mark.timeout(1800)])],
     ids=lambda n: f"{n} seeds",
 )
 def test_essential_parameters_are_recovered_within_their_own_standard_deviations(seeds: int) -> None:

@@ -52,7 +52,7 @@ def test_every_method_meets_the_arm(method: Method) -> None:
 
 # The noise alone is 6.1 % of the torque of the EMPS by every method, and 4.6 % of that of the TX40.
 @pytest.mark.parametrize(
-    ("robot", "noise_pct"), [("emps", 6.3), pytest.param("tx40", 5.5, marks=pytest.mark.proof)], ids=["emps", "tx40"]
+    ("robot", "noise_pct"), [("emps", 6.3), pytest.param("tx40", 5.5, marks=pytest.mark.nightly)], ids=["emps", "tx40"]
 )
 @pytest.mark.parametrize("method", ["clie", "cloe"])
 def test_output_errors_meet_the_arm_too(method: Method, robot: str, noise_pct: float) -> None:

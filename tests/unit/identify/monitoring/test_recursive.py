@@ -304,7 +304,7 @@ def test_a_life_of_repeated_motions_raises_no_alarm() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.proof
+@pytest.mark.nightly
 @pytest.mark.timeout(50 * 3600)
 def test_hours_of_healthy_life_raise_no_alarm() -> None:
     life = healthy_life(float(os.environ.get("ARMIDENT_HEALTHY_HOURS", "50")), 5)
