@@ -64,7 +64,6 @@ def start_command(
     niceness: int = 0,
     own_session: bool = False,
     with_parent: bool = False,
-    stdin: bool = False,
     environment: Mapping[str, str] | None = None,
 ) -> "subprocess.Popen[bytes]":
     """Start ``python -m module words...`` with this interpreter.
@@ -85,8 +84,6 @@ def start_command(
         Start a new session: signals of the terminal (Ctrl-C) then do not reach the process.
     with_parent
         Send SIGTERM to the process when the thread that started it ends, also by SIGKILL (Linux).
-    stdin
-        Connect standard input to a pipe instead of the null device.
     environment
         Variables added to the environment of this process.
     """
@@ -94,7 +91,7 @@ def start_command(
     parent = {PARENT_VARIABLE: str(os.getpid())} if with_parent else {}
     return subprocess.Popen(
         [*nice, sys.executable, "-m", module, *words],
-        stdin=subprocess.PIPE if stdin else subprocess.DEVNULL,
+        stdin=subprocess.DEVNULL,
         stdout=out,
         stderr=err,
         env={**os.environ, **parent, **(environment or {})},
@@ -236,21 +233,6 @@ class CommandProcess:
         """
         return ArmidentError(self._message(problem))
 
-    def send_line(self, text: str) -> None:
-        """Write one line to standard input; needs ``start_command(..., stdin=True)``.
-
-        ``text``: the line, without its end. Raises ProcessEnded if the process has ended.
-        """
-        stdin = getattr(self.process, "stdin", None)
-        if stdin is None:
-            raise ArmidentError(f"{self.name} has no standard input")
-        try:
-            stdin.write(text.encode() + b"\n")
-        except BrokenPipeError as error:
-            with suppress(subprocess.TimeoutExpired):
-                self.process.wait(STOP_S)
-            raise ProcessEnded(self._message(f"ended with exit code {self.exit_code}")) from error
-
     def wait_for_line(self, text: str, timeout: float) -> str:
         """Wait for the next line of standard output that begins with ``text``, and return it.
 
@@ -320,12 +302,3 @@ class CommandProcess:
         files, self._files = self._files, None
         for file in files:
             file.close()
-
-
-def resident_bytes(pid: int) -> int:
-    """Return the resident memory of a process, bytes; 0 after its end (Linux, proc(5), ``statm``)."""
-    try:
-        pages = Path(f"/proc/{pid}/statm").read_text(encoding="ascii").split()[1]
-    except (FileNotFoundError, ProcessLookupError):
-        return 0
-    return int(pages) * os.sysconf("SC_PAGE_SIZE")

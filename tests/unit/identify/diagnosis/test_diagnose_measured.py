@@ -12,7 +12,7 @@ from armident.identify.diagnosis.selection import StepwiseSelection
 from armident.identify.diagnosis.study import build_study
 from armident.identify.documents.diagnosis import Gap
 from tests.fixtures.diagnoses import measured_diagnosis
-from tests.statistics.measured import tx40
+from tests.reproduction.recordings import measured_recording
 
 pytestmark = pytest.mark.slow
 
@@ -35,7 +35,9 @@ def uncoupled_wrist(shared_data: Path) -> DiagnosisResult:
 def coupled_wrist(shared_data: Path) -> tuple[Gap, Gap]:
     """Errors of the model that knows it, on the same parts of the recording."""
     robot = load_robot("tx40")
-    state = with_report_part(StepwiseSelection(build_study([tx40(shared_data, robot)], [], robot)).start())
+    state = with_report_part(
+        StepwiseSelection(build_study([measured_recording(shared_data).experiment], [], robot)).start()
+    )
     return gap_of(state, held=False), gap_of(state, held=True)
 
 

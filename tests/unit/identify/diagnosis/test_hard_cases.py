@@ -9,7 +9,7 @@ import pytest
 
 from armident.identify.documents.files import to_json
 from tests.evaluation.cases import all_cases
-from tests.evaluation.plants.json_server import simulate_request
+from tests.evaluation.plants.two_robots import simulate
 from tests.evaluation.schema import load_suite
 from tests.evaluation.tasks import DiagnosisTask, diagnose_file
 
@@ -25,7 +25,6 @@ def diagnosed(name: str, folder: Path) -> tuple[dict[str, Any], dict[str, float]
     (case,) = (case for case in all_cases(load_suite()) if case.name == name)
     file = folder / "case.mcap"
     request = {
-        "id": case.key,
         "robot": case.config,
         "trajectory": case.trajectory,
         "repeats": case.repeats,
@@ -34,7 +33,7 @@ def diagnosed(name: str, folder: Path) -> tuple[dict[str, Any], dict[str, float]
         "effects": [asdict(part) for part in case.parts],
         "out": str(file),
     }
-    hidden = simulate_request(request)["truth"][0]
+    hidden = simulate(request)["truth"][0]
     joints = tuple(part.joint for part in case.parts) if case.leave_out else ()
     document = diagnose_file(DiagnosisTask(file, case.config, case.leave_out, joints)).document
     return json.loads(to_json(document)), hidden
