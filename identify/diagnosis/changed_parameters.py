@@ -19,7 +19,7 @@ from armident.identify.diagnosis.baseline_comparison import BaselineComparison, 
 from armident.identify.diagnosis.candidates import ColumnCache
 from armident.identify.diagnosis.changes import changes, p_value_of_change, ranked
 from armident.identify.diagnosis.precision import variance_of_sum
-from armident.identify.diagnosis.regression import IvFit, relative_torque_errors
+from armident.identify.diagnosis.regression import IvFit, relative_fit_errors
 from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.regression.multiple_testing import holm
 
@@ -194,7 +194,7 @@ def _joint(fit: IvFit, change: Change) -> str:
 
 def _gap(fit: IvFit, theta: Array, change: Change) -> float:
     """Relative torque error on held-out data, percent, of the joint or of all."""
-    overall, each = relative_torque_errors(fit, theta, held=True)
+    overall, each = relative_fit_errors(fit, theta, held=True)
     return overall if change.effect.scope == "arm" else float(each[change.place.joint])
 
 
@@ -226,8 +226,8 @@ def _rest(comparison: BaselineComparison, found: Sequence[Change], alpha: float)
             parameters={name: rest for name, (_, rest, _) in zip(names, changed, strict=True)},
             std={name: std for name, (_, _, std) in zip(names, changed, strict=True)},
             p_value=p,
-            gap_before=relative_torque_errors(fit, before, held=True)[0],
-            gap_after=relative_torque_errors(fit, held=True)[0],
+            gap_before=relative_fit_errors(fit, before, held=True)[0],
+            gap_after=relative_fit_errors(fit, held=True)[0],
             confidence=1.0 - p,
             ambiguous_with=(),
             alternatives=(),

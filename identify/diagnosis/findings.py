@@ -12,7 +12,7 @@ from armident.identify.diagnosis.criteria import Criteria
 from armident.identify.diagnosis.model_state import ModelState
 from armident.identify.diagnosis.next_experiment import recommended_experiment
 from armident.identify.diagnosis.precision import standard_deviations
-from armident.identify.diagnosis.regression import relative_torque_errors
+from armident.identify.diagnosis.regression import relative_fit_errors
 from armident.identify.diagnosis.selected import Selected
 from armident.identify.documents.diagnosis import Alternative, Finding, Gap, Negligible, NotVisible, Unexplained
 from armident.identify.effects.effect import Effect
@@ -165,7 +165,7 @@ def negligible(
 
 def gap_of(state: ModelState, *, held: bool) -> Gap:
     """Relative torque errors of a model. ``held``: True for the held-out data, false for the training data."""
-    overall, each = relative_torque_errors(state.fit, held=held)
+    overall, each = relative_fit_errors(state.fit, held=held)
     errors = np.concatenate(state.fit.errors(state.fit.theta, held=held))
     rms = np.sqrt(np.mean(errors**2, axis=0))
     joints = state.study.joints

@@ -184,7 +184,7 @@ def solved(equations: Equations, noise: Sequence[ArModel], known: IvRegression |
     return found
 
 
-def relative_torque_errors(fit: IvFit, theta: Array | None = None, *, held: bool) -> tuple[float, Array]:
+def relative_fit_errors(fit: IvFit, theta: Array | None = None, *, held: bool) -> tuple[float, Array]:
     """``|y - X theta| / |y|`` in percent in the band of the comparison, overall and of each joint (n,).
 
     ``fit``: fit with data and model. ``theta``: parameters (b,); ``None``: those of the fit. ``held``: True for the
