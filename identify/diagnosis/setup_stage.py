@@ -40,8 +40,6 @@ class SetupStage:
         Common shifts of the torques between which the check could not decide, samples; the diagnosis compares them.
     shift_known
         True if the common shift of the torques is known.
-    criteria
-        Thresholds.
     """
 
     training: tuple[Experiment, ...]

@@ -77,8 +77,6 @@ class Case:
         Files of the robot configuration and of the trajectory; empty for random arms.
     repeats
         Number of runs of the trajectory in the recording.
-    period
-        Sampling period, s.
     seed
         Seed of the noise; number of the random arm.
     parts

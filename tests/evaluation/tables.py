@@ -27,8 +27,6 @@ class Row:
 
     Parameters
     ----------
-    label, level
-        Names of the effects, and their level.
     n, failed
         Number of cases with a diagnosis, and of cases that failed.
     first, second
@@ -78,8 +76,6 @@ class Outside:
 
     Parameters
     ----------
-    label, level
-        Name of the effect, and its level.
     n, failed
         Number of cases with a diagnosis, and of cases that failed.
     unexplained

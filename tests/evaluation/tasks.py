@@ -18,8 +18,6 @@ class DiagnosisTask:
 
     Parameters
     ----------
-    recording
-        File of the recording.
     robot
         Name or file of the robot configuration.
     leave_out
