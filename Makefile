@@ -15,7 +15,7 @@ WITH_VCAN := $(PY) -m armident.drivers.vcan -n 2 --
 PARALLEL := -n auto --dist worksteal
 LINT := $(PY) -m ruff check $(SOURCES) && $(PY) -m ruff format --check $(SOURCES) && $(PY) -m mypy && $(VENV)/bin/lint-imports
 
-.PHONY: help install develop demo check test nightly off-bus on-bus coverage lint vcan suite reproduce docs bench lock clean
+.PHONY: help install develop demo check quick test nightly off-bus on-bus coverage lint vcan suite reproduce docs bench lock clean
 
 help: ## what there is to do
 	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "make %-9s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -73,11 +73,14 @@ demo: install ## the whole story on this machine, ends with a report (DEMO="--ou
 lint: develop
 	@$(LINT)
 
-check: lint ## ruff, mypy, import-linter and the quick tests, about four minutes on two cores
+check: develop ## ruff, mypy, import-linter and the quick tests, side by side
+	@$(MAKE) --no-print-directory -k -j2 lint quick
+
+quick:
 	@$(PYTEST) -q $(PARALLEL) -m "not vcan and not slow and not nightly"
 
-test: lint ## everything but the nightly tests, those on vcan included
-	@$(MAKE) --no-print-directory -k -j2 NAME=tests SELECTED="not nightly" off-bus on-bus && failed= || failed=1
+test: develop ## everything but the nightly tests, those on vcan included
+	@$(MAKE) --no-print-directory -k -j3 NAME=tests SELECTED="not nightly" on-bus lint off-bus && failed= || failed=1
 	echo
 	echo "Skipped, or failing as expected:"
 	grep -hE '^(SKIPPED|XFAIL)' .cache/tests.log .cache/tests-vcan.log || echo "nothing"

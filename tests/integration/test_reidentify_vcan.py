@@ -175,6 +175,7 @@ def test_ctrl_c_stops_the_arm_and_ends_with_one_line(vcan_bus: str, tmp_path: Pa
     print(f"last stop order {(stops[-1] - sent) * 1e-6:.2f} ms after the signal")
 
 
+@pytest.mark.nightly
 def test_missing_drives_are_one_error_line(vcan_bus: str, tmp_path: Path) -> None:
     config = cell_file(tmp_path, vcan_bus, "nobody", sdo_timeout_s=0.2)
     _, err = finished(job(config, tmp_path), 2)

@@ -54,7 +54,9 @@ def essential(result: IdentificationResult) -> list[int]:
     return [result.names.index(name) for name in ESSENTIAL]
 
 
-@pytest.mark.parametrize("method", ["idim-ls", "idim-iv", "idim-piv"])
+@pytest.mark.parametrize(
+    "method", [*(pytest.param(m, marks=pytest.mark.nightly) for m in ("idim-ls", "idim-iv")), "idim-piv"]
+)
 def test_without_noise_the_bias_is_far_below_what_noise_will_cost(method: Method) -> None:
     clean = identified(noise=0.0, method=method)
     noisy = identified()
