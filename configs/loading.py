@@ -35,7 +35,7 @@ _LISTED = 12
 T = TypeVar("T", bound=BaseModel)
 
 
-def config_path(name: str | Path, listed: tuple[str, ...] = ("robots", "cells")) -> Path:
+def config_path(name: str | Path, listed: tuple[str, ...] = ("robots", "cells"), of_folder: str = "robot.yaml") -> Path:
     """Path of a configuration file: the path as given, else a file that is shipped with armident.
 
     Parameters
@@ -45,6 +45,8 @@ def config_path(name: str | Path, listed: tuple[str, ...] = ("robots", "cells"))
         all find the shipped ``configs/robots/tx40.yaml`` if the working directory has no file of that name.
     listed
         Folders of shipped files that the error message lists.
+    of_folder
+        File that is taken of a folder, as ``armident init`` writes it.
 
     Raises
     ------
@@ -52,8 +54,9 @@ def config_path(name: str | Path, listed: tuple[str, ...] = ("robots", "cells"))
         If there is no such file.
     """
     path = Path(name)
-    if is_file(path):
-        return path
+    for file in (path, path / of_folder):
+        if is_file(file):
+            return file
     found = _shipped(path)
     if found is not None:
         return found
@@ -71,7 +74,7 @@ def _shipped(path: Path) -> Path | None:
     return next((c for c in candidates if is_file(c)), None)
 
 
-def load_robot(name: str | Path, command: str | None = None) -> RobotConfig:
+def load_robot(name: str | Path, command: str = "") -> RobotConfig:
     """Load a robot configuration.
 
     If the file has a key ``urdf`` (see `armident.configs.urdf`), joints and geometry come from the URDF. In this case
@@ -80,15 +83,21 @@ def load_robot(name: str | Path, command: str | None = None) -> RobotConfig:
     Parameters
     ----------
     name
-        A path, or the name of a shipped file (see `config_path`).
+        A path, the folder that ``armident init`` wrote, or the name of a shipped file (see `config_path`).
     command
-        Command that uses the robot, such as ``identify``: keys that it does not need may be marked as blank
-        (`armident.configs.blanks`). ``None``: no key may.
+        Command that uses the robot, such as ``identify``: refuse it if it lacks a value that the command needs. By
+        default such values may be marked as blank (``FILL_IN``); a function that needs them refuses the robot.
 
     Raises
     ------
     ConfigError
         If the file is missing or wrong; names file, key and expected value. If values are missing, names all.
+
+    Examples
+    --------
+    >>> import armident
+    >>> armident.load_robot("tx40").n
+    6
     """
     path = config_path(name)
     robot = _robot(path)
@@ -236,7 +245,7 @@ def load_session(name: str | Path, command: str | None = None) -> SessionConfig:
     Parameters
     ----------
     name
-        A path, or the name of a shipped file (see `config_path`).
+        A path, the folder that ``armident init`` wrote, or the name of a shipped file (see `config_path`).
     command
         Command that uses the session, such as ``capture``: keys that it does not need may be marked as blank
         (`armident.configs.blanks`). ``None``: no key may.
@@ -247,7 +256,7 @@ def load_session(name: str | Path, command: str | None = None) -> SessionConfig:
         If the file is missing or wrong; names file, key and expected value. If values are missing in session or robot,
         names all.
     """
-    path = config_path(name)
+    path = config_path(name, of_folder="session.yaml")
     session = _checked(_marked(path), SessionConfig, str(path))
     base = path.resolve().parent
 

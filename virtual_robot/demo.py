@@ -56,7 +56,7 @@ SCENARIO = "scenarios/tx40_worn_joint2.yaml"
 VCAN = "vcan0"
 """Bus of a configured arm, in place of those of its session: real drives stay apart."""
 WEAR = 0.3
-"""Difference of the viscous friction from its mean, in either direction, of the worn bearing of a configured arm."""
+"""Share by which the viscous friction of a worn bearing differs from its mean, in either direction."""
 GUEST_VARIABLE = "ARMIDENT_GUEST"
 REPEATS = 3
 """Number of runs of the trajectory in the second part: one run is too short for the small hidden effect."""
@@ -214,8 +214,9 @@ def worn(twin: Twin) -> Scenario:
     robot, standard = twin.robot, twin.parameters.standard
     scale = torque_scale(robot, standard).torque
     share = [standard[f"fv{j + 1}"] * joint.limits.velocity / scale[j] for j, joint in enumerate(robot.joints)]
-    joint = robot.joints[int(np.argmax(share))].name
-    hidden = HiddenEffect(effect="asymmetric_viscous_friction", joint=joint, parameters={"ratio": WEAR})
+    worst = int(np.argmax(share))
+    joint, change = robot.joints[worst].name, {"fva": WEAR * standard[f"fv{worst + 1}"]}
+    hidden = HiddenEffect(effect="asymmetric_viscous_friction", joint=joint, parameters=change)
     text = f"worn bearing in {joint}: its viscous friction depends on the direction"
     return Scenario(schema="armident/scenario/1", description=text, effects=(hidden,))
 

@@ -10,13 +10,11 @@ import numpy as np
 
 from armident.compiled import PLAIN, compiled
 from armident.virtual_robot.effects.bristles import bristle_rate
-from armident.virtual_robot.effects.forces import CODES, effect_torque
+from armident.virtual_robot.effects.forces import LOAD_CODE, effect_torque
 from armident.virtual_robot.effects.gears import gear_torque
 
 SUBSTEPS = 6
 """Inner steps per control period of 200 us: 33 us, below the time constant of 50 us of joint 6 at standstill."""
-
-LOAD_CODE = CODES.index("load_dependent_friction")
 
 # ROS3: L-stable Rosenbrock method of order 3 (Sandu et al., Atmospheric Environment 31, 1997), two evaluations.
 GAMMA = 0.43586652150845899941601945119356

@@ -13,10 +13,8 @@ import can
 import numpy as np
 from numpy.typing import NDArray
 
-from armident.configs import ConfigError, DataError, RobotConfig, SessionConfig, load_robot
-from armident.configs.blanks import LOG
+from armident.configs import ConfigError, DataError, RobotConfig, SessionConfig
 from armident.daq.interchange.clocks import check_sync_period, clock_steps
-from armident.daq.interchange.import_options import ImportOptions
 from armident.daq.interchange.log_file import read_log
 from armident.daq.interchange.log_frames import LogFrames
 from armident.daq.matching.assembler import Assembler, Batch
@@ -31,11 +29,6 @@ _ANSWER_NS = 20_000
 """Time between frames of a SYNC in a log written from a recording, which has only the time of the SYNC, ns."""
 NOTES = "source_remarks"
 """Key of the metadata with everything that an import left out or interpreted."""
-
-
-def import_log(path: Path, session: SessionConfig, _: ImportOptions) -> Recording:
-    """Return the recording of a log, whose robot is that of the session."""
-    return recording_from_log(path, session, load_robot(session.robot, LOG))
 
 
 def recording_from_log(path: Path, session: SessionConfig, robot: RobotConfig) -> Recording:

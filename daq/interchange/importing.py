@@ -2,13 +2,14 @@
 
 import hashlib
 import logging
+import re
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Unpack
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from armident.configs import ConfigError, DataError, RobotConfig, SessionConfig
 from armident.daq.interchange.bag_files import bag_files
@@ -50,10 +51,59 @@ def import_recording(
     if isinstance(found, Recording):
         return found
     assert isinstance(config, RobotConfig)
-    return _from_table(path, config, found, options)
+    facts = {"source": path.name, "source_sha256": _digest(path)}
+    effort = options.get("effort")
+    if effort is not None:
+        facts |= {"effort": effort.name, "effort_sha256": _digest(effort)}
+    return _from_table(config, found, options, facts)
 
 
-def _from_table(path: Path, robot: RobotConfig, source: Source, options: ImportOptions) -> Recording:
+@np.errstate(over="ignore", invalid="ignore", divide="ignore")
+def recording_of_arrays(
+    t: ArrayLike,
+    position: ArrayLike,
+    torque: ArrayLike,
+    robot: RobotConfig,
+    reference: ArrayLike | None = None,
+    resample_hz: float | None = None,
+) -> Recording:
+    """Return arrays as a recording, after the checks of an import; see `Recording.from_arrays`."""
+    table: dict[str, NDArray[np.float64]] = {"t": np.asarray(t, np.float64).reshape(-1)}
+    for name, label, given in (("q", "position", position), ("tau", "torque", torque), ("qr", "reference", reference)):
+        if given is not None:
+            values = np.asarray(given, np.float64)
+            table[name] = values[:, None] if values.ndim == 1 else values
+            if table[name].shape != (table["t"].size, robot.n):
+                raise DataError(
+                    f"{label}: an array of shape {values.shape}; expected ({table['t'].size}, {robot.n}): one row for "
+                    f"each time and one column for each joint of {robot.name}"
+                )
+    _check_rates(None, False, resample_hz)
+    try:
+        return _from_table(robot, Source(Path("arrays"), table), {"resample_hz": resample_hz}, {"source": "arrays"})
+    except DataError as error:
+        raise type(error)(_as_arguments(str(error))) from error
+
+
+def _as_arguments(message: str) -> str:
+    """Return a message with the options of ``armident import`` as arguments of `Recording.from_arrays`."""
+    for option, argument in (
+        (r"--resample (\S+)", r"resample_hz=\1"),
+        (r"--rate (\S+)( if the samples are even)?", r"t = numpy.arange(len(t)) / \1\2"),
+        (r"--time-unit (m|u|n)s reads it so", r"t has to be in s"),
+        (r"give the sampling rate with --rate, and omit the times: --map time=-", "t has to be in s, at equal steps"),
+        (r" unless --motor-side", ""),
+        (r"--units \w+=\w+ if they are", "convert them if they are"),
+        (rf"--map demand={OMITTED} omits (it|the demand)", r"reference=None omits \1"),
+        (rf", or omit the demand with --map demand={OMITTED}", ", or leave the reference out"),
+    ):
+        message = re.sub(option, argument, message)
+    return message
+
+
+def _from_table(robot: RobotConfig, source: Source, options: ImportOptions, facts: Mapping[str, str]) -> Recording:
+    """Return a table as a recording, after checks of content, units and clock."""
+    path = source.path
     rate_hz, resample_hz = options.get("rate_hz"), options.get("resample_hz")
     polled, motor_side = options.get("polled", False), options.get("motor_side", False)
     rows = in_si(table_rows(source, robot, options), robot, options.get("units") or {})
@@ -91,13 +141,8 @@ def _from_table(path: Path, robot: RobotConfig, source: Source, options: ImportO
         notes += fast_note(robot, made.values["position"], made.rate_hz)
     for note in notes:
         logging.getLogger(__name__).warning("%s: %s", path, note)
-    facts = {"source": path.name, "source_sha256": _digest(path), **made.facts}
-    effort = options.get("effort")
-    if effort is not None:
-        facts |= {"effort": effort.name, "effort_sha256": _digest(effort)}
-    if notes:
-        facts[NOTES] = "; ".join(notes)
-    recording = _recording(robot, fields, made, known, facts)
+    remarks = {NOTES: "; ".join(notes)} if notes else {}
+    recording = _recording(robot, fields, made, known, {**facts, **made.facts, **remarks})
     if resample_hz is None or abs(made.rate_hz / resample_hz - 1.0) < 1e-9:
         return recording
     return at_rate(recording, resample_hz)

@@ -154,9 +154,17 @@ class BusLog(Reader):
     name = "bus log"
     suffixes = (".log", ".asc", ".blf", ".trc")
     reads = "SYNC and TPDOs as the session configuration maps them: candump, Vector ASC and BLF, PEAK TRC"
-    reader, writer = "bus_log:import_log", "bus_log:write_log"
+    writer = "bus_log:write_log"
     options = frozenset()
     session = True
+
+    def read(self, path: Path, config: Any, options: ImportOptions) -> Recording:
+        """Return the recording of a log, whose robot is that of the session."""
+        from armident.configs import load_robot
+        from armident.configs.blanks import LOG
+        from armident.daq.interchange.bus_log import recording_from_log
+
+        return recording_from_log(path, config, load_robot(config.robot, LOG))
 
 
 READERS: tuple[Reader, ...] = (

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from armident.identify.diagnosis.stretch import Stretch
+from armident.identify.diagnosis.stretch import MotionStretch
 from armident.identify.diagnosis.study import Study
 from armident.identify.effects.effect import Effect, Place
 from armident.identify.effects.effect import Shapes as Shapes
@@ -55,7 +55,7 @@ class ColumnCache:
     study: Study
     theta: Array
     kept: dict[Cached, tuple[Kept, ...]] = field(default_factory=dict)
-    _motions: dict[tuple[int, str], Motion] = field(default_factory=dict)
+    _motions: dict[tuple[MotionStretch, str], Motion] = field(default_factory=dict)
 
     def instruments(
         self, effect: Effect, place: Place, shapes: Shapes, noise: Sequence[ArModel], *, keep: bool = True
@@ -67,12 +67,11 @@ class ColumnCache:
         """
         return whitened(self.band(effect, place, shapes, "train", "simulated", keep=keep), noise)
 
-    def motion(self, stretch: Stretch, kind: str) -> Motion:
+    def motion(self, stretch: MotionStretch, kind: str) -> Motion:
         """Signals of a stretch on which the columns of effects depend. ``kind``: ``measured`` or ``simulated``."""
-        key = (id(stretch), kind)
-        if key not in self._motions:
-            self._motions[key] = self.study.motion(stretch, kind, self.theta)
-        return self._motions[key]
+        if (stretch, kind) not in self._motions:
+            self._motions[stretch, kind] = self.study.motion(stretch, kind, self.theta)
+        return self._motions[stretch, kind]
 
     def joints(self, candidate: Candidate) -> list[int]:
         """Joints on whose torques a candidate acts."""
@@ -130,7 +129,7 @@ class ColumnCache:
         return [made[key(shapes)] if key(shapes) in made else self.kept[key(shapes)] for shapes in grid]
 
     def _filtered(
-        self, effect: Effect, place: Place, grid: Sequence[Shapes], stretch: Stretch, kind: str
+        self, effect: Effect, place: Place, grid: Sequence[Shapes], stretch: MotionStretch, kind: str
     ) -> list[Kept]:
         """Columns of one stretch in the band of the comparison, of every shape."""
         motion, moving = self.motion(stretch, kind), stretch.moving

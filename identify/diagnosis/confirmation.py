@@ -1,4 +1,4 @@
-"""Confirmation of a finding by the report part of the data, which chose nothing."""
+"""Confirmation of a finding by the report part of the data, which is not used for selection."""
 
 from dataclasses import dataclass
 

@@ -5,30 +5,23 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from armident.identify.diagnosis.candidate_comparison import Addition, SelectionStep
 from armident.identify.diagnosis.candidates import ColumnCache, Key
-from armident.identify.diagnosis.comparison import Addition, Step
+from armident.identify.diagnosis.changed_parameters import NumbersFinding
 from armident.identify.diagnosis.criteria import Criteria
-from armident.identify.diagnosis.experiment import recommended_experiment
 from armident.identify.diagnosis.model_state import ModelState
-from armident.identify.diagnosis.numbers import NumbersFinding
+from armident.identify.diagnosis.next_experiment import recommended_experiment
 from armident.identify.diagnosis.precision import standard_deviations
-from armident.identify.diagnosis.regression import relative_errors
+from armident.identify.diagnosis.regression import relative_torque_errors
 from armident.identify.diagnosis.selected import Selected
 from armident.identify.documents.diagnosis import Alternative, Finding, Gap, Negligible, NotVisible, Unexplained
 from armident.identify.effects.effect import Effect
-from armident.identify.effects.numbers import ParameterChange
+from armident.identify.effects.parameter_change import ParameterChange
 from armident.identify.effects.registry import catalogue, known, of_entry
 from armident.identify.effects.unnamed import NAME as UNNAMED
 from armident.identify.effects.wiring import Wiring
 
 Array = NDArray[np.float64]
-
-ALTERNATIVES = 3
-"""Most alternatives named beside a finding."""
-STRONG = float(np.exp(Criteria.close))
-"""Odds beyond which an explanation is no longer ambiguous."""
-DOUBTFUL = 0.6
-"""Confidence below which another experiment is recommended."""
 
 
 def findings_of(final: ModelState, selected: Sequence[Selected]) -> list[Finding]:
@@ -54,6 +47,7 @@ def _finding(final: ModelState, one: Selected, parameters: Mapping[str, float], 
     chance = min(1.0, one.step.tests * float(np.exp(-addition.gain)))
     rivals = one.step.rivals(addition)
     odds = tempered_odds(one.step, addition)
+    ambiguous = final.study.criteria.ambiguous_odds
     return Finding(
         effect=effect.name,
         law=effect.law,
@@ -67,7 +61,7 @@ def _finding(final: ModelState, one: Selected, parameters: Mapping[str, float], 
         gap_after=float(report.best[joint]),
         evidence={
             "title": effect.title,
-            "description": effect.says,
+            "description": effect.description,
             "reference": effect.reference,
             "score": addition.gain,
             "p_value": report.p_value,
@@ -80,7 +74,7 @@ def _finding(final: ModelState, one: Selected, parameters: Mapping[str, float], 
             "change_of_torque_pct": addition.material_pct,
             "std": std,
             "units": _units(effect, final.robot.joints[place.joint].type == "prismatic"),
-            "ambiguous_with": [key[0] for key, ratio in odds.items() if addition.named and ratio * STRONG > 1.0],
+            "ambiguous_with": [key[0] for key, ratio in odds.items() if addition.named and ratio * ambiguous > 1.0],
         },
     )
 
@@ -113,7 +107,7 @@ def _known_shares(left: Sequence[Unexplained]) -> dict[str, float]:
     return shares
 
 
-def tempered_odds(step: Step, one: Addition) -> dict[Key, float]:
+def tempered_odds(step: SelectionStep, one: Addition) -> dict[Key, float]:
     """Return the posterior odds of each other effect in place of one, whatever its law, with equal prior odds.
 
     Differences of log-likelihood are reduced by the serial correlation that the noise models leave: the gain of the
@@ -137,14 +131,13 @@ def _alternatives(final: ModelState, one: Addition, rivals: Sequence[Addition]) 
             joint = final.study.joints[rival.candidate.place.joint]
             entry = Alternative(effect=rival.family[0], joint=joint, score=rival.log_likelihood - one.log_likelihood)
             found.setdefault(rival.family, entry)
-    return list(found.values())[:ALTERNATIVES]
+    return list(found.values())[: final.study.criteria.alternatives]
 
 
 def negligible(
     final: ModelState,
     conventional: Sequence[Selected],
-    step: Step | None,
-    criteria: Criteria,
+    step: SelectionStep | None,
     immaterial: Sequence[Addition] = (),
 ) -> list[Negligible]:
     """Return the effects that are significant, and no cause: too small, or within the sampling convention of drives.
@@ -155,7 +148,7 @@ def negligible(
     found: dict[Key, Negligible] = {}
     small = [*(one.addition for one in conventional), *immaterial]
     if step is not None:
-        needed = np.log(max(step.tests, 1) / criteria.alpha["selection"])
+        needed = final.study.criteria.needed_gain(step.tests)
         small += [a for a in step.ranked if a.gain > needed and a not in step.passing]
     for addition in small:
         if addition.allowed and addition.named:
@@ -172,7 +165,7 @@ def negligible(
 
 def gap_of(state: ModelState, *, held: bool) -> Gap:
     """Relative torque errors of a model. ``held``: True for the held-out data, false for the training data."""
-    overall, each = relative_errors(state.fit, held=held)
+    overall, each = relative_torque_errors(state.fit, held=held)
     errors = np.concatenate(state.fit.errors(state.fit.theta, held=held))
     rms = np.sqrt(np.mean(errors**2, axis=0))
     joints = state.study.joints
@@ -216,9 +209,9 @@ def undetectable(state: ModelState, hidden: frozenset[Key]) -> list[NotVisible]:
             elif (effect.key, place.joint, place.other) in hidden:
                 reason = "the motion does not excite it, or the model already contains it"
             if reason is not None:
-                joint = study.joints[place.joint]
-                entry = NotVisible(effect=effect.name, joint=joint, reason=reason, required_motion=effect.needs)
-                found.setdefault((effect.name, joint), entry)
+                name, joint, motion_text = effect.name, study.joints[place.joint], effect.required_motion
+                entry = NotVisible(effect=name, joint=joint, reason=reason, required_motion=motion_text)
+                found.setdefault((name, joint), entry)
     return list(found.values())
 
 
@@ -247,7 +240,7 @@ def changed_parameters(numbers: Sequence[NumbersFinding]) -> list[Finding]:
     ]
 
 
-def experiment_to_separate(findings: Sequence[Finding]) -> str | None:
+def experiment_to_separate(findings: Sequence[Finding], criteria: Criteria) -> str | None:
     """Return the experiment that separates a finding from a close rival or raises a low confidence.
 
     ``findings``: findings of a diagnosis. Returns ``None`` if none is needed.
@@ -257,7 +250,7 @@ def experiment_to_separate(findings: Sequence[Finding]) -> str | None:
         rivals = [known(name) for name in finding.evidence.get("ambiguous_with", [])]
         if rivals:
             return recommended_experiment(known(finding.effect), finding.joint, rivals)
-    doubtful = [f for f in named if f.kind == "structure" and f.confidence < DOUBTFUL]
+    doubtful = [f for f in named if f.kind == "structure" and f.confidence < criteria.doubtful]
     return recommended_experiment(known(doubtful[0].effect), doubtful[0].joint) if doubtful else None
 
 

@@ -2,24 +2,16 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from armident.identify.diagnosis.study import Study
+from armident.identify.diagnosis.variables import VARIABLES, Kind
+from armident.identify.effects.free_shapes import hats
 from armident.identify.robot.motion import Motion
 
 Array = NDArray[np.float64]
-
-Kind = Literal[
-    "velocity", "position", "position and direction", "motor angle", "load", "load and direction", "torque",
-    "acceleration", "time", "time and direction", "position of another joint", "velocity of another joint",
-    "torque of another joint", "frequency", "motion", "transients",
-]  # fmt: skip
-"""Variables; those with a direction have the opposite sign in the negative direction. The last three have no free
-functions of their own: a frequency independent of the motion, all functions of the motion together, and ``transients``
-of documents of former versions."""
 
 SIDE = (0.0, 0.05, 0.15, 0.35, 0.65, 1.0)
 """Speeds of the knots of either direction, over the top speed: close at low speeds, where friction is curved."""
@@ -69,22 +61,8 @@ class FreeFunction:
 
     def variable(self, motion: Motion) -> Array:
         """Values of the variable, (N,). ``motion``: motion of the arm, N samples."""
-        at = self.joint if self.other is None else self.other
-        match self.kind:
-            case "velocity" | "velocity of another joint":
-                return motion.qd[:, at]
-            case "position" | "position and direction" | "position of another joint":
-                return motion.q[:, at]
-            case "motor angle":
-                return motion.motor[:, at]
-            case "load" | "load and direction":
-                return motion.transmitted[:, at]
-            case "torque" | "torque of another joint":
-                return motion.torque[:, at]
-            case "acceleration":
-                return motion.qdd[:, at]
-            case _:
-                return motion.t
+        signal: Array = getattr(motion, VARIABLES[self.kind].signal)
+        return signal if signal.ndim == 1 else signal[:, self.joint if self.other is None else self.other]
 
     def basis(self, x: Array, side: Array) -> Array:
         """Basis functions, (N, k).
@@ -117,20 +95,6 @@ class FreeFunction:
             return x, basis, [basis[x <= 0], basis[x >= 0]]
         basis = self.basis(x, np.ones_like(x))
         return x, basis, [basis]
-
-
-def hats(x: Array, knots: Sequence[float] | Array) -> Array:
-    """Piecewise linear functions (N, k), one at each knot, constant beyond the outermost.
-
-    ``x``: values, (N,); ``knots``: increasing knots, (k,).
-    """
-    at = np.asarray(knots, dtype=np.float64)
-    left = np.clip(np.searchsorted(at, x, side="right") - 1, 0, at.size - 2)
-    share = np.clip((x - at[left]) / (at[left + 1] - at[left]), 0.0, 1.0)
-    out, rows = np.zeros((x.size, at.size)), np.arange(x.size)
-    out[rows, left] = 1.0 - share
-    out[rows, left + 1] = share
-    return out
 
 
 def free_functions(study: Study, motions: Sequence[Motion], joint: int) -> Iterator[FreeFunction]:

@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 from armident.configs import DataError, RobotConfig
 from armident.configs.schema.robot import Effect as Entry
 from armident.identify.diagnosis.candidates import ColumnCache
+from armident.identify.diagnosis.noise_beyond import noise_beyond_shapes
 from armident.identify.diagnosis.predictive_score import PredictiveScore, references_of
-from armident.identify.diagnosis.regression import MAX_AR_ORDER, Fit, fit, safe
-from armident.identify.diagnosis.screening import noise_beyond_shapes
+from armident.identify.diagnosis.regression import MAX_AR_ORDER, IvFit, fit_model, safe
 from armident.identify.diagnosis.study import Study
 from armident.identify.effects.effect import SIGN_TOLERANCE
-from armident.identify.effects.recorded import of_recording
+from armident.identify.effects.recording_corrections import of_recording
 from armident.identify.effects.terms import Term, arm_model, effect_terms
 from armident.identify.regression.ar_noise import ArModel
 from armident.identify.robot.arm import ArmModel
@@ -30,10 +30,18 @@ CONVERGED = 0.1
 
 @dataclass(frozen=True, eq=False)
 class ModelState:
-    """Model of one step of the selection. ``study``: data with the model and the motion of its closed loop."""
+    """Model of one step of the selection: its fit to the data, with the motion of its closed loop."""
 
-    study: Study
-    fit: Fit
+    fit: IvFit
+
+    @property
+    def study(self) -> Study:
+        """Data with the model and the motion of its closed loop."""
+        return self.fit.study
+
+    def of_study(self, study: Study) -> "ModelState":
+        """Return the model with another study of the same training stretches."""
+        return ModelState(self.fit.of_study(study))
 
     @property
     def robot(self) -> RobotConfig:
@@ -76,14 +84,12 @@ class ModelState:
         """
         if all(one is own for one, own in zip(noise, self.fit.noise, strict=True)):
             return self
-        key = tuple(id(one) for one in noise)
-        if key not in self._under:
-            # The fit keeps the noise models, so that their identities stay theirs.
-            self._under[key] = replace(self, fit=safe(self.fit.renoised(noise)))
-        return self._under[key]
+        if noise not in self._under:
+            self._under[noise] = ModelState(safe(self.fit.renoised(noise)))
+        return self._under[noise]
 
     @cached_property
-    def _under(self) -> dict[tuple[int, ...], "ModelState"]:
+    def _under(self) -> dict[tuple[ArModel, ...], "ModelState"]:
         return {}
 
     @property
@@ -138,19 +144,19 @@ def fitted(study: Study, robot: RobotConfig, before: ModelState | None) -> Model
     if before is not None:
         first_motions = before.study.auxiliary.first_motions
         changed = replace(changed, auxiliary=replace(changed.auxiliary, first_motions=first_motions))
-        theta = padded(before.fit, model)
+        theta = rigid_parameters(before.fit, model)
     elif any(term.depends_on_torque for term in effect_terms(model)):
         bare = robot.model_copy(update={"effects": ()})
-        rigid = fit(replace(changed, robot=bare, model=arm_model(bare)))
+        rigid = fit_model(replace(changed, robot=bare, model=arm_model(bare)))
         theta = np.concatenate([rigid.theta, np.zeros(model.e)])
     noise = None if before is None else before.weights
-    first = fit(changed, theta, noise)
+    first = fit_model(changed, theta, noise)
     moved = changed.resimulated(first.theta)
     if moved is not changed:
-        first = fit(moved, first.theta if model.e else None, noise or first.noise)
+        first = fit_model(moved, first.theta if model.e else None, noise or first.noise)
     if any(term.scales_torque for term in effect_terms(model)):
         first = _iterated(first)
-    return ModelState(moved, first)
+    return ModelState(first)
 
 
 def fitted_in_loop_of(before: ModelState, robot: RobotConfig) -> ModelState | None:
@@ -161,7 +167,7 @@ def fitted_in_loop_of(before: ModelState, robot: RobotConfig) -> ModelState | No
     """
     study = before.study.of_robot(robot)
     try:
-        return ModelState(study, fit(study, padded(before.fit, study.model), before.weights))
+        return ModelState(fit_model(study, rigid_parameters(before.fit, study.model), before.weights))
     except (DataError, np.linalg.LinAlgError):
         return None
 
@@ -186,15 +192,14 @@ def with_own_noise(state: ModelState) -> ModelState:
 
     ``state``: model of the selection, fitted with the noise models of an earlier one.
     """
-    own = replace(state, fit=safe(state.fit.renoised(state.own_noise)))
+    own = ModelState(safe(state.fit.renoised(state.own_noise)))
     sizes = (float(np.log(np.maximum(one.score.rms, 1e-300)).sum()) for one in (own, state))
     return own if next(sizes) < next(sizes) else state
 
 
 def with_first_motions(state: ModelState) -> ModelState:
     """Return a model from whose loop the simulations of its successors begin. ``state``: model of the selection."""
-    study = state.study.with_first_motions(state.fit.theta)
-    return ModelState(study, replace(state.fit, study=study))
+    return state.of_study(state.study.with_first_motions(state.fit.theta))
 
 
 def with_references(state: ModelState) -> ModelState:
@@ -202,8 +207,7 @@ def with_references(state: ModelState) -> ModelState:
 
     ``state``: model to which nothing is added yet.
     """
-    study = replace(state.study, references=references_of(state.fit))
-    return ModelState(study, replace(state.fit, study=study))
+    return state.of_study(replace(state.study, references=references_of(state.fit)))
 
 
 def with_report_part(state: ModelState) -> ModelState:
@@ -211,9 +215,7 @@ def with_report_part(state: ModelState) -> ModelState:
 
     The selection simulates the training part alone.
     """
-    moved = state.study.with_report_part(state.fit.theta)
-    equations = state.fit.equations.with_held(moved)
-    return ModelState(moved, replace(state.fit, study=moved, equations=equations))
+    return state.of_study(state.study.with_report_part(state.fit.theta))
 
 
 def viscous_friction_rises(state: ModelState, term: Term) -> bool:
@@ -247,7 +249,7 @@ def acted_on(with_it: ModelState, without: ModelState) -> NDArray[np.bool_]:
     return np.array([bool(np.isin(added, joint.x).any()) for joint in joints])
 
 
-def _iterated(found: Fit) -> Fit:
+def _iterated(found: IvFit) -> IvFit:
     """Fit whose terms scale the torques predicted by the model itself, by iteration.
 
     A drive that gives half its torque scales another torque than the model without it predicts.
@@ -255,13 +257,13 @@ def _iterated(found: Fit) -> Fit:
     terms = slice(found.study.model.base.b - found.study.model.e, None)
     for _ in range(ITERATIONS):
         before, std = found.theta[terms], np.sqrt(np.diag(found.covariance)[terms])
-        found = fit(found.study, found.theta, found.noise)
+        found = fit_model(found.study, found.theta, found.noise)
         if np.all(np.abs(found.theta[terms] - before) <= CONVERGED * std):
             break
     return found
 
 
-def padded(before: Fit, model: ArmModel) -> Array:
+def rigid_parameters(before: IvFit, model: ArmModel) -> Array:
     """Rigid parameters of an earlier fit, zeros for the terms, (b,)."""
     rigid = before.theta[: before.study.model.base.b - before.study.model.e]
     return np.concatenate([rigid, np.zeros(model.e)])

@@ -9,10 +9,10 @@ from scipy import stats
 from armident.configs.schema.robot import Effect as Entry
 from armident.identify.diagnosis.candidates import ColumnCache
 from armident.identify.diagnosis.model_state import ModelState
-from armident.identify.diagnosis.regression import Fit
+from armident.identify.diagnosis.regression import IvFit
 from armident.identify.effects.drive import Correction
 from armident.identify.effects.effect import Place
-from armident.identify.effects.recorded import of_recording
+from armident.identify.effects.recording_corrections import of_recording
 from armident.identify.effects.registry import of_entry
 from armident.identify.effects.terms import Term
 from armident.identify.regression.ar_noise import ArModel
@@ -48,7 +48,7 @@ def standard_deviations(state: ModelState) -> dict[int, dict[str, float]]:
     return found
 
 
-def p_value(state: ModelState, entry: Entry) -> float:
+def p_value_of_effect(state: ModelState, entry: Entry) -> float:
     """Probability of linear parameters of an effect so far from zero if it is not there (Wald's test).
 
     Their covariance is that of `standard_deviations` with the nonlinear parameters of the effect as they are: without
@@ -127,7 +127,7 @@ def _slope(column_cache: ColumnCache, noise: Sequence[ArModel], term: Term, name
     return slope
 
 
-def _deviations(fit: Fit, slopes: list[Array]) -> Array:
+def _deviations(fit: IvFit, slopes: list[Array]) -> Array:
     """Standard deviations of the model's own parameters and of further ones with columns ``slopes``, (b + s,).
 
     Those of the rigid model stay as they are (4.34).
@@ -140,7 +140,7 @@ def _deviations(fit: Fit, slopes: list[Array]) -> Array:
     return variances**0.5
 
 
-def _covariances(fit: Fit, slopes: list[Array], own: list[int]) -> tuple[Array, Array]:
+def _covariances(fit: IvFit, slopes: list[Array], own: list[int]) -> tuple[Array, Array]:
     """Covariances (k, k) of some parameters beside further ones with columns ``slopes``.
 
     The first is that of white innovations, the second that of the residual along the influence of each parameter.

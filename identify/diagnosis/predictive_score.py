@@ -19,8 +19,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from armident.identify.diagnosis.regression import MAX_AR_ORDER, Fit
-from armident.identify.effects.tables import FreeShape
+from armident.identify.diagnosis.regression import MAX_AR_ORDER, IvFit
+from armident.identify.effects.free_shapes import FreeShape
 from armident.identify.effects.terms import effect_terms
 from armident.identify.regression.ar_noise import ArModel, ar_models
 from armident.identify.regression.iv import JointEquations
@@ -36,9 +36,7 @@ FOLDS = 10
 
 LAGS = 5
 """Samples to either side in the filter between simulated and measured motion: half a period of the loop's bandwidth,
-see `armident.identify.diagnosis.study.BAND`."""
-NOISE_SHARE = 0.5
-"""Share of the torque beyond the simulated motion from which it counts as measurement noise: more than half."""
+see `Criteria.band`."""
 LEAST_ROWS = 10 * (2 * LAGS + 1)
 """Rows of a stretch from which that filter is estimated: ten for each of its coefficients."""
 
@@ -47,7 +45,7 @@ LEAST_ROWS = 10 * (2 * LAGS + 1)
 class PredictiveScore:
     """Cross-validated errors of a fitted model. ``fit``: the fit of all training data, with its noise models."""
 
-    fit: Fit
+    fit: IvFit
 
     @cached_property
     def folds(self) -> Array:
@@ -205,7 +203,7 @@ def fold_of(rows: int) -> NDArray[np.int64]:
     return np.arange(rows) * BLOCKS // max(rows, 1) % FOLDS
 
 
-def references_of(fit: Fit) -> tuple[Array | None, ...]:
+def references_of(fit: IvFit) -> tuple[Array | None, ...]:
     """Rigid parameters of a fit, (b - e,), for each joint whose motion has much measurement noise; ``None`` for others.
 
     Measured motion beyond the simulated one is measurement noise, or motion that disturbances caused. Measurement noise
@@ -223,7 +221,7 @@ def references_of(fit: Fit) -> tuple[Array | None, ...]:
             noise = ar.whiten(noise_of_motion(joint, rows, theta[None])[:, 0])
             along -= float(noise @ ar.whiten(rows[:, -1] - rows[:, : joint.x.size] @ fit.theta[joint.x]))
             power += float(noise @ noise)
-        found.append(theta if along > NOISE_SHARE * power else None)
+        found.append(theta if along > fit.study.criteria.noisy_motion * power else None)
     return tuple(found)
 
 

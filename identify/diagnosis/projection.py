@@ -14,15 +14,9 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from armident.identify.diagnosis.free_functions import FreeFunction
+from armident.identify.diagnosis.predictive_score import SUMS
 
 Array = NDArray[np.float64]
-
-BLOCKS = 20
-"""Blocks of the block sums, as in `armident.identify.diagnosis.predictive_score`."""
-
-RANK_TOLERANCE = 0.1
-"""Relative norm orthogonal to the model below which the model contains a direction: 1 % of its power. Coefficients
-along such directions would have ten times the standard deviation, and distort the curve."""
 
 UNPENALISED = 1e-9
 """Roughness, relative to the roughest direction, below which a direction counts as smooth altogether."""
@@ -95,6 +89,8 @@ class JointResidual:
         Held-out rows of every joint.
     regressor, covariance
         Held-out regressor of the model, (R', b), and the covariance of its parameters, (b, b).
+    least
+        Least norm of a direction orthogonal to the model, over its own: see `Criteria.beyond_model_function`.
     """
 
     joint: int
@@ -110,6 +106,7 @@ class JointResidual:
     held_joints: Sequence[slice]
     regressor: Array
     covariance: Array
+    least: float
 
     def directions(self, columns: NDArray[np.int64]) -> tuple[Array, Array, Array] | None:
         """Orthonormal directions (R, r) of some functions beyond the model, their coefficients (k, r), and powers (r,).
@@ -120,7 +117,7 @@ class JointResidual:
         scale = np.linalg.norm(d, axis=0)
         scale = np.where(scale > 0, scale, np.inf)
         power, right = np.linalg.eigh((z / scale).T @ (z / scale))
-        kept = power > RANK_TOLERANCE**2
+        kept = power > self.least**2
         if not kept.any():
             return None
         right, power = right[:, kept], power[kept]
@@ -191,7 +188,7 @@ class JointResidual:
         )
         through = self.regressor.T @ change
         variance = variance * max(1.0, inflation_of_sums(here, after)) + float(through @ self.covariance @ through)
-        return float(stats.t.sf(float(change @ self.held_e) / np.sqrt(max(variance, 1e-300)), BLOCKS - 1))
+        return float(stats.t.sf(float(change @ self.held_e) / np.sqrt(max(variance, 1e-300)), SUMS - 1))
 
 
 def significance(u: Array, e: Array, estimate: Array) -> tuple[float, float]:
@@ -203,7 +200,7 @@ def significance(u: Array, e: Array, estimate: Array) -> tuple[float, float]:
     ``u``: directions, (R, r); ``e``: whitened residual, (R,); ``estimate``: projection of the residual on the
     directions, (r,).
     """
-    edges = np.arange(BLOCKS + 1) * e.size // BLOCKS
+    edges = np.arange(SUMS + 1) * e.size // SUMS
     sums, white = [], 0.0
     for begin, end in pairwise(edges):
         part = u[begin:end]
@@ -212,7 +209,7 @@ def significance(u: Array, e: Array, estimate: Array) -> tuple[float, float]:
         white += float(np.trace(gram) - np.sum(gram**2))
     spread = np.array(sums)
     covariance = spread.T @ spread
-    r, free = estimate.size, BLOCKS - 1
+    r, free = estimate.size, SUMS - 1
     trace = float(np.trace(covariance))
     squared = free**2 / ((free - 1) * (free + 2)) * (float(np.sum(covariance**2)) - trace**2 / free)
     equivalent = float(np.clip(trace**2 / max(squared, 1e-300), 1.0, r))
@@ -226,7 +223,7 @@ def inflation_of_sums(change: Array, e: Array) -> float:
 
     ``change``: change of prediction, (R,); ``e``: whitened residual orthogonal to it, (R,).
     """
-    edges = np.arange(BLOCKS) * e.size // BLOCKS
+    edges = np.arange(SUMS) * e.size // SUMS
     sums, weights = np.add.reduceat(change * e, edges), np.add.reduceat(change**2, edges)
     total = float(weights.sum())
     white = _mean_square(e) * (total - float(weights @ weights) / max(total, 1e-300))

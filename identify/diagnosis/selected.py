@@ -5,10 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from armident.configs.schema.robot import Effect as Entry
-from armident.identify.diagnosis.comparison import Addition, Step
+from armident.identify.diagnosis.candidate_comparison import Addition, SelectionStep
 from armident.identify.diagnosis.confirmation import Confirmation
 from armident.identify.diagnosis.model_state import ModelState
-from armident.identify.effects.recorded import of_recording
+from armident.identify.effects.recording_corrections import of_recording
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,7 +32,7 @@ class Selected:
     """
 
     entry: Entry
-    step: Step
+    step: SelectionStep
     addition: Addition
     confirmation: Confirmation | None = None
     without: ModelState | None = None

@@ -15,8 +15,8 @@ KINDS = ("measured", "simulated")
 """Kinds of motion of a stretch."""
 
 
-@dataclass(frozen=True)
-class Stretch:
+@dataclass(frozen=True, eq=False)
+class MotionStretch:
     """One uninterrupted stretch of motion at the working rate, SI, joint side.
 
     Parameters
@@ -55,7 +55,7 @@ class Stretch:
     moving: NDArray[np.bool_]
     before: tuple[Derivatives, Derivatives] | None = None
 
-    def resimulated(self, motion: Derivatives, dt: float, factor: int) -> "Stretch":
+    def resimulated(self, motion: Derivatives, dt: float, factor: int) -> "MotionStretch":
         """Stretch with another simulation of the whole experiment.
 
         ``motion``: simulated motion of the experiment; ``factor``: decimation factor to the working rate.
@@ -95,7 +95,7 @@ def rows_before(kept: NDArray[np.int64], rows: NDArray[np.int64]) -> NDArray[np.
     return kept[max(first - rows.size, 0) : first]
 
 
-def distances(stretches: Sequence[Stretch]) -> Array:
+def distances(stretches: Sequence[MotionStretch]) -> Array:
     """Squared errors of the simulated velocities of each joint over its own measured ones, (n,)."""
     apart = sum(np.sum((s.simulated.qd - s.measured.qd) ** 2, axis=0) for s in stretches)
     size = sum(np.sum(s.measured.qd**2, axis=0) for s in stretches)

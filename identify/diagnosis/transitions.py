@@ -14,13 +14,6 @@ STEPS = tuple(0.5**k for k in range(1, 6))
 """Steps of the pattern search: logarithm of the velocity, and lead in samples. The last one is 3 %."""
 ROUNDS = 4
 """Most rounds with one step."""
-CLEAR = 3.0
-"""Gain of log-likelihood from which a joint has a transition: odds of 20 to 1."""
-
-LARGEST = 2.0
-"""Largest transition over the dry friction of the joint. One needs no more; dry friction breaks away at up to twice the
-level of slow motion (Armstrong-Helouvry, Dupont, Canudas de Wit 1994, Automatica 30(7)), and a joint that sticks looks
-like that."""
 
 
 def with_transitions(state: ModelState, model: Fitter) -> ModelState:
@@ -128,11 +121,11 @@ def _clear(state: ModelState, less: ModelState | None, entry: Entry, joint: int)
         return False
     own = (state.score.own_log_likelihoods - less.score.own_log_likelihoods)[joint]
     alike = [one.score.log_likelihoods_under(less.weights)[joint] for one in (state, less)]
-    return bool(max(own, alike[0] - alike[1]) > CLEAR)
+    return bool(max(own, alike[0] - alike[1]) > state.study.criteria.close)
 
 
 def _possible(state: ModelState, entry: Entry, joint: int) -> bool:
-    """True if a transition is positive, and at most `LARGEST` within two standard deviations.
+    """True if a transition is positive, and at most `Criteria.largest_transition` within two standard deviations.
 
     Together with the smoothed sign, a larger one is friction that falls with the velocity: an effect (Stribeck).
     """
@@ -141,6 +134,6 @@ def _possible(state: ModelState, entry: Entry, joint: int) -> bool:
     if state.fit.theta[own] <= 0.0 or dry not in names:
         return bool(state.fit.theta[own] > 0.0)
     direction = np.zeros(state.fit.theta.size)
-    direction[own], direction[names.index(dry)] = 1.0, -LARGEST
+    direction[own], direction[names.index(dry)] = 1.0, -state.study.criteria.largest_transition
     std = float(np.sqrt(direction @ state.fit.covariance @ direction))
     return bool(direction @ state.fit.theta <= SIGN_TOLERANCE * std)

@@ -5,14 +5,20 @@ from importlib.metadata import entry_points
 
 from armident.configs import ConfigError
 from armident.configs.schema.robot import Effect as Entry
-from armident.identify.effects import drive, friction, link, numbers, transmission, unnamed, wiring
+from armident.identify.effects import drive, friction, link, parameter_change, transmission, unnamed, wiring
 from armident.identify.effects.effect import Effect
 
 ENTRY_POINTS = "armident.effects"
 """Entry-point group of plug-ins: each entry names a subclass of `Effect`, an instance, or a sequence of them."""
 
-REQUIRED = ("name", "title", "says", "reference", "needs", "linear")
+REQUIRED = ("name", "title", "description", "reference", "required_motion", "linear")
 """Attributes without a usual value."""
+
+
+def own_effects() -> list[Effect]:
+    """Return the effects of this package."""
+    modules = (friction, link, transmission, drive, parameter_change, wiring, unnamed)
+    return [effect() for module in modules for effect in module.EFFECTS]
 
 
 @cache
@@ -21,8 +27,7 @@ def catalogue() -> dict[str, Effect]:
 
     Raises ConfigError if an entry point cannot be loaded, is not an effect, or repeats a name.
     """
-    modules = (friction, link, transmission, drive, numbers, wiring, unnamed)
-    found = {e.key: e for e in (effect() for module in modules for effect in module.EFFECTS)}
+    found = {effect.key: effect for effect in own_effects()}
     for point in sorted(entry_points(group=ENTRY_POINTS), key=lambda p: p.name):
         where = f"effect {point.name} ({point.value})"
         try:

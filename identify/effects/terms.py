@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from armident.configs import ConfigError, RobotConfig
 from armident.configs.schema.robot import Effect as Entry
 from armident.identify.effects.effect import Effect, Linear, Place
-from armident.identify.effects.recorded import of_recording
+from armident.identify.effects.recording_corrections import of_recording
 from armident.identify.effects.registry import of_entry
 from armident.identify.robot.arm import ArmModel
 from armident.identify.robot.motion import Motion
@@ -94,7 +94,7 @@ def terms_of(robot: RobotConfig) -> tuple[Term, ...]:
         if of_recording(entry):
             continue
         where = f"effects[{k}]: {entry.effect} of {entry.joint}"
-        place = place_of(entry, effect, robot, where)
+        place = place_of_entry(entry, effect, robot, where)
         shapes = _shapes(entry, effect, where)
         kind = int(robot.joints[place.joint].type == "prismatic")
         number = f"{place.joint + 1}" if place.other is None else f"{place.joint + 1}{place.other + 1}"
@@ -118,7 +118,7 @@ def terms_of(robot: RobotConfig) -> tuple[Term, ...]:
     return tuple(terms)
 
 
-def place_of(entry: Entry, effect: Effect, robot: RobotConfig, where: str) -> Place:
+def place_of_entry(entry: Entry, effect: Effect, robot: RobotConfig, where: str) -> Place:
     """Return the location of an effect entry.
 
     ``entry``: entry of the ``effects`` of the configuration; ``where``: key of the entry, for messages. Raises

@@ -6,7 +6,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armident.compiled import ARITHMETIC, compiled
-from armident.identify.effects.effect import POSITION, TORQUE, Linear, Periodic, Place, Shape, TorqueDependent, Trials
+from armident.identify.effects.effect import (
+    POSITION,
+    TORQUE,
+    UNITLESS,
+    Linear,
+    Periodic,
+    Place,
+    Shape,
+    TorqueDependent,
+    Trials,
+)
 from armident.identify.effects.rotor import ROTOR, rotors
 from armident.identify.robot.motion import Motion
 
@@ -31,13 +41,23 @@ class CoggingTorque(MotorOrder):
 
     name = "cogging_torque"
     title = "a torque ripple of the motor"
-    says = "a torque ripple that is periodic in the motor angle: magnets of the motor, or an eccentric gear"
+    description = "a torque ripple that is periodic in the motor angle: magnets of the motor, or an eccentric gear"
     reference = "Petrovic et al. 2000, IEEE Trans. Power Electronics 15(6); Gandhi et al. 2002, ICRA"
-    needs = "slow motion over several motor turns"
+    required_motion = "slow motion over several motor turns"
     excitation = ("slow", "range")
     scope = "motor"
-    linear = (Linear("cgc", TORQUE), Linear("cgs", TORQUE))
-    shapes = (Shape("harmonic", ("per rad of the motor", "rad/m"), continuous=(False, False)),)
+    linear = (
+        Linear("cgc", TORQUE, "Amplitude of the cosine component of the ripple, on the joint side."),
+        Linear("cgs", TORQUE, "Amplitude of the sine component of the ripple, on the joint side."),
+    )
+    shapes = (
+        Shape(
+            "harmonic",
+            ("per rad of the motor", "rad/m"),
+            "Periods of the ripple per turn of the motor; for a prismatic axis a wave number.",
+            continuous=(False, False),
+        ),
+    )
 
     def columns(self, motion: Motion, place: Place, shapes: Mapping[str, float]) -> Array:
         """Return cosine and sine of ``harmonic`` times the motor angle."""
@@ -65,12 +85,16 @@ class JointElasticity(TorqueDependent):
 
     name = "joint_elasticity"
     title = "an elastic joint"
-    says = "the link oscillates relative to its motor: an elastic gear, belt or coupling, or a bending link"
+    description = "the link oscillates relative to its motor: an elastic gear, belt or coupling, or a bending link"
     reference = "Spong 1987, J. Dyn. Sys. Meas. Control 109(4)"
-    needs = "quick accelerations near the resonance, under load"
+    required_motion = "quick accelerations near the resonance, under load"
     excitation = ("accelerations",)
-    linear = (Linear("compliance", ("rad/(N m)", "m/N"), sign=1),)
-    shapes = (Shape("frequency", ("Hz", "Hz")), Shape("damping", ("", ""), default=DAMPINGS[-1]), ROTOR)
+    linear = (Linear("compliance", ("rad/(N m)", "m/N"), "Compliance: deflection per transmitted torque.", sign=1),)
+    shapes = (
+        Shape("frequency", ("Hz", "Hz"), "Natural frequency of the link at its mean inertia along the motion."),
+        Shape("damping", UNITLESS, "Damping ratio of that oscillation.", default=DAMPINGS[-1]),
+        ROTOR,
+    )
 
     def columns(self, motion: Motion, place: Place, shapes: Mapping[str, float]) -> Array:
         """Return the torques by `swinging` of the link.
@@ -122,12 +146,14 @@ class Backlash(TorqueDependent):
 
     name = "backlash"
     title = "backlash of the gear"
-    says = "after a sign change of the load the motor crosses a gap before the link follows: worn teeth, a loose key"
+    description = (
+        "after a sign change of the load the motor crosses a gap before the link follows: worn teeth, a loose key"
+    )
     reference = "Nordin, Gutman 2002, Automatica 38(10)"
-    needs = "many changes of the load's direction"
+    required_motion = "many changes of the load's direction"
     excitation = ("reversals", "accelerations")
-    linear = (Linear("behind", ("", ""), sign=1, bounds=(0.1, 1.5)),)
-    shapes = (Shape("gap", POSITION), ROTOR)
+    linear = (Linear("behind", UNITLESS, "Torque pulses over those of plastic impacts.", sign=1, bounds=(0.1, 1.5)),)
+    shapes = (Shape("gap", POSITION, "Width of the gap at the joint, from side to side."), ROTOR)
     regressor_signals = "measured"
     instrument_signals = "measured"
 

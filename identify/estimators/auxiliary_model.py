@@ -19,7 +19,7 @@ from armident.identify.robot.simulation import Simulation
 from armident.identify.signals.bandpass import butterworth
 from armident.identify.signals.decimate import Decimation
 from armident.identify.signals.differentiate import Derivatives
-from armident.identify.streamed import chosen, kept, mapped
+from armident.identify.signals.streamed import chosen, kept, mapped
 
 HALVINGS = 8
 """Step halvings towards the last estimate that could be simulated."""

@@ -19,7 +19,7 @@ from armident.identify.regression.equations import (
 )
 from armident.identify.regression.iterations import ITERATIONS, iterate
 from armident.identify.regression.iv import IvProducts, factored_parts, instrumented_parts, serial_covariance
-from armident.identify.streamed import mapped
+from armident.identify.signals.streamed import mapped
 
 
 def idim_iv(

@@ -15,7 +15,7 @@ from armident.identify.regression.equations import (
 )
 from armident.identify.regression.iv import serial_covariance
 from armident.identify.regression.least_squares import Triangle, require_excitation
-from armident.identify.streamed import mapped
+from armident.identify.signals.streamed import mapped
 
 
 def idim_ls(

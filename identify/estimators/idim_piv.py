@@ -23,7 +23,7 @@ from armident.identify.regression.equations import (
 from armident.identify.regression.iterations import ITERATIONS, iterate
 from armident.identify.regression.iv import IvProducts, iv_products
 from armident.identify.regression.orders import MAX_AR_ORDER
-from armident.identify.streamed import mapped
+from armident.identify.signals.streamed import mapped
 
 NOISE_UPDATES = 6
 """Iterations after which the noise models are held: an order that flips between two equal AICs never settles."""

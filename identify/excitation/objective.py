@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from armident.configs import ConfigError, RobotConfig
 from armident.identify.diagnosis.candidates import Shapes
 from armident.identify.effects.effect import Effect, Place
-from armident.identify.effects.numbers import ParameterChange
+from armident.identify.effects.parameter_change import ParameterChange
 from armident.identify.effects.registry import known
 from armident.identify.effects.wiring import Wiring
 from armident.identify.robot.motion import Motion

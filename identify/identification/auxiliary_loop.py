@@ -15,7 +15,6 @@ from armident.identify.controller.parametric import ControlLaw, identify_paramet
 from armident.identify.estimators.auxiliary_model import AuxiliaryModel
 from armident.identify.estimators.measured_instruments import MotionInstruments
 from armident.identify.estimators.methods import estimator
-from armident.identify.experiment import Experiment
 from armident.identify.identification.equations import PIV_CUTOFF, Prepared
 from armident.identify.identification.identification_criteria import IdentificationCriteria
 from armident.identify.identification.options import CONTROLLERS, Options
@@ -25,7 +24,8 @@ from armident.identify.robot.simulation import Simulation
 from armident.identify.signals.bandpass import butterworth
 from armident.identify.signals.decimate import Decimation
 from armident.identify.signals.differentiate import Derivatives, differentiate
-from armident.identify.streamed import kept, mapped
+from armident.identify.signals.experiments import Experiment
+from armident.identify.signals.streamed import kept, mapped
 
 RUNAWAY = 3.0
 """Speed of a simulated joint, over the highest measured speed, beyond which the simulation has diverged: a stable loop

@@ -8,14 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armident.configs.schema.robot import Preprocessing
-from armident.identify.experiment import Experiment
 from armident.identify.regression.equations import ExperimentEquations, filtered_regressor
 from armident.identify.robot.arm import ArmModel
 from armident.identify.signals.bandpass import butterworth, central_difference
 from armident.identify.signals.decimate import Decimation, design
 from armident.identify.signals.differentiate import Derivatives
+from armident.identify.signals.experiments import Experiment
 from armident.identify.signals.published_filters import chebyshev_decimate, kept_samples
-from armident.identify.streamed import Streamed, chosen, kept
+from armident.identify.signals.streamed import Streamed, chosen, kept
 
 LS_CUTOFF = 2.0
 """Cut-off of the least-squares decimation in closed-loop bandwidths (thesis 2.3.1: ``w_Fp >= 2 w_dyn``)."""
@@ -76,7 +76,7 @@ def aligned_torque(tau: NDArray[np.float64], late: float = 0.0) -> NDArray[np.fl
     that is late by some more is interpolated between its samples.
 
     ``tau``: torques as recorded, (N, n); ``late``: samples by which they are late, see
-    :class:`~armident.identify.experiment.Experiment`.
+    :class:`~armident.identify.signals.experiments.Experiment`.
     """
     if late:
         k = np.arange(tau.shape[0], dtype=np.float64)

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from armident.configs import DataError, Joint, RobotConfig
 from armident.configs.schema.limits import ENDLESS
 from armident.daq.recording import Recording, Stream
-from armident.identify.experiment import Experiment
 from armident.identify.identification.identification_criteria import IdentificationCriteria
 from armident.identify.identification.set_points import between_set_points
-from armident.identify.streamed import OnDisk
+from armident.identify.signals.experiments import Experiment
+from armident.identify.signals.streamed import OnDisk
 
 MAX_MISSING_SHARE = 0.05
 """Largest share of missing samples of an experiment; with more, the rest is no longer the designed motion."""

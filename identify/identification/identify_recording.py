@@ -7,7 +7,6 @@ from itertools import chain
 from armident.configs import DataError, RobotConfig
 from armident.daq.recording import Recording
 from armident.identify.documents.identification import IdentificationDocument
-from armident.identify.experiment import Experiment
 from armident.identify.identification.document import identification_document
 from armident.identify.identification.from_recording import WHOLE, StretchRule, experiments_from_recording
 from armident.identify.identification.identification_result import IdentificationResult
@@ -16,7 +15,8 @@ from armident.identify.identification.pipeline import identify_experiment
 from armident.identify.identification.sign_smoothing import with_numbers
 from armident.identify.setup.check import check_setup
 from armident.identify.setup.result import SetupCheck
-from armident.identify.streamed import OnDisk, Streamed
+from armident.identify.signals.experiments import Experiment
+from armident.identify.signals.streamed import OnDisk, Streamed
 
 CHECKED_VALUES = 6_000_000
 """Number of values (samples times joints) of a long recording by which the set-up is checked."""

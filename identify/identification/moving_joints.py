@@ -6,10 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armident.configs import DataError, RobotConfig
-from armident.identify.experiment import Experiment
 from armident.identify.identification.identification_criteria import IdentificationCriteria
 from armident.identify.signals.differentiate import encoder_resolution
-from armident.identify.streamed import mapped
+from armident.identify.signals.experiments import Experiment
+from armident.identify.signals.streamed import mapped
 
 NOISE_SAMPLES = 100_000
 """Samples from which the position noise is estimated."""

@@ -9,14 +9,13 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from armident.configs import DataError, RobotConfig
-from armident.identify.effects.recorded import put_right
+from armident.identify.effects.recording_corrections import corrected_experiments
 from armident.identify.effects.terms import arm_model
 from armident.identify.estimators.diagnostics import diagnose_estimate
 from armident.identify.estimators.essential import essential_parameters
 from armident.identify.estimators.idim_ls import idim_ls
 from armident.identify.estimators.methods import estimator
 from armident.identify.estimators.reason import Reason
-from armident.identify.experiment import Experiment, check_one_rate
 from armident.identify.identification.auxiliary_loop import ClosedLoop, closed_loop, velocity_error
 from armident.identify.identification.checks.interval import doubts_of_least_squares, interval_reason
 from armident.identify.identification.checks.judged import Judged
@@ -53,7 +52,8 @@ from armident.identify.setup.result import SetupCheck, with_torque_shift
 from armident.identify.signals.bandwidth import motion_bandwidth
 from armident.identify.signals.decimate import Decimation
 from armident.identify.signals.differentiate import Derivatives, differentiate, encoder_resolution
-from armident.identify.streamed import kept, mapped
+from armident.identify.signals.experiments import Experiment, check_one_rate
+from armident.identify.signals.streamed import kept, mapped
 
 TORQUE_PREDICTIONS = 2
 """Largest number of predictions of the torques on which terms depend."""
@@ -116,7 +116,7 @@ def _identify(
     clock.enter("model", 0.0)
     moving = moving_joints(experiments, robot, criteria)
     require_motion(experiments, robot, moving)
-    experiments = shifted_experiments(put_right(experiments, robot), robot, options, setup, notes)
+    experiments = shifted_experiments(corrected_experiments(experiments, robot), robot, options, setup, notes)
     bandwidth = (
         options.bandwidth_hz
         or robot.bandwidth_hz

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from armident.identify.effects.tables import hats
+from armident.identify.effects.free_shapes import hats
 from armident.identify.identification.equations import Prepared
 from armident.identify.regression.ar_noise import ArModel
 from armident.identify.regression.equations import (

@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armident.configs import RobotConfig
-from armident.identify.experiment import Experiment
 from armident.identify.identification.identification_criteria import IdentificationCriteria
 from armident.identify.signals.bandpass import butterworth, central_difference
 from armident.identify.signals.bandwidth import position_noise
-from armident.identify.streamed import Streamed
+from armident.identify.signals.experiments import Experiment
+from armident.identify.signals.streamed import Streamed
 
 SATURATION = 450.0
 """``g`` times the top speed of the joint.

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from scipy import signal, stats
 
 from armident.identify.estimators.auxiliary_model import AuxiliaryModel
-from armident.identify.experiment import Experiment
 from armident.identify.identification.equations import Prepared, aligned_torque
 from armident.identify.identification.identification_criteria import IdentificationCriteria
 from armident.identify.regression.ar_noise import ArModel
@@ -36,7 +35,8 @@ from armident.identify.signals.bandwidth import position_noise
 from armident.identify.signals.choices import DerivativesName
 from armident.identify.signals.decimate import Decimation
 from armident.identify.signals.differentiate import Derivatives, differentiate
-from armident.identify.streamed import kept, mapped
+from armident.identify.signals.experiments import Experiment
+from armident.identify.signals.streamed import kept, mapped
 
 SIMULATION_ERROR = 0.15
 """Standard deviation of the part of the bias that the simulation misses, over the bias.

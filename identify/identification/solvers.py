@@ -42,7 +42,7 @@ from armident.identify.regression.iv import serial_covariance
 from armident.identify.robot.simulation import Simulation
 from armident.identify.signals.decimate import Decimation, design
 from armident.identify.signals.differentiate import Derivatives
-from armident.identify.streamed import chosen
+from armident.identify.signals.streamed import chosen
 
 NOT_FINITE = "infs or NaNs"
 """Text of scipy's ``ValueError`` for arrays that are not finite."""

@@ -18,7 +18,7 @@ from armident.identify.regression.qr import triangularize_parts
 from armident.identify.robot.arm import ArmModel
 from armident.identify.signals.decimate import Decimation
 from armident.identify.signals.differentiate import Derivatives
-from armident.identify.streamed import kept, mapped
+from armident.identify.signals.streamed import kept, mapped
 
 NEGLIGIBLE = 1e-6
 """Torque per SI unit of a parameter, relative to the greatest of all, below which a motion does not show it."""

@@ -15,7 +15,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from armident.identify.experiment import Experiment
 from armident.identify.regression.ar_noise import WHITE, ArModel
 from armident.identify.regression.equations import (
     ExperimentEquations,
@@ -28,6 +27,7 @@ from armident.identify.regression.whitening import whitened
 from armident.identify.robot.arm import ArmModel
 from armident.identify.signals.decimate import Decimation
 from armident.identify.signals.differentiate import Derivatives, differentiate
+from armident.identify.signals.experiments import Experiment
 
 HELD = 0.5
 """Delay in samples of a drive that reports the torque it holds until the next sample."""

@@ -22,14 +22,6 @@ class Verdict:
     level: Level
     reasons: tuple[Reason, ...] = ()
 
-    @property
-    def sentence(self) -> str:
-        """The level and, if not trustworthy, the first reason."""
-        if not self.reasons:
-            return self.level
-        more = len(self.reasons) - 1
-        return f"{self.level}: {self.reasons[0].message}" + (f" (and {more} more)" if more else "")
-
     def of_kind(self, kind: Kind) -> tuple[Reason, ...]:
         """Return the reasons of one kind. ``kind``: property that was judged."""
         return tuple(reason for reason in self.reasons if reason.kind == kind)

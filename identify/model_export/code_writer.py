@@ -14,7 +14,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from armident.identify.documents.base import versions
 from armident.identify.documents.files import write_atomically
 from armident.identify.effects.link import GravityDirection
-from armident.identify.effects.numbers import ParameterChange
+from armident.identify.effects.parameter_change import ParameterChange
 from armident.identify.effects.registry import of_entry
 from armident.identify.model_export.exported_model import ExportedModel
 from armident.identify.model_export.formulas import FUNCTIONS, InstantModel, instant_model

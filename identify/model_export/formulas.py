@@ -15,8 +15,8 @@ import numpy as np
 from numba.core.errors import NumbaError
 
 from armident.identify.effects.link import GravityDirection, across
-from armident.identify.effects.numbers import ParameterChange
-from armident.identify.effects.recorded import of_recording
+from armident.identify.effects.parameter_change import ParameterChange
+from armident.identify.effects.recording_corrections import of_recording
 from armident.identify.effects.terms import Term, effect_terms
 from armident.identify.robot.arm import ArmModel
 from armident.identify.robot.chain import Floats

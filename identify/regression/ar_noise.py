@@ -16,7 +16,7 @@ PIECE = 4096
 """Numbers multiplied at a time: they stay in the cache."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ArModel:
     """Noise model ``C(z^-1) xi = e`` with ``C = 1 + c_1 z^-1 + ...`` (6.19), ``e`` white.
 

@@ -15,7 +15,7 @@ from armident.identify.robot.arm import ArmModel
 from armident.identify.robot.kernels import fill_regressor
 from armident.identify.signals.decimate import Decimation
 from armident.identify.signals.differentiate import Derivatives
-from armident.identify.streamed import mapped
+from armident.identify.signals.streamed import mapped
 
 COVARIANCE_PASSES = 3
 """Noise model and covariance need each other; the third pass changes standard deviations by less than 1 %."""

@@ -12,7 +12,7 @@ import matplotlib
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 from markupsafe import Markup, escape
 
-from armident.identify.report.glossary import in_words
+from armident.identify.report.glossary import CONVENTIONS, in_words, mentioned
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -49,6 +49,8 @@ _TEMPLATES = Environment(
 )
 _TEMPLATES.filters["code"] = lambda text: Markup(re.sub("`([^`]+)`", r"<code>\1</code>", str(escape(text))))
 _TEMPLATES.filters["words"] = in_words
+_TEMPLATES.filters["mentioned"] = mentioned
+_TEMPLATES.globals["conventions"] = CONVENTIONS
 _TEMPLATES.globals["plot_hint"] = Markup(
     '<p class="hint">Drag over a plot to zoom all of them, double-click to see all again. '
     "The line below a plot reads the values under the pointer; a click on a name hides its curve.</p>"

@@ -40,6 +40,8 @@ class Motion:
         Arm model; effects use its geometry, transmission and smoothing of the sign.
     q, qd, qdd
         Positions, velocities, accelerations, (N, n) each; rad or m, s.
+    dt
+        Sampling period, s.
     start
         Time of the first sample since the beginning of the first recording, s.
     theta
@@ -127,7 +129,10 @@ class Motion:
     def torque(self) -> Array:
         """Joint torques that the model predicts, with friction, N m or N, (N, n).
 
-        Raises ValueError if ``theta`` is missing.
+        Raises
+        ------
+        ValueError
+            If ``theta`` is missing.
         """
         return self._predicted(self._theta)
 
@@ -139,8 +144,17 @@ class Motion:
     def handed_on(self, joint: int, rotor: float) -> Array:
         """Torque that the gear of a joint transmits if part of the link's inertia belongs to the motor.
 
-        ``joint``: index of the joint, from 0; ``rotor``: part of the link's inertia that belongs to the motor, kg m^2
-        or kg. Returns the torque, N m or N, shape (N,).
+        Parameters
+        ----------
+        joint
+            Index of the joint, from 0.
+        rotor
+            Part of the link's inertia that belongs to the motor, kg m^2 or kg.
+
+        Returns
+        -------
+        ndarray
+            Torque, N m or N, shape (N,).
         """
         load: Array = self.transmitted[:, joint] - rotor * self.qdd[:, joint]
         return load
@@ -166,8 +180,17 @@ class Motion:
     def of_motor(self, motor: int, torque: Array) -> Array:
         """Joint torques caused by a torque at the shaft of one motor.
 
-        ``motor``: index of the motor, from 0; ``torque``: torque at its shaft (N,), N m or N. Result: shape (N, n, 1),
-        N m or N.
+        Parameters
+        ----------
+        motor
+            Index of the motor, from 0.
+        torque
+            Torque at its shaft (N,), N m or N.
+
+        Returns
+        -------
+        ndarray
+            Shape (N, n, 1), N m or N.
         """
         joints: Array = (torque[:, None] * self.model.robot.transmission_matrix[motor])[:, :, None]
         return joints
@@ -177,9 +200,16 @@ class Motion:
     ) -> Array:
         """First-order change (N, n) of the predicted torques when the motion of one joint changes.
 
-        ``joint``: index of the joint, from 0. ``shift``, ``rate``, ``acceleration``: changes of the joint's position,
-        velocity and acceleration, (N,) each; rad or m, s. ``links``: torques of the links alone, without friction and
-        rotors. ``rotor``: part of the link's inertia that belongs to the motor, kg m^2 or kg.
+        Parameters
+        ----------
+        joint
+            Index of the joint, from 0.
+        shift, rate, acceleration
+            Changes of the joint's position, velocity and acceleration, (N,) each; rad or m, s.
+        links
+            Torques of the links alone, without friction and rotors.
+        rotor
+            Part of the link's inertia that belongs to the motor, kg m^2 or kg.
         """
         change: Array = _first_order(*self.slopes(joint, links=links), shift, rate, acceleration, joint, rotor)
         return change
@@ -187,8 +217,17 @@ class Motion:
     def slopes(self, joint: int, *, links: bool = False) -> tuple[Array, Array, Array]:
         """Derivatives of the predicted torques with respect to position, velocity and acceleration of one joint.
 
-        ``joint``: index of the joint, from 0; ``links``: torques of the links alone, without friction and rotors.
-        Returns three arrays (N, n), in N m or N per rad or m, s.
+        Parameters
+        ----------
+        joint
+            Index of the joint, from 0.
+        links
+            Torques of the links alone, without friction and rotors.
+
+        Returns
+        -------
+        tuple of ndarray
+            Three arrays (N, n), in N m or N per rad or m, s.
         """
         key = (joint, links)
         if key not in self._slopes:
@@ -219,7 +258,13 @@ class Motion:
         return self._still[links]
 
     def rate(self, values: Array) -> Array:
-        """Time derivative along the first axis by central differences, in units of ``values`` per s."""
+        """Return the time derivative along the first axis by central differences.
+
+        Parameters
+        ----------
+        values
+            Values (N, ...), in any unit; the derivative is in this unit per s.
+        """
         slope: Array = np.gradient(values, self.dt, axis=0)
         return slope
 

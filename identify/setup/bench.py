@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armident.configs import DataError, RobotConfig
-from armident.identify.experiment import Experiment
 from armident.identify.robot.arm import ArmModel
 from armident.identify.signals.bandwidth import motion_bandwidth
 from armident.identify.signals.decimate import Decimation, design
+from armident.identify.signals.experiments import Experiment
 
 Array = NDArray[np.float64]
 

@@ -138,14 +138,14 @@ class Search:
         """Return the corrected set-up. ``start``: the set-up as configured."""
         first = Step(start, rank=self.rank(start))
         best = self._greedy(first)
-        understood = self._understood(best.h)
+        explained = self._explained(best.h)
         starts: list[Step] = []
         if self.bench.moving.sum() > 2:
             # An exchange that needs a second mistake beside it may be a part of another order.
-            if not understood or (len(best.families) > 1 and {"exchange", "assignment"} & set(best.families)):
+            if not explained or (len(best.families) > 1 and {"exchange", "assignment"} & set(best.families)):
                 starts += self._orders(first)
             # Several mistakes may be one that a set of joints shares.
-            if not understood or len(best.families) > 1:
+            if not explained or len(best.families) > 1:
                 starts += self._sets(first)
         # An order or a set that explains no more than the configuration is no part of an explanation.
         starts = sorted((s for s in starts if s.rank < first.rank), key=lambda s: s.rank)
@@ -156,11 +156,11 @@ class Search:
             if better and self._material(first.h, other.h, LEAST_TOGETHER):
                 best = other
             clear = all(0.5 * RANKED_ROWS * (s.rank - step.rank) > LEAST_ODDS for s in starts[k + 1 : k + 2])
-            if clear and self._understood(best.h):
+            if clear and self._explained(best.h):
                 break
         return best
 
-    def _understood(self, h: Hypothesis) -> bool:
+    def _explained(self, h: Hypothesis) -> bool:
         """True if the model leaves little of every joint's torque, apart from noise."""
         # Torques of another order are wrong at rest, too.
         errors, memory = joint_errors(self.bench.everywhere, h, free=True)

@@ -7,9 +7,9 @@ from numpy.typing import NDArray
 from scipy import signal
 
 from armident.configs import RobotConfig
-from armident.identify.experiment import Experiment
 from armident.identify.setup.plausible import NO_LIMIT
 from armident.identify.setup.result import SetupFinding
+from armident.identify.signals.experiments import Experiment
 
 Array = NDArray[np.float64]
 

@@ -19,11 +19,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armident.configs import DataError
-from armident.identify.experiment import Experiment
 from armident.identify.regression.ar_noise import ArModel, fit_ar
 from armident.identify.setup.bench import Bench, make_bench
 from armident.identify.setup.fit import Hypothesis
 from armident.identify.setup.result import CONVENTIONS, TorqueShift
+from armident.identify.signals.experiments import Experiment
 
 Array = NDArray[np.float64]
 Motion = tuple[Array, Array, Array]

@@ -17,7 +17,7 @@ NVR_BY_HAND = 1e-5
 """Noise-variance ratio chosen manually in the thesis (section 5.3.1)."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Derivatives:
     """Positions and their derivatives at the sampling instants.
 

@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
-from armident.identify.print_table import print_table
+from armident.identify.cli.print_table import print_table
 from tests.evaluation.cases import Case
 from tests.evaluation.store import CaseResult
 from tests.evaluation.tables import AIM_COLUMNS, COLUMNS, HEALTHY_COLUMNS, OUTSIDE_COLUMNS, Tables

@@ -85,7 +85,7 @@ def diagnose_file(task: DiagnosisTask) -> TimedDiagnosis:
     diagnosis.
     """
     # Imported here: the process of the command line needs none of it.
-    from armident.identify.diagnosis.diagnose import diagnose
+    from armident.identify.diagnosis.diagnose import run_diagnosis
     from armident.identify.identification.from_recording import experiments_from_recording
 
     begin = time.perf_counter()
@@ -93,7 +93,7 @@ def diagnose_file(task: DiagnosisTask) -> TimedDiagnosis:
     recording = read_recording(task.recording)
     baseline = None if task.baseline is None else load_document(task.baseline, IdentificationDocument)
     experiments, notes = experiments_from_recording(recording, robot)
-    result = diagnose(experiments, [], robot, [reference(recording)], baseline, notes)
+    result = run_diagnosis(experiments, [], robot, [reference(recording)], baseline, notes)
     return TimedDiagnosis(result.document, time.perf_counter() - begin)
 
 

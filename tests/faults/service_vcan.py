@@ -24,7 +24,7 @@ import yaml
 from armident.configs import ArmidentError, load_session
 from armident.daq.recording import read_recording
 from armident.drivers.vcan import ensure_vcan, remove_vcan
-from armident.identify.monitoring.recorded import captured_in
+from armident.identify.monitoring.worker.recorded import captured_in
 from tests.faults.service import (
     Audience,
     options_of_rounds,

@@ -27,7 +27,10 @@ pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]  # the kernels are com
 REPOSITORY = Path(__file__).resolve().parents[2]
 FOLDERS = ("configs", "drivers", "daq", "identify", "virtual_robot", "tests")
 COMMAND = ["-m", "armident.daq.cli", "bus-load", "--config", "tx40_cell.yaml"]
-IMPORT = ["-c", "import armident.daq.capture.capture, armident.identify.monitoring.worker, armident.virtual_robot.run"]
+IMPORT = [
+    "-c",
+    "import armident.daq.capture.capture, armident.identify.monitoring.worker.worker, armident.virtual_robot.run",
+]
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ from armident.daq.streaming.codec import end_content, start_content
 from armident.identify.documents.files import from_json, load_document
 from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.identification.identify_recording import identify_recording
-from armident.identify.monitoring.worker import Worker
+from armident.identify.monitoring.worker.worker import Worker
 from tests.fixtures import arms
 
 pytestmark = pytest.mark.slow
@@ -148,7 +148,9 @@ def test_a_capture_too_long_for_the_memory_is_read_from_its_file(
     monkeypatch: pytest.MonkeyPatch,
     capfd: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.setattr("armident.identify.monitoring.stream_buffer.MOST_BYTES", 10 * next(blocks_of(captured)).nbytes)
+    monkeypatch.setattr(
+        "armident.identify.monitoring.worker.stream_buffer.MOST_BYTES", 10 * next(blocks_of(captured)).nbytes
+    )
     with Worker(session, captured.robot, tmp_path) as worker:
         publish(captured, session)
         assert worker.result(LONGEST_S) == 0
@@ -177,7 +179,7 @@ def test_invalid_messages_are_logged_once_and_then_at_powers_of_ten(
 def test_a_block_that_never_comes_is_fetched_from_the_file(
     captured: Recording, session: SessionConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("armident.identify.monitoring.stream_buffer.MAX_WAITING_S", 1.0)
+    monkeypatch.setattr("armident.identify.monitoring.worker.stream_buffer.MAX_WAITING_S", 1.0)
     with Worker(session, captured.robot, tmp_path) as worker:
         publish(captured, session, leave_out=3)
         assert worker.result(LONGEST_S) == 0
@@ -192,7 +194,7 @@ def test_missing_blocks_without_a_file_end_with_exit_code_3_and_say_how_many(
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    monkeypatch.setattr("armident.identify.monitoring.stream_buffer.MAX_WAITING_S", 1.0)
+    monkeypatch.setattr("armident.identify.monitoring.worker.stream_buffer.MAX_WAITING_S", 1.0)
     with Worker(session, captured.robot, tmp_path) as worker:
         publish(captured, session, leave_out=3, path=tmp_path / "gone.mcap")
         assert worker.result(LONGEST_S) == 3

@@ -18,9 +18,9 @@ from armident.configs import ArmidentError, ConfigError, DataError, RobotConfig,
 from armident.configs.yaml_loader import is_file
 from armident.daq.recording import read_recording
 from armident.identify.controller.nominal import saturation
-from armident.identify.experiment import Experiment
 from armident.identify.identification.from_recording import experiments_from_recording
 from armident.identify.robot.controller import DiscreteController
+from armident.identify.signals.experiments import Experiment
 
 SESSION = "tx40_cell.yaml"
 EMPS_SESSION = "emps_cell.yaml"

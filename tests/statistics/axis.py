@@ -11,7 +11,7 @@ from scipy import signal
 
 from armident.compiled import compiled
 from armident.configs import RobotConfig
-from armident.identify.experiment import Experiment
+from armident.identify.signals.experiments import Experiment
 
 Floats = NDArray[np.float64]
 

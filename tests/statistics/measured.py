@@ -24,9 +24,9 @@ from scipy.io import loadmat
 from armident.configs import RobotConfig, load_robot
 from armident.configs.loading import parse
 from armident.daq.interchange.importing import import_recording
-from armident.identify.diagnosis.diagnose import Diagnosis, diagnose
-from armident.identify.experiment import Experiment
+from armident.identify.diagnosis.diagnose import DiagnosisResult, run_diagnosis
 from armident.identify.identification.from_recording import experiments_from_recording
+from armident.identify.signals.experiments import Experiment
 from tests.conftest import REPOSITORY
 
 FORCE_PER_VOLT = 35.15065
@@ -65,9 +65,9 @@ class Measured:
     training: tuple[Experiment, ...]
     validation: tuple[Experiment, ...] = ()
 
-    def diagnosed(self) -> Diagnosis:
+    def diagnosed(self) -> DiagnosisResult:
         """With the defaults."""
-        return diagnose(self.training, self.validation, self.robot)
+        return run_diagnosis(self.training, self.validation, self.robot)
 
 
 def emps(data: Path, name: str) -> Experiment:
@@ -153,7 +153,7 @@ MACHINES: dict[str, tuple[str, Callable[[Path], Measured]]] = {
 """Title, and how it is loaded."""
 
 
-def said(found: Diagnosis) -> list[str]:
+def said(found: DiagnosisResult) -> list[str]:
     """Lines that tell a diagnosis."""
     document = found.document
     gap = document.gap.validation
@@ -169,8 +169,6 @@ def said(found: Diagnosis) -> list[str]:
         )
         gap_of_joint = f"{f.gap_before:.2f} -> {f.gap_after:.2f} %"
         lines.append(f"  {f.effect} of {where}, confidence {f.confidence:.2f}, {gap_of_joint}: {values}")
-    if document.considered:
-        lines.append("  considered: " + ", ".join(f"{f.effect} of {f.joint}" for f in document.considered))
     for u in document.unexplained:
         lines.append(f"  unexplained: {u.joint}, {100 * u.share_of_residual:.0f} % varies with {u.varies_with}")
     return lines
@@ -199,7 +197,7 @@ class Row:
     lines: tuple[str, ...]
 
 
-def flags_of(found: Diagnosis, cpu_s: float, memory_gb: float) -> tuple[str, ...]:
+def flags_of(found: DiagnosisResult, cpu_s: float, memory_gb: float) -> tuple[str, ...]:
     """Limits that a diagnosis exceeds. ``cpu_s``: its CPU time, s; ``memory_gb``: its largest memory, GB."""
     flags = []
     if cpu_s > MOST_CPU_S:

@@ -15,10 +15,10 @@ from scipy import signal
 
 from armident.configs import RobotConfig
 from armident.identify.estimators.methods import Method
-from armident.identify.experiment import Experiment
 from armident.identify.identification.from_recording import experiments_from_recording
 from armident.identify.identification.options import Options
 from armident.identify.identification.pipeline import identify_experiment
+from armident.identify.signals.experiments import Experiment
 from armident.virtual_robot.offline import simulate_recording, with_encoder_counts
 from tests.statistics import axis
 from tests.statistics.coverage import ESSENTIAL, SIGMAS, trajectory, truth

@@ -46,8 +46,11 @@ VALUES = {
 }
 """Renamed words in the values of documents, old to new, also inside a longer text."""
 
-ADDED = {"further_recordings"}
-"""New keys, which older documents lack; null counts as absent."""
+OPTIONAL = {"further_recordings", "considered"}
+"""Keys that older or newer documents lack; null and an empty list count as absent."""
+
+EXTENDED = {"criteria"}
+"""Mappings to which newer documents add keys."""
 
 SKIPPED = {"timing_s", "versions", "path", "sha256"}
 """Keys whose values may differ wherever they stand: they tell of a run and its machine."""
@@ -317,7 +320,9 @@ class Comparison:
         """Compare two objects, key by key."""
         for key in [*before, *(key for key in after if key not in before)]:
             place = f"{where}.{key}" if where else key
-            if key in SKIPPED or (key in ADDED and before.get(key) is None and after.get(key) is None):
+            if key in SKIPPED or (key in OPTIONAL and not before.get(key) and not after.get(key)):
+                continue
+            if key not in before and where.rpartition(".")[2] in EXTENDED:
                 continue
             if key not in before or key not in after:
                 self.differences.append(f"{place}: only {'before' if key in before else 'after'}")

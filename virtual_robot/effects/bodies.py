@@ -9,9 +9,61 @@ import pinocchio
 from numpy.typing import NDArray
 
 from armident.configs import ConfigError
-from armident.virtual_robot.effects.hidden import Hidden
+from armident.virtual_robot.effects.spec import EffectSpec, Hidden, ParameterSpec, positive
 
 pin: Any = pinocchio
+
+EFFECTS: dict[str, EffectSpec] = {
+    "payload": EffectSpec(
+        "body",
+        "mass fixed to the joint's link, in that link's frame",
+        {
+            "mass": positive("kg", "mass"),
+            "x": ParameterSpec("m", "centre of mass", 0.0),
+            "y": ParameterSpec("m", "centre of mass", 0.0),
+            "z": ParameterSpec("m", "centre of mass", 0.1),
+            "radius": positive("m", "radius of gyration about every axis through the centre of mass", 0.05),
+        },
+    ),
+    "rotor_inertia": EffectSpec(
+        "body",
+        "additional rotor inertia; between two joints with ``other``",
+        {"inertia": ParameterSpec("kg m^2", "joint side")},
+        other="optional",
+    ),
+    "gravity_direction": EffectSpec(
+        "body",
+        "base mounted out of level",
+        {
+            "tilt": ParameterSpec("rad", "angle", None, -math.pi, math.pi),
+            "azimuth": ParameterSpec("rad", "horizontal axis of the tilt, from the base's x axis", 0.0),
+        },
+        first_joint=True,
+    ),
+    "slosh_payload": EffectSpec(
+        "body",
+        "liquid in a vessel on the joint's link, as a pendulum about the link's x axis",
+        {
+            "mass": positive("kg", "mass that swings"),
+            "length": positive("m", "length of the pendulum", 0.1),
+            "z": ParameterSpec("m", "position of its hinge in the link's frame", 0.05),
+            "damping": positive("-", "damping of the pendulum, of critical", 0.05, 2.0),
+        },
+        group="outside",
+    ),
+    "base_vibration": EffectSpec(
+        "body",
+        "horizontal vibration of the base",
+        {
+            "amplitude": ParameterSpec("m/s^2", "acceleration"),
+            "frequency": positive("Hz", "frequency", 4.0),
+            "azimuth": ParameterSpec("rad", "direction, from the base's y axis", 0.0),
+        },
+        first_joint=True,
+        group="outside",
+    ),
+}
+"""Effects of this module."""
 
 
 def change_bodies(model: Any, hidden: Sequence[Hidden]) -> None:

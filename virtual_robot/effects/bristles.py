@@ -8,10 +8,35 @@ from numpy.typing import NDArray
 
 from armident.compiled import PLAIN, compiled
 from armident.configs import ConfigError, RobotConfig
-from armident.virtual_robot.effects.hidden import Hidden
+from armident.virtual_robot.effects.spec import AUTO, EffectSpec, Hidden, ParameterSpec, positive
 
 COLUMNS = 7
 """Columns of a bristle: joint, Coulomb friction, extra at rest, Stribeck velocity, exponent, stiffness, damping."""
+
+EFFECTS: dict[str, EffectSpec] = {
+    "stribeck_friction": EffectSpec(
+        "bristle",
+        "LuGre bristle in place of Coulomb friction, with more friction at low speed",
+        {
+            "extra": positive("N m", "break-away friction above Coulomb friction"),
+            "velocity": positive("rad/s", "Stribeck velocity; 2 % of the joint's limit unless given", AUTO),
+            "exponent": positive("-", "exponent of the decrease", 2.0, 4.0),
+            "deflection": positive(
+                "rad", "bristle deflection when sliding; 4 us times the velocity limit unless given", AUTO
+            ),
+            "damping": ParameterSpec("-", "damping of the stuck joint, of critical", 0.02, 0.0, 1.0),
+        },
+    ),
+    "presliding_friction": EffectSpec(
+        "bristle",
+        "Dahl bristle in place of Coulomb friction: elastic before it slides",
+        {
+            "deflection": positive("rad", "bristle deflection when sliding"),
+            "damping": ParameterSpec("-", "damping of the stuck joint, of critical", 0.0, 0.0, 1.0),
+        },
+    ),
+}
+"""Effects of this module."""
 
 
 @compiled("f8[::1], f8", **PLAIN)

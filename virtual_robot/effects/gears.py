@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from armident.compiled import PLAIN, compiled
 from armident.configs import ConfigError, RobotConfig
-from armident.virtual_robot.effects.hidden import Hidden
+from armident.virtual_robot.effects.spec import AUTO, EffectSpec, Hidden, ParameterSpec, positive
 
 COLUMNS = 6
 """Columns of a gear: coordinates of motor and link (-1: the base), stiffness, damping, gap, rounding of the gap."""
@@ -18,6 +18,33 @@ MOTOR_SHARE = 0.3
 """Motor's fraction of the inertia that moves with a joint, if the robot has no separate rotor inertia."""
 ROUNDING = 0.004
 """Distance over which a contact closes on either side of its edge, relative to the gap."""
+
+EFFECTS: dict[str, EffectSpec] = {
+    "joint_elasticity": EffectSpec(
+        "gear",
+        "two masses: the motor, with encoder and friction, drives the link through a spring",
+        {
+            "stiffness": positive("N m/rad", "stiffness between motor and link"),
+            "damping": ParameterSpec("-", "damping of motor against link, of critical", 0.05, 0.0, 2.0),
+            "motor_inertia": positive(
+                "kg m^2", "inertia of the motor, joint side; the robot's own, or 0.3 of the total if it has none", AUTO
+            ),
+        },
+    ),
+    "backlash": EffectSpec(
+        "gear",
+        "two masses: the motor drives the link through a gap",
+        {
+            "gap": positive("rad", "total play"),
+            "stiffness": positive(
+                "N m/rad", "stiffness of the contact; motor against link at 100 Hz unless given", AUTO
+            ),
+            "damping": ParameterSpec("-", "damping in contact, of critical", 0.1, 0.0, 2.0),
+            "motor_inertia": positive("kg m^2", "as for joint_elasticity", AUTO),
+        },
+    ),
+}
+"""Effects of this module."""
 
 
 @compiled(**PLAIN)

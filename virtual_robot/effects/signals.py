@@ -9,9 +9,87 @@ from numpy.typing import NDArray
 from armident.compiled import PLAIN, compiled
 from armident.configs import RobotConfig
 from armident.virtual_robot.effects.forces import waves
-from armident.virtual_robot.effects.hidden import Hidden
+from armident.virtual_robot.effects.spec import (
+    AUTO,
+    PER_TURN,
+    PHASE,
+    PITCH,
+    EffectSpec,
+    Hidden,
+    ParameterSpec,
+    flag,
+    positive,
+)
 
 Vector = NDArray[np.float64]
+
+EFFECTS: dict[str, EffectSpec] = {
+    "drive_gain_error": EffectSpec(
+        "drive",
+        "true torque per unit of the drive's signal differs from the configured one",
+        {"error": ParameterSpec("-", "true gain over configured gain, minus 1", None, -0.9, 5.0)},
+    ),
+    "drive_gain_saturation": EffectSpec(
+        "drive",
+        "torque less than proportional to the signal by magnetic saturation: i / sqrt(1 + (i / i_s)^2)",
+        {
+            "drop": positive("-", "share of the torque lost at ``torque``", None, 0.9),
+            "torque": positive("N m", "torque of that loss; half of the joint's limit unless given", AUTO),
+        },
+    ),
+    "sign_error": EffectSpec(
+        "report",
+        "a signal of the drive is recorded with the wrong sign",
+        {"torque": flag("1: the torque signal", 1.0), "position": flag("1: the position and the demand", 0.0)},
+    ),
+    "joint_order": EffectSpec(
+        "report",
+        "signals of two drives are exchanged in the recording",
+        {"torque": flag("1: the torque signals", 1.0), "position": flag("1: the positions and the demands", 1.0)},
+        other="required",
+    ),
+    "time_delay": EffectSpec(
+        "report",
+        "the torque signal is reported late",
+        {"delay": ParameterSpec("s", "delay, whole samples or not", None, 0.0, 1.0)},
+    ),
+    "encoder_eccentricity": EffectSpec(
+        "report",
+        "periodic error of the measured position, which the drive follows",
+        {
+            "amplitude": ParameterSpec("rad", "amplitude, joint side"),
+            "per_turn": PER_TURN,
+            "phase": PHASE,
+            "motor": flag("1: turns of the motor; 0: of the joint, metres of a prismatic one", 0.0),
+            "pitch": PITCH,
+        },
+        repeatable=True,
+    ),
+    "actuator_bandwidth": EffectSpec(
+        "drive",
+        "first-order lag between the torque reported and the torque applied",
+        {"time_constant": positive("s", "time constant", None, 1.0)},
+    ),
+    "mains_ripple": EffectSpec(
+        "report",
+        "interference of the mains frequency in the torque signal",
+        {
+            "amplitude": ParameterSpec("N m", "amplitude, joint side"),
+            "frequency": positive("Hz", "frequency", 50.0),
+            "phase": PHASE,
+        },
+        group="outside",
+        repeatable=True,
+    ),
+    "current_crosstalk": EffectSpec(
+        "report",
+        "the torque signal contains a share of another drive's",
+        {"share": ParameterSpec("-", "joint torque read per joint torque of the other", None, -1.0, 1.0)},
+        other="required",
+        group="outside",
+    ),
+}
+"""Effects of this module."""
 
 
 @compiled("f8[::1], f8[:, ::1], f8[:, ::1]", **PLAIN)

@@ -7,12 +7,12 @@ from numpy.typing import NDArray
 
 from armident.configs import RobotConfig
 from armident.identify.estimators.reason import Level, Reason
-from armident.identify.experiment import Experiment
 from armident.identify.identification.checks.judged import Judged
 from armident.identify.identification.identification_criteria import IdentificationCriteria
 from armident.identify.identification.moving_joints import FARTHEST, MOVE
 from armident.identify.identification.verdict import listed
 from armident.identify.robot.arm import ArmModel
+from armident.identify.signals.experiments import Experiment
 
 EXAMINED_POSTURES = 100
 """Postures of the motion, and of the workspace, at which inertia and gravity are examined: the standard error of a mean

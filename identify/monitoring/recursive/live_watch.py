@@ -20,7 +20,7 @@ from armident.identify.monitoring.recursive.block_order import BlockOrder
 from armident.identify.monitoring.recursive.estimator import RecursiveEstimator, RecursiveResult
 from armident.identify.monitoring.recursive.report import document
 from armident.identify.monitoring.recursive.rows import SampleBlock
-from armident.identify.monitoring.stream_buffer import LARGEST_BLOCK
+from armident.identify.monitoring.worker.stream_buffer import LARGEST_BLOCK
 
 log = logging.getLogger(__name__)
 

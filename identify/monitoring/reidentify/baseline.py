@@ -6,7 +6,7 @@ from pathlib import Path
 from armident.configs import ConfigError, DataError
 from armident.identify.documents.files import load_document, to_json, write_atomically
 from armident.identify.documents.identification import IdentificationDocument
-from armident.identify.monitoring.history import History
+from armident.identify.monitoring.change.history import History
 
 
 @dataclass(frozen=True)

@@ -14,11 +14,11 @@ from armident.identify.documents.files import load_document, to_json
 from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.identification.identify_recording import identify_recording
 from armident.identify.identification.options import Options
-from armident.identify.monitoring.ledger import FILE, Ledger, LedgerError, LedgerUnusable, unique_owner
-from armident.identify.monitoring.recorded import captured_in, result_of
 from armident.identify.monitoring.reidentify.publish import StatusPublisher
 from armident.identify.monitoring.reidentify.record_run import Say
-from armident.identify.report.files import write_identification
+from armident.identify.monitoring.worker.ledger import FILE, Ledger, LedgerError, LedgerUnusable, unique_owner
+from armident.identify.monitoring.worker.recorded import captured_in, result_of
+from armident.identify.report.robot_file import write_identification
 
 RENEW_S = 1.0
 """Interval at which the lease is renewed, s."""

@@ -11,7 +11,7 @@ from armident.configs import ConfigError, RobotConfig, SessionConfig
 from armident.daq.streaming import Announcer, Keys, open_session
 from armident.daq.streaming.announcer import longest_retry_s
 from armident.daq.streaming.zenoh_session import configuration
-from armident.identify.monitoring.status_messages import failure_status, status
+from armident.identify.monitoring.worker.status_messages import failure_status, status
 
 log = logging.getLogger(__name__)
 

@@ -27,7 +27,7 @@ from armident.identify.effects.terms import arm_model
 from armident.identify.excitation.point_to_point import sample_trajectory
 from armident.identify.excitation.previous_estimate import previous_estimate
 from armident.identify.identification.options import Options
-from armident.identify.monitoring.change_test import Inconclusive, ParameterChangeTest, compare
+from armident.identify.monitoring.change.change_test import Inconclusive, ParameterChangeTest, compare
 from armident.identify.monitoring.reidentify.baseline import Baseline, baseline_of
 from armident.identify.monitoring.reidentify.identify_once import identify_once
 from armident.identify.monitoring.reidentify.keep import HistoryEntry, history_or_reason, kept

@@ -25,7 +25,7 @@ def test_help_messages_docs_and_fuzz_targets_name_every_format(tmp_path: Path, m
     with pytest.raises(ConfigError, match=r"cannot read \.xyz; readable: ") as refused:
         reader_of(tmp_path / "a.xyz")
     monkeypatch.syspath_prepend(str(ROOT / "docs" / "extensions"))
-    import generated_reference
+    import generated_reference  # type: ignore[import-not-found]
 
     shown = [CliRunner().invoke(application([name]), [name, "--help"]).output for name in ("import", "init")]
     texts = [str(refused.value), generated_reference.formats_page(), *(" ".join(text.split()) for text in shown)]

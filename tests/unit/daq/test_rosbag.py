@@ -291,6 +291,7 @@ def test_an_invalid_bag_is_reported_in_one_line(tmp_path: Path) -> None:
         read_joint_states(mcap_bag(tmp_path / "e.mcap", states(), message_type="sensor_msgs/msg/Imu"), TX40)
     with pytest.raises(DataError, match=r"found /a b \(a b\); record a topic of this type"):
         read_joint_states(mcap_bag(tmp_path / "g.mcap", states(topic="/a\x00\nb"), message_type="a\x07b"), TX40)
+    (tmp_path / "a.csv").touch()
     with pytest.raises(ConfigError, match=r"--topic is an option of ROS 2 bag; not of a CSV"):
         import_recording(tmp_path / "a.csv", TX40, topic="/a")
 

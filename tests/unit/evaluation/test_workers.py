@@ -232,25 +232,9 @@ def test_results_are_used_with_the_code_that_produced_them_only(tmp_path: Path) 
     assert Store(path, "two", any_version=True).get("a") is not None
     line = json.loads(path.read_text(encoding="utf-8").splitlines()[0])
     assert line["document"] == document() | {
-        "not_visible": [], "detection_limits": [], "simulated": None, "considered": [],
+        "not_visible": [], "detection_limits": [], "simulated": None,
         "sign_smoothing": None, "transitions": None, "alpha": None, "criteria": None, "negligible": [],
     }  # fmt: skip
-
-
-def test_a_result_of_an_earlier_version_is_read_with_the_names_of_today(tmp_path: Path) -> None:
-    old = document(
-        "armident/diagnosis/1",
-        could_hide=[{"effect": "joint_spring", "joint": "joint_1", "other": None, "below": {"ks": 2.0}, "units": {}}],
-        simulated={"torque_foretold": {"joint_1": 3.0}},
-    )
-    seconds = {"simulate": 1.0, "diagnose": 2.0}
-    record = {"key": "a", "case": "A", "effects": [], "truth": [], "document": old, "seconds": seconds, "code": "old"}
-    path = tmp_path / "results.jsonl"
-    path.write_text(json.dumps(record) + "\n", encoding="utf-8")
-    result = Store(path, "new", any_version=True).get("a")
-    assert result is not None
-    assert result.diagnosis.detection_limits[0].limits == {"ks": 2.0}
-    assert result.diagnosis.simulated == {"torque_without_derivative_noise": {"joint_1": 3.0}}
 
 
 def test_a_line_that_is_no_result_is_named(tmp_path: Path) -> None:

@@ -112,8 +112,6 @@ def test_a_coupling_has_to_account_for_both_of_its_joints(strength: str, tmp_pat
     assert all(found["confidence"] < 0.5 for found in told["findings"])
     assert "joint_4" in {rest["joint"] for rest in told["unexplained"]}
     assert told["verdict"] == "unexplained"
-    (other,) = (found for found in told["considered"] if found["effect"] == "coupling_friction")
-    assert "torque of joint_3 at joint_4" in other["evidence"]["better_unnamed_dependences"]
 
 
 @pytest.mark.parametrize(
@@ -130,7 +128,6 @@ def test_friction_for_moments_at_random_times_is_no_noise(case: str, tmp_path: P
     assert hidden == {}
     assert told["verdict"] == "unexplained"
     (rest,) = told["unexplained"]
-    assert rest["varies_with"] == "transients"
     assert rest["joint"] == case.split()[2]
 
 

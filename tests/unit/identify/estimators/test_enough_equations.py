@@ -11,7 +11,6 @@ from armident.configs import load_robot
 from armident.identify.effects.terms import arm_model
 from armident.identify.estimators.methods import Method
 from armident.identify.estimators.reason import Reason
-from armident.identify.experiment import Experiment
 from armident.identify.identification.equations import (
     EQUATIONS_PER_PARAMETER,
     LS_CUTOFF,
@@ -24,6 +23,7 @@ from armident.identify.identification.equations import (
 from armident.identify.identification.solvers import decimation_of
 from armident.identify.signals.decimate import design
 from armident.identify.signals.differentiate import differentiate
+from armident.identify.signals.experiments import Experiment
 
 DT = 5e-3
 SAMPLES = (5000, 5000)

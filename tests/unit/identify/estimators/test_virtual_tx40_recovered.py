@@ -11,11 +11,11 @@ from scipy import stats
 from armident.configs import RobotConfig, load_robot
 from armident.identify.effects.terms import arm_model
 from armident.identify.estimators.methods import Method
-from armident.identify.experiment import Experiment
 from armident.identify.identification.from_recording import experiments_from_recording
 from armident.identify.identification.identification_result import IdentificationResult
 from armident.identify.identification.options import Options
 from armident.identify.identification.pipeline import identify_experiment
+from armident.identify.signals.experiments import Experiment
 from armident.virtual_robot.inertias import plant_parameters
 from tests.fixtures import arms
 

@@ -8,11 +8,11 @@ from scipy.io import loadmat
 
 from armident.configs import load_robot
 from armident.identify.effects.terms import arm_model
-from armident.identify.experiment import Experiment
 from armident.identify.identification.equations import published_equations
 from armident.identify.identification.identification_result import IdentificationResult
 from armident.identify.identification.options import ControllerName, Options
 from armident.identify.identification.pipeline import identify_experiment
+from armident.identify.signals.experiments import Experiment
 
 FORCE_PER_VOLT = 35.15065
 NAMES = ("m1", "fv1", "fc1", "off1")

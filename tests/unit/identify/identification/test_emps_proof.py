@@ -23,7 +23,6 @@ from armident.identify.effects.terms import arm_model
 from armident.identify.estimators.auxiliary_model import AuxiliaryModel
 from armident.identify.estimators.didim import didim
 from armident.identify.estimators.idim_iv import idim_iv
-from armident.identify.experiment import Experiment
 from armident.identify.identification.equations import equations, published_equations
 from armident.identify.identification.identification_result import relative_torque_errors
 from armident.identify.identification.options import Options
@@ -33,6 +32,7 @@ from armident.identify.robot.simulation import Simulation, simulate
 from armident.identify.signals.bandpass import butterworth, central_difference
 from armident.identify.signals.decimate import design
 from armident.identify.signals.differentiate import differentiate
+from armident.identify.signals.experiments import Experiment
 
 pytestmark = pytest.mark.slow
 

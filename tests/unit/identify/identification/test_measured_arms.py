@@ -27,7 +27,6 @@ from armident.identify.effects.terms import arm_model
 from armident.identify.estimators.idim_iv import idim_iv
 from armident.identify.estimators.idim_ls import idim_ls
 from armident.identify.estimators.measured_instruments import MotionInstruments
-from armident.identify.experiment import Experiment
 from armident.identify.identification.equations import LS_CUTOFF, PIV_CUTOFF, decimated_rows, equations, least_rows
 from armident.identify.identification.from_recording import experiments_from_recording
 from armident.identify.identification.identification_result import IdentificationResult, relative_torque_errors
@@ -38,6 +37,7 @@ from armident.identify.regression.equations import ExperimentEquations
 from armident.identify.signals.bandpass import butterworth
 from armident.identify.signals.decimate import Decimation, design
 from armident.identify.signals.differentiate import Derivatives, differentiate
+from armident.identify.signals.experiments import Experiment
 
 pytestmark = pytest.mark.slow
 

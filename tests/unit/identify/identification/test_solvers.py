@@ -13,7 +13,7 @@ from armident.identify.effects.terms import arm_model
 from armident.identify.estimators.methods import METHODS, Method, estimator
 from armident.identify.identification.identify_recording import IdentificationOutcome, identify_recording
 from armident.identify.identification.options import Options, parse_decimation, parse_nvr
-from armident.identify.report.identification import identification_report
+from armident.identify.report.identification_report import identification_report
 from armident.virtual_robot.inertias import plant_parameters
 from tests.fixtures.arms import recording
 

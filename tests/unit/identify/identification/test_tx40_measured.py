@@ -7,10 +7,10 @@ import pytest
 
 from armident.configs import load_robot
 from armident.identify.estimators.methods import Method
-from armident.identify.experiment import Experiment
 from armident.identify.identification.identification_result import IdentificationResult
 from armident.identify.identification.options import Options
 from armident.identify.identification.pipeline import identify_experiment
+from armident.identify.signals.experiments import Experiment
 from tests.tx40_reference import TABLE_B4, published_estimate
 
 pytestmark = pytest.mark.slow

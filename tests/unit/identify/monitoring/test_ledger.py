@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from armident.configs import ArmidentError
-from armident.identify.monitoring import ledger as module
-from armident.identify.monitoring.ledger import FILE, LEASE_S, Ledger, LedgerError
+from armident.identify.monitoring.worker.ledger import FILE, LEASE_S, Ledger, LedgerError
+from armident.identify.monitoring.worker.worker import ledger as module
 
 A, B = "a" * 64, "b" * 64
 

@@ -10,14 +10,14 @@ import pytest
 from armident.configs import ArmidentError, DataError, config_path, load_session
 from armident.daq.recording import Recording, read_recording, write_recording
 from armident.identify.identification.identify_recording import identify_recording
-from armident.identify.monitoring import history_schema
-from armident.identify.monitoring import ledger as ledger_module
-from armident.identify.monitoring.history import History
-from armident.identify.monitoring.ledger import FILE, Ledger
+from armident.identify.monitoring.change import history_schema
+from armident.identify.monitoring.change.history import History
 from armident.identify.monitoring.reidentify import identify_once, keep, run
 from armident.identify.monitoring.reidentify.baseline import Baseline
 from armident.identify.monitoring.reidentify.publish import StatusPublisher
 from armident.identify.monitoring.reidentify.run import Job, carry_out
+from armident.identify.monitoring.worker.ledger import FILE, Ledger
+from armident.identify.monitoring.worker.worker import ledger as ledger_module
 from tests.fixtures import arms
 
 pytestmark = pytest.mark.slow
