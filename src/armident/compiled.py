@@ -176,7 +176,7 @@ def _meaning(value: Any, seen: set[int]) -> Iterator[bytes]:
     if isinstance(value, Dispatcher):
         if id(value) not in seen:
             seen.add(id(value))
-            yield repr(sorted((name, str(option)) for name, option in value.targetoptions.items())).encode()
+            yield from _meaning(tuple(sorted(value.targetoptions.items())), seen)
             yield from _meaning(value.py_func, seen)
     elif isinstance(value, FunctionType) and not _is_foreign(value.__module__):
         code = value.__code__
@@ -198,6 +198,8 @@ def _meaning(value: Any, seen: set[int]) -> Iterator[bytes]:
     elif isinstance(value, tuple):
         for part in value:
             yield from _meaning(part, seen)
+    elif isinstance(value, set | frozenset):
+        yield repr(sorted(map(repr, value))).encode()
     elif isinstance(value, np.ndarray):
         yield repr((value.dtype.str, value.shape)).encode() + value.tobytes()
     elif isinstance(value, numba.types.ExternalFunction):

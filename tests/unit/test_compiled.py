@@ -150,6 +150,27 @@ def test_without_a_folder_that_can_be_written_a_kernel_runs(package: Package) ->
     assert package.run() == (7.0, False)
 
 
+def test_every_process_gives_machine_code_the_same_name() -> None:
+    program = (
+        "import armident.compiled as c\n"
+        "from armident.identify.robot import kernels, simulation\n"
+        "from armident.daq.matching import pdo_matching\n"
+        "for kernel, _ in c._KERNELS: kernel._cache.names((), c.cpu_target.target_context); print(kernel._cache.meaning)\n"
+    )
+    found = {
+        subprocess.run(
+            [sys.executable, "-c", program],
+            env={**os.environ, "PYTHONHASHSEED": str(seed)},
+            capture_output=True,
+            check=True,
+            timeout=120,
+        ).stdout
+        for seed in (1, 2)
+    }
+    assert len(found) == 1
+    assert b" at 0x" not in found.pop()
+
+
 def run(program: str, *words: object, cwd: Path) -> "subprocess.CompletedProcess[str]":
     command = [sys.executable, "-c", WATCH + program, *map(str, words)]
     return subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=280, check=False)
