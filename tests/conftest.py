@@ -1,8 +1,9 @@
 """Fixtures of all tests: the measured data, a bus of its own, and the folder of results shared between processes."""
 
+import gc
 import itertools
 import os
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from pathlib import Path
 
 import can
@@ -27,6 +28,17 @@ hypothesis.settings.register_profile("nightly", deadline=None, print_blob=True, 
 hypothesis.settings.load_profile(os.environ.get("ARMIDENT_HYPOTHESIS_PROFILE", "armident"))
 
 _bus_numbers = itertools.count()
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Generator[None, object, object]:
+    """Collect without the garbage collector: it takes a fifth of the time, and what is collected stays."""
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.enable()
+        gc.freeze()
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:

@@ -49,7 +49,7 @@ _UNCOUNTED: dict[str, Any] = {"_nrt": False, "forceinline": True}
 SHIPPED = Path(__file__).with_name("kernels")
 """Folder of the machine code in this installation; part of a wheel."""
 
-_KERNELS: list[tuple[Dispatcher, tuple[str, ...]]] = []
+_KERNELS: list[tuple[Any, tuple[str, ...]]] = []
 _TYPES: dict[str, Any] = dict(vars(numba.types))
 
 
@@ -102,12 +102,12 @@ class _MachineCode:
         self._kernel, self.meaning = kernel, b""
         self.cache_path = str(SHIPPED)
 
-    def load_overload(self, signature: Any, target: Any) -> CompileResult | None:
+    def load_overload(self, signature: Any, target: Any) -> Any:
         target.refresh()
         path = self.path(signature, target)
         return CompileResult._rebuild(target, *pickle.loads(path.read_bytes())) if path else None
 
-    def save_overload(self, signature: Any, result: CompileResult) -> None:
+    def save_overload(self, signature: Any, result: Any) -> None:
         if result.library.has_dynamic_globals:
             raise ValueError(f"{self._kernel}: its machine code holds addresses of this process")
         data = dumps(result._reduce())
@@ -214,7 +214,8 @@ def main() -> None:
     """Compile what is declared and not yet there, on all processors; remove machine code that nothing declares."""
     begun = time.monotonic()
     if _has_baseline():
-        numba.config.CPU_NAME, numba.config.CPU_FEATURES = BASELINE, ""
+        options: Any = numba.config
+        options.CPU_NAME, options.CPU_FEATURES = BASELINE, ""
     for module in _modules():
         try:
             import_module(module)

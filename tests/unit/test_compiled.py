@@ -155,7 +155,9 @@ def test_every_process_gives_machine_code_the_same_name() -> None:
         "import armident.compiled as c\n"
         "from armident.identify.robot import kernels, simulation\n"
         "from armident.daq.matching import pdo_matching\n"
-        "for kernel, _ in c._KERNELS: kernel._cache.names((), c.cpu_target.target_context); print(kernel._cache.meaning)\n"
+        "for kernel, _ in c._KERNELS:\n"
+        "    kernel._cache.names((), c.cpu_target.target_context)\n"
+        "    print(kernel._cache.meaning)\n"
     )
     found = {
         subprocess.run(
