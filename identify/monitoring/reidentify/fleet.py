@@ -21,6 +21,7 @@ from armident.identify.monitoring.change.change_test import ParameterChangeTest,
 from armident.identify.monitoring.change.history import History
 from armident.identify.monitoring.reidentify.reidentify_options import ReidentifyOptions
 from armident.identify.monitoring.reidentify.summary import change_lines
+from armident.identify.monitoring.worker.worker import options_of
 from armident.identify.report.robot_file import write_identification
 
 if TYPE_CHECKING:
@@ -144,7 +145,7 @@ def identify_one(path: str, robot: RobotConfig | None, out: str) -> Identified:
 def _options(recording: Recording) -> Options:
     """Return the identification options of the recording's session."""
     session = recording.session
-    return Options() if session is None else Options(**session.identification.model_dump())
+    return Options() if session is None else options_of(session)
 
 
 def _judged(

@@ -26,7 +26,6 @@ from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.effects.terms import arm_model
 from armident.identify.excitation.point_to_point import sample_trajectory
 from armident.identify.excitation.previous_estimate import previous_estimate
-from armident.identify.identification.options import Options
 from armident.identify.monitoring.change.change_test import Inconclusive, ParameterChangeTest, compare
 from armident.identify.monitoring.reidentify.baseline import Baseline, baseline_of
 from armident.identify.monitoring.reidentify.identify_once import identify_once
@@ -35,6 +34,7 @@ from armident.identify.monitoring.reidentify.publish import StatusPublisher
 from armident.identify.monitoring.reidentify.record_run import Say, record_run, start_process
 from armident.identify.monitoring.reidentify.reidentify_options import ReidentifyOptions
 from armident.identify.monitoring.reidentify.summary import change_lines, finding_lines
+from armident.identify.monitoring.worker.worker import options_of
 from armident.processes import Start
 
 DRIFTED = 4
@@ -172,7 +172,7 @@ def carry_out(job: Job, announcer: StatusPublisher, say: Say, start: Start = sta
     recording = record_run(job.config, job.out, say, start)
     say(f"recorded {recording.path}")
     announcer.status("identifying", recording=str(recording.path))
-    options = Options(**job.session.identification.model_dump())
+    options = options_of(job.session)
     done = identify_once(recording, job.robot, options, job.out, announcer, say)
     document, path = done.document, done.path
     for reason in document.reasons:
