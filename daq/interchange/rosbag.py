@@ -300,4 +300,4 @@ def write_joint_states(
                 "effort": [] if tau is None else tau[k].tolist(),
             }
             writer.write_message(TOPIC, schema, message, at, at, k)
-        writer.finish()  # type: ignore[no-untyped-call]
+        writer.finish()

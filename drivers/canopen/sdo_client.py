@@ -28,7 +28,7 @@ class MatchingSdoClient(SdoClient):
     """
 
     def __init__(self, rx_cobid: int, tx_cobid: int, od: Any) -> None:
-        super().__init__(rx_cobid, tx_cobid, od)  # type: ignore[no-untyped-call]
+        super().__init__(rx_cobid, tx_cobid, od)
         self._object = bytes(3)
 
     def request_response(self, sdo_request: bytes) -> bytes:
@@ -40,7 +40,7 @@ class MatchingSdoClient(SdoClient):
         if sdo_request[0] >> 5 in (_DOWNLOAD, _UPLOAD):
             self._object = bytes(sdo_request[1:4])
         self.responses: queue.Queue[bytes] = queue.Queue()
-        self.send_request(sdo_request)  # type: ignore[no-untyped-call]
+        self.send_request(sdo_request)
         until, others = time.monotonic() + self.RESPONSE_TIMEOUT, 0
         while (left := until - time.monotonic()) > 0:
             try:
@@ -52,7 +52,7 @@ class MatchingSdoClient(SdoClient):
                     raise SdoAbortedError(int.from_bytes(answer[4:8], "little"))
                 return answer
             others += 1
-        self.abort(_TIMED_OUT)  # type: ignore[no-untyped-call]
+        self.abort(_TIMED_OUT)
         if others:
             raise OtherAnswersError(f"{others} answers to other requests")
         raise SdoCommunicationError("no answer")
