@@ -29,11 +29,10 @@ class NumbersFinding:
     """Change of the plant that explains why parameters differ from a baseline.
 
     ``effect``: ``changed_parameters`` if no entry of the catalogue explains it. ``parameters``, ``std``: changes
-    estimable one by one; the uncertainty of the baseline is included. ``p_value``: corrected for the number of
-    candidates. ``gap_before``, ``gap_after``: relative torque error on held-out data, percent, without and with this
-    finding: of the joint, or of all for the whole arm. ``confidence``: share of the posterior odds times the
-    probability of any change. ``ambiguous_with``: effects at odds below 20 to 1. ``alternatives``: effect, joint and
-    score (`RankedChange`).
+    estimable one by one; includes the uncertainty of the baseline. ``p_value``: corrected for the number of candidates.
+    ``gap_before``, ``gap_after``: relative torque error on held-out data, percent, without and with this finding: of
+    the joint, or of all for the whole arm. ``confidence``: share of the posterior odds times the probability of any
+    change. ``ambiguous_with``: effects at odds below 20 to 1.
     """
 
     effect: str

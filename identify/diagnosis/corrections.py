@@ -1,7 +1,4 @@
-"""Screening of effects on recorded torques, such as delays, over the values of their parameter.
-
-A first-order expansion holds only for delays shorter than the fastest change of the torque.
-"""
+"""Screening of effects on recorded torques, such as delays, over values too large for a first-order expansion."""
 
 from collections.abc import Callable, Sequence
 

@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 def detection_limits(state: ModelState, step: SelectionStep | None) -> list[DetectionLimit]:
     """Return the detection limits of single linear parameters of effects that the final model lacks.
 
-    There, `Criteria.detection_power` is the chance to reach the needed gain, and the joint's error falls by enough.
+    At the limit, the gain reaches its threshold with `Criteria.detection_power`, and the joint's error falls by enough.
     """
     column_cache = ColumnCache(state.study, state.fit.theta)
     shapes = {} if step is None else {a.candidate.key: a.shapes for a in reversed(step.ranked)}

@@ -133,10 +133,7 @@ def negligible(
     step: SelectionStep | None,
     immaterial: Sequence[Addition] = (),
 ) -> list[Negligible]:
-    """Return the significant effects that are no cause: too small, or within the sampling convention of drives.
-
-    ``conventional``: effects within that convention; ``immaterial``: effects that change too little of the report part.
-    """
+    """Return the significant effects that are no cause: too small, or within the sampling convention of drives."""
     found: dict[Key, Negligible] = {}
     small = [*(one.addition for one in conventional), *immaterial]
     if step is not None:

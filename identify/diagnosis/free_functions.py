@@ -33,7 +33,7 @@ POINTS = 121
 class FreeFunction:
     """Basis functions of one variable from ``low`` to ``high``, for a joint's residual (thesis 7.3.2).
 
-    ``other``: joint or motor of the variable, if another one. ``knots``: wave numbers of angles; time constant, s.
+    ``other``: joint or motor of the variable, if another. ``knots``: of hats; wave numbers of angles; time constant, s.
     """
 
     joint: int

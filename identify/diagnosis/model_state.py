@@ -190,10 +190,7 @@ def with_report_part(state: ModelState) -> ModelState:
 
 
 def viscous_friction_rises(state: ModelState, term: Term) -> bool:
-    """False if a term makes the viscous friction of its joint fall with the speed, beyond two standard deviations.
-
-    Friction that falls with the speed is Stribeck friction.
-    """
+    """False if the viscous friction of a term's joint falls with the speed (Stribeck) by two standard deviations."""
     slopes, names = term.effect.viscous_slope(term.shapes)[list(term.kept)], state.study.model.base.names
     viscous = f"fv{term.place.joint + 1}"
     if not slopes.any() or viscous not in names:

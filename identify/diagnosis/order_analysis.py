@@ -1,7 +1,4 @@
-"""Order analysis: torque ripple that is periodic in an angle, at any real order.
-
-Samples are summed in bins of the angle; a fast Fourier transform of the bins gives every order at once.
-"""
+"""Order analysis: torque ripple at any real order of an angle, by a fast Fourier transform of bins of the angle."""
 
 from collections.abc import Sequence
 
@@ -30,10 +27,7 @@ PEAKS = 3
 def strongest_orders(
     angle: Sequence[Array], residual: Sequence[Array], highest: float, lowest: float = 0.0
 ) -> list[tuple[float, float]]:
-    """Return the `PEAKS` strongest orders over an angle (rad, m), with their power over the neighbourhood's median.
-
-    Orders are cycles per 2 pi of the angle; angles and residual torques (N m, N) are (N,) of each stretch.
-    """
+    """Return the `PEAKS` strongest orders, cycles per 2 pi of the angle, with power over the neighbourhood's median."""
     low = min(float(a.min()) for a in angle)
     span = max(float(a.max()) for a in angle) - low
     if span <= 0.0 or highest <= lowest:

@@ -65,10 +65,7 @@ class PredictiveScore:
 
     @cached_property
     def _prior(self) -> Array:
-        """Inverse prior variances (b,) of free shapes, whose values are of the size of the joint's error; else zero.
-
-        A fold that does not visit a part of the range would leave these values undetermined.
-        """
+        """Inverse prior variances (b,) of free shapes, for folds that do not visit a part of their range; else zero."""
         study = self.fit.study
         inverse = np.zeros(self.fit.theta.size)
         errors = np.concatenate(self.fit.left)

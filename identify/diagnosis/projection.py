@@ -58,8 +58,8 @@ class JointResidual:
 
     ``rows``, ``held_rows``: of this joint among all. ``d`` (R_j, K): functions at the simulated motion; ``z`` (R, K),
     ``held`` (R', K): orthogonal to the model, training and held-out. ``e`` (R,), ``held_e`` (R',): residuals. ``band``
-    (M', K), ``errors`` (M',): held-out functions and errors before whitening. ``regressor`` (R', b), ``covariance`` (b,
-    b): of the model. ``least``: see `Criteria.beyond_model_function`.
+    (M', K), ``errors`` (M',): held-out functions and errors before whitening. ``regressor`` (R', b): held-out, of the
+    model, with its ``covariance``. ``least``: see `Criteria.beyond_model_function`.
     """
 
     joint: int
@@ -191,8 +191,7 @@ def smoothing(estimate: Array, through: Array, power: Array, function: FreeFunct
     """Factor of each coordinate (r,) at the smoothing strength of the largest likelihood, and the coordinates (r, r).
 
     A spline penalised on its second differences, as state-dependent parameters (thesis section 7.3.2; Young, McKenna,
-    Bruun 2001, Int. J. Control 74(18)); all functions together on their size. ``power`` (r,): beyond the model, over
-    the whole.
+    Bruun 2001, Int. J. Control 74(18)); all functions together on their size. ``power`` (r,): beyond the model.
     """
     if function is None:
         roughness, axes = 1.0 / power, np.eye(power.size)

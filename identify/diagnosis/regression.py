@@ -109,10 +109,7 @@ class IvFit:
 
 
 def fit_model(study: Study, theta0: Array | None = None, noise: Sequence[ArModel] | None = None) -> IvFit:
-    """Alternate instrumental variables and AR noise models (thesis sections 2.3.3 and 6.1.3), from ``noise`` if given.
-
-    ``theta0`` (b,): predicts the torques on which terms depend; ``None`` if no term does.
-    """
+    """Alternate instrumental variables and AR noise models (thesis sections 2.3.3, 6.1.3), from ``noise`` if given."""
     equations = Equations(study, theta0)
     if noise is None:
         rows = Triangle.of(stacked_parts(equations.train, [WHITE] * study.robot.n))
@@ -155,10 +152,7 @@ def require_solution(found: IvFit) -> None:
 
 
 def solved(equations: Equations, noise: Sequence[ArModel], known: IvRegression | None = None) -> IvFit:
-    """Parameters by instrumental variables under given noise models; DataError if the equations are singular.
-
-    ``known``: regression of the same equations under other noise models.
-    """
+    """Parameters by instrumental variables under given noise models; DataError if the equations are singular."""
     found = IvFit(equations, IvRegression.of(equations, noise, known))
     try:
         _ = found.theta

@@ -15,7 +15,7 @@ from armident.identify.effects.recording_corrections import of_recording
 class Selected:
     """A selected effect, with the step in which it was compared without it in the model.
 
-    ``confirmation``, ``without``: of the final model, later. ``p_value``: of its parameters there, if it is not there.
+    ``confirmation``, ``without``: comparison with the final model without it, and that model; ``None`` before.
     """
 
     entry: Entry

@@ -54,10 +54,10 @@ Array = NDArray[np.float64]
 
 @dataclass
 class StepwiseSelection:
-    """Selection of the effects of one diagnosis.
+    """Selection of the effects of one diagnosis; ``shifts``: undecided common shifts of all torques, samples.
 
-    ``progress``: called with the name of each step; ``tested``: with the share of its candidates done. At ``deadline``
-    (`time.monotonic`, s) the current step is dropped. ``shifts``: undecided common shifts of all torques, samples.
+    ``progress``, ``tested``: called with the name of each step, and the share of its candidates done. At ``deadline``
+    of `time.monotonic`, s, the current step is dropped.
     """
 
     study: Study
@@ -125,10 +125,7 @@ class StepwiseSelection:
         return with_own_noise(state)
 
     def step(self, state: ModelState, incumbent: Incumbent | None = None) -> SelectionStep:
-        """Compare all candidates in a model; with an ``incumbent``, only those that could take its place.
-
-        These act on a joint on which it acts, and do not promise much less.
-        """
+        """Compare all candidates in a model; with an ``incumbent``, those on its joints that promise hardly less."""
         key = _key(state.robot)
         if key in self._steps:
             return self._steps[key]
@@ -179,9 +176,9 @@ class StepwiseSelection:
     def admitted(self, step: SelectionStep) -> Addition | None:
         """Addition that the step admits: the best law of the best effect; ``None`` if there is none.
 
-        No effect with a name is admitted beside a clearly better explanation of its joint, even one too small for a
-        finding. It comes first if it explains most of what the best unnamed term does. Of equal laws, the fewest
-        parameters come first.
+        A named effect is admitted if no explanation of its joint, even one too small for a finding, is clearly better.
+        It comes first if it explains most of what the best unnamed term does. Of equal laws, the fewest parameters come
+        first.
         """
         able = [a for a in step.passing if not (a.named and self._superseded(a, step))]
         if not able:
@@ -321,7 +318,7 @@ class StepwiseSelection:
             found = tuple(one for one in found if one.entry is not gone.entry)
 
     def _holds(self, one: Selected) -> bool:
-        """True if the report part confirms a finding: same direction, material, parameters still unlike zero."""
+        """True if the report part confirms a finding: same direction, material, and parameters still significant."""
         report = one.confirmation
         assert report is not None
         determined = one.p_value < self.criteria.selection_level(one.step.tests)

@@ -36,7 +36,8 @@ def shapes_of_both_signals(
 def instrumented_shapes(fit: IvFit, candidate: Candidate, column_cache: ColumnCache, shapes: Shapes) -> Shapes:
     """Continuous nonlinear parameters, one after the other, between their neighbours on the grid.
 
-    Effects of the motion alone keep theirs: measured velocities are least accurate at standstill, simulated ones good.
+    Effects of the motion alone keep theirs: that is simulated well; measured velocities are least accurate at
+    standstill.
     """
     found = shapes
     if not candidate.effect.depends_on_torque:

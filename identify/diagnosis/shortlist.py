@@ -29,10 +29,7 @@ class Incumbent:
 
 @dataclass(frozen=True, eq=False)
 class Shortlist:
-    """Candidates of a step for their own closed loops, with nonlinear parameters or starting values of a correction.
-
-    ``hidden``: candidates that the motion does not show.
-    """
+    """Candidates of a step, with nonlinear parameters or starting values; ``hidden``: not shown by the motion."""
 
     chosen: list[tuple[Candidate, Shapes, Starts]]
     tests: int

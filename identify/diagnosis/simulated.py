@@ -15,10 +15,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class SimulatedErrors:
-    """Errors of simulated velocities and torques on the held-out data, percent of the measured ones, (n,) each.
-
-    NaN where a simulated loop diverges or the difference is undefined.
-    """
+    """Errors of simulated signals, percent of the measured held-out ones, (n,); NaN where a loop diverges."""
 
     joints: tuple[str, ...]
     velocity_before: Array

@@ -57,11 +57,10 @@ KAISER = 6.0
 class Study:
     """Training and held-out stretches of one robot.
 
-    ``decimation``: from the working rate to that of the comparison; ``thinning``: from the recorded to the working
-    rate. ``dt``: working period, s. ``loop``: kind of controller. ``auxiliary``: that loop with the IDIM-LS estimate of
-    the arm. ``sources``: training and validation recordings without corrections; ``signals``: derivatives of their
-    positions. ``volume`` (n,): see `log_volume`. ``references``: see `predictive_score.references_of`; empty before the
-    fit.
+    ``decimation``: from the working rate (period ``dt``, s) to that of the comparison; ``thinning``: from the recorded
+    to the working rate. ``loop``: kind of controller; ``auxiliary``: that loop with the IDIM-LS estimate. ``sources``:
+    training and validation recordings without corrections; ``signals``: derivatives of their positions. ``volume``
+    (n,): see `log_volume`. ``references``: see `predictive_score.references_of`; empty before the fit.
     """
 
     robot: RobotConfig
@@ -229,10 +228,7 @@ def build_study(
     known_signals: Sequence[Derivatives] | None = None,
     criteria: Criteria | None = None,
 ) -> Study:
-    """Differentiate, simulate, split and filter the experiments; without ``validation`` their last part is held out.
-
-    ``known_signals``: derivatives of the positions of both, if known. DataError if the motion is too short or poor.
-    """
+    """Differentiate, simulate, split and filter the experiments; without ``validation`` their last part is held out."""
     criteria = criteria or Criteria()
     experiments = corrected_experiments([*training, *validation], robot)
     check_one_rate(experiments)

@@ -90,10 +90,7 @@ class _Search:
         return made
 
     def _moved(self, place: Place, shapes: Shapes, factor: float, samples: float) -> Shapes:
-        """Return a transition beside another one, with velocity and lead no less than those of the grid.
-
-        A lead of zero would be certain; the grid's smallest one has a standard deviation.
-        """
+        """Return a transition beside another one, no less than the grid: a lead of zero would have no uncertainty."""
         given = dict(shapes)
         velocities, leads = ([dict(one)[name] for one in self.grids[place]] for name in ("velocity", "lead"))
         velocity = float(np.clip(given["velocity"] * np.exp(factor), min(velocities), max(velocities)))

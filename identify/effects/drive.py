@@ -35,8 +35,7 @@ def motor_limit(robot: RobotConfig, motor: int) -> float:
 class Correction(TorqueDependent):
     """Effect with one linear parameter, for whose value the recorded torque of a motor can be corrected.
 
-    The columns, its first-order expansion, have noise larger than the effect; the corrected recording has no added
-    noise.
+    The columns, its first-order expansion, have noise larger than the effect; a corrected recording adds none.
     """
 
     scope = "motor"

@@ -27,8 +27,7 @@ APART = 0.05
 def rotors(motion: Motion, joint: int) -> Sequence[float]:
     """Return the rotor inertias to try, kg m^2 or kg: zero where the model has one, else shares of the link's inertia.
 
-    The link's base parameters contain the rotor there; load-dependent effects tell, unless all load is from
-    acceleration.
+    Base parameters without a rotor contain it in the link. It matters where load is not proportional to acceleration.
     """
     if f"ia{joint + 1}" in motion.model.base.names:
         return (0.0,)

@@ -166,10 +166,7 @@ class Backlash(TorqueDependent):
 
 
 def falls(motion: Motion, joint: int, rotor: float = 0.0) -> Array:
-    """Return the acceleration (N,) of a link relative to its motor without contact of the teeth, rad/s^2 or m/s^2.
-
-    ``rotor``: rotor inertia that the model contains in the link, kg m^2 or kg.
-    """
+    """Return the free acceleration (N,) of a link relative to its motor, rad/s^2 or m/s^2; ``rotor``: in the link."""
     inertia = inertias(motion, joint, rotor)
     if inertia.max() <= 0.0:
         return np.zeros(motion.samples)

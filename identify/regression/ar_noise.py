@@ -48,11 +48,10 @@ class ArModel:
     def widened(self, samples: int) -> "ArModel":
         """The same filter, its variance times ``((N + l) / (N - l))^2``: for weights and covariances of an estimate.
 
-        Two errors of relative size ``2 l / N`` make the information ``X' Omega^-1 X`` too large. On other residuals the
-        filter's error has a variance ``(N + l) / (N - l)`` times as large (Akaike, Fitting autoregressive models for
-        prediction, 1969). An estimate weighted by the model scatters more than one weighted by the process: by ``2 l /
-        N`` on the average of the frequencies (Berk, Consistent autoregressive spectral estimates, 1974). N: all
-        ``samples`` behind the model.
+        The information ``X' Omega^-1 X`` has two relative errors of ``2 l / N`` (N: all ``samples``). On other
+        residuals the filter's error has ``(N + l) / (N - l)`` times the variance (Akaike, Fitting autoregressive models
+        for prediction, 1969). A weighted estimate scatters by the relative variance of an AR spectrum, ``2 l / N`` on
+        the average of the frequencies (Berk, Consistent autoregressive spectral estimates, 1974).
         """
         factor = ((samples + self.order) / (samples - self.order)) ** 2
         return replace(self, variance=factor * self.variance)
@@ -125,7 +124,7 @@ def fit_ar(
 
 
 def lowest_aic(r: NDArray[np.float64], samples: int) -> ArModel:
-    """AR model of the order with the lowest Akaike criterion (6.24, 6.25), from autocovariances ``r`` at lags 0..."""
+    """AR model of the order with the lowest Akaike criterion (6.24, 6.25), from autocovariances ``r``, ``r[0] > 0``."""
     return ArModel(*_lowest_aic(r, samples))
 
 

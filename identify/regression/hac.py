@@ -11,8 +11,7 @@ Array = NDArray[np.float64]
 def newey_west(series: Sequence[Array], lags: int) -> Array:
     """Heteroskedasticity and autocorrelation consistent variance, () or (b,), of the sum of terms of mean zero.
 
-    Lag k of L has the Bartlett weight ``1 - k / (L + 1)`` (Newey, West 1987, Econometrica 55); experiments are
-    independent.
+    Lag k of L has the weight ``1 - k / (L + 1)`` (Newey, West 1987, Econometrica 55); experiments are independent.
     """
     variance = np.asarray(sum(_summed_products(s, s) for s in series))
     for lag in range(1, min(lags, max(s.shape[0] for s in series) - 1) + 1):

@@ -113,8 +113,7 @@ def serial_covariance(
     """Covariance (b, b) of an IV estimate with weights 2.24 whose residuals are serially correlated.
 
     ``A Omega A'`` with ``A = (Z' W X)^-1 Z' W`` and ``Omega`` of the AR models ``noise``: ``Z' W Omega W Z`` is the
-    Gram matrix of ``H' W Z``. ``zeta``, ``x``: (M, n, b) per experiment; ``keep``: (M, n); ``weights``: white noise
-    models.
+    Gram matrix of ``H' W Z``. ``zeta``, ``x`` (M, n, b) and ``keep`` (M, n): per experiment.
     """
     b = zeta[0].shape[2]
     squares, cross, meat = np.zeros(b), np.zeros((b, b)), np.zeros((b, b))

@@ -56,8 +56,7 @@ class Fit:
 class Normal:
     """Normal equations of all rows of the model, for one assignment of positions and one gravity.
 
-    ``grams`` (n, c, c): ``X_m' X_m`` of ``x`` (M, n, c). ``products`` (n, n, c): ``X_m' y_k``, by the shifts of
-    torques.
+    ``grams`` (n, c, c): ``X_m' X_m`` of ``x`` (M, n, c). ``products`` (n, n, c): ``X_m' y_k``, by shifts of torques.
     """
 
     x: Array

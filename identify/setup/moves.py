@@ -24,8 +24,7 @@ LEAST_SPREAD = 0.01
 class Move:
     """One mistake; all members of a ``family`` share its prior probability.
 
-    ``position``, ``torque`` (n, n) multiply the corrections. ``drives``: raw numbers and scales of two drives
-    exchanged.
+    ``position``, ``torque`` (n, n) multiply the corrections. ``drives``: raw numbers and scales of drives exchanged.
     """
 
     family: str

@@ -49,7 +49,7 @@ class SetupFinding:
 
 @dataclass(frozen=True)
 class TorqueShift:
-    """Time by which all torques are late against positions, beyond the torque held until the next sample; in samples.
+    """Samples by which torques are late against positions, beyond a torque held until the next sample; negative: early.
 
     ``odds``: torque of the sample's instant over a held one. ``instrumented``: references gave undisturbed instruments.
     """

@@ -1,9 +1,8 @@
 """Time shift between all torques and the positions, in fractions of a sample, estimated with instruments (thesis 2.33).
 
-At low rates half a sample changes the residual as much as an effect. To first order, a torque late by ``s`` is ``phi
-theta - s d(phi theta)/dt``. A disturbance moves the arm before the torque of the closed loop, so instruments are
-regressors of filtered references. A joint stops suddenly, and leaves standstill slowly, so the change of the friction
-with time has free factors.
+At low rates half a sample changes the residual as much as an effect. A torque that is late by ``s`` is, to first order,
+``phi theta - s d(phi theta)/dt``. A disturbance moves the arm before the torque of the closed loop, so instruments are
+regressors of filtered references. A joint stops suddenly, and leaves standstill slowly: the change of friction is free.
 """
 
 from collections.abc import Sequence
