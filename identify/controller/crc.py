@@ -34,10 +34,9 @@ NO_FILTER = ArModel(np.empty(0), 1.0, 0.0)
 class JointResponse:
     """Impulse response of one motor's controller.
 
-    ``error_taps``: from tracking error (rad or m at the motor) to motor torque, one per sampling period.
-    ``position_taps``: from measured motor position; their sum is zero, as a velocity loop responds only to changes.
-    Empty where the tracking error alone explains the torque. ``prewhitening_order``: order of the AR filter; 0: none.
-    ``fit_pct``: explained share of the held-out torque's variance, percent.
+    ``error_taps``: from tracking error (rad or m at the motor) to motor torque. ``position_taps``: from measured motor
+    position; their sum is zero, as a velocity loop responds only to changes; empty where the error alone explains the
+    torque. ``prewhitening_order``: of the AR filter. ``fit_pct``: explained share of the held-out torque's variance.
     """
 
     error_taps: NDArray[np.float64]
@@ -67,14 +66,13 @@ def identify_crc(
     """Impulse response of each motor's controller from tracking error to torque.
 
     Correlation analysis solves ``R_nu,eps(tau) = sum_k h(k) R_eps,eps(tau - k)`` (5.31, 5.32), with the signals as
-    recorded, and prewhitened by an AR model of the error. The response that predicts the held-out torque best is
-    returned. A cascade also feeds back the measured velocity: a second response, from position changes, is kept if the
-    held-out error falls.
+    recorded, and prewhitened by an AR model of the error; the better prediction of the held-out torque is returned. A
+    cascade also feeds back the measured velocity: a second response, from position changes, is kept if the held-out
+    error falls.
 
     Inputs: position, reference (rad or m) and torque (N m or N) at the motors, one (N, n) array per experiment.
     ``length``: taps, of all motors or of each; ``None``: the best of `LENGTHS`. ``velocity_loop``: response from
-    position changes; ``None``: compare both. ``saturation``: largest torque (n,). Raises DataError if a motor never
-    deviates.
+    position changes; ``None``: compare both. ``saturation``: largest torque (n,).
     """
     n = q_motor[0].shape[1]
     lengths: list[tuple[int, ...]]

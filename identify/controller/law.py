@@ -92,10 +92,7 @@ class Structure:
 
 @dataclass(frozen=True)
 class Stretch:
-    """Uninterrupted samples (N,) of one motor: position ``q``, reference ``r``, rad or m; torque ``nu``, N m or N.
-
-    ``added``: known torque in ``nu`` that does not come from the controller.
-    """
+    """Samples (N,) of a motor without gaps: ``q``, ``r``, torque ``nu``; ``added``: known part of other origin."""
 
     q: Array
     r: Array
@@ -134,10 +131,9 @@ def columns(stretch: Stretch, structure: Structure, theta: Array, dt: float) -> 
 
 
 def integral_slopes(stretch: Stretch, structure: Structure, theta: Array, dt: float) -> Array:
-    """Derivatives of the torque by the gains inside the integral's input (N - lead, m).
+    """Derivatives of the torque by the gains inside the integral's input (N - lead, m), for a Gauss-Newton step.
 
-    With those of `columns` they are the Jacobian. Their product with ``theta`` is zero: a regression on the sum is a
-    Gauss-Newton step.
+    The sum with `columns` is the Jacobian; these slopes times ``theta`` are zero: a regression on the sum suffices.
     """
     names, past = structure.names, 1.0 / (1.0 - structure.pole(theta))
     level = {name: 1.0 if i < structure.unfiltered else past for i, name in enumerate(names)}

@@ -1,7 +1,7 @@
 """Refined instrumental variables for the control law of a drive (thesis section 3.2).
 
-A controller's recorded inputs are exactly those that it uses; all noise is on its recorded output (thesis 5.2.2). They
-are their own instruments. That of a filter's past output is the output simulated with the last estimate (3.10).
+A controller's recorded inputs are exactly those that it uses; all noise is on its recorded output (thesis 5.2.2). The
+inputs are their own instruments. That of a filter's past output is the output simulated with the last estimate (3.10).
 """
 
 from collections.abc import Sequence
@@ -76,9 +76,8 @@ def refined_iv(
     """Fit the law by iteration over parameters and noise model (3.2.2, steps 1 to 5).
 
     Let ``a'`` be the pole of the last iteration and ``w`` the filtered part of the torque. Index f denotes the filter
-    ``1 / (1 - a' z^-1)``. Then ``nu + a' w_f(k-1) = U0 k + U1_f b + a w_f(k-1)`` is linear in ``k``, ``b`` and ``a``.
-    The regressor contains the measured ``w``, the instruments the simulated ``w``. Without ``noise_model``: SRIV, with
-    a sandwich covariance.
+    ``1 / (1 - a' z^-1)``. Then ``nu + a' w_f(k-1) = U0 k + U1_f b + a w_f(k-1)`` is linear in ``k``, ``b``, ``a``. The
+    regressor has the measured ``w``, the instruments the simulated one. No ``noise_model``: SRIV, sandwich covariance.
     """
     size, noise, converged = structure.size, WHITE, False
     theta = _integral_start(stretches, structure, dt) if structure.integral else np.zeros(size)

@@ -77,10 +77,9 @@ class _Body:
 
 
 class CollisionModel:
-    """Pairs of bodies of an arm and its cell, and their distances.
+    """Pairs of bodies of an arm and its cell; ConfigError if a box contains the arm in nearly every posture.
 
-    ``geometry``: capsules, in frames j, for links without given ones. Raises ConfigError if a box contains the arm in
-    nearly every posture.
+    ``geometry``: capsules, in frames j, for links without given ones.
     """
 
     def __init__(self, robot: RobotConfig, geometry: Sequence[LinkCapsule] = ()) -> None:

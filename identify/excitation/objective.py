@@ -66,10 +66,7 @@ class EffectObjective:
         return float(np.mean(values))
 
     def std(self, motion: Motion, x: Array, decimation: Decimation, sigma: Array) -> dict[str, float]:
-        """Return the predicted standard deviations of the linear parameters by name; inf: not identifiable.
-
-        Arguments as in `cost`. Nonlinear parameters are in the middle of their grids.
-        """
+        """Return standard deviations by name, nonlinear parameters at mid-grid; inf: not identifiable; see `cost`."""
         found: dict[str, float] = {}
         for location, rival in self.pairs:
             shapes = location.shapes[len(location.shapes) // 2]

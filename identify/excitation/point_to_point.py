@@ -77,8 +77,8 @@ MISS_UNIT = 0.01
 class Rank(NamedTuple):
     """Rank of a candidate, smaller is better: ``violation`` of limits first, then ``cost``.
 
-    ``violation``: relative excess of torque plus missing distance in `MISS_UNIT`. ``cost``: mean log standard deviation
-    with penalties.
+    ``violation``: relative excess of torque plus missing distance in `MISS_UNIT`. ``cost``: mean log std with
+    penalties.
     """
 
     violation: float

@@ -24,11 +24,7 @@ NO_BOXES = "list what stands around it in collision.boxes of the robot configura
 
 @dataclass(frozen=True, eq=False)
 class SafetyModel:
-    """Masses and bodies of an arm, with ``remarks`` on properties that cannot be checked.
-
-    ``theta``: base (b,) or standard (p,) parameters, ``None`` without masses; ``torque_source``: their origin, for
-    messages.
-    """
+    """Masses (parameters (b,) or (p,), ``None`` if unknown) and bodies of an arm; ``remarks``: not checkable."""
 
     collision: CollisionModel
     theta: Floats | None
@@ -53,8 +49,7 @@ def safety_model(
 ) -> SafetyModel:
     """Collect masses and bodies of an arm: of an earlier estimate, of a file, of its configuration, of its URDF.
 
-    ``source``: path or shipped name of the configuration. ``masses``: JSON file of standard parameters, as ``armident
-    robot --truth`` writes it; replaces the masses of the URDF.
+    ``masses``: file of standard parameters from ``armident robot --truth``; replaces the masses of the URDF.
     """
     shapes = None if source is None else load_shapes(source)
     capsules, unread = ([], []) if shapes is None else capsules_of(shapes.shapes)

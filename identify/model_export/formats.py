@@ -19,10 +19,7 @@ from armident.identify.model_export.urdf_writer import write_urdf
 
 @dataclass(frozen=True)
 class Format:
-    """A format of exported models: suffix of the main file with its dot, name in words, and writer.
-
-    ``write`` returns all files written, the main one first, and the sheet.
-    """
+    """A format of exported models; ``write`` returns all files, the main one first, and the sheet."""
 
     suffix: str
     title: str

@@ -93,8 +93,7 @@ class Formula:
     def hats(self, knots: Floats) -> "list[Formula]":
         """Return the piecewise linear functions at increasing knots, constant beyond the outermost.
 
-        ``hat(x, left, top, right)`` rises from 0 at ``left`` to 1 at ``top``; it stays 1 on a side whose end is
-        ``top``.
+        ``hat(x, left, top, right)`` rises from 0 at ``left`` to 1 at ``top``, and stays 1 where an end is ``top``.
         """
         ends = [knots[0], *knots, knots[-1]]
         return [

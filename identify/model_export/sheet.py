@@ -23,10 +23,7 @@ ATTRIBUTES = ("rotor_inertia", "viscous", "coulomb", "offset")
 
 @dataclass(frozen=True)
 class Omission:
-    """Part of the model that a format cannot hold, for example ``offset of joint_2: 0.31 N m``.
-
-    ``reason``: consequence or next step, one sentence, or empty.
-    """
+    """Part that a format cannot hold, as ``offset of joint_2: 0.31 N m``; ``reason``: consequence or next step."""
 
     part: str
     reason: str = ""

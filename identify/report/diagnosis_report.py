@@ -128,8 +128,7 @@ def _gap_figure(document: DiagnosisDocument) -> str:
 def _finding_figure(diagnosis: DiagnosisResult, joint: int, lacking: Array | None, own: Array | None) -> str:
     """Return a figure of the joint's held-out residual without and with a finding, over time and over its variable.
 
-    ``lacking``: torques (M, n) without the finding; ``None``: the model as configured. ``own``: torques (M, n) of the
-    finding itself; ``None`` if it is no term.
+    ``lacking``: torques (M, n) without it, ``None``: the model as configured; ``own``: its torques, ``None``: no term.
     """
     name, unit = diagnosis.robot.joints[joint].name, _unit(diagnosis, joint)
     seen = [d for d in diagnosis.where if d.joint == name]

@@ -66,10 +66,7 @@ def render(template: str, **content: Any) -> str:
 
 @contextmanager
 def figure(rows: int, columns: int, height: float) -> Iterator[tuple["Figure", Any, list[str]]]:
-    """Draw on a grid of axes (rows, columns); at the end of the block the list receives the picture as a ``data:`` URL.
-
-    ``height``: of one row, inches.
-    """
+    """Draw on a grid of axes, ``height`` inches a row; the list finally receives the picture as a ``data:`` URL."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

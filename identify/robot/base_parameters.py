@@ -111,9 +111,8 @@ def independent_columns(
 ) -> tuple[Ints, Floats]:
     """Independent columns of a random regressor, and the dependence of the others on them (A.30 to A.35).
 
-    The QR decomposition takes the columns from base to tip, within a link in the order `KEEP_FIRST`, and so finds the
-    set of tables B.2 and B.3. Returns ``kept`` (b,), increasing, and ``mixing`` with ``theta_base = mixing @
-    theta[candidates]``.
+    QR decomposition from base to tip, within a link in the order `KEEP_FIRST`, finds the set of tables B.2 and B.3.
+    Returns ``kept`` (b,), increasing, and ``mixing`` with ``theta_base = mixing @ theta[candidates]``.
     """
     if candidates is None:
         candidates = np.arange(len(names), dtype=np.int64)

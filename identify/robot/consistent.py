@@ -110,8 +110,7 @@ def nearest_consistent(
     Minimises ``(K theta - theta_base)' P^-1 (K theta - theta_base)``. Of several solutions the lightest arm is
     returned: the smallest sum of the traces of the pseudo-inertias, second moments over the square of the arm's mean
     length. A consistent estimate keeps its base parameters; otherwise the squared distance may exceed its minimum by
-    `INDIFFERENCE`. ``smallest_link``: pseudo-inertia (4, 4) that every link contains, so that no link is a point or a
-    thin disc.
+    `INDIFFERENCE`. ``smallest_link``: pseudo-inertia (4, 4) that every link contains: none is a point or a thin disc.
 
     Test: ``N(truth, P)`` of a physical arm is projected onto the convex set of physical base parameters. Given its
     face, the squared distance is at most chi-square with the face's codimension (Wollan and Dykstra 1986). That is the
@@ -155,10 +154,7 @@ def nearest_consistent(
 
 @dataclass(frozen=True, eq=False)
 class NearestBase:
-    """Base parameters (b,) of the nearest physically consistent arm, without choice among equal ones and without test.
-
-    ``shifts`` (b,) and Mahalanobis ``distance`` in standard deviations of the estimate.
-    """
+    """Base parameters (b,) of the nearest physical arm, their shifts (b,) and Mahalanobis distance, in std."""
 
     theta: Floats
     shifts: Floats
@@ -180,8 +176,7 @@ def nearest_base(model: ArmModel, theta_base: ArrayLike, covariance: ArrayLike) 
 def identifiability(model: ArmModel) -> tuple[Identifiability, ...]:
     """Identifiability of each standard parameter (p,) from torques; it depends on the model only.
 
-    ``alone``: its unit vector lies in the row space of the regrouping matrix K; then it is the same for all standard
-    parameters with equal base parameters.
+    ``alone``: its unit vector is in the row space of the regrouping matrix K: equal base parameters give it one value.
     """
     grouping = model.base.regroup
     outside = np.eye(grouping.shape[1]) - np.linalg.pinv(grouping) @ grouping
@@ -215,9 +210,8 @@ def non_negative(model: ArmModel) -> Ints:
 class _Projection:
     """Semidefinite programme for whitened base parameters, set up once and solved for several right sides.
 
-    Variables are the standard parameters and ``r = L^-1 (K theta - theta_base)``, in units of ``scale`` standard
-    deviations (t values of a thousand beside masses of one are badly conditioned). ``factor``: Cholesky factor L of the
-    covariance.
+    Variables are the standard parameters and ``r = L^-1 (K theta - theta_base)``, with the Cholesky factor L, in units
+    of ``scale`` standard deviations: t values of a thousand beside masses of one are badly conditioned.
     """
 
     def __init__(self, model: ArmModel, factor: Floats, scale: float, smallest_link: Floats | None = None) -> None:
@@ -254,10 +248,7 @@ class _Projection:
         return x[: self._p], self._scale * x[self._p :]
 
     def lightest(self, whitened: Floats, nearest: Floats, distance: float) -> Floats:
-        """Find the lightest arm (p,) whose squared distance exceeds the minimum by at most `INDIFFERENCE`.
-
-        The weight of a kilogram is increased in steps until the squared distance exceeds this limit.
-        """
+        """Find the lightest arm (p,) within `INDIFFERENCE` of the minimum, by increasing the weight of a kilogram."""
         best, price = nearest, REGULARISATION
         while price < 1.0:
             price *= PRICE_STEP

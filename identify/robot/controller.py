@@ -13,10 +13,9 @@ from armident.identify.robot.chain import Floats
 class DiscreteController:
     """One linear controller per motor, with saturation of the output ``nu``.
 
-    ``nu(k) = sum_i error_taps[:, i] eps(k-i) + sum_i position_taps[:, i] q_motor(k-i) + sum_i output_taps[:, i]
-    nu(k-1-i)`` with ``eps = R (q_ref - q)``, ``q_motor = R q`` and the transmission matrix R. Later samples use the
-    limited ``nu``. Taps are (n, m), N m/rad or N/m, those of outputs without unit; ``saturation`` (n,), N m or N, may
-    be ``inf``.
+    ``nu(k) = sum_i error_taps[:, i] eps(k-i) + sum_i position_taps[:, i] q_motor(k-i)
+    + sum_i output_taps[:, i] nu(k-1-i)`` with ``eps = R (q_ref - q)``, ``q_motor = R q`` and the transmission matrix R.
+    Later samples use the limited ``nu``. Taps: (n, m), N m/rad or N/m, of outputs without unit; ``saturation``: (n,).
     """
 
     error_taps: Floats

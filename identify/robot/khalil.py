@@ -150,8 +150,7 @@ def _regroup(forms: dict[str, Form], name: str, j: int, rows: Mapping[str, Polyn
 def _transfer(chain: Chain, j: int) -> dict[str, dict[str, Polynomial]]:
     """Contribution of each parameter of link j+1 to the parameters of its parent link.
 
-    For a revolute joint the combinations independent of the joint angle are ``xx + yy`` (entry ``yy``), ``mz`` and
-    ``m``.
+    At a revolute joint ``xx + yy`` (entry ``yy``), ``mz`` and ``m`` do not depend on the joint angle.
     """
     ca, sa = float(chain.cos_alpha[j]), float(chain.sin_alpha[j])
     c, s = cos_sin(float(chain.theta[j])) if chain.prismatic[j] else (1.0, 0.0)

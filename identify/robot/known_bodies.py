@@ -28,11 +28,10 @@ INSIDE = -1e-12
 
 
 def nearest_to_known(model: ArmModel, theta: Floats, known: Floats, smallest_link: Floats) -> Floats:
-    """Return the consistent standard parameters nearest to known ones, with the same base parameters.
+    """Return the consistent standard parameters nearest to known ones (p,), with the same base parameters.
 
-    Distances are in kg: first moments over the arm's mean length, moments of inertia over its square. ``known``: (p,),
-    of which only links count. Every link contains ``smallest_link`` (4, 4). If nothing is nearer, the result is
-    ``theta``.
+    Distances in kg: first moments over the arm's mean length, moments of inertia over its square; only links count.
+    Every link contains ``smallest_link`` (4, 4). If nothing is nearer, the result is ``theta``.
     """
     free = linalg.null_space(model.base.regroup)
     if not free.shape[1]:

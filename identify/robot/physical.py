@@ -17,10 +17,7 @@ MOST_HALVINGS = 30
 
 @dataclass(frozen=True, eq=False)
 class Damped:
-    """Physical iterate and the applied fraction of its step, 0 to 1.
-
-    ``reason``: defects of the proposed iterate and their correction; empty if there were none.
-    """
+    """Physical iterate, applied fraction of its step (0 to 1), and the corrected defects; empty if there were none."""
 
     theta: Floats
     step: float

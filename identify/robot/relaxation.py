@@ -60,10 +60,9 @@ def simulate_with_terms(
 ) -> Simulation:
     """Simulate the closed loop with the terms of the model; see :func:`armident.identify.robot.simulation.simulate`.
 
-    ``theta_base``: base or standard parameters, last those of the terms. ``band_hz``: low-pass for the torque of the
-    terms: references in steps, two or three times differentiated, prevent convergence. ``tolerated``: difference of the
-    terms' torque and the load, over each joint's torque, that suffices. ``motion``: first guess, ``None``: no load.
-    ``tau`` of the result is what the drives report: rigid arm plus terms.
+    ``band_hz``: low-pass for the torque of the terms: references in steps would prevent convergence. ``tolerated``:
+    difference of the terms' torque and the load, over each joint's torque, that suffices. ``motion``: for the first
+    load; ``None``: no load. ``tau`` of the result is what the drives report: rigid arm plus terms.
     """
     theta = np.asarray(theta_base, dtype=np.float64)
     values = theta[theta.size - model.e :]

@@ -75,10 +75,9 @@ def simulate(
 ) -> Simulation:
     """Simulate the arm, without its terms, under its controller along a reference (thesis equation 2.9, section B.3).
 
-    The controller acts once per sample; its torque is held for one period. ``q0``, ``qd0``: first state (n,), by
-    default that of the reference; before it tracking error and velocity were constant. ``max_velocity``: diverged above
-    it, by default ten times the limits. ``disturbance``: motor torques (N, n) added after saturation, part of ``tau``.
-    ``inertia``: additional, of the joints (n,).
+    A torque is held for one period. ``q0``, ``qd0``: first state (n,), by default that of the reference; before it,
+    tracking error and velocity were constant. ``max_velocity``: diverged above it, by default ten times the limits.
+    ``disturbance``: motor torques (N, n) added after saturation, part of ``tau``. ``inertia``: additional, joints (n,).
     """
     reference = np.ascontiguousarray(q_ref, dtype=np.float64)
     samples, n = reference.shape
@@ -146,8 +145,7 @@ def friction(
 ) -> None:
     """Compute friction torques and their derivatives with respect to velocity (thesis equations 2.7, B.1).
 
-    ``x``, ``bend``, ``steep``: scratch of length ``padded(n + pairs)``: arguments, values, derivatives of the
-    arctangent.
+    ``x``, ``bend``, ``steep``: scratch, ``padded(n + pairs)``: argument, value and derivative of the arctangent.
     """
     g = values.smoothing
     for j in range(n):
@@ -227,9 +225,8 @@ def run(
 ) -> int:
     """Simulate the closed loop; fill ``q, qd, qdd, tau`` from the state in the first row of ``q`` and ``qd``.
 
-    Returns the sample at which the simulation stopped, or -1. With the lengths of the tuples ``joints`` and
-    ``couplings`` the compiler unrolls short loops. ``memory``: samples that the controller uses. ``disturbance``: (0,
-    n) if none.
+    Returns the sample at which the simulation stopped, or -1. The lengths of the tuples ``joints`` and ``couplings``
+    let the compiler unroll loops. ``memory``: samples that the controller uses. ``disturbance``: no rows if none.
     """
     samples, n = reference.shape[0], len(joints)
     coupled = values.coupling_joints

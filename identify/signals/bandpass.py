@@ -14,8 +14,7 @@ def butterworth(
 ) -> NDArray[np.float64]:
     """Zero-phase Butterworth low-pass along the first axis, in second-order sections; -6 dB at the cut-off.
 
-    ``padlen``: samples of odd extension at each end, by default ``3 * order`` (of one pass). Raises DataError if the
-    cut-off is not below the Nyquist frequency, or the signal is too short.
+    ``padlen``: samples of odd extension at each end, by default ``3 * order`` (of one pass).
     """
     if cutoff_hz * dt >= 0.5:
         raise DataError(f"cut-off {cutoff_hz:g} Hz is not below half the sampling rate ({0.5 / dt:g} Hz)")

@@ -25,8 +25,8 @@ PERIODS = 50.0
 def motion_bandwidth(q: Sequence[NDArray[np.float64]], dt: float) -> float:
     """Bandwidth (Hz) for the choice of filters: `MARGIN` times that of the fastest joint's velocity.
 
-    The encoder's noise floor is that of the upper half of the position's spectrum. At least `PERIODS` per shortest
-    experiment: decimation would otherwise leave too few equations. Raises DataError if no joint moves.
+    The encoder's noise floor is that of the upper half of the spectrum. At least `PERIODS` per shortest experiment:
+    decimation would otherwise leave too few equations.
     """
     highest = max((_velocity_bandwidth(positions, dt) for positions in q), default=0.0)
     if highest == 0:

@@ -23,8 +23,7 @@ _ROWS = 8
 class Decimation:
     """Linear-phase low-pass with symmetric ``taps`` (m,), m odd, that keeps one sample of ``factor``.
 
-    Centred, so zero-phase; finite, so without initial state. Samples whose window extends beyond the record are
-    dropped.
+    Centred, so zero-phase; finite, so without initial state. Samples with an incomplete window are dropped.
     """
 
     factor: int
@@ -81,8 +80,7 @@ class Decimation:
 def design(dt: float, cutoff_hz: float, factor: int | None = None) -> Decimation:
     """Design a low-pass with half-amplitude frequency ``cutoff_hz`` (thesis: ``w_Fp >= 2 w_dyn``) and its decimation.
 
-    ``factor``: 1 gives the identity; ``None`` the largest with a Nyquist frequency not below the cut-off, the thesis's
-    ``n_d = w_nyq / w_Fp``.
+    ``factor``: 1: identity; ``None``: the largest with Nyquist frequency from the cut-off on, ``n_d = w_nyq / w_Fp``.
     """
     if factor is None:
         factor = max(1, int(0.5 / (dt * cutoff_hz) + 1e-9))

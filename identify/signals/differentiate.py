@@ -51,9 +51,8 @@ def differentiate(
     which needs ``q_ref`` and ``resolution`` (:func:`encoder_resolution`).
 
     The slope is the forward difference of the level, half a sample later. IRWSM 1 therefore yields velocities midway
-    between samples: their smoothed difference is the acceleration at the sample, the mean of two the velocity. Its
-    second pass uses the ratio of the first, as the noise is then not white; only ``likelihood`` estimates both, as the
-    thesis.
+    between samples: their smoothed difference is the acceleration at the sample, the mean of two the velocity. Noise is
+    not white after the first pass: the second uses its ratio. Only ``likelihood`` estimates both, as the thesis.
     """
     if derivatives == "bandpass":
         if bandwidth_hz is None:

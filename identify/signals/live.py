@@ -48,8 +48,7 @@ class VelocityFilter:
     """Causal filter for velocities and accelerations of n joints, sample by sample or batch by batch.
 
     ``nvr``: as for the smoother, for instance ``automatic_nvr(q[:, j], order)`` of an earlier recording. ``order`` 3:
-    acceleration too, without lag while it is constant. ``F``, ``H``, ``Q``, ``R``: filterpy's notation, time in
-    samples.
+    acceleration too, no lag while it is constant. ``F``, ``H``, ``Q``, ``R``: filterpy's notation, time in samples.
     """
 
     _saved = ("_x", "_p", "_squares", "_measured")

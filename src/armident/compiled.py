@@ -56,8 +56,7 @@ _TYPES: dict[str, Any] = dict(vars(numba.types))
 def compiled(*signatures: str, kept: bool = False, nogil: bool = True, **options: Any) -> Callable[[F], F]:
     """Compile a kernel that Python calls with arguments of the ``signatures``; without any, one that kernels call.
 
-    Signatures list numba's types, ``f8[:, ::1], i8``, and tuples of `structure`. ``kept``: keep code compiled on a
-    call.
+    Signatures list numba's types, ``f8[:, ::1], i8``, and tuples of `structure`. ``kept``: keep code of first calls.
     """
 
     def decorate(function: F) -> F:
