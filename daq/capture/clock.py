@@ -26,11 +26,9 @@ class _Timex(ctypes.Structure):
 
 @dataclass(frozen=True)
 class ClockState:
-    """State of the system clock.
+    """State of the system clock, as the process that sets it (chrony, ntpd) states it.
 
-    ``offset_us``: offset that is still to be corrected, us; ``error_us``, ``largest_error_us``: estimated and largest
-    error, as the process that sets the clock states them, us; ``synchronised``: True if a process such as chrony or
-    ntpd sets the clock.
+    ``offset_us``: offset still to be corrected; ``error_us``, ``largest_error_us``: estimated and largest error.
     """
 
     offset_us: float
