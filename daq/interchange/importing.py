@@ -40,7 +40,7 @@ def import_recording(
     """Return measured motion and effort as a recording, after checks of content, units and clock.
 
     ``config`` is the robot that was measured, the session of a bus log, or ``None`` for a recording: the robot inside
-    it. Raises ConfigError if a file or option is wrong, DataError if the content is.
+    it.
     """
     reader = reader_of(path)
     check_options(path, reader, options)
