@@ -84,11 +84,7 @@ def checks_for(config: str | Path, command: Command) -> list[Check]:
 
 
 def run_checks(config: str | Path) -> list[Check]:
-    """Check everything that a capture of a session needs; nothing is sent, and only a probe file is written.
-
-    If the configuration is invalid, the checks are that, the clock, and the data sheets of drives if the session could
-    be read.
-    """
+    """Check everything that a capture of a session needs; nothing is sent, and only a probe file is written."""
     try:
         session = load_session(config, "")
         robot = load_robot(session.robot, "")

@@ -1,7 +1,4 @@
-"""Log output of the commands: one line per record on stderr.
-
-The logger ``armident`` has no output by itself, so that a program that imports armident chooses its own.
-"""
+"""Log output of the commands: a line per record on stderr; the logger ``armident`` by itself has none."""
 
 import contextlib
 import logging

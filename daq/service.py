@@ -203,8 +203,7 @@ def _system(cell: str, root: Path, executable: Path | None) -> System:
 def install(cell: str, root: Path = Path("/"), executable: Path | None = None, dry_run: bool = False) -> list[str]:
     """Install the service of a cell, and return the lines of a report; nothing is enabled or started.
 
-    A second run does nothing. ``executable``: by default that of this environment, or ``/opt/armident/bin/armident`` in
-    a system image (``root``).
+    By default ``executable`` is that of this environment; in a system image (``root``) it is in ``/opt/armident/bin``.
     """
     system = _system(cell, root, executable)
     with_sudo = f"sudo {system.executable} service install {cell}"

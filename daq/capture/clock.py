@@ -26,10 +26,7 @@ class _Timex(ctypes.Structure):
 
 @dataclass(frozen=True)
 class ClockState:
-    """State of the system clock, as the process that sets it (chrony, ntpd) states it.
-
-    ``offset_us``: offset still to be corrected; ``error_us``, ``largest_error_us``: estimated and largest error.
-    """
+    """State of the system clock, as chrony or ntpd states it; ``offset_us`` is still to be corrected."""
 
     offset_us: float
     error_us: float

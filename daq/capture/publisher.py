@@ -35,13 +35,11 @@ log = logging.getLogger(__name__)
 
 
 class Publisher:
-    """Publishes blocks, events, health and status of a capture.
+    """Publishes blocks, events, health and status of a capture, which does not depend on it: its thread tries again.
 
     If the queue of blocks (``session.zenoh.queue_blocks``) is full, they are dropped and counted; the file remains
     complete. Sequence numbers show missing blocks; the last ``cache_blocks`` can be queried. Of health and status only
-    the latest waits. A capture does not depend on Zenoh: failures are logged and in :attr:`problem`, and its thread
-    tries again. ``exclusive`` refuses to run beside another capture of the robot, whose master would command the same
-    drives.
+    the latest waits. ``exclusive``: refuse to run beside another capture, whose master would command the same drives.
     """
 
     def __init__(self, session: SessionConfig, keys: Keys, *, exclusive: bool = True) -> None:

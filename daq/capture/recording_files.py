@@ -28,10 +28,7 @@ def open_series(
     name: str,
     metadata: dict[str, str],
 ) -> QueuedSeries:
-    """Return the writer of a capture's files, which a thread of its own writes.
-
-    With a trigger it keeps the last seconds in memory, and writes a file at each event.
-    """
+    """Return the queued writer of a capture's files; with a trigger it writes the last seconds at each event."""
     options = session.recording
     layouts = [stream.layout for stream in streams]
     every = {layout.name: layout.every for layout in layouts}

@@ -1,7 +1,4 @@
-"""Reload of the configuration during a capture; a change of any key outside of `CHANGEABLE` is refused.
-
-A thread reads and checks it; the capture applies it between two reads of the buses, so that no sample is delayed.
-"""
+"""Reload of the configuration by a thread; the capture applies keys of `CHANGEABLE` between two reads of the buses."""
 
 import logging
 import threading

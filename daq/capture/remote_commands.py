@@ -68,10 +68,7 @@ class Commands:
 
 
 def send_command(session: SessionConfig, robot: str, command: Command, answer_s: float = ANSWER_S) -> None:
-    """Send a command to a running capture and wait until it is accepted, at most ``answer_s`` for each answer.
-
-    Raises ConfigError if no capture of the cell answers, DataError with the reason if it refuses.
-    """
+    """Send a command and wait until a capture accepts it; ConfigError if none answers, DataError if it refuses."""
     with open_session(session, "observer") as zenoh_session:
         key = Keys(session.cell, robot).command(command.name)
         replies: queue.SimpleQueue[zenoh.Reply] = queue.SimpleQueue()

@@ -28,10 +28,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class MotionLimits:
-    """Limits of the joints, (n,) each; rad and N m, or m and N.
-
-    ``low``, ``high``: range of position; ``following``: largest distance between demand and position.
-    """
+    """Limits of the joints, (n,), SI units; ``following``: largest distance between demand and position."""
 
     low: Floats
     high: Floats

@@ -48,9 +48,8 @@ class DhRow:
 def from_dh_table(file: Path, convention: Convention | None) -> Geometry:
     """Geometry of a table of Denavit-Hartenberg parameters; a ConfigError has line and column.
 
-    The header is ``theta, d, a, alpha`` or ``alpha, d, theta, r``, perhaps with ``name``, ``type`` and units, such as
-    ``a [mm]``; angles may be ``-pi/2``. ``classical`` (x to the next axis) or ``modified``; ``None``: modified if there
-    is a column ``r``.
+    The header is ``theta, d, a, alpha`` or ``alpha, d, theta, r``, perhaps with ``name``, ``type`` and units (``a
+    [mm]``). ``classical`` (x to the next axis) or ``modified``; ``None``: modified if there is a column ``r``.
     """
     rows, khalil, notes = _read(file)
     if khalil and convention == "classical":

@@ -25,9 +25,8 @@ class InitOptions:
     """Options of ``armident init``; the geometry is that of ``urdf``, ``robot``, ``dh``, or only a number of ``axes``.
 
     ``convention``: of the table ``dh``; ``None``: by its columns. ``base``, ``tip``: links of the chain in the URDF.
-    ``stated``: options of `armident.daq.interchange.importing.import_recording`. ``name``, ``signal``: ``None``: those
-    of the source, and of the recording. ``link_torques``: efforts are measured behind the gears. ``gravity``: m/s^2 in
-    the frame of the base; ``None``: upright.
+    ``stated``: options of `import_recording`. ``link_torques``: efforts are measured behind the gears. ``gravity``:
+    m/s^2 in the frame of the base; ``None``: upright.
     """
 
     out: Path
@@ -49,10 +48,7 @@ class InitOptions:
 
 
 def run_init(options: InitOptions) -> str:
-    """Write ``robot.yaml`` and ``session.yaml``, and return the summary for the user.
-
-    Raises ConfigError if a source is missing or wrong, or a file exists; DataError if the recording is of another arm.
-    """
+    """Write ``robot.yaml`` and ``session.yaml``, return the summary; DataError if the recording is of another arm."""
     robot_file, session_file = options.out / "robot.yaml", options.out / "session.yaml"
     taken = [str(file) for file in (robot_file, session_file) if file.exists()]
     if taken and not options.overwrite:

@@ -53,10 +53,7 @@ class RecordedFacts:
 
 
 def examine(path: Path, robot: RobotConfig, stated: Mapping[str, Any]) -> RecordedFacts:
-    """Facts of a recording of a robot; ``stated``: options of `import_recording` that the user has stated.
-
-    Units of positions, torques and times, and times that jitter, are recognized; ``options`` has the corrections.
-    """
+    """Facts of a recording of a robot, with options that correct units and jitter; ``stated``: options of the user."""
     if is_recording(path):
         return _facts(path, read_recording(path), robot, {})
     options: dict[str, Any] = dict(given(stated))

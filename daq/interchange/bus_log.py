@@ -1,7 +1,4 @@
-"""Conversion between recordings and logs of CAN tools: candump, Vector ASC and BLF, PEAK TRC.
-
-The session defines the frames that hold samples. They are matched to their SYNC like captured frames.
-"""
+"""Conversion of recordings and logs of CAN tools (candump, Vector ASC and BLF, PEAK TRC) by a session's mapping."""
 
 import hashlib
 import logging

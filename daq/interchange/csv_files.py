@@ -33,8 +33,7 @@ _UNIT = re.compile(
 class CsvTable:
     """Values (N, columns) of a table in a text file; NaN where a cell is empty, and in the whole row of a damaged line.
 
-    ``header``: ``None`` if there is none. ``units``: from the line below it, or empty. ``lines`` (N,): line of each
-    row.
+    ``header``: ``None`` if there is none. ``units``: from the line below it, or empty. ``lines`` (N,): of each row.
     """
 
     header: list[str] | None

@@ -34,9 +34,9 @@ def match_joints(
 ) -> JointMatch:
     """Return the index of each of a robot's n joints among the names of a file; order is no evidence.
 
-    Compared in this order: names of the source (``Joint.source_name``, those of a URDF), of the configuration, either
-    without case and separators, either with one common prefix. ``by_position`` takes n names in order where they do not
-    match; ``joints`` (n) replaces all comparison. A DataError has both lists of names.
+    Compared in this order: names of the source (``Joint.source_name``, those of a URDF), names of the configuration,
+    both without case and separators, both with one common prefix. ``by_position`` takes n names in order where they do
+    not match; ``joints`` (n) replaces all comparison. A DataError has both lists of names.
     """
     twice = sorted({name for name in found if list(found).count(name) > 1})
     if twice:

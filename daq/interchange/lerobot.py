@@ -51,10 +51,7 @@ def joined(parts: Mapping[Path, Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def lerobot_table(path: Path, arrays: Mapping[str, Any]) -> tuple[dict[str, NDArray[np.float64]], list[str]]:
-    """Return times, positions, demand and effort of a data set, and notes; DataError without effort.
-
-    ``path``: file or folder of the data set, whose ``meta/info.json`` names the joints.
-    """
+    """Return times, positions, demand and effort of a data set, and notes; ``meta/info.json`` names its joints."""
     features = _features(path)
     table: dict[str, NDArray[np.float64]] = {}
     notes: list[str] = []

@@ -22,8 +22,7 @@ LATEST_NS = 9_000_000_000 * 1_000_000_000
 class LogFrames:
     """Classic data frames (N,) with 11-bit identifiers, times in ns, in the order of the log, and their buses (N,).
 
-    ``foreign``: number of CAN FD, extended, remote and error frames. ``notes``: what was left out or interpreted.
-    ``skipped``: number of lines or objects that were left out.
+    ``foreign``: number of CAN FD, extended, remote and error frames; ``skipped``: number of lines or objects left out.
     """
 
     frames: Frames

@@ -256,8 +256,7 @@ class AscLines:
     def _of_fd_channel(self, t_ns: int, words: list[str]) -> FrameLine | LineKind:
         """Return a classic frame of a CAN FD channel, or the kind of another line.
 
-        The words are channel, direction, identifier, perhaps a name, BRS, ESI, DLC, length, data, duration, bits and
-        flags.
+        Words: channel, direction, identifier, perhaps a name, BRS, ESI, DLC, length, data, duration, bits and flags.
         """
         if len(words) > 3 and not words[3].isdecimal():
             del words[3]

@@ -256,9 +256,8 @@ def at_rate(recording: Recording, rate_hz: float) -> Recording:
     """Return a recording at another sampling rate, 1/s.
 
     Positions, velocities and efforts pass a linear-phase low-pass filter (windowed sinc) below the lower Nyquist
-    frequency. Demands are interpolated linearly, as a CiA 402 drive does (60C2h); status words are held. Gaps, marks
-    and pieces keep their times; so does the time from a position to its torque, which in sampling periods is another
-    number.
+    frequency. Demands are linear, as in a CiA 402 drive (60C2h); status words are held. Gaps, marks and pieces keep
+    their times, and so does the time from a position to its torque.
     """
     if not (np.isfinite(rate_hz) and rate_hz > 0):
         raise ConfigError(f"--rate: expected a sampling rate greater than 0 Hz, found {rate_hz:g}")

@@ -53,9 +53,8 @@ def read_joint_states(
 ) -> JointStates:
     """Return positions and efforts of a robot's joints from a bag, by their names in every message.
 
-    ``topic``: ``None`` is the only one with the robot's joints. ``joints``: their names in the bag. Messages of one
-    stamp with parts of the joints are one sample. Times are the stamps, or those of recording if none is set. What is
-    damaged is left out, with a remark.
+    ``topic``: ``None`` is the only one with these joints; ``joints``: their names in the bag. Messages of one stamp are
+    one sample. Times are the stamps, or those of recording if none is set. What is damaged is left out, with a remark.
     """
     reader = BagReader(path, MESSAGE_TYPE)
     found: dict[str, TopicMessages] = {}

@@ -46,10 +46,7 @@ def check_units(
     raw: Mapping[str, NDArray[np.float64]],
     known: slice,
 ) -> None:
-    """Refuse values (N, n) far outside the limits in SI units on the stated side; ``known``: rows with a demand.
-
-    Raises DataError if positions or torques are far beyond their limits, or no joint followed its demand.
-    """
+    """Refuse positions and torques (N, n) far beyond SI limits, or a demand (``known`` rows) that none followed."""
     transmission = robot.transmission_matrix
     for name, values in raw.items():
         values = values[known] if name == "demand" else values

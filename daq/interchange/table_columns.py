@@ -57,8 +57,7 @@ def without_units(
 ) -> tuple[dict[str, NDArray[np.float64]], dict[str, str], list[str]]:
     """Return the table in SI without units in its names (``q1 [deg]``, ``time_ms``), the units by name, and notes.
 
-    Units that are not known are kept, for `armident.daq.interchange.column_units.check_unit`. ``units``: from a line of
-    units, one per column, or empty.
+    Units that are not known are kept, for `check_unit`. ``units``: from a line of units, one per column, or empty.
     """
     made: dict[str, NDArray[np.float64]] = {}
     stated: dict[str, str] = {}
@@ -105,11 +104,7 @@ def find_columns(
     by_position: bool = False,
     joints: Sequence[str] | None = None,
 ) -> TableColumns | None:
-    """Return the columns of a quantity in the robot's order, or ``None`` if there are none.
-
-    ``table`` has columns (N,) or arrays (N, n) by name. ``name``: stated by the user. ``by_position``, ``joints``: as
-    in `match_joints`.
-    """
+    """Return the columns of a quantity in the robot's order, or ``None``; ``name``: stated by the user."""
     for base in (name,) if name is not None else NAMES[quantity]:
         found = _numbered(table, base, robot.n)
         if found is not None:

@@ -78,10 +78,7 @@ class Rows:
 
 @dataclass(frozen=True)
 class Batch:
-    """Result of a batch of frames: complete rows by stream, and gaps that have ended.
-
-    ``certain``: number of the SYNC, by stream, before which all rows are known: they are complete, or in a gap.
-    """
+    """Complete rows and ended gaps; ``certain``: SYNC by stream before which all rows are complete or in a gap."""
 
     rows: dict[str, Rows]
     gaps: tuple[Gap, ...]
@@ -91,11 +88,10 @@ class Batch:
 class Assembler:
     """Matches SYNC and TPDO frames; the division of a bus's frames into batches does not matter.
 
-    Drives are compared with those of other buses as far as these have been read. Late answers of a drive may thus be
-    assigned or become a gap ``ambiguous order``, depending on when its bus is read. ``overflow``: of the SYNC counter
-    (CiA 301, 1019h; 0: none). ``first_counter``: that of SYNC 0; ``None``: the first SYNC received is SYNC 0.
-    ``bus_of``: bus of each joint's drive; empty: all on one. ``nodes``: node IDs, if SDO requests are watched: a write
-    to TPDO parameters makes TPDOs unverified until :meth:`mark_unverified`.
+    Drives on several buses are compared as far as these have been read: the time of reading decides if late answers are
+    assigned, or a gap ``ambiguous order``. ``overflow``: of the SYNC counter (CiA 301, 1019h; 0: none).
+    ``first_counter``: of SYNC 0; ``None``: the first received. ``bus_of`` empty: all on one. ``nodes``: if SDO requests
+    are watched: a write to TPDO parameters makes TPDOs unverified until :meth:`mark_unverified`.
     """
 
     def __init__(
@@ -183,11 +179,7 @@ class Assembler:
 
     @property
     def counters(self) -> dict[str, int]:
-        """Counters of frames, SYNCs and samples.
-
-        Of a stream's ``expected`` rows, ``rows`` are complete and others ``in_gaps``; ``discarded`` are samples of
-        single joints received for the latter.
-        """
+        """Counters of frames, SYNCs and samples; ``discarded``: samples of single joints received for rows in gaps."""
         counts = dict(zip(COUNT_NAMES, (int(c) for c in self._state.counts), strict=True))
         return counts | self._totals
 

@@ -127,10 +127,7 @@ def _update_progress(m: MatcherState, s: int, j: int) -> None:
 
 @compiled()
 def _is_aligned(m: MatcherState, s: int, j: int, head: int) -> bool:
-    """Return True if the surplus is that of answers to discarded rows: a drive never answers early.
-
-    The surplus is then the largest one, which the drive reaches whenever it is prompt.
-    """
+    """Return True if the surplus is that of answers to discarded rows, the largest one: drives never answer early."""
     if m.progress[s, j, BALANCE_RUN] >= ALIGNED_SYNCS:
         return True
     lasting = head - m.progress[s, j, BALANCE_AT] >= m.config[s, SHORT_WINDOW] // 2

@@ -35,10 +35,7 @@ class CapturedStream:
 
 
 def captured_streams(session: SessionConfig, robot: RobotConfig) -> tuple[CapturedStream, ...]:
-    """Return the streams of a session, with the joints in the robot's order.
-
-    Raises ConfigError if a joint has no drive, a stream does not fit into its TPDO, or a position has no scale.
-    """
+    """Return the streams of a session, joints in robot order; ConfigError without drive, room in a TPDO, or scale."""
     nodes = node_ids(session, robot)
     fd = all(bus.fd for bus in session.all_buses)
     if robot.transmission is None:

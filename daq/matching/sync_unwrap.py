@@ -33,19 +33,13 @@ _MISALIGNED = 2.0
 
 @compiled()
 def turns_in(periods: float, overflow: int) -> int:
-    """Return the number of whole counter turns in a time, in SYNC periods.
-
-    SYNCs may be late, when their master was delayed, but at most a quarter of a turn early.
-    """
+    """Return the number of whole counter turns in SYNC periods; SYNCs may be late, but at most a quarter turn early."""
     return int(np.floor(periods / overflow + _EARLY))
 
 
 @compiled()
 def _is_delayed(counter: int, previous: int, elapsed: float, irregular: bool, overflow: int) -> bool:
-    """Return True if the master was delayed between consecutive counters: the time is no multiple of counter turns.
-
-    The time of an ``irregular`` master is no evidence for missing turns.
-    """
+    """Return True if the time between counters is no multiple of turns; an ``irregular`` master's tells nothing."""
     step = (counter - previous) % overflow
     deviation = elapsed - step - turns_in(elapsed - step, overflow) * overflow
     return bool(step == 1 and (irregular or abs(deviation) > _ON_TIME + _DRIFT * elapsed))

@@ -109,12 +109,10 @@ class RecordingScan:
     """Iterates over the records up to the end of the data, and collects the content of those other than chunks.
 
     A damaged record behind the head is skipped and described in ``damage``; other threads decompress chunks ahead. A
-    file that another MCAP tool wrote (``rewritten``) is judged by its chunks' checksums, numbers of messages and
-    metadata.
+    file of another MCAP tool (``rewritten``) is judged by its chunks' checksums, numbers of messages and metadata.
 
-    By channel id: ``channels``, ``layouts``, ``messages`` so far, and ``expected`` by the summary (``None``: it is
-    invalid). ``head_crc``: ``None`` before its record; ``finished``: data end and closing magic are there; ``end``:
-    bytes.
+    By channel id: ``channels``, ``layouts``, ``messages`` so far, ``expected`` (``None``: the summary is invalid).
+    ``finished``: data end and closing magic are there. ``end``: end of the last complete record, bytes.
     """
 
     def __init__(self, data: memoryview) -> None:

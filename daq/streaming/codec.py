@@ -46,8 +46,7 @@ _MOST_ROWS = 1 << 20
 class Block:
     """Consecutive rows of one stream: SYNC numbers and times (N,), ns UTC, and raw values (N, n) by field.
 
-    ``sequence``: number in the capture, over all streams. ``capture``: its name, as in events; empty for a block of
-    none.
+    ``sequence``: number in the capture, over all streams. ``capture``: its name, as in events; empty without capture.
     """
 
     layout: StreamLayout

@@ -61,10 +61,9 @@ _sendmmsg.argtypes = [ctypes.c_int, ctypes.c_void_p, ctypes.c_uint, ctypes.c_int
 class RawSocket:
     """Raw socket on one CAN interface that moves batches of frames; a ConfigError has the command for an administrator.
 
-    ``filters``: frames to receive (``None``: all; empty: none, for a socket that only sends). ``errors``: receive error
-    frames too. ``own``, ``loopback``: give sent frames to this socket, and to other sockets. ``receive_buffer``: bytes,
-    beyond the system's limit with the right to it. ``fd``: batches are arrays of ``FD_FRAME``. ``hardware``: use the
-    interface's time stamps, if any, converted to the machine's time.
+    ``filters``: frames to receive (``None``: all; empty: none, to send only). ``errors``: receive error frames too.
+    ``own``, ``loopback``: give sent frames to this socket, and to others. ``receive_buffer``: bytes. ``fd``: batches
+    are arrays of ``FD_FRAME``. ``hardware``: use the interface's time stamps, converted to the machine's time.
     """
 
     def __init__(

@@ -37,9 +37,8 @@ def has_hardware_timestamps(channel: str) -> bool:
 class InterfaceClock:
     """Conversion of one interface's clock to the machine's clock.
 
-    Software stamp = hardware stamp + offset of the clocks + interrupt latency. The latency is never negative: the
-    offset is the smallest difference, which may grow at the drift rate. Converted times keep the even spacing of the
-    hardware stamps.
+    Software stamp = hardware stamp + offset of the clocks + interrupt latency, which is never negative: the offset is
+    the smallest difference, which may grow at the drift rate. The even spacing of the hardware stamps is kept.
     """
 
     def __init__(self) -> None:

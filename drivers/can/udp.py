@@ -28,11 +28,7 @@ MULTICAST_ALL = {socket.AF_INET: (socket.IPPROTO_IP, 49), socket.AF_INET6: (sock
 
 
 class UdpBus:
-    """Bus over UDP multicast with the interface of :class:`RawSocket`; receives the frames that it sends itself.
-
-    ``channel``: multicast address, such as ``239.74.163.2``. ``filters``: frames to receive; ``None``: all, empty:
-    none.
-    """
+    """Bus over UDP multicast (``239.74.163.2``) like :class:`RawSocket`; receives the frames that it sends itself."""
 
     fd = False
     timestamp_source = "software"

@@ -29,9 +29,8 @@ def setup_message(period_us: int, counter: int) -> bytes:
 class KernelSync:
     """SYNC producer in the kernel: sends SYNC k = 0, 1, 2, ... with counter ``k % counter + 1`` on one bus.
 
-    Its timer needs no process, so SYNC is punctual on a busy machine too. It starts each period at the end of the last:
-    the timer's latency lengthens it, and clocks of several buses would drift apart. Set points cannot follow SYNC
-    directly.
+    Its timer is punctual on a busy machine too. Each period starts at the end of the last, lengthened by the timer's
+    latency: clocks of several buses would drift apart. Set points cannot follow SYNC directly.
     """
 
     sent: int | None = None

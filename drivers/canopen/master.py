@@ -53,9 +53,8 @@ class DriveEvent:
 class DriveMaster:
     """CANopen master of the drives of one session; use it in a ``with`` block.
 
-    Call `configure`, then `start`, then `supervise` regularly, and `stop` at the end. A drive that boots again, or
-    whose mapping another master changes, is configured and enabled again; `unverified_mapping` holds the times until
-    then.
+    Call `configure`, `start`, `supervise` regularly, and `stop`. A drive that boots again, or whose mapping another
+    master changes, is configured and enabled again; `unverified_mapping` holds the times until then.
     """
 
     def __init__(self, session: SessionConfig, robot: RobotConfig) -> None:
@@ -97,8 +96,7 @@ class DriveMaster:
     def configure(self) -> None:
         """Check every drive against the robot, then map and enable the session's TPDOs; ConfigError if one refuses.
 
-        Drives that do not answer yet are waited for (``boot_timeout_s``). What is unusual but harmless becomes an event
-        ``remark``.
+        Late drives are waited for (``boot_timeout_s``). What is unusual but harmless becomes an event ``remark``.
         """
         for sdo in self._drives:
             self._command(NmtCommand.PRE_OPERATIONAL, sdo)

@@ -125,8 +125,7 @@ EVENT_DRIVEN = 255
 class TpdoLayout:
     """Data bytes of one TPDO: its objects in mapping order, little endian, without gaps.
 
-    It holds ``pack`` samples, the oldest first; of more than one, mapped from the objects' arrays
-    (:data:`ARRAY_OFFSET`).
+    ``pack`` > 1: it holds several samples, the oldest first, mapped from the objects' arrays (:data:`ARRAY_OFFSET`).
     """
 
     objects: tuple[MappedObject, ...]

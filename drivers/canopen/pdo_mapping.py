@@ -12,8 +12,7 @@ ROUNDING_US = 0.5
 def map_drive(sdo: DriveSdo, session: SessionConfig) -> None:
     """Write the session's TPDOs and the RPDO of its set points to a pre-operational drive, and read them back.
 
-    A PDO that is right already is not written; other TPDOs are disabled. A ConfigError names the refused object or
-    mapping.
+    A PDO that is right already is not written; other TPDOs are disabled. A ConfigError names the refused object.
     """
     node = sdo.drive.node_id
     streams = {s.tpdo: (name, s) for name, s in session.streams.items()}

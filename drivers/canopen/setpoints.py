@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 class SetpointPlan:
     """Position set points of all n drives, counts, int32 rows (M, n), one row per ``every`` SYNCs.
 
-    ``cob_ids`` (n,) are those of the drives' set point RPDOs, ``bus_of`` (n,) numbers of their buses; empty: all on
-    one.
+    ``cob_ids`` (n,): of the drives' set point RPDOs. ``bus_of`` (n,): numbers of their buses; empty: all on one.
     """
 
     rows: NDArray[np.int32]

@@ -83,11 +83,7 @@ class Loop:
     def __call__(
         self, rows: NDArray[np.int32], cob_ids: NDArray[np.uint32], bus_of: NDArray[np.int64], every: int
     ) -> None:
-        """Send SYNCs and set points until ``state[STOP]``, ``state[RETURN]`` or ``state[WANTED]``.
-
-        From row ``state[ROW]`` on, a row of ``rows`` (M, n), counts, is sent every ``every`` SYNCs. ``cob_ids`` and
-        ``bus_of`` (n,) are those of the set point frames.
-        """
+        """Send SYNCs, and set points (M, n) from ``state[ROW]`` on, until ``STOP``, ``RETURN`` or ``WANTED`` is set."""
         self._call(self._state, rows, cob_ids, bus_of, every)
 
     def _call(

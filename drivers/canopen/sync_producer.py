@@ -1,9 +1,8 @@
 """SYNC producer: SYNC with counter on an absolute time grid on all buses, and position set points after it.
 
 A compiled loop without the interpreter's lock sleeps to each deadline (``clock_nanosleep``) and sends by one system
-call. After a late SYNC the next ones return to the grid, at least half a period apart, which leaves time to other
-threads. Beyond ``MAX_LATE_PERIODS`` the grid moves by whole periods (``SyncStats.skipped``); no SYNC number is left
-out.
+call. After a late SYNC the next ones return to the grid, at least half a period apart: this leaves time to other
+threads. Beyond ``MAX_LATE_PERIODS`` the grid moves by whole periods; no SYNC number is left out.
 """
 
 import errno
@@ -54,8 +53,8 @@ REALTIME_PRIORITY = 10
 class SyncStats:
     """Punctuality of the SYNCs; the delay counts from the grid until all buses took the SYNC.
 
-    ``overruns`` are SYNCs late by more than a period, ``skipped`` the periods by which the grid moved, ``unsent`` the
-    SYNCs that each bus refused.
+    ``overruns``: SYNCs late by more than a period. ``skipped``: periods by which the grid moved. ``unsent``: refused,
+    by bus.
     """
 
     sent: int

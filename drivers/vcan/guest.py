@@ -93,10 +93,7 @@ def run(command: Sequence[str], buses: int = 1, memory: str = "4096M", writable:
 
 
 def _allow_mappings(memory: str) -> None:
-    """Allow a process of the guest to use all of its memory, until the next boot; say so where that is not permitted.
-
-    Beyond the limit a process of the guest hangs in a page fault, or ends by SIGSEGV.
-    """
+    """Allow guest processes all of their memory until the next boot: beyond the limit they hang or end by SIGSEGV."""
     number, unit = (memory[:-1], memory[-1]) if memory[-1:] in MEMORY_UNITS else (memory, "")
     needed = int(number) * MEMORY_UNITS.get(unit, 1) // os.sysconf("SC_PAGE_SIZE")
     with suppress(OSError, ValueError):
