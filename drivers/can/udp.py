@@ -1,7 +1,4 @@
-"""Bus for machines without SocketCAN: python-can's ``udp_multicast``, for low rates.
-
-UDP may lose frames, and does so above some thousand per second. It is suitable for trials, not for measurements.
-"""
+"""Bus without SocketCAN by ``udp_multicast`` of python-can; loses frames above some thousand per second: for trials."""
 
 import os
 import socket
@@ -31,13 +28,7 @@ MULTICAST_ALL = {socket.AF_INET: (socket.IPPROTO_IP, 49), socket.AF_INET6: (sock
 
 
 class UdpBus:
-    """Bus over UDP multicast with the interface of :class:`RawSocket`.
-
-    It receives the frames that it sends itself.
-
-    ``channel``: multicast address, ``239.74.163.2``. ``filters``: frames to receive; ``None``: all, empty: none. Raises
-    ConfigError if the address is not a multicast address or the network has no route for it.
-    """
+    """Bus over UDP multicast (``239.74.163.2``) like :class:`RawSocket`; receives the frames that it sends itself."""
 
     fd = False
     timestamp_source = "software"
@@ -56,10 +47,7 @@ class UdpBus:
         self._ahead: can.Message | None = None
 
     def receive(self, batch: Frames) -> int:
-        """Write received frames to the beginning of ``batch`` without waiting; return their number.
-
-        ``batch``: array of ``FRAME``, shape (N,), written in place. Raises BusDown if the network went down.
-        """
+        """Write received frames to the beginning of ``batch`` (N,) without waiting; return their number."""
         n = 0
         while n < batch.size and (message := self._next(0.0)) is not None:
             if not self._passes(message.arbitration_id):
@@ -78,10 +66,7 @@ class UdpBus:
         return n
 
     def poll(self, timeout: float) -> bool:
-        """Return True if a frame arrives within the timeout.
-
-        ``timeout``: longest wait, s. Raises BusDown if the network went down.
-        """
+        """Return True if a frame arrives within the timeout, s; raises BusDown if the network went down."""
         deadline = time.monotonic() + timeout
         while self._ahead is None:
             message = self._next(max(0.0, deadline - time.monotonic()))
@@ -92,10 +77,7 @@ class UdpBus:
         return True
 
     def send(self, frames: Frames) -> int:
-        """Send all frames in order; return their number.
-
-        ``frames``: array of ``FRAME``, shape (N,). Raises BusDown if the network refuses a frame.
-        """
+        """Send all frames (N,) in order and return N; raises BusDown if the network refuses one."""
         for one in frames:
             can_id = int(one["can_id"])
             message = can.Message(
@@ -151,12 +133,7 @@ def open_python_can(bus: Bus, filters: Sequence[dict[str, Any]] | None = None) -
 def open_bus(
     bus: Bus, *, filters: Sequence[Filter] | None = None, errors: bool = False, hardware: bool = False
 ) -> FrameBus:
-    """Open a bus of a session.
-
-    ``filters``: frames to receive; ``None``: all, empty: none. ``errors``: receive error frames, if the bus has them.
-    ``hardware``: use hardware time stamps, if the interface has them. Raises ConfigError if the bus does not exist;
-    BusDown if the bus is down.
-    """
+    """Open a bus of a session; ``errors`` and ``hardware`` (time stamps) have an effect where the bus has them."""
     if bus.interface == "udp_multicast":
         return UdpBus(bus.channel, filters=filters)
     return RawSocket(bus.channel, filters=filters, errors=errors, fd=bus.fd, hardware=hardware)

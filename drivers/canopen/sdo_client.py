@@ -23,8 +23,6 @@ class MatchingSdoClient(SdoClient):
     """SDO client that takes only the answer to its request: by command, and by index and sub-index or toggle bit.
 
     On the default SDO channel, answers to other clients of the drive arrive too, and some drives repeat theirs.
-
-    ``rx_cobid``, ``tx_cobid``: identifiers of requests and of answers.
     """
 
     def __init__(self, rx_cobid: int, tx_cobid: int, od: Any) -> None:
@@ -32,11 +30,7 @@ class MatchingSdoClient(SdoClient):
         self._object = bytes(3)
 
     def request_response(self, sdo_request: bytes) -> bytes:
-        """Send a request and return its answer.
-
-        ``sdo_request``: the eight bytes of the request. Raises SdoAbortedError if the drive aborts the transfer;
-        OtherAnswersError if there were answers to other requests only; SdoCommunicationError if there was no answer.
-        """
+        """Send the eight bytes of a request and return its answer; OtherAnswersError if only other answers came."""
         if sdo_request[0] >> 5 in (_DOWNLOAD, _UPLOAD):
             self._object = bytes(sdo_request[1:4])
         self.responses: queue.Queue[bytes] = queue.Queue()
