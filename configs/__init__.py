@@ -1,11 +1,10 @@
-"""Configuration files of robots, sessions, trajectories, scenarios and suites, and the schema that checks them."""
+"""Configuration files of robots, sessions, trajectories and scenarios, and the schema that checks them."""
 
 from armident.configs.errors import ArmidentError, ConfigError, DataError
-from armident.configs.loading import config_path, load_robot, load_scenario, load_session, load_suite, load_trajectory
+from armident.configs.loading import config_path, load_robot, load_scenario, load_session, load_trajectory
 from armident.configs.schema.robot import Coupling, Drive, Joint, Limits, Mdh, RobotConfig
 from armident.configs.schema.scenario import Scenario
 from armident.configs.schema.session import SessionConfig
-from armident.configs.schema.suite import SuiteConfig
 from armident.configs.schema.trajectory import Trajectory
 
 __all__ = [
@@ -20,12 +19,10 @@ __all__ = [
     "RobotConfig",
     "Scenario",
     "SessionConfig",
-    "SuiteConfig",
     "Trajectory",
     "config_path",
     "load_robot",
     "load_scenario",
     "load_session",
-    "load_suite",
     "load_trajectory",
 ]

@@ -18,14 +18,9 @@ LOG = "import of a bus log"
 class Need:
     """Use of a key that may be blank.
 
-    Parameters
-    ----------
-    commands
-        Commands that need its value; other commands work without it.
-    how
-        Way to find the value, for the user.
-    placeholder
-        Value in place of a required key, from the position of its entry in the list; ``None``: the default of the key.
+    ``commands``: commands that need its value; other commands work without it. ``how``: way to find the value, for the
+    user. ``placeholder``: value in place of a required key, from the position of its entry in the list; ``None``: the
+    default of the key.
     """
 
     commands: tuple[str, ...]
@@ -86,13 +81,7 @@ NEEDS: dict[str, Need] = {
 
 
 def pattern(key: str) -> str:
-    """Key without the names of the entries: ``joints[elbow].mdh`` is ``joints[].mdh``.
-
-    Parameters
-    ----------
-    key
-        Key of a blank.
-    """
+    """Key without the names of the entries: ``joints[elbow].mdh`` is ``joints[].mdh``."""
     return re.sub(r"\[[^\]]*\]", "[]", key)
 
 
@@ -101,10 +90,7 @@ def without_marks(data: dict[str, Any]) -> tuple[dict[str, Any], tuple[str, ...]
 
     A list with a blank among its elements is blank as a whole. Required keys get a placeholder (`Need.placeholder`).
 
-    Parameters
-    ----------
-    data
-        Content of a configuration file.
+    ``data``: content of a configuration file.
     """
     blanks: list[str] = []
     content = _stripped(data, "", 0, blanks)
@@ -145,14 +131,8 @@ def _entry(entry: dict[str, Any], k: int) -> str:
 def needed(blanks: Sequence[str], command: str | None, *, efforts_are_torques: bool = True) -> tuple[str, ...]:
     """Blanks whose value a command needs.
 
-    Parameters
-    ----------
-    blanks
-        Keys of blanks.
-    command
-        The command; ``None``: one that needs everything.
-    efforts_are_torques
-        ``False`` if drives report currents or voltages: the transmission is then needed to identify.
+    ``command``: the command; ``None``: one that needs everything. ``efforts_are_torques``: ``False`` if drives report
+    currents or voltages: the transmission is then needed to identify.
     """
 
     def wanted(key: str) -> bool:
@@ -165,13 +145,7 @@ def needed(blanks: Sequence[str], command: str | None, *, efforts_are_torques: b
 
 
 def grouped(keys: Iterable[str]) -> dict[str, list[str]]:
-    """Entries that lack a key, by key without indices; no entry where the key is that of no list.
-
-    Parameters
-    ----------
-    keys
-        Keys of blanks.
-    """
+    """Entries that lack a key, by key without indices; no entry where the key is that of no list."""
     entries: dict[str, list[str]] = {}
     for key in keys:
         found = re.search(r"\[([^\]]*)\]", key)
@@ -180,13 +154,7 @@ def grouped(keys: Iterable[str]) -> dict[str, list[str]]:
 
 
 def listed(keys: Iterable[str]) -> list[str]:
-    """Blanks as lines of text: key, the entries that lack it, and how to find its value.
-
-    Parameters
-    ----------
-    keys
-        Keys of blanks.
-    """
+    """Blanks as lines of text: key, the entries that lack it, and how to find its value."""
     lines = []
     for key, names in grouped(keys).items():
         need = NEEDS.get(key)
@@ -198,19 +166,8 @@ def listed(keys: Iterable[str]) -> list[str]:
 def check_filled(where: str, blanks: Sequence[str], command: str | None) -> None:
     """Refuse a configuration with blanks.
 
-    Parameters
-    ----------
-    where
-        Name of the configuration in messages.
-    blanks
-        Keys whose value is needed.
-    command
-        The command that needs them; ``None``: not named.
-
-    Raises
-    ------
-    ConfigError
-        If there are any; lists all of them, each with the way to find its value.
+    ``blanks``: keys whose value is needed. ``command``: the command that needs them; ``None``: not named. Raises
+    ConfigError if there are any; lists all of them, each with the way to find its value.
     """
     if blanks:
         who = f"armident {command} needs" if command is not None else "expected"

@@ -28,19 +28,8 @@ _SHOWN = 80
 def evaluate(expression: str | float, names: Mapping[str, float], where: str = "expression") -> float:
     """Value of an arithmetic expression.
 
-    Parameters
-    ----------
-    expression
-        A number, or text such as ``0.3 * fc``.
-    names
-        Values of the names that the expression may use.
-    where
-        Name of the expression in messages.
-
-    Raises
-    ------
-    ConfigError
-        If the text is not an expression, a name is unknown, or the value is not finite.
+    ``expression``: a number, or text such as ``0.3 * fc``; ``names``: values of the names that the expression may use.
+    Raises ConfigError if the text is not an expression, a name is unknown, or the value is not finite.
     """
     shown = repr(expression) if isinstance(expression, str) else "the number"
     shown = shown if len(shown) <= _SHOWN else f"{shown[: _SHOWN - 3]}..."

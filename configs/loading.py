@@ -1,8 +1,6 @@
 """Loading and checking of configuration files; an error is one line that names file, key and expected value."""
 
 import difflib
-import logging
-from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -12,8 +10,7 @@ from armident.configs.blanks import check_filled, needed, without_marks
 from armident.configs.errors import ConfigError
 from armident.configs.schema.robot import RobotConfig
 from armident.configs.schema.scenario import Scenario
-from armident.configs.schema.session import RENAMED, DriveNode, SessionConfig
-from armident.configs.schema.suite import SuiteConfig
+from armident.configs.schema.session import DriveNode, SessionConfig
 from armident.configs.schema.trajectory import Trajectory
 from armident.configs.suspected_units import suspected_units
 from armident.configs.urdf import UrdfGeometry, geometry_from_urdf, urdf_file
@@ -26,11 +23,10 @@ KINDS: dict[str, type[BaseModel]] = {
     "robot": RobotConfig,
     "session": SessionConfig,
     "trajectory": Trajectory,
-    "suite": SuiteConfig,
     "scenario": Scenario,
 }
 """Kinds of files by the word in their ``schema`` key."""
-SHIPPED = ("robots", "cells", "trajectories", "scenarios", "suites", "eds", "zenoh")
+SHIPPED = ("robots", "cells", "trajectories", "scenarios", "eds", "zenoh")
 """Folders of shipped files, in the order of the search for a bare name."""
 _LONGEST = 80
 """Maximum number of characters of a file that a message quotes."""
@@ -38,10 +34,8 @@ _LISTED = 12
 """Maximum number of missing keys that a message lists."""
 T = TypeVar("T", bound=BaseModel)
 
-log = logging.getLogger(__name__)
 
-
-def config_path(name: str | Path, listed: tuple[str, ...] = ("robots", "cells")) -> Path:
+def config_path(name: str | Path, listed: tuple[str, ...] = ("robots", "cells"), of_folder: str = "robot.yaml") -> Path:
     """Path of a configuration file: the path as given, else a file that is shipped with armident.
 
     Parameters
@@ -51,6 +45,8 @@ def config_path(name: str | Path, listed: tuple[str, ...] = ("robots", "cells"))
         all find the shipped ``configs/robots/tx40.yaml`` if the working directory has no file of that name.
     listed
         Folders of shipped files that the error message lists.
+    of_folder
+        File that is taken of a folder, as ``armident init`` writes it.
 
     Raises
     ------
@@ -58,8 +54,9 @@ def config_path(name: str | Path, listed: tuple[str, ...] = ("robots", "cells"))
         If there is no such file.
     """
     path = Path(name)
-    if is_file(path):
-        return path
+    for file in (path, path / of_folder):
+        if is_file(file):
+            return file
     found = _shipped(path)
     if found is not None:
         return found
@@ -77,7 +74,7 @@ def _shipped(path: Path) -> Path | None:
     return next((c for c in candidates if is_file(c)), None)
 
 
-def load_robot(name: str | Path, command: str | None = None) -> RobotConfig:
+def load_robot(name: str | Path, command: str = "") -> RobotConfig:
     """Load a robot configuration.
 
     If the file has a key ``urdf`` (see `armident.configs.urdf`), joints and geometry come from the URDF. In this case
@@ -86,15 +83,21 @@ def load_robot(name: str | Path, command: str | None = None) -> RobotConfig:
     Parameters
     ----------
     name
-        A path, or the name of a shipped file (see `config_path`).
+        A path, the folder that ``armident init`` wrote, or the name of a shipped file (see `config_path`).
     command
-        Command that uses the robot, such as ``identify``: keys that it does not need may be marked as blank
-        (`armident.configs.blanks`). ``None``: no key may.
+        Command that uses the robot, such as ``identify``: refuse it if it lacks a value that the command needs. By
+        default such values may be marked as blank (``FILL_IN``); a function that needs them refuses the robot.
 
     Raises
     ------
     ConfigError
         If the file is missing or wrong; names file, key and expected value. If values are missing, names all.
+
+    Examples
+    --------
+    >>> import armident
+    >>> armident.load_robot("tx40").n
+    6
     """
     path = config_path(name)
     robot = _robot(path)
@@ -242,7 +245,7 @@ def load_session(name: str | Path, command: str | None = None) -> SessionConfig:
     Parameters
     ----------
     name
-        A path, or the name of a shipped file (see `config_path`).
+        A path, the folder that ``armident init`` wrote, or the name of a shipped file (see `config_path`).
     command
         Command that uses the session, such as ``capture``: keys that it does not need may be marked as blank
         (`armident.configs.blanks`). ``None``: no key may.
@@ -253,14 +256,8 @@ def load_session(name: str | Path, command: str | None = None) -> SessionConfig:
         If the file is missing or wrong; names file, key and expected value. If values are missing in session or robot,
         names all.
     """
-    path = config_path(name)
-    data = _marked(path)
-    session = _checked(data, SessionConfig, str(path))
-    for key in data.get("recording", {}):
-        if key in RENAMED:
-            _warn_once(
-                f"{path}: recording.{key} is now recording.{RENAMED[key]}; the next release refuses the old name"
-            )
+    path = config_path(name, of_folder="session.yaml")
+    session = _checked(_marked(path), SessionConfig, str(path))
     base = path.resolve().parent
 
     def resolved(relative: Path, key: str) -> Path:
@@ -304,22 +301,6 @@ def _with_known_joints(session: SessionConfig, robot: RobotConfig, path: Path) -
     return tuple(d.model_copy(update={"joint": joints[d.joint.lower()]}) for d in session.drives)
 
 
-def load_suite(name: str | Path) -> SuiteConfig:
-    """Load the cases of a diagnosis suite.
-
-    Parameters
-    ----------
-    name
-        A path, or the name of a shipped file (see `config_path`).
-
-    Raises
-    ------
-    ConfigError
-        If the file is missing or wrong; names file, key and expected value.
-    """
-    return _load(config_path(name), SuiteConfig)
-
-
 def load_scenario(name: str | Path) -> Scenario:
     """Load the hidden effects of a virtual arm.
 
@@ -334,11 +315,6 @@ def load_scenario(name: str | Path) -> Scenario:
         If the file is missing or wrong; names file, key and expected value.
     """
     return _load(config_path(name, listed=("scenarios",)), Scenario)
-
-
-@cache
-def _warn_once(message: str) -> None:
-    log.warning(message)
 
 
 def _load(path: Path, kind: type[T]) -> T:

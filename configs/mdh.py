@@ -29,14 +29,9 @@ Floats = NDArray[np.float64]
 class MdhChain:
     """A serial chain in modified Denavit-Hartenberg parameters.
 
-    Parameters
-    ----------
-    base
-        Frame 0 in the frame that the axes were given in, homogeneous, shape (4, 4); its z is the first axis.
-    parameters
-        One per joint; ``theta`` (revolute) or ``r`` (prismatic) holds the offset of the joint variable.
-    frames
-        Frames 1 to n in the frame of the axes, all joint variables zero, shape (n, 4, 4).
+    ``base``: frame 0 in the frame that the axes were given in, homogeneous, shape (4, 4); its z is the first axis.
+    ``parameters``: one per joint; ``theta`` (revolute) or ``r`` (prismatic) holds the offset of the joint variable.
+    ``frames``: frames 1 to n in the frame of the axes, all joint variables zero, shape (n, 4, 4).
     """
 
     base: Floats
@@ -52,19 +47,9 @@ def modified_dh(axes: ArrayLike, points: ArrayLike, names: Sequence[str]) -> Mdh
     the normal with ``r_j = 0``. The last frame has ``theta_n = r_n = 0``, and frame 0 has ``alpha_1 = d_1 = 0`` with
     ``x_0`` towards the given x.
 
-    Parameters
-    ----------
-    axes
-        Unit vectors of the joint axes in the direction of positive motion, all joint variables zero, shape (n, 3).
-    points
-        A point on each axis, shape (n, 3), m.
-    names
-        Joint names for messages, length n.
-
-    Raises
-    ------
-    ConfigError
-        If two axes are nearly but not exactly parallel, so that their common normal is too far away.
+    ``axes``: unit vectors of the joint axes in the direction of positive motion, all joint variables zero, shape
+    (n, 3); ``points``: a point on each axis, shape (n, 3), m; ``names``: joint names for messages, length n. Raises
+    ConfigError if two axes are nearly but not exactly parallel, so that their common normal is too far away.
     """
     z = np.array(axes, dtype=np.float64)
     p = np.asarray(points, dtype=np.float64)

@@ -30,17 +30,9 @@ LONGEST_AXIS = 200.0
 def suspected_units(robot: RobotConfig, geometry: bool = True) -> list[str]:
     """Values of a robot that look like degrees or millimetres.
 
-    Parameters
-    ----------
-    robot
-        Robot configuration, of which the file claims rad and m.
-    geometry
-        ``True`` to include the modified Denavit-Hartenberg parameters, as for a robot that is not from a URDF.
-
-    Returns
-    -------
-    list
-        Key, value and the suspected unit of each value.
+    ``robot``: robot configuration, of which the file claims rad and m; ``geometry``: ``True`` to include the modified
+    Denavit-Hartenberg parameters, as for a robot that is not from a URDF. Returns the key, value and the suspected unit
+    of each value.
     """
     found: list[str] = []
     if math.hypot(*robot.gravity) > STRONGEST_GRAVITY:

@@ -10,20 +10,8 @@ from armident.configs.schema.robot import RobotConfig
 def counts_per_si(robot: RobotConfig) -> NDArray[np.float64]:
     """Encoder counts per rad (revolute joint) or per metre (prismatic joint) of each motor.
 
-    Parameters
-    ----------
-    robot
-        Robot whose drives have ``counts_per_unit``.
-
-    Returns
-    -------
-    ndarray
-        Counts per rad or m at the motor, shape (n,).
-
-    Raises
-    ------
-    ConfigError
-        If a drive has no ``counts_per_unit``.
+    ``robot``: robot whose drives have ``counts_per_unit``. Returns the counts per rad or m at the motor, shape (n,).
+    Raises ConfigError if a drive has no ``counts_per_unit``.
     """
     counts = []
     for joint in robot.joints:

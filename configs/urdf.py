@@ -108,22 +108,9 @@ class UrdfGeometry(FrozenModel):
 def geometry_from_urdf(given: UrdfGeometry, where: Path) -> dict[str, Any]:
     """Convert the geometry of a URDF to ``joints`` and ``gravity`` of a robot configuration.
 
-    Parameters
-    ----------
-    given
-        Keys of the robot configuration that are combined with the URDF.
-    where
-        Path of the robot configuration.
-
-    Returns
-    -------
-    dict
-        Plain values: ``joints`` with ``mdh``; ``gravity`` and the bodies of ``collision`` in frames of the chain.
-
-    Raises
-    ------
-    ConfigError
-        If the URDF is wrong or not a serial chain; names file and element.
+    ``given``: keys of the robot configuration that are combined with the URDF. Returns plain values: ``joints`` with
+    ``mdh``; ``gravity`` and the bodies of ``collision`` in frames of the chain. Raises ConfigError if the URDF is wrong
+    or not a serial chain; names file and element.
     """
     file = urdf_file(given, where)
     joints = read_chain(file, given.urdf.base, given.urdf.tip)
@@ -148,12 +135,8 @@ def geometry_from_urdf(given: UrdfGeometry, where: Path) -> dict[str, Any]:
 def link_placements(joints: tuple[UrdfJoint, ...], names: list[str], chain: MdhChain) -> dict[str, NDArray[np.float64]]:
     """Frames (4, 4) of the moved links of a URDF, and of its base link, in the frames of the chain, by link.
 
-    Parameters
-    ----------
-    joints, names
-        Moving joints, base to tip, and their names in the configuration.
-    chain
-        Their modified Denavit-Hartenberg parameters.
+    ``joints``, ``names``: moving joints, base to tip, and their names in the configuration; ``chain``: their modified
+    Denavit-Hartenberg parameters.
     """
     moved = zip(names, chain.frames, joints, strict=True)
     base: dict[str, NDArray[np.float64]] = {BASE: np.asarray(np.linalg.inv(chain.base))}
@@ -187,17 +170,7 @@ def _triple(values: NDArray[np.float64]) -> tuple[float, float, float]:
 def urdf_file(given: UrdfGeometry, where: Path) -> Path:
     """Path of the URDF of a robot configuration.
 
-    Parameters
-    ----------
-    given
-        Keys of the configuration.
-    where
-        Path of the configuration.
-
-    Raises
-    ------
-    ConfigError
-        If there is no such file.
+    ``given``: keys of the configuration. Raises ConfigError if there is no such file.
     """
     file = where.resolve().parent / given.urdf.file
     if not is_file(file):
@@ -210,10 +183,7 @@ def _additions(
 ) -> dict[str, JointGiven]:
     """Additions of the configuration by name of the joint; joints are found by either of their names.
 
-    Raises
-    ------
-    ConfigError
-        If the chain has no such joint, or a joint is there twice.
+    Raises ConfigError if the chain has no such joint, or a joint is a duplicate.
     """
     known = {joint_name(name).lower(): name for name in names}
     known |= {joint.name: name for joint, name in zip(joints, names, strict=True)}
@@ -224,7 +194,7 @@ def _additions(
             listed = ", ".join(joint.name for joint in joints)
             raise ConfigError(f"{where}: joints[{k}].name: the chain has no joint {more.name!r}; it has {listed}")
         if found in extra:
-            raise ConfigError(f"{where}: joints[{k}].name: {more.name!r} is there twice")
+            raise ConfigError(f"{where}: joints[{k}].name: duplicate joint {more.name!r}")
         extra[found] = more
     return extra
 
@@ -232,17 +202,8 @@ def _additions(
 def joint_names(names: list[str], file: Path) -> list[str]:
     """Names of joints in a configuration: those of the URDF, or ``joint_1``, ... by place if no Latin letter is left.
 
-    Parameters
-    ----------
-    names
-        Names in the URDF, base to tip.
-    file
-        Path of the URDF for messages.
-
-    Raises
-    ------
-    ConfigError
-        If names in Latin letters differ only in case or punctuation.
+    ``names``: names in the URDF, base to tip; ``file``: path of the URDF for messages. Raises ConfigError if names in
+    Latin letters differ only in case or punctuation.
     """
     plain = [joint_name(name) for name in names]
     for k, name in enumerate(names):
@@ -258,11 +219,6 @@ def joint_name(name: str) -> str:
     """Name of a joint in a configuration: Latin letters and digits as in the URDF, underscores for other characters.
 
     Accents are dropped, and a name that begins with a digit follows ``joint_``. Empty if no letter or digit is left.
-
-    Parameters
-    ----------
-    name
-        Name of the joint in the URDF.
     """
     letters = "".join(c for c in unicodedata.normalize("NFKD", name) if not unicodedata.combining(c))
     plain = re.sub(r"[^A-Za-z0-9]+", "_", letters).strip("_")
@@ -272,17 +228,8 @@ def joint_name(name: str) -> str:
 def mdh_of(joints: tuple[UrdfJoint, ...], file: Path) -> MdhChain:
     """Modified Denavit-Hartenberg parameters of a chain, with frames in the base link.
 
-    Parameters
-    ----------
-    joints
-        Moving joints from base to tip.
-    file
-        Path of the URDF for messages.
-
-    Raises
-    ------
-    ConfigError
-        If two axes are nearly parallel; names ``file`` and joints.
+    ``joints``: moving joints from base to tip; ``file``: path of the URDF for messages. Raises ConfigError if two axes
+    are nearly parallel; names ``file`` and joints.
     """
     axes = np.array([joint.placement[:3, :3] @ joint.axis for joint in joints])
     try:

@@ -15,19 +15,9 @@ LARGEST = 1e9
 def only(file: Path, element: ET.Element, tag: str, of: ET.Element | None = None) -> ET.Element | None:
     """Return the element of a name in another one, or ``None``.
 
-    Parameters
-    ----------
-    file
-        Path of the URDF, for messages.
-    element, tag
-        Element of a joint or link, or one below it, and the name.
-    of
-        Joint or link around the element, for messages; ``None``: it is one.
-
-    Raises
-    ------
-    ConfigError
-        If there are two that differ.
+    ``file``: path of the URDF, for messages. ``element``, ``tag``: element of a joint or link, or one below it, and the
+    name. ``of``: joint or link around the element, for messages; ``None``: it is one. Raises ConfigError if there are
+    two that differ.
     """
     found = element.findall(tag)
     contents = {tuple((part.tag, *sorted(part.items())) for part in each.iter()) for each in found}
@@ -39,15 +29,7 @@ def only(file: Path, element: ET.Element, tag: str, of: ET.Element | None = None
 
 
 def end_link(element: ET.Element, end: Literal["parent", "child"]) -> str:
-    """Name of the ``parent`` or ``child`` link of a joint; empty if it has none.
-
-    Parameters
-    ----------
-    element
-        Element of the joint.
-    end
-        The end.
-    """
+    """Name of the ``parent`` or ``child`` link of a joint; empty if it has none."""
     found = element.find(end)
     return "" if found is None else found.get("link", "")
 
@@ -57,21 +39,9 @@ def words(
 ) -> list[str]:
     """Finite numbers of an attribute, as written.
 
-    Parameters
-    ----------
-    file, element
-        Path of the URDF, and element of the joint or link, for messages.
-    child, key
-        Element below it, and the attribute.
-    count
-        Number of numbers.
-    default
-        Text if there is no such attribute; ``None``: it is required.
-
-    Raises
-    ------
-    ConfigError
-        If there are not that many finite numbers.
+    ``file``, ``element``: path of the URDF, and element of the joint or link, for messages. ``child``, ``key``: element
+    below it, and the attribute. ``default``: text if there is no such attribute; ``None``: it is required. Raises
+    ConfigError if there are not that many finite numbers.
     """
     text = child.get(key, default)
     words = (text or "").split()

@@ -34,13 +34,7 @@ _ATTRIBUTES: Mapping[str, tuple[str, ...]] = {
 
 
 def expand(file: Path) -> str:
-    """Text with the command that makes a URDF of a xacro file.
-
-    Parameters
-    ----------
-    file
-        Path of the file.
-    """
+    """Text with the command that makes a URDF of a xacro file."""
     stem = file.name.split(".")[0]
     return f"this is xacro, expand it first: xacro {file.name} > {stem}_expanded.urdf"
 
@@ -48,16 +42,8 @@ def expand(file: Path) -> str:
 def parse_urdf(file: Path) -> ET.Element:
     """Root element of a URDF file; xacro is refused by its name.
 
-    Parameters
-    ----------
-    file
-        Path of the file.
-
-    Raises
-    ------
-    ConfigError
-        If the file cannot be read, is not XML, is xacro, has an attribute of more than ``LONGEST`` characters, or
-        names that differ from those of URDF in case.
+    Raises ConfigError if the file cannot be read, is not XML, is xacro, has an attribute of more than ``LONGEST``
+    characters, or names that differ from those of URDF in case.
     """
     try:
         content = file.read_bytes().lstrip()

@@ -52,17 +52,8 @@ def read_inertials(file: Path, base: str | None = None, tip: str | None = None) 
 
     Links on fixed joints belong to the link that carries them, and everything after the tip to the last link.
 
-    Parameters
-    ----------
-    file
-        Path of the URDF.
-    base, tip
-        First and last link of the chain, as of `armident.configs.urdf_tree.read_chain`.
-
-    Raises
-    ------
-    ConfigError
-        If the file is wrong, or a mass or inertia is negative or not a number; names file and element.
+    ``base``, ``tip``: first and last link of the chain, as of `armident.configs.urdf_tree.read_chain`. Raises
+    ConfigError if the file is wrong, or a mass or inertia is negative or not a number; names file and element.
     """
     joints = read_chain(file, base, tip)
     frames = mdh_of(joints, file).frames
@@ -97,14 +88,7 @@ def read_inertials(file: Path, base: str | None = None, tip: str | None = None) 
 def carried_links(tree: UrdfTree, base: str, chain: list[str]) -> Iterator[tuple[str, int, Floats, str | None]]:
     """Links below the base: name, index of the joint that moves it (-1: none), placement, joint that is held still.
 
-    Parameters
-    ----------
-    tree
-        Links and joints of the URDF.
-    base
-        First link of the chain.
-    chain
-        Names of the moving joints of the chain in the URDF.
+    ``base``: first link of the chain.
     """
     todo: list[tuple[str, int, Floats]] = [(base, -1, np.eye(4))]
     while todo:

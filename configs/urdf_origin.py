@@ -22,15 +22,7 @@ Floats = NDArray[np.float64]
 def rotation(roll: float, pitch: float, yaw: float) -> Floats:
     """Rotation matrix of URDF's fixed-axis angles, exact for right angles: ``Rot(z, y) Rot(y, p) Rot(x, r)``.
 
-    Parameters
-    ----------
-    roll, pitch, yaw
-        Angles, rad.
-
-    Returns
-    -------
-    ndarray
-        Rotation matrix, shape (3, 3).
+    ``roll``, ``pitch``, ``yaw``: angles, rad. Returns the rotation matrix, shape (3, 3).
     """
     (cr, sr), (cp, sp), (cy, sy) = (_cos_sin(angle) for angle in (roll, pitch, yaw))
     about_x = np.array([[1.0, 0.0, 0.0], [0.0, cr, -sr], [0.0, sr, cr]])
@@ -43,10 +35,7 @@ def rotation(roll: float, pitch: float, yaw: float) -> Floats:
 def fixed_axis_angles(matrix: Floats) -> tuple[float, float, float]:
     """Return URDF's fixed-axis angles ``roll, pitch, yaw`` of a rotation, rad; yaw is 0 at a pitch of 90 degrees.
 
-    Parameters
-    ----------
-    matrix
-        Rotation matrix, shape (3, 3).
+    ``matrix``: rotation matrix, shape (3, 3).
     """
     pitch = math.atan2(-matrix[2, 0], math.hypot(matrix[0, 0], matrix[1, 0]))
     if math.hypot(matrix[0, 0], matrix[1, 0]) < EXACT:
@@ -72,20 +61,8 @@ def rounded_angle(word: str) -> float:
 def rotation_of_quaternion(quaternion: Sequence[float]) -> Floats:
     """Rotation matrix of a quaternion, exact for right angles.
 
-    Parameters
-    ----------
-    quaternion
-        ``x, y, z, w`` in the order of URDF's ``quat_xyzw``, of length 1 but for rounding.
-
-    Returns
-    -------
-    ndarray
-        Rotation matrix, shape (3, 3).
-
-    Raises
-    ------
-    ValueError
-        If the length of the quaternion is not 1.
+    ``quaternion``: ``x, y, z, w`` in the order of URDF's ``quat_xyzw``, of length 1 but for rounding. Returns the
+    rotation matrix, shape (3, 3). Raises ValueError if the length of the quaternion is not 1.
     """
     values = np.array(quaternion, dtype=np.float64)
     length = float(np.linalg.norm(values))

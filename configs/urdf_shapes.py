@@ -34,8 +34,6 @@ class UrdfShape:
         ``box``, ``cylinder``, ``sphere`` or ``mesh``.
     size
         Edges of a box (3,), radius and length of a cylinder (2,), radius of a sphere (1,), scale of a mesh (3,); m.
-    mesh
-        File of the mesh.
     """
 
     link: str
@@ -49,12 +47,8 @@ class UrdfShape:
 class UrdfShapes:
     """Shapes of the links of a chain of a URDF.
 
-    Parameters
-    ----------
-    shapes
-        All shapes that could be read: of each link its ``collision`` shapes, or its ``visual`` ones if it has no other.
-    missing
-        Mesh files that were not found, each with the name of its link in the URDF.
+    ``shapes``: all shapes that could be read: of each link its ``collision`` shapes, or its ``visual`` ones if it has
+    no other; ``missing``: mesh files that were not found, each with the name of its link in the URDF.
     """
 
     shapes: tuple[UrdfShape, ...]
@@ -64,17 +58,8 @@ class UrdfShapes:
 def read_shapes(file: Path, base: str | None = None, tip: str | None = None) -> UrdfShapes:
     """Shapes of the links between two links of a URDF; links on fixed joints belong to the link that carries them.
 
-    Parameters
-    ----------
-    file
-        Path of the URDF.
-    base, tip
-        First and last link of the chain, as of `armident.configs.urdf_tree.read_chain`.
-
-    Raises
-    ------
-    ConfigError
-        If the file is wrong, or a shape has no size; names file and element.
+    ``base``, ``tip``: first and last link of the chain, as of `armident.configs.urdf_tree.read_chain`. Raises
+    ConfigError if the file is wrong, or a shape has no size; names file and element.
     """
     joints = read_chain(file, base, tip)
     given = [joint.name for joint in joints]

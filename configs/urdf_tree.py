@@ -32,16 +32,9 @@ Floats = NDArray[np.float64]
 class UrdfJoint:
     """A moving joint of a chain.
 
-    Parameters
-    ----------
-    name, type
-        As in the file.
-    placement
-        Frame of the joint, and of the link it moves, in the base link with all variables zero, shape (4, 4).
-    axis
-        Unit vector in that frame, shape (3,).
-    limits
-        Limits of the file: ``position`` (rad or m), ``velocity`` (rad/s or m/s), ``torque`` (N m or N).
+    ``placement``: frame of the joint, and of the link it moves, in the base link with all variables zero, shape (4, 4);
+    ``axis``: unit vector in that frame, shape (3,); ``limits``: limits of the file: ``position`` (rad or m),
+    ``velocity`` (rad/s or m/s), ``torque`` (N m or N).
     """
 
     name: str
@@ -57,20 +50,9 @@ def read_chain(file: Path, base: str | None = None, tip: str | None = None) -> t
     Side branches that cannot move belong to the link they are fixed to. Branches at the base are ignored, and links
     after the tip are its load.
 
-    Parameters
-    ----------
-    file
-        Path of the URDF.
-    base
-        First link of the chain; ``None``: the root of the tree.
-    tip
-        Last link of the chain; ``None``: the chain ends with its last moving joint.
-
-    Raises
-    ------
-    ConfigError
-        If the file is not a URDF or not a tree, if the chain branches, or if a joint is not of a serial chain.
-        Names file and element.
+    ``base``: first link of the chain; ``None``: the root of the tree. ``tip``: last link of the chain; ``None``: the
+    chain ends with its last moving joint. Raises ConfigError if the file is not a URDF or not a tree, if the chain
+    branches, or if a joint is not of a serial chain. Names file and element.
     """
     tree = read_tree(file)
     base, path = tree.path(base, tip)
@@ -87,17 +69,8 @@ def read_chain(file: Path, base: str | None = None, tip: str | None = None) -> t
 def serial_tips(file: Path, base: str | None = None) -> dict[str, tuple[str, ...]]:
     """Names of the moving joints to each link at which a serial chain can end: ends of branches, and their forks.
 
-    Parameters
-    ----------
-    file
-        Path of the URDF.
-    base
-        First link of the chains; ``None``: the root of the tree.
-
-    Raises
-    ------
-    ConfigError
-        If the file is not a URDF or not a tree. Chains that cannot be identified are left out.
+    ``base``: first link of the chains; ``None``: the root of the tree. Raises ConfigError if the file is not a URDF or
+    not a tree. Chains that cannot be identified are left out.
     """
     tree = read_tree(file)
     found: dict[str, tuple[str, ...]] = {}
@@ -115,17 +88,8 @@ def serial_tips(file: Path, base: str | None = None) -> dict[str, tuple[str, ...
 def moving_links(file: Path, base: str | None, tip: str) -> list[tuple[str, str]]:
     """Links before and after each moving joint of a chain, base to tip.
 
-    Parameters
-    ----------
-    file
-        Path of the URDF.
-    base, tip
-        First and last link of the chain; ``base`` ``None``: the root of the tree.
-
-    Raises
-    ------
-    ConfigError
-        If the file is not a URDF, or the base does not move the tip.
+    ``base``, ``tip``: first and last link of the chain; ``base`` ``None``: the root of the tree. Raises ConfigError if
+    the file is not a URDF, or the base does not move the tip.
     """
     tree = read_tree(file)
     path = tree.path_to(tree.root() if base is None else base, tree.known(tip, "urdf.tip"))
@@ -139,17 +103,7 @@ def moving_links(file: Path, base: str | None, tip: str) -> list[tuple[str, str]
 def orientation(file: Path, link: str) -> Floats:
     """Rotation of a link in the root of a URDF with all joints at zero, shape (3, 3).
 
-    Parameters
-    ----------
-    file
-        Path of the URDF.
-    link
-        Name of the link.
-
-    Raises
-    ------
-    ConfigError
-        If the file is not a URDF, or has no such link.
+    Raises ConfigError if the file is not a URDF, or has no such link.
     """
     tree = read_tree(file)
     turned = np.eye(3)
@@ -163,15 +117,7 @@ def orientation(file: Path, link: str) -> Floats:
 def robot_name(file: Path) -> str:
     """Name of the robot in a URDF, as it is written there; empty if it has none.
 
-    Parameters
-    ----------
-    file
-        Path of the URDF.
-
-    Raises
-    ------
-    ConfigError
-        If the file is not a URDF or not a tree.
+    Raises ConfigError if the file is not a URDF or not a tree.
     """
     return read_tree(file).name
 
@@ -180,14 +126,7 @@ def robot_name(file: Path) -> str:
 class UrdfTree:
     """Links and joints of a URDF.
 
-    Parameters
-    ----------
-    file
-        Path of the URDF, for messages.
-    links
-        Link elements by name.
-    above, below
-        Joint elements by child link, and by parent link.
+    ``file``: path of the URDF, for messages; ``above``, ``below``: joint elements by child link, and by parent link.
     """
 
     file: Path
@@ -199,17 +138,8 @@ class UrdfTree:
     def known(self, link: str, key: str) -> str:
         """Return the name of a link that the file contains.
 
-        Parameters
-        ----------
-        link
-            Name of the link.
-        key
-            Key of the configuration that names the link, for messages.
-
-        Raises
-        ------
-        ConfigError
-            If the file has no such link.
+        ``key``: key of the configuration that names the link, for messages. Raises ConfigError if the file has no such
+        link.
         """
         if link not in self.links:
             raise ConfigError(f"{self.file}: no link {link!r} ({key}); links are {', '.join(sorted(self.links))}")
@@ -226,15 +156,8 @@ class UrdfTree:
     def path(self, base: str | None, tip: str | None) -> tuple[str, list[ET.Element]]:
         """First link of a chain, and all its joints, fixed ones included, from base to tip.
 
-        Parameters
-        ----------
-        base, tip
-            First and last link, as of `read_chain`.
-
-        Raises
-        ------
-        ConfigError
-            If there is no such link, or no chain between them.
+        ``base``, ``tip``: first and last link, as of `read_chain`. Raises ConfigError if there is no such link, or no
+        chain between them.
         """
         base = self.root() if base is None else self.known(base, "urdf.base")
         if tip is None:
@@ -244,15 +167,8 @@ class UrdfTree:
     def path_to(self, base: str, tip: str) -> list[ET.Element]:
         """Joints from base to tip; branches that move are refused on the way.
 
-        Parameters
-        ----------
-        base, tip
-            First and last link of the chain.
-
-        Raises
-        ------
-        ConfigError
-            If the base does not move the tip, or a second moving joint branches off.
+        ``base``, ``tip``: first and last link of the chain. Raises ConfigError if the base does not move the tip, or a
+        second moving joint branches off.
         """
         path: list[ET.Element] = []
         link = tip
@@ -292,36 +208,20 @@ class UrdfTree:
             )
 
     def moves(self, element: ET.Element) -> bool:
-        """Return True if this joint or any joint after it moves.
-
-        Parameters
-        ----------
-        element
-            Element of the joint.
-        """
+        """Return True if this joint or any joint after it moves."""
         return self.type_of(element) != "fixed" or any(
             self.moves(after) for after in self.below.get(end_link(element, "child"), [])
         )
 
     def type_of(self, element: ET.Element) -> str:
-        """Return the URDF type of a joint.
-
-        Parameters
-        ----------
-        element
-            Element of the joint.
-        """
+        """Return the URDF type of a joint."""
         return element.get("type", "")
 
     def origin(self, element: ET.Element, found: ET.Element | None) -> Floats:
         """Placement of a joint in its parent link, or of an inertia in its link, homogeneous, shape (4, 4).
 
-        Parameters
-        ----------
-        element
-            Element of the joint or link, for messages.
-        found
-            Element ``origin``; ``None``: the origin of the parent.
+        ``element``: element of the joint or link, for messages. ``found``: element ``origin``; ``None``: the origin of
+        the parent.
         """
         frame = np.eye(4)
         if found is not None:
@@ -358,17 +258,8 @@ class UrdfTree:
     def moving_joint(self, element: ET.Element, placement: Floats) -> UrdfJoint:
         """Return a moving joint of the chain.
 
-        Parameters
-        ----------
-        element
-            Element of the joint.
-        placement
-            Frame of the joint in the base link with all variables zero, shape (4, 4).
-
-        Raises
-        ------
-        ConfigError
-            If the joint is of another type, follows another joint, or has no usable axis.
+        ``placement``: frame of the joint in the base link with all variables zero, shape (4, 4). Raises ConfigError if
+        the joint is of another type, follows another joint, or has no usable axis.
         """
         where = f"{self.file}: {element.tag} {element.get('name')!r}"
         kind = self.type_of(element)
@@ -418,15 +309,7 @@ class UrdfTree:
 def read_tree(file: Path) -> UrdfTree:
     """Links and joints of a URDF file, checked to be a tree.
 
-    Parameters
-    ----------
-    file
-        Path of the URDF.
-
-    Raises
-    ------
-    ConfigError
-        If the file is not a URDF, or its joints are not those of a tree; names file and element.
+    Raises ConfigError if the file is not a URDF, or its joints are not those of a tree; names file and element.
     """
     root = parse_urdf(file)
     if root.tag != "robot":

@@ -23,13 +23,7 @@ LARGEST = 1_000_000
 
 
 def is_file(path: Path) -> bool:
-    """Return True if the file exists; no error if its name is too long or its folder is not accessible.
-
-    Parameters
-    ----------
-    path
-        Path of the file.
-    """
+    """Return True if the file exists; no error if its name is too long or its folder is not accessible."""
     return os.path.isfile(path)
 
 
@@ -37,19 +31,13 @@ class _Loader(yaml.SafeLoader):
     """Safe loader with the numbers of YAML 1.2, without dates and without duplicate keys."""
 
     def compose_mapping_node(self, anchor: Any) -> yaml.MappingNode:
-        """Compose a mapping and refuse duplicate keys; keys merged in (<<) come later and do not override.
-
-        Parameters
-        ----------
-        anchor
-            Anchor of the node.
-        """
+        """Compose a mapping and refuse duplicate keys; keys merged in (<<) come later and do not override."""
         node = super().compose_mapping_node(anchor)
         seen = set()
         for key, _ in node.value:
             name = (key.tag, key.value) if isinstance(key, yaml.ScalarNode) else None
             if name is not None and name in seen:
-                problem = f"the key {key.value[:80]!r} is there twice"
+                problem = f"duplicate key {key.value[:80]!r}"
                 raise yaml.composer.ComposerError(None, None, problem, key.start_mark)
             seen.add(name)
         return node
@@ -84,12 +72,8 @@ class _SelfReference(Exception):
 def _expanded(value: Any, known: dict[int, int]) -> int:
     """Return the number of values in a value, each as often as aliases repeat it.
 
-    Parameters
-    ----------
-    value
-        Value of a YAML document.
-    known
-        Numbers of the lists and mappings so far, by identity; 0 within their own value.
+    ``value``: value of a YAML document. ``known``: numbers of the lists and mappings so far, by identity; 0 within
+    their own value.
     """
     if not isinstance(value, dict | list):
         return 1
@@ -103,20 +87,7 @@ def _expanded(value: Any, known: dict[int, int]) -> int:
 
 
 def read_yaml(text: str, where: str) -> Any:
-    """Parse a YAML text.
-
-    Parameters
-    ----------
-    text
-        YAML text.
-    where
-        Name of the text in messages.
-
-    Raises
-    ------
-    ConfigError
-        If the text is not valid YAML; one line that names the line of the file.
-    """
+    """Parse a YAML text. Raises ConfigError if the text is not valid YAML; one line that names the line of the file."""
     try:
         data = yaml.load(text, _Loader)
         if _expanded(data, {}) > len(text) + LARGEST:

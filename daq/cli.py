@@ -4,7 +4,6 @@ A command is an entry point of group ``armident.commands`` that names a function
 must import quickly: heavy imports belong into the function.
 """
 
-import errno
 import functools
 import importlib.metadata
 import logging
@@ -56,12 +55,8 @@ def application(
 ) -> typer.Typer:
     """Return the command line with the command that is called, or with all if none is (help, completion).
 
-    Parameters
-    ----------
-    words
-        Arguments of the command line.
-    entry_points
-        The registered commands; default: those of the installed packages.
+    ``words``: arguments of the command line. ``entry_points``: the registered commands; default: those of the installed
+    packages.
     """
     app = typer.Typer(
         no_args_is_help=True,
@@ -111,6 +106,7 @@ def _reported(function: Callable[..., Any], name: str) -> Callable[..., Any]:
             raise typer.Exit(INTERRUPTED) from None
         except Exception as error:
             from armident.configs.errors import ArmidentError, ConfigError
+            from armident.configs.reasons import reason_of
             from armident.extras import install_line, needed_extra
 
             if interrupts:
@@ -125,7 +121,7 @@ def _reported(function: Callable[..., Any], name: str) -> Callable[..., Any]:
                 print(f"armident: {_one_line(error)}", file=sys.stderr)
                 raise typer.Exit(error.exit_code) from None
             if isinstance(error, OSError) and error.strerror:
-                print(f"armident: {_reason_of(error)}", file=sys.stderr)
+                print(f"armident: {reason_of(error, step=True)}", file=sys.stderr)
                 raise typer.Exit(1) from None
             hint = f" (--debug or {DEBUG_VARIABLE}=1 prints the traceback)"
             print(f"armident: {type(error).__name__}: {_one_line(error)}{hint}", file=sys.stderr)
@@ -151,20 +147,6 @@ def _noted(interrupts: list[int]) -> Iterator[None]:
     finally:
         if usual and signal.getsignal(signal.SIGINT) is note:
             signal.signal(signal.SIGINT, signal.default_int_handler)
-
-
-def _reason_of(error: OSError) -> str:
-    """Return file, reason and next step of a refused file operation."""
-    where = f"{os.fspath(error.filename)!s}: " if error.filename else ""
-    steps = {
-        errno.ENOSPC: "free space on the disk, or choose another folder",
-        errno.EDQUOT: "free space on the disk, or choose another folder",
-        errno.EROFS: "choose another folder",
-        errno.EACCES: "check its permissions, or choose another folder",
-        errno.ENOTDIR: "choose another folder",
-    }
-    step = f"; {steps[error.errno]}" if error.errno in steps else ""
-    return f"{where}{error.strerror}{step}"
 
 
 def _one_line(error: BaseException) -> str:

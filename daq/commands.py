@@ -1,10 +1,15 @@
 """Commands of data acquisition: options and help texts; the work is imported when a command runs."""
 
 import logging
+from functools import partial
+from inspect import cleandoc
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal, Unpack
 
 import typer
+
+from armident.daq.interchange.import_options import ImportOptions, with_import_options
+from armident.daq.interchange.readers import help_of_formats, names_of_formats, reader_of, written_suffixes
 
 if TYPE_CHECKING:
     from armident.daq.recording import Recording
@@ -61,8 +66,9 @@ def command(
     print(f"{name}: accepted")
 
 
+@with_import_options()
 def import_(
-    file: Annotated[Path, typer.Argument(help="CSV, MAT, NPZ, Parquet, rosbag2, bus log, or recording.")],
+    file: Annotated[Path, typer.Argument(help=f"File or folder: {names_of_formats()}.")],
     out: Annotated[Path, typer.Option("--out", help="The recording to write.")],
     config: Annotated[
         str | None,
@@ -71,101 +77,33 @@ def import_(
             help="Robot configuration; for a bus log the session configuration. [required, except for a recording]",
         ),
     ] = None,
-    effort: Annotated[
-        Path | None, typer.Option("--effort", help="Second CSV file with one effort column per joint.")
-    ] = None,
-    motor_side: Annotated[
-        bool, typer.Option("--motor-side", help="Values are on the motor side, not on the joint side.")
-    ] = False,
-    rate: Annotated[
-        float | None,
-        typer.Option("--rate", help="Sampling rate, Hz; default: column t. A recording is resampled to it.", min=0.001),
-    ] = None,
-    names: Annotated[
-        str, typer.Option("--map", help="Names in the file: position=qm,voltage=vir,...; demand=- omits it.")
-    ] = "",
-    polled: Annotated[
-        bool,
-        typer.Option("--polled", help="Samples were polled from a controller of --rate: put them on its clock."),
-    ] = False,
-    resample: Annotated[
-        float | None,
-        typer.Option(
-            "--resample",
-            help="Put samples with uneven times, or polled ones, on an even clock of this rate, Hz; holes are gaps.",
-            min=0.001,
-        ),
-    ] = None,
-    time_unit: Annotated[
-        str | None, typer.Option("--time-unit", help="Unit of the times: s, ms, us or ns; default: s.")
-    ] = None,
-    topic: Annotated[
-        str | None, typer.Option("--topic", help="Topic of joint states, if a bag has several with the robot's joints.")
-    ] = None,
-    joints: Annotated[
-        str, typer.Option("--joints", help="Joint names in the file, in the robot's order: NAME,NAME,...")
-    ] = "",
-    by_position: Annotated[
-        bool, typer.Option("--by-position", help="Take joints of other names in the order of the file.")
-    ] = False,
-    units: Annotated[
-        str, typer.Option("--units", help="Units other than SI: position=deg,torque=mnm,current=ma; mm, deg|mm, mv.")
-    ] = "",
+    **options: Unpack[ImportOptions],
 ) -> None:
-    """Convert measurements of other tools to a recording.
+    """Convert measurements of other tools to a recording, in SI units.
 
-    CSV columns: t (s), q1..qn, tau1..taun or current1..currentn, optionally the demand qr1..qrn, also as ref1,
-    q_ref1, setpoint1, target_position1 or elbow_cmd; SI units. Columns may be named after joints, such as
-    elbow/position and elbow/effort. MAT, NPZ and Parquet: the same names, or positions, torques, times. LeRobot data
-    sets (file or folder): observation.state, and an effort or current. ROS 2 bags (.mcap, .db3, or the folder):
-    sensor_msgs/msg/JointState, joints by their names. Logs of a bus (candump -l, .asc, .blf, .trc): SYNC and TPDOs,
-    as the session configuration maps them.
+    FORMATS
 
     Missing samples are gaps. Damaged lines are left out, counted and named.
-
-    A recording of armident (.mcap) is resampled to --rate, with an anti-alias filter.
 
     Example: armident import DATA_EMPS.mat --config emps.yaml --out emps.mcap
     """
     from armident.configs import ConfigError, load_robot, load_session
     from armident.configs.blanks import LOG
-    from armident.daq.interchange.bus_log import SUFFIXES, recording_from_log
     from armident.daq.interchange.importing import import_recording
-    from armident.daq.interchange.text_files import pairs_of
-    from armident.daq.recording import is_recording, write_recording
+    from armident.daq.recording import write_recording
 
-    own = is_recording(file)
-    if config is None and not own:
-        raise ConfigError(f"{file}: --config is missing, the robot configuration")
-    if file.suffix.lower() in SUFFIXES:
-        others = (effort, motor_side, rate, names, polled, resample, time_unit, topic, joints, by_position, units)
-        if any(others):
-            raise ConfigError(f"{file}: a bus log takes no option but --config and --out")
-        session = load_session(str(config), LOG)
-        logged = recording_from_log(file, session, load_robot(session.robot, LOG))
-        write_recording(logged, out)
-        rows, gaps = logged.counters["samples.rows"], logged.counters["samples.in_gaps"]
-        print(f"{out}: {rows} samples at {logged.sample_rate_hz:g} Hz, {gaps} in gaps, {_fields(logged)}")
-        return
-
-    recording = import_recording(
-        file,
-        None if config is None else load_robot(config, "import"),
-        effort=effort,
-        motor_side=motor_side,
-        rate_hz=rate,
-        names=pairs_of("--map", names),
-        units=pairs_of("--units", units),
-        polled=polled,
-        resample_hz=resample,
-        time_unit=time_unit,
-        topic=topic,
-        joints=[name.strip() for name in joints.split(",")] if joints else None,
-        by_position=by_position,
-    )
+    reader = reader_of(file)
+    if config is None and not reader.own:
+        raise ConfigError(f"{file}: --config is missing, the {'session' if reader.session else 'robot'} configuration")
+    load = partial(load_session, command=LOG) if reader.session else partial(load_robot, command="import")
+    recording = import_recording(file, None if config is None else load(config), **options)
     write_recording(recording, out)
-    rows, gaps, fields = recording.samples.sync.size, recording.counters.get("samples.in_gaps", 0), _fields(recording)
-    print(f"{out}: {rows} samples at {recording.sample_rate_hz:g} Hz, {f'{gaps} in gaps, ' if gaps else ''}{fields}")
+    rows, gaps = recording.samples.sync.size, recording.counters.get("samples.in_gaps", 0)
+    lost = f"{gaps} in gaps, " if gaps or reader.session else ""
+    print(f"{out}: {rows} samples at {recording.sample_rate_hz:g} Hz, {lost}{_fields(recording)}")
+
+
+import_.__doc__ = cleandoc(str(import_.__doc__)).replace("FORMATS", help_of_formats())
 
 
 def _fields(recording: "Recording") -> str:
@@ -177,7 +115,7 @@ def export(
     recording: Annotated[Path, typer.Argument(help="The recording.")],
     out: Annotated[
         Path,
-        typer.Option("--out", help="File to write: .csv, .npz, .mat, .parquet, .mcap (ROS 2), .log, .asc, .blf, .trc."),
+        typer.Option("--out", help=f"File to write: {written_suffixes()}; .mcap is a bag of ROS 2."),
     ],
 ) -> None:
     """Export a recording for other tools, in SI units at the joints.
@@ -246,8 +184,7 @@ def service(
     Example: armident service install line3 --dry-run
     """
     from armident.configs import ConfigError
-    from armident.daq.service import install
-    from armident.daq.service_state import status, uninstall
+    from armident.daq.service import install, status, uninstall
 
     if action == "status":
         lines, complete = status(cell, root, executable)
@@ -289,15 +226,3 @@ def recover(
     for result in results:
         kept = "" if result.original is None else f"; damaged file kept as {result.original}"
         print(f"{result.path}: " + ("complete" if result.missing is None else f"recovered: {result.missing}{kept}"))
-
-
-def heal(
-    recordings: Annotated[list[Path], typer.Argument(help="Recordings that were not finished.")],
-    as_json: Annotated[bool, typer.Option("--json", help="Print the results as JSON.")] = False,
-) -> None:
-    """Former name of `armident recover`.
-
-    Example: armident heal recordings/*.mcap
-    """
-    logging.getLogger(__name__).warning("heal is now recover; the next release removes the old name")
-    recover(recordings, as_json)

@@ -6,6 +6,7 @@ import shutil
 import socket
 import statistics
 import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -13,6 +14,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Literal
 
+from armident.compiled import BASELINE, missing
 from armident.configs import (
     ArmidentError,
     ConfigError,
@@ -27,14 +29,13 @@ from armident.configs.blanks import listed, needed, pattern
 from armident.configs.loading import is_session
 from armident.configs.schema.session import Bus
 from armident.daq.capture.clock import clock_state
-from armident.daq.capture.files import chunk_duration_ns
+from armident.daq.capture.recording_files import chunk_duration_ns
 from armident.daq.matching.streams import captured_streams, unknown_phase
-from armident.daq.streaming.session import configuration, endpoints, unreadable_files
+from armident.daq.streaming.zenoh_session import configuration, endpoints, unreadable_files
 from armident.drivers.can.socketcan import RECEIVE_BUFFER, RawSocket
 from armident.drivers.can.timestamps import has_hardware_timestamps
 from armident.drivers.canopen.bus_load import check_fits
 from armident.drivers.canopen.eds import read_eds
-from armident.drivers.compiled import MODE, require_compiled
 from armident.drivers.vcan.interfaces import NETWORK, have_socketcan, is_up
 
 Verdict = Literal["ok", "warning", "failed"]
@@ -52,14 +53,8 @@ _CHUNKS = 20
 class Check:
     """Result of one check.
 
-    Parameters
-    ----------
-    name
-        Name of the check.
-    verdict
-        ``ok``, ``warning`` or ``failed``: a capture would not run.
-    message
-        Findings, and the remedy if there are any.
+    ``verdict``: ``ok``, ``warning`` or ``failed``: a capture would not run; ``message``: findings, and the remedy if
+    there are any.
     """
 
     name: str
@@ -70,12 +65,8 @@ class Check:
 def checks_for(config: str | Path, command: Command) -> list[Check]:
     """Check everything that a command needs of a configuration.
 
-    Parameters
-    ----------
-    config
-        Robot or session configuration.
-    command
-        The command; for ``capture`` as `run_checks`, which needs a session.
+    ``config``: robot or session configuration. ``command``: the command; for ``capture`` as `run_checks`, which needs a
+    session.
     """
     if command == "capture":
         return run_checks(config)
@@ -106,10 +97,7 @@ def run_checks(config: str | Path) -> list[Check]:
     Nothing is sent to the buses, and only a probe file is written. If the configuration is invalid, the checks are
     that, the data sheets of the drives if the session could be read, and the clock.
 
-    Parameters
-    ----------
-    config
-        Session configuration.
+    ``config``: session configuration.
     """
     try:
         session = load_session(config, "")
@@ -196,7 +184,7 @@ def _interface(bus: Bus) -> Iterator[Check]:
         timing = details.get(key)
         actual = timing.get("bitrate") if isinstance(timing, dict) else None
         if wanted is not None and actual is not None and actual != wanted:
-            yield Check("bus", "failed", f"{name} runs at {actual} bit/s ({key}), the configuration says {wanted}")
+            yield Check("bus", "failed", f"{name} runs at {actual} bit/s ({key}), the configuration has {wanted}")
             return
     state = details.get("state")
     if state not in (None, "ERROR-ACTIVE"):
@@ -250,12 +238,17 @@ def _receive_buffer(bus: Bus) -> Check:
 
 
 def _installation() -> Check:
-    """Check that the loops that handle every frame are compiled."""
-    try:
-        require_compiled()
-    except ConfigError as error:
-        return Check("installation", "failed", str(error))
-    return Check("installation", "ok", f"armident {version('armident')}, loops of the bus compiled {MODE}")
+    """Check that the kernels of a capture are compiled for this machine."""
+    absent = missing("armident.daq.matching.pdo_matching", "armident.drivers.canopen.sync_loop")
+    if absent:
+        return Check(
+            "installation",
+            "warning",
+            f"armident {version('armident')} has no machine code of {', '.join(absent)}: a wheel has it for processors "
+            f"with the features of {BASELINE}. It is compiled at the first start, or now: "
+            f"{sys.executable} -m armident.compiled",
+        )
+    return Check("installation", "ok", f"armident {version('armident')}, kernels are compiled")
 
 
 def _clock() -> Check:
@@ -357,19 +350,8 @@ def _zenoh(session: SessionConfig) -> Check:
 def doctor(config: str, as_json: bool, command: Command = "capture") -> None:
     """Run ``armident doctor``: print the checks.
 
-    Parameters
-    ----------
-    config
-        Session configuration; for other commands than ``capture`` also a robot configuration.
-    as_json
-        Print JSON.
-    command
-        Command in mind.
-
-    Raises
-    ------
-    ConfigError
-        If a check failed: the command would not run.
+    ``config``: session configuration; for other commands than ``capture`` also a robot configuration. ``command``:
+    command in mind. Raises ConfigError if a check failed: the command would not run.
     """
     checks = checks_for(config, command)
     if as_json:

@@ -13,13 +13,7 @@ LOGGER = logging.getLogger("armident")
 
 
 class LineFormatter(logging.Formatter):
-    """Formats a record as its message, and from WARNING on with its level in front: ``warning: the disk is slow``.
-
-    Parameters
-    ----------
-    program
-        Name in front of the level.
-    """
+    """Formats a record as its message, and from WARNING on with its level in front: ``warning: the disk is slow``."""
 
     def __init__(self, program: str | None = None) -> None:
         super().__init__()
@@ -34,13 +28,7 @@ class LineFormatter(logging.Formatter):
 
 
 class StderrHandler(logging.Handler):
-    """Writes records as lines to the present ``sys.stderr``.
-
-    Parameters
-    ----------
-    program
-        Name in front of warnings and errors.
-    """
+    """Writes records as lines to the present ``sys.stderr``. ``program``: name in front of warnings and errors."""
 
     def __init__(self, program: str | None = None) -> None:
         super().__init__()
@@ -58,12 +46,8 @@ class StderrHandler(logging.Handler):
 def log_to(handler: logging.Handler, level: int | None = None) -> Iterator[None]:
     """Send the records of armident to a handler while the block runs, in place of another `StderrHandler`.
 
-    Parameters
-    ----------
-    handler
-        Takes the records; closed at the end.
-    level
-        Lowest level that is logged; default: the level that is set already, else INFO.
+    ``handler``: takes the records; closed at the end. ``level``: lowest level that is logged; default: the level that
+    is set already, else INFO.
     """
     replaced = [other for other in LOGGER.handlers if isinstance(other, StderrHandler)]
     level_before = LOGGER.level

@@ -1,14 +1,17 @@
-"""The command ``armident service``: user, folders, permissions and systemd units of a cell, made idempotently."""
+"""The command ``armident service``: files for systemd-sysusers, systemd-tmpfiles and systemctl."""
 
 import grp
 import os
 import pwd
 import re
+import shutil
 import stat
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from fnmatch import fnmatch
+from functools import partial
 from pathlib import Path
 
 from armident.configs import ArmidentError, ConfigError
@@ -25,40 +28,27 @@ SETTINGS = Path("etc/armident")
 CACHE = Path("var/cache/armident")
 HIDDEN = ("/home", "/root", "/run/user", "/tmp", "/var/tmp")
 """Folders that the units do not see: ``ProtectHome``, ``PrivateTmp``."""
+INSTALLED = "installed"
+LONGEST_STOP_S = 240.0
+"""Longest time for a service to stop, s: more than the 180 s that a capture may take to finish its file."""
 _CELL = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
 """Cells whose name systemd accepts as an instance name without escapes, and that is one component of a path."""
+_WORDS = {"d": "folder ", "z": ""}
+"""Types of the lines for systemd-tmpfiles, in messages."""
 
 
 @dataclass(frozen=True)
-class Step:
-    """One part of an installation.
-
-    Parameters
-    ----------
-    name
-        Result of the step, for example ``folder /etc/armident``.
-    is_done
-        Returns whether the result is there already.
-    apply
-        Makes the result.
-    """
+class InstallStep:
+    """One part of an installation: its name, a check that it is there, and the function that makes it."""
 
     name: str
     is_done: Callable[[], bool]
-    apply: Callable[[], None]
+    apply: Callable[[], object]
 
 
 @dataclass(frozen=True)
 class System:
-    """The system on which a service is installed.
-
-    Parameters
-    ----------
-    root
-        Root folder: ``/``, or the folder of a system image.
-    executable
-        The command ``armident`` as the units start it.
-    """
+    """The system on which a service is installed: its root folder, and the command ``armident`` of the units."""
 
     root: Path
     executable: Path
@@ -69,59 +59,32 @@ class System:
                 raise ConfigError(f"--root {self.root}: not the root of a Linux system: it has no etc/{name}")
 
     @property
-    def is_running(self) -> bool:
-        """True for the running system, false for an image."""
-        return self.root == Path("/")
-
-    @property
     def has_systemd(self) -> bool:
-        """True if the running system was started by systemd."""
-        return self.is_running and Path("/run/systemd/system").is_dir()
+        """True if the running system was started by systemd, false for an image."""
+        return self.root == Path("/") and Path("/run/systemd/system").is_dir()
 
-    def user_id(self) -> int | None:
-        """Return the id of the user of the units, ``None`` if there is none."""
-        if not self.is_running:
-            return self._listed_id("passwd")
-        try:
-            return pwd.getpwnam(ACCOUNT).pw_uid
-        except KeyError:
-            return None
-
-    def group_id(self) -> int | None:
-        """Return the id of the group of the units, ``None`` if there is none."""
-        if not self.is_running:
-            return self._listed_id("group")
-        try:
-            return grp.getgrnam(ACCOUNT).gr_gid
-        except KeyError:
-            return None
-
-    def _listed_id(self, name: str) -> int | None:
-        lines = (self.root / "etc" / name).read_text(encoding="utf-8").splitlines()
+    def id_of(self, name: str, kind: str) -> int | None:
+        """Return the id of a user (``passwd``) or group (``group``); ``None`` if there is none."""
+        if self.root == Path("/"):
+            try:
+                return pwd.getpwnam(name).pw_uid if kind == "passwd" else grp.getgrnam(name).gr_gid
+            except KeyError:
+                return None
+        lines = (self.root / "etc" / kind).read_text(encoding="utf-8").splitlines()
         fields = (line.split(":") for line in lines)
-        return next((int(found[2]) for found in fields if found[0] == ACCOUNT and len(found) > 2), None)
+        return next((int(found[2]) for found in fields if found[0] == name and len(found) > 2), None)
+
+    def has_account(self) -> bool:
+        """Return ``True`` if there are user and group of the units."""
+        return None not in (self.id_of(ACCOUNT, "passwd"), self.id_of(ACCOUNT, "group"))
 
     def run(self, *words: str, timeout_s: float = 60.0) -> None:
-        """Run a command of the package ``passwd`` or of systemd.
-
-        Parameters
-        ----------
-        *words
-            The command.
-        timeout_s
-            Longest time for it, s.
-
-        Raises
-        ------
-        ArmidentError
-            If it is missing or fails.
-        """
-        prefix = () if self.is_running else ("--prefix", str(self.root))
-        command = (words[0], *prefix, *words[1:]) if words[0] != "systemctl" else words
+        """Run a command of systemd for this system; one that is missing or fails is an ArmidentError."""
+        command = (words[0], *(() if self.root == Path("/") else (f"--root={self.root}",)), *words[1:])
         try:
             subprocess.run(command, check=True, capture_output=True, text=True, timeout=timeout_s)
         except FileNotFoundError:
-            raise ArmidentError(f"{words[0]}: no such command; is /usr/sbin in PATH?") from None
+            raise ArmidentError(f"{words[0]}: no such command; it belongs to systemd") from None
         except subprocess.TimeoutExpired:
             raise ArmidentError(f"{' '.join(command)}: no answer in {timeout_s:g} s") from None
         except subprocess.CalledProcessError as error:
@@ -129,95 +92,53 @@ class System:
             raise ArmidentError(f"{' '.join(command)}: {reason}") from None
 
 
-def steps(system: System, cell: str) -> Iterator[Step]:
-    """Return the steps of the installation of a cell, in their order: its parts, and a reload of systemd.
-
-    Parameters
-    ----------
-    system
-        The system.
-    cell
-        Name of the cell: its session configuration is ``/etc/armident/CELL.yaml``.
-    """
+def steps(system: System, cell: str) -> Iterator[InstallStep]:
+    """Return the steps of the installation of a cell, in their order: its parts, and a reload of systemd."""
     found = list(parts(system, cell))
     changed = not all(step.is_done() for step in found if step.name.startswith("unit "))
     yield from found
     if changed and system.has_systemd:
-        yield Step("units known to systemd", lambda: False, lambda: system.run("systemctl", "daemon-reload"))
+        yield InstallStep("units known to systemd", lambda: False, lambda: system.run("systemctl", "daemon-reload"))
 
 
-def parts(system: System, cell: str) -> Iterator[Step]:
-    """Return the parts of the installation of a cell, in their order.
-
-    Parameters
-    ----------
-    system
-        The system.
-    cell
-        Name of the cell: its session configuration is ``/etc/armident/CELL.yaml``.
-    """
-    yield Step(
-        f"system group {ACCOUNT}",
-        lambda: system.group_id() is not None,
-        lambda: system.run("groupadd", "--system", ACCOUNT),
+def parts(system: System, cell: str) -> Iterator[InstallStep]:
+    """Return the parts of the installation of a cell, in their order."""
+    yield _file(system, Path("etc/sysusers.d/armident.conf"), shipped_text("armident.sysusers"), "users")
+    yield InstallStep(
+        f"system group {ACCOUNT} and user {ACCOUNT}, without login",
+        system.has_account,
+        lambda: system.run("systemd-sysusers", "armident.conf"),
     )
-    yield Step(
-        f"system user {ACCOUNT}, without login",
-        lambda: system.user_id() is not None,
-        lambda: system.run(
-            *("useradd", "--system", "--gid", ACCOUNT, "--no-create-home", "--home-dir", f"/{STATE}"),
-            *("--shell", "/usr/sbin/nologin", ACCOUNT),
-        ),
-    )
-    # Keys of Zenoh may be beside the configuration: only the group reads it. systemd makes the others, with 0755, too.
-    yield _folder(system, SETTINGS, 0o750, owner="root")
-    yield _folder(system, STATE, 0o755, owner="root", group="root")
-    yield _folder(system, STATE / cell, 0o755)
-    yield _folder(system, CACHE, 0o755)
-    session = SETTINGS / f"{cell}.yaml"
-    if (system.root / session).is_file():
-        yield _permissions(system, f"/{session}", session, 0o640, "root", ACCOUNT)
-    for file in sorted((CONFIGS / "systemd").glob("armident-*@.*")):
-        yield _unit(system, file)
+    cell_lines = shipped_text("armident-cell.tmpfiles").replace("CELL", cell)
+    for name, text in (("armident", shipped_text("armident.tmpfiles")), (f"armident-{cell}", cell_lines)):
+        yield _file(system, Path(f"etc/tmpfiles.d/{name}.conf"), text, "folders")
+        for line in text.splitlines():
+            kind, path, mode, owner, group = line.split()
+            if kind == "d" or (system.root / path[1:]).is_file():
+                yield InstallStep(
+                    f"{_WORDS[kind]}{path} ({owner}:{group}, {mode})",
+                    partial(_agrees, system, path, mode, owner, group),
+                    partial(system.run, "systemd-tmpfiles", "--create", f"{name}.conf"),
+                )
+    for name in _unit_names():
+        yield _file(
+            system, UNITS / name, shipped_text(name).replace(SHIPPED_EXECUTABLE, str(system.executable)), "unit"
+        )
 
 
-def _folder(system: System, path: Path, mode: int, owner: str = ACCOUNT, group: str = ACCOUNT) -> Step:
-    step = _permissions(system, f"folder /{path}", path, mode, owner, group)
+def _agrees(system: System, path: str, mode: str, owner: str, group: str) -> bool:
+    """Return ``True`` if a file or folder has its mode, owner and group."""
+    target = system.root / path[1:]
+    if not target.exists():
+        return False
+    found = target.stat()
+    wanted = (system.id_of(owner, "passwd"), system.id_of(group, "group"), int(mode, 8))
+    return (found.st_uid, found.st_gid, stat.S_IMODE(found.st_mode)) == wanted
 
-    def apply() -> None:
-        (system.root / path).mkdir(mode=mode, parents=True, exist_ok=True)
-        step.apply()
 
-    return Step(step.name, step.is_done, apply)
-
-
-def _permissions(system: System, name: str, path: Path, mode: int, owner: str, group: str) -> Step:
-    """Return the step that gives owner, group and mode to a file or folder."""
+def _file(system: System, path: Path, plain: str, kind: str) -> InstallStep:
+    """Return the step that writes a file of ours; one of other origin is refused."""
     target = system.root / path
-
-    def ids() -> tuple[int | None, int | None]:
-        return (0 if owner == "root" else system.user_id()), (0 if group == "root" else system.group_id())
-
-    def is_done() -> bool:
-        if not target.exists():
-            return False
-        found = target.stat()
-        return (found.st_uid, found.st_gid, stat.S_IMODE(found.st_mode)) == (*ids(), mode)
-
-    def apply() -> None:
-        user, group_id = ids()
-        if user is None or group_id is None:
-            raise ArmidentError(f"{name}: there is no user or no group {ACCOUNT}")
-        os.chown(target, user, group_id)
-        target.chmod(mode)
-
-    return Step(f"{name} ({owner}:{group}, {mode:04o})", is_done, apply)
-
-
-def _unit(system: System, file: Path) -> Step:
-    """Return the step that writes a unit with the path of the installed command."""
-    target = system.root / UNITS / file.name
-    plain = shipped_text(file.name).replace(SHIPPED_EXECUTABLE, str(system.executable))
     wanted = HEADER + plain
 
     def is_done() -> bool:
@@ -238,46 +159,22 @@ def _unit(system: System, file: Path) -> Step:
         whole.chmod(0o644)
         whole.replace(target)
 
-    return Step(f"unit /{UNITS / file.name}", is_done, apply)
+    return InstallStep(f"{kind} /{path}", is_done, apply)
+
+
+def _unit_names() -> list[str]:
+    """Return the names of the shipped units, those that start others first."""
+    files = sorted((CONFIGS / "systemd").glob("armident-*@.*"), key=lambda file: (file.suffix != ".timer", file.name))
+    return [file.name for file in files]
 
 
 def shipped_text(name: str) -> str:
-    """Return the text of a shipped unit.
-
-    Parameters
-    ----------
-    name
-        Name of its file.
-    """
+    """Return the text of a shipped file for systemd."""
     return (CONFIGS / "systemd" / name).read_text(encoding="utf-8")
 
 
-def named_cell(cell: str) -> str:
-    """Return the name of a cell, after a check that a unit and a folder can have it.
-
-    Parameters
-    ----------
-    cell
-        The name.
-
-    Raises
-    ------
-    ConfigError
-        If it cannot be the name of a unit.
-    """
-    if _CELL.fullmatch(cell) is None:
-        raise ConfigError(f"{cell!r}: expected letters, digits, '_', '-' and '.' as the name of a cell, at most 64")
-    return cell
-
-
 def installed_executable() -> Path:
-    """Return the command ``armident`` of the running environment, as a unit can start it.
-
-    Raises
-    ------
-    ConfigError
-        If the units would not see it, or may not run it.
-    """
+    """Return the command ``armident`` of this environment; ConfigError if the units would not see or may not run it."""
     beside = Path(sys.executable).with_name("armident")
     remedy = (
         "install armident where every user may read it: sudo python3 -m venv /opt/armident && "
@@ -295,35 +192,22 @@ def installed_executable() -> Path:
     return beside
 
 
-def install(cell: str, root: Path = Path("/"), executable: Path | None = None, dry_run: bool = False) -> list[str]:
-    """Install the service of a cell, and return the lines that say what was done.
-
-    Parts that are there are left alone, so that a second run does nothing. No unit is enabled or started.
-
-    Parameters
-    ----------
-    cell
-        Name of the cell.
-    root
-        Root folder of the system; another than ``/`` is that of a system image.
-    executable
-        The command ``armident`` as the units start it; default: that of this environment, in an image
-        ``/opt/armident/bin/armident``.
-    dry_run
-        Change nothing.
-
-    Raises
-    ------
-    ConfigError
-        If the name of the cell cannot be that of a unit, without the rights of root, or if there is a unit of other
-        origin.
-    """
-    named_cell(cell)
+def _system(cell: str, root: Path, executable: Path | None) -> System:
+    """Return a system after a check of the name of the cell, which a unit and a folder must be able to have."""
+    if _CELL.fullmatch(cell) is None:
+        raise ConfigError(f"{cell!r}: expected letters, digits, '_', '-' and '.' as the name of a cell, at most 64")
     root = root.resolve()
-    if executable is None:
-        executable = installed_executable() if root == Path("/") else Path(SHIPPED_EXECUTABLE)
-    system = System(root, executable)
-    with_sudo = f"sudo {executable} service install {cell}"
+    return System(root, executable or (installed_executable() if root == Path("/") else Path(SHIPPED_EXECUTABLE)))
+
+
+def install(cell: str, root: Path = Path("/"), executable: Path | None = None, dry_run: bool = False) -> list[str]:
+    """Install the service of a cell, and return the lines that report what was done; nothing is enabled or started.
+
+    Parts that are there are left alone, so that a second run does nothing. ``executable`` is the command of the units;
+    by default that of this environment, in a system image (``root``) ``/opt/armident/bin/armident``.
+    """
+    system = _system(cell, root, executable)
+    with_sudo = f"sudo {system.executable} service install {cell}"
     try:
         open_steps = [step for step in steps(system, cell) if not step.is_done()]
         remaining = list(_next(system, cell))
@@ -331,25 +215,12 @@ def install(cell: str, root: Path = Path("/"), executable: Path | None = None, d
         raise ConfigError(f"{error.filename}: only root may read it: {with_sudo}") from None
     if open_steps and not dry_run and os.geteuid() != 0:
         raise ConfigError(f"only root can install a service: {with_sudo}")
-    lines = carry_out(open_steps, dry_run=dry_run)
+    lines = _carry_out(open_steps, dry_run)
     return [*(lines or [f"nothing to do: the service of cell {cell} is installed"]), *remaining]
 
 
-def carry_out(open_steps: Sequence[Step], *, dry_run: bool) -> list[str]:
-    """Carry out steps, and return one line for each.
-
-    Parameters
-    ----------
-    open_steps
-        The steps.
-    dry_run
-        Change nothing.
-
-    Raises
-    ------
-    ArmidentError
-        If a step fails.
-    """
+def _carry_out(open_steps: Sequence[InstallStep], dry_run: bool) -> list[str]:
+    """Carry out steps, and return one line for each."""
     lines = []
     for step in open_steps:
         if not dry_run:
@@ -369,3 +240,143 @@ def _next(system: System, cell: str) -> Iterator[str]:
         return
     yield f"next: cd /{STATE / cell} && sudo -u {ACCOUNT} {system.executable} doctor --config /{session}"
     yield f"next: sudo systemctl enable --now armident-capture@{cell}"
+
+
+def status(cell: str, root: Path = Path("/"), executable: Path | None = None) -> tuple[list[str], bool]:
+    """Return the lines on the state of the services of a cell, and ``True`` if all parts are installed."""
+    system = _system(cell, root, executable)
+    try:
+        states = [(_state(step), step.name) for step in parts(system, cell)]
+        lines = [f"{state}: {name}" for state, name in states]
+        session = SETTINGS / f"{cell}.yaml"
+        if not (system.root / session).is_file():
+            lines.append(f"missing: session configuration /{session}, which you write")
+        lines += [f"{_activity(system, name)}: {name}" for name in _instances(cell)]
+        lines.append(_recordings(system.root, cell))
+    except PermissionError as error:
+        raise ConfigError(f"{error.filename}: only root may read it: sudo armident service status {cell}") from None
+    return lines, all(state == INSTALLED for state, _ in states)
+
+
+def _state(step: InstallStep) -> str:
+    """Return the state of a part of an installation in words."""
+    try:
+        return INSTALLED if step.is_done() else "missing or different"
+    except ConfigError:
+        return "written by another program or person"
+
+
+def uninstall(cell: str, root: Path = Path("/"), dry_run: bool = False) -> list[str]:
+    """Remove the services of a cell, and return the lines that report what was done and what was kept.
+
+    Its units are stopped and disabled. The files that all cells share go with the last cell. Recordings, results,
+    configurations and the user that owns them are kept.
+    """
+    system = _system(cell, root, Path(SHIPPED_EXECUTABLE))
+    try:
+        open_steps = list(_removals(system, cell))
+        kept = list(_kept(system, cell))
+    except PermissionError as error:
+        raise ConfigError(f"{error.filename}: only root may read it: sudo armident service uninstall {cell}") from None
+    if open_steps and not dry_run and os.geteuid() != 0:
+        raise ConfigError(f"only root can remove a service: sudo armident service uninstall {cell}")
+    lines = _carry_out(open_steps, dry_run)
+    return [*(lines or [f"nothing to do: the service of cell {cell} is not installed"]), *kept]
+
+
+def _instances(cell: str) -> list[str]:
+    return [name.replace("@.", f"@{cell}.") for name in _unit_names()]
+
+
+def _links(system: System, name: str) -> list[Path]:
+    """Return the links with which systemd starts a unit; those of an image may lead nowhere."""
+    folders = sorted(path for path in (system.root / UNITS).glob("*.*") if path.is_dir())
+    return [path for each in folders for path in each.iterdir() if fnmatch(path.name, name) and path.is_symlink()]
+
+
+def _is_active(system: System, name: str) -> bool:
+    """Return ``True`` if a unit of the running system is active."""
+    if not system.has_systemd:
+        return False
+    return subprocess.run(["systemctl", "is-active", "--quiet", name], check=False, timeout=60).returncode == 0
+
+
+def _activity(system: System, name: str) -> str:
+    enabled = "enabled" if _links(system, name) else "not enabled"
+    if not system.has_systemd:
+        return enabled
+    return f"{enabled}, {'active' if _is_active(system, name) else 'not active'}"
+
+
+def _removals(system: System, cell: str) -> Iterator[InstallStep]:
+    """Return the parts of the removal of a cell that are needed, in their order."""
+
+    def step(name: str, apply: Callable[[], object]) -> InstallStep:
+        return InstallStep(name, lambda: False, apply)
+
+    for name in _instances(cell):
+        if _is_active(system, name):
+            words = ("systemctl", "stop", name)
+            yield step(f"stop {name}", partial(system.run, *words, timeout_s=LONGEST_STOP_S))
+    links = [link for name in _instances(cell) for link in _links(system, name)]
+    yield from (step(f"disable {link.name} ({link.parent.name})", link.unlink) for link in links)
+    own = system.root / f"etc/tmpfiles.d/armident-{cell}.conf"
+    units = [] if _other_cells(system, cell) else [unit for unit in _units(system) if _is_ours(unit)]
+    files = [own, *([*units, system.root / "etc/tmpfiles.d/armident.conf"] if units else [])]
+    for file in files:
+        if file.is_file():
+            kind = "unit" if file in units else "folders"
+            yield step(f"remove {kind} /{file.relative_to(system.root)}", file.unlink)
+    cache = system.root / CACHE
+    if units and cache.is_dir():
+        yield step(f"remove folder /{CACHE} (fonts, compiled kernels)", lambda: shutil.rmtree(cache))
+    if (units or links) and system.has_systemd:
+        yield step("units known to systemd", partial(system.run, "systemctl", "daemon-reload"))
+
+
+def _units(system: System) -> list[Path]:
+    """Return the installed unit files of the shipped names."""
+    return [path for name in sorted(_unit_names()) if (path := system.root / UNITS / name).is_file()]
+
+
+def _is_ours(unit: Path) -> bool:
+    """Return ``True`` if a unit file was written by ``armident service install``, or is a copy of the shipped one."""
+    text = unit.read_text(encoding="utf-8", errors="replace")
+    return text.startswith(HEADER) or text == shipped_text(unit.name)
+
+
+def _other_cells(system: System, cell: str) -> list[str]:
+    """Return the other cells that use the unit files: those with a session configuration or an enabled unit."""
+    settings = system.root / SETTINGS
+    files = sorted(settings.glob("*.yaml")) if settings.is_dir() else []
+    sessions = {file.stem for file in files if "armident/session/" in file.read_text("utf-8", errors="replace")}
+    enabled = {
+        link.name.partition("@")[2].rpartition(".")[0] for link in (system.root / UNITS).glob("*.*/armident-*@*.*")
+    }
+    return sorted((sessions | enabled) - {cell})
+
+
+def _kept(system: System, cell: str) -> Iterator[str]:
+    """Return the lines on what a removal leaves."""
+    yield _recordings(system.root, cell)
+    session = SETTINGS / f"{cell}.yaml"
+    if (system.root / session).is_file():
+        yield f"kept: session configuration /{session}; delete it yourself if the cell does not come back"
+    others = _other_cells(system, cell)
+    if others and _units(system):
+        yield f"kept: unit files, for {', '.join(others)} (session in /{SETTINGS}, or enabled)"
+    for unit in _units(system):
+        if not _is_ours(unit):
+            yield f"kept: unit /{unit.relative_to(system.root)}, which this command did not write"
+    if system.has_account():
+        yield f"kept: user and group {ACCOUNT}, which own the recordings"
+
+
+def _recordings(root: Path, cell: str) -> str:
+    """Return the line on recordings and results of a cell: folder, number of files and size."""
+    folder = root / STATE / cell
+    if not folder.is_dir():
+        return f"no recordings and results: there is no folder /{STATE / cell}"
+    files = [path for path in folder.rglob("*") if path.is_file() and not path.is_symlink()]
+    size = sum(path.stat().st_size for path in files) / 1e6
+    return f"recordings and results: /{STATE / cell} ({len(files)} files, {size:.1f} MB); never deleted"

@@ -10,9 +10,9 @@ from armident.configs import RobotConfig
 from armident.identify.documents.base import RecordingReference
 from armident.identify.documents.identification import IdentificationDocument, parameter
 from armident.identify.effects.terms import arm_model
+from armident.identify.identification.saved_model import model_of
 from armident.identify.model_export.exported_model import ExportedModel, exported_model
 from armident.identify.robot.arm import ArmModel
-from armident.identify.saved_model import model_of
 from tests.pinocchio_oracle import random_parameters
 
 Floats = NDArray[np.float64]

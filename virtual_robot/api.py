@@ -70,6 +70,7 @@ def simulate_recording(
         from armident.virtual_robot.twin import complete
 
     config = robot if isinstance(robot, RobotConfig) else load_robot(robot, "robot")
+    config.check_filled("robot")
     inertials = None if isinstance(robot, RobotConfig) else load_inertials(robot)
     document = None if model is None else Path(model)
     config, parameters, _ = complete(config, model=document, inertials=inertials, seed=arm_seed)

@@ -35,25 +35,13 @@ class DriveBackend(Protocol):
     demand: Raw32
 
     def enable(self, joint: int, enabled: bool) -> None:
-        """Handle that a drive enters or leaves operation enabled.
-
-        Parameters
-        ----------
-        joint
-            Number of the joint.
-        enabled
-            New state.
-        """
+        """Handle that a drive enters or leaves operation enabled. ``enabled``: new state."""
 
     def set_targets(self, targets: Raw32, fresh: NDArray[np.bool_]) -> None:
         """Set new targets, which the drives reach after their interpolation time.
 
-        Parameters
-        ----------
-        targets
-            Target positions, counts, int32, shape (n,).
-        fresh
-            ``True`` where the target is new, shape (n,).
+        ``targets``: target positions, counts, int32, shape (n,); ``fresh``: ``True`` where the target is new, shape
+        (n,).
         """
 
     def advance(self) -> None:
@@ -64,7 +52,8 @@ class Arm:
     """Virtual arm: plant, drives and noise, with the raw numbers of the bus.
 
     Drives of arms without a control period of their own (``servo.OWN_PERIODS``) report the position and the demand of
-    the last SYNC, and the mean of their signal since then: what moved the arm from that position to the next.
+    the last SYNC, and the mean of their signal since then: what moved the arm from that position to the next. Raises
+    ConfigError if the SYNC period is not a multiple of the control period, or an encoder resolution is missing.
 
     Parameters
     ----------
@@ -82,11 +71,6 @@ class Arm:
         Structure of the drives' velocity loop, see ``servo.design``.
     parameters
         Parameters of the arm; ``None``: `armident.virtual_robot.arm_parameters.arm_parameters` of the robot.
-
-    Raises
-    ------
-    ConfigError
-        If the SYNC period is not a multiple of the control period, or an encoder resolution is missing.
     """
 
     def __init__(
@@ -119,7 +103,7 @@ class Arm:
         self._ratio = robot.transmission_matrix
         drives = [joint.drive for joint in robot.joints]
         self._per_rad = counts_per_si(robot)
-        self._torque = self._ratio.T * np.array([drive.gain for drive in drives])
+        self._torque = np.ascontiguousarray(self._ratio.T * [drive.gain for drive in drives])
         self._limit = np.array([drive.saturation or np.inf for drive in drives])
         self._permille = np.array([1000.0 / drive.rated for drive in drives])
         # Drives are tuned for the arm without hidden effects.
@@ -143,26 +127,13 @@ class Arm:
         self.position[:], self.current[:], self.demand[:] = self._now
 
     def interpolation_time(self, joint: int, seconds: float) -> None:
-        """Set the interpolation time of a drive (60C2h).
-
-        Parameters
-        ----------
-        joint
-            Number of the joint.
-        seconds
-            Time from one target to the next, s.
-        """
+        """Set the interpolation time of a drive (60C2h). ``seconds``: time from one target to the next, s."""
         self._steps[joint] = max(round(seconds / self._servo.period), 1)
 
     def enable(self, joint: int, enabled: bool) -> None:
         """Open or close the brake of a joint; its demand starts at the measured position.
 
-        Parameters
-        ----------
-        joint
-            Number of the joint.
-        enabled
-            ``True`` opens the brake.
+        ``enabled``: ``True`` opens the brake.
         """
         self._held[joint] = not enabled
         self.plant.brake[joint] = 0.0 if enabled else BRAKE
@@ -170,12 +141,8 @@ class Arm:
     def set_targets(self, targets: Raw32, fresh: NDArray[np.bool_]) -> None:
         """Set new targets; interpolation starts at the last target.
 
-        Parameters
-        ----------
-        targets
-            Target positions, counts, int32, shape (n,).
-        fresh
-            ``True`` where the target is new, shape (n,).
+        ``targets``: target positions, counts, int32, shape (n,); ``fresh``: ``True`` where the target is new, shape
+        (n,).
         """
         take = fresh & ~self._held
         np.copyto(self._origin, self._target, where=take)
@@ -231,25 +198,9 @@ def design_drives(
 ) -> servo.Servo:
     """Design the drives of a virtual arm: gains of the scenario, else those of its configuration, else tuned gains.
 
-    Parameters
-    ----------
-    robot
-        The robot.
-    mass
-        Mass matrix of the healthy arm at power-on, joint side, rotors included, shape (n, n).
-    velocity_feedback
-        As for ``servo.design``.
-    period
-        Control period, s.
-    scenario
-        The scenario; ``None``: none.
-    parameters
-        Parameters of the arm in this scenario.
-
-    Raises
-    ------
-    ConfigError
-        If the gains are not those of n joints, or contradict ``velocity_feedback``.
+    ``mass``: mass matrix of the healthy arm at power-on, joint side, rotors included, shape (n, n).
+    ``velocity_feedback``: as for ``servo.design``. ``scenario``: the scenario; ``None``: none. Raises ConfigError if
+    the gains are not those of n joints, or contradict ``velocity_feedback``.
     """
     given = None if scenario is None or scenario.controller is None else scenario.controller
     known = None if given is None else given.gains

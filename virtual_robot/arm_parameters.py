@@ -61,21 +61,10 @@ def arm_parameters(
 
     Masses are those of ``model``, else of the URDF, else those shipped for the robot (TX40, EMPS), else drawn.
 
-    Parameters
-    ----------
-    robot
-        Robot with limits of position, velocity and acceleration (`armident.virtual_robot.twin.with_limits`).
-    model
-        ``identification.json`` with physically consistent parameters.
-    inertials
-        Masses of the robot's URDF.
-    seed
-        Seed of what is drawn: rotors, friction, and masses if there are no others.
-
-    Raises
-    ------
-    ConfigError
-        If the document is not of this robot, or masses leave a joint without inertia.
+    ``robot``: robot with limits of position, velocity and acceleration (`armident.virtual_robot.twin.with_limits`);
+    ``model``: ``identification.json`` with physically consistent parameters; ``inertials``: masses of the robot's URDF;
+    ``seed``: seed of what is drawn: rotors, friction, and masses if there are no others. Raises ConfigError if the
+    document is not of this robot, or masses leave a joint without inertia.
     """
     if model is not None:
         identified = read_identified(model, robot)
@@ -143,19 +132,8 @@ def _rest(robot: RobotConfig) -> tuple[float, ...]:
 def with_scenario(parameters: ArmParameters, robot: RobotConfig, scenario: Scenario | None) -> ArmParameters:
     """Parameters of the arm with the friction, the noise and the bandwidth of a scenario.
 
-    Parameters
-    ----------
-    parameters
-        Parameters of the arm.
-    robot
-        The robot.
-    scenario
-        The scenario; ``None``: no changes.
-
-    Raises
-    ------
-    ConfigError
-        If the scenario names a joint that the robot does not have, or has another number of bandwidths.
+    ``scenario``: the scenario; ``None``: no changes. Raises ConfigError if the scenario names a joint that the robot
+    does not have, or has another number of bandwidths.
     """
     if scenario is None:
         return parameters

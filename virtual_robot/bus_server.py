@@ -30,52 +30,24 @@ REOPEN_S = 0.02
 
 
 class GuardingListener(can.Listener):
-    """Receives the requests of node guarding (CiA 301), which are remote frames, for the drives of a bus.
-
-    Parameters
-    ----------
-    drives
-        The drives.
-    """
+    """Receives the requests of node guarding (CiA 301), which are remote frames, for the drives of a bus."""
 
     def __init__(self, drives: Sequence[Drive]) -> None:
         self._drives = {COB_HEARTBEAT + drive.node_id: drive for drive in drives}
 
     def on_message_received(self, msg: can.Message) -> None:
-        """Let a drive answer a request.
-
-        Parameters
-        ----------
-        msg
-            The received frame.
-        """
+        """Let a drive answer a request. ``msg``: the received frame."""
         if msg.is_remote_frame and msg.arbitration_id in self._drives:
             self._drives[msg.arbitration_id].nmt.answer_guarding()
 
     def on_error(self, exc: Exception) -> None:
-        """Accept the error of a bus that is down.
-
-        Parameters
-        ----------
-        exc
-            The error.
-        """
+        """Accept the error of a bus that is down."""
 
 
 class DriveBus:
     """Virtual drives on one bus.
 
-    Parameters
-    ----------
-    bus
-        The bus.
-    drives, motion, period
-        As for :class:`Exchange`.
-
-    Raises
-    ------
-    ConfigError
-        If the bus does not exist.
+    ``drives``, ``motion``, ``period``: as for :class:`Exchange`. Raises ConfigError if the bus does not exist.
     """
 
     def __init__(self, bus: Bus, drives: Sequence[Drive], motion: DriveBackend, period: float) -> None:
@@ -130,25 +102,14 @@ class DriveBus:
     def take(self, start: int, stop: int, sequence: int) -> int:
         """Process the frames of ``batch`` up to the next SYNC, as :meth:`Exchange.take`.
 
-        Parameters
-        ----------
-        start, stop, sequence
-            As in :meth:`Exchange.take`.
+        ``start``, ``stop``, ``sequence``: as in :meth:`Exchange.take`.
         """
         return self.exchange.take(*self._columns, start, stop, sequence)
 
     def receive(self, wait: bool) -> int:
         """Receive frames into ``batch`` and return their number.
 
-        Parameters
-        ----------
-        wait
-            ``True``: wait up to ``RECEIVE_TIMEOUT`` for the first frame.
-
-        Raises
-        ------
-        BusDown
-            If the bus is down.
+        ``wait``: ``True``: wait up to ``RECEIVE_TIMEOUT`` for the first frame. Raises BusDown if the bus is down.
         """
         # One system call if possible, because they are slow in a guest kernel.
         if isinstance(self.bus, RawSocket):
@@ -180,10 +141,7 @@ class DriveBus:
     def answer(self, sequence: int) -> None:
         """Queue the answers to the next SYNC and apply set points.
 
-        Parameters
-        ----------
-        sequence
-            Counter of the SYNC if it carries none.
+        ``sequence``: counter of the SYNC if it carries none.
         """
         self._syncs.pop()
         at = self.take(self._at, self._count, sequence)

@@ -10,13 +10,7 @@ MOVING = (DriveState.ENABLED, DriveState.QUICK_STOP_ACTIVE)
 
 
 def statusword(state: DriveState) -> int:
-    """Statusword (6041h) of a drive in cyclic synchronous position mode.
-
-    Parameters
-    ----------
-    state
-        State of the drive.
-    """
+    """Statusword (6041h) of a drive in cyclic synchronous position mode."""
     word = STATE_CODES[state][1] | REMOTE
     if state is not DriveState.SWITCH_ON_DISABLED:
         word |= VOLTAGE_ENABLED
@@ -30,12 +24,7 @@ def statusword(state: DriveState) -> int:
 def next_state(state: DriveState, control: int, before: int) -> DriveState:
     """State of a drive after a controlword (6040h).
 
-    Parameters
-    ----------
-    state
-        Present state.
-    control, before
-        New and previous controlword.
+    ``state``: present state; ``control``, ``before``: new and previous controlword.
     """
     if state is DriveState.FAULT:
         rising = control & Control.FAULT_RESET and not before & Control.FAULT_RESET

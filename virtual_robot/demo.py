@@ -56,7 +56,7 @@ SCENARIO = "scenarios/tx40_worn_joint2.yaml"
 VCAN = "vcan0"
 """Bus of a configured arm, in place of those of its session: real drives stay apart."""
 WEAR = 0.3
-"""Difference of the viscous friction from its mean, in either direction, of the worn bearing of a configured arm."""
+"""Share by which the viscous friction of a worn bearing differs from its mean, in either direction."""
 GUEST_VARIABLE = "ARMIDENT_GUEST"
 REPEATS = 3
 """Number of runs of the trajectory in the second part: one run is too short for the small hidden effect."""
@@ -89,12 +89,7 @@ class _ElapsedTime(logging.LoggerAdapter[logging.Logger]):
     def process(self, msg: Any, kwargs: MutableMapping[str, Any]) -> tuple[Any, MutableMapping[str, Any]]:
         """Add the elapsed time to a message.
 
-        Parameters
-        ----------
-        msg
-            The message.
-        kwargs
-            Keyword arguments of the logging call, which are returned unchanged.
+        ``kwargs``: keyword arguments of the logging call, which are returned unchanged.
         """
         return f"[{time.monotonic() - self.begin:5.1f} s] {msg}", kwargs
 
@@ -144,16 +139,8 @@ class DemoOptions:
 class Subject:
     """The arm of the demo.
 
-    Parameters
-    ----------
-    session, robot
-        Its session and robot.
-    scenario
-        Scenario of the second part.
-    robot_options
-        Further options of ``armident robot``.
-    repeats
-        Number of runs of the trajectory in the second part.
+    ``scenario``: scenario of the second part; ``robot_options``: further options of ``armident robot``; ``repeats``:
+    number of runs of the trajectory in the second part.
     """
 
     session: SessionConfig
@@ -163,30 +150,15 @@ class Subject:
     repeats: int = REPEATS
 
     def at(self, session: SessionConfig) -> "Subject":
-        """Return the same arm in another session.
-
-        Parameters
-        ----------
-        session
-            The session.
-        """
+        """Return the same arm in another session."""
         return replace(self, session=session)
 
 
 def demo(options: DemoOptions) -> None:
     """Run both parts and write the report.
 
-    Parameters
-    ----------
-    options
-        Options of the command.
-
-    Raises
-    ------
-    ConfigError
-        If a configuration is wrong, or the bus cannot be set up.
-    ArmidentError
-        If a process fails; contains its name and the end of its output.
+    Raises ConfigError if a configuration is wrong, or the bus cannot be set up. Raises ArmidentError if a process
+    fails; contains its name and the end of its output.
     """
     out = options.out.resolve()
     subject = _subject(options, out)
@@ -237,31 +209,21 @@ def _subject(options: DemoOptions, out: Path) -> Subject:
 def worn(twin: Twin) -> Scenario:
     """Scenario of a worn bearing: viscous friction depends on the direction, in the joint where there is most of it.
 
-    Parameters
-    ----------
-    twin
-        The virtual arm.
+    ``twin``: the virtual arm.
     """
     robot, standard = twin.robot, twin.parameters.standard
     scale = torque_scale(robot, standard).torque
     share = [standard[f"fv{j + 1}"] * joint.limits.velocity / scale[j] for j, joint in enumerate(robot.joints)]
-    joint = robot.joints[int(np.argmax(share))].name
-    hidden = HiddenEffect(effect="asymmetric_viscous_friction", joint=joint, parameters={"ratio": WEAR})
+    worst = int(np.argmax(share))
+    joint, change = robot.joints[worst].name, {"fva": WEAR * standard[f"fv{worst + 1}"]}
+    hidden = HiddenEffect(effect="asymmetric_viscous_friction", joint=joint, parameters=change)
     text = f"worn bearing in {joint}: its viscous friction depends on the direction"
     return Scenario(schema="armident/scenario/1", description=text, effects=(hidden,))
 
 
 @dataclass(frozen=True)
 class Recorded:
-    """Result of a capture.
-
-    Parameters
-    ----------
-    path
-        The recording.
-    lost, lost_share
-        Number and fraction of the samples in gaps.
-    """
+    """Result of a capture. ``lost``, ``lost_share``: number and fraction of the samples in gaps."""
 
     path: Path
     lost: int
@@ -417,17 +379,8 @@ class _DemoProcess(CommandProcess):
     def wait(self, seconds: float, accepted: Sequence[int] = (0,)) -> None:
         """Wait for the end and log the lines that the process prints in the meantime.
 
-        Parameters
-        ----------
-        seconds
-            Longest time to wait, s.
-        accepted
-            Exit codes of success.
-
-        Raises
-        ------
-        ArmidentError
-            If it takes longer, or ends with another exit code.
+        ``seconds``: longest time to wait, s; ``accepted``: exit codes of success. Raises ArmidentError if it takes
+        longer, or ends with another exit code.
         """
         until = time.monotonic() + seconds
         while True:

@@ -20,16 +20,8 @@ _PART = re.compile(r"<!-- chapter begins -->(.*?)<!-- chapter ends -->", re.DOTA
 class Identified:
     """Results of the first part.
 
-    Parameters
-    ----------
-    document
-        Content of ``identification.json``.
-    report
-        Report of the identification.
-    truth
-        True values of the identified parameters by name, where they are known.
-    lost
-        Number of lost samples.
+    ``document``: content of ``identification.json``; ``report``: report of the identification; ``truth``: true values
+    of the identified parameters by name, where they are known; ``lost``: number of lost samples.
     """
 
     document: dict[str, Any]
@@ -42,14 +34,8 @@ class Identified:
 class Diagnosed:
     """Results of the second part.
 
-    Parameters
-    ----------
-    document
-        Content of ``diagnosis.json``.
-    report
-        Report of the diagnosis.
-    hidden
-        Effects that were hidden, each with its joint.
+    ``document``: content of ``diagnosis.json``; ``report``: report of the diagnosis; ``hidden``: effects that were
+    hidden, each with its joint.
     """
 
     document: dict[str, Any]
@@ -60,14 +46,8 @@ class Diagnosed:
 def true_values(document: Mapping[str, Any], truth: Mapping[str, float], robot: RobotConfig) -> dict[str, float]:
     """True values of identified parameters: of the arm, or of the formula of a regrouped parameter.
 
-    Parameters
-    ----------
-    document
-        Content of ``identification.json``.
-    truth
-        Parameters of the virtual arm by name.
-    robot
-        The robot; its lengths ``d1``, ``r1``, ... occur in the formulas.
+    ``document``: content of ``identification.json``. ``truth``: parameters of the virtual arm by name. ``robot``: the
+    robot; its lengths ``d1``, ``r1``, ... occur in the formulas.
     """
     names = dict(truth)
     for j, joint in enumerate(robot.joints, start=1):
@@ -88,19 +68,8 @@ def true_values(document: Mapping[str, Any], truth: Mapping[str, float], robot: 
 def write_report(out: Path, robot: RobotConfig, first: Identified, second: Diagnosed | None) -> Path:
     """Join the reports of both parts to one page.
 
-    Parameters
-    ----------
-    out
-        Folder of the page ``report.html``.
-    robot
-        The robot.
-    first, second
-        Results of the parts; ``None``: the second was left out.
-
-    Returns
-    -------
-    Path
-        The page.
+    ``out``: folder of the page ``report.html``. ``first``, ``second``: results of the parts; ``None``: the second was
+    left out.
     """
     page = first.report.read_text(encoding="utf-8")
     parts = [_part(page)] + ([] if second is None else [_part(second.report.read_text(encoding="utf-8"))])
@@ -182,10 +151,7 @@ def _against_truth(first: Identified) -> list[tuple[str, float, float, float, fl
 def print_table(first: Identified, second: Diagnosed | None) -> None:
     """Print the identified parameters beside the true ones, and the findings.
 
-    Parameters
-    ----------
-    first, second
-        Results of the parts; ``None``: the second was left out.
+    ``first``, ``second``: results of the parts; ``None``: the second was left out.
     """
     print(f"\n{'parameter':>10} {'identified':>11} {'+- std':>9} {'true':>9} {'off by':>9}")
     for name, value, std, truth, distance in _against_truth(first):
@@ -202,13 +168,7 @@ def print_table(first: Identified, second: Diagnosed | None) -> None:
 
 
 def print_next_steps(report: Path) -> None:
-    """Print the path of the report and the commands for a user's own robot.
-
-    Parameters
-    ----------
-    report
-        The report.
-    """
+    """Print the path of the report and the commands for a user's own robot."""
     print(
         "\nnext, with measurements of your own robot (or on its bus: armident capture --config CELL.yaml):\n"
         "  armident import DATA.csv --config ROBOT.yaml --out my_robot.mcap\n"

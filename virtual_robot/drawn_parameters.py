@@ -1,8 +1,7 @@
 """Plausible parameters of a robot whose masses or friction are not known, drawn from a seed.
 
 Masses follow the geometry: a body lies between its joint and the next one, and links become lighter towards the tip.
-The total is such that gravity and acceleration take a share of the torque limits. Shapes, rotors and friction have the
-ranges of the random arms.
+The total is such that gravity and acceleration take a share of the torque limits.
 """
 
 from collections.abc import Mapping
@@ -16,8 +15,6 @@ from numpy.typing import NDArray
 from armident.configs import ConfigError, RobotConfig
 from armident.configs.urdf_inertials import INERTIAL
 from armident.virtual_robot.model import build_model
-from armident.virtual_robot.random_arms.arm import log_uniform, random_body
-from armident.virtual_robot.random_arms.halves import DEVELOPMENT
 
 pin: Any = pinocchio
 Floats = NDArray[np.float64]
@@ -31,21 +28,22 @@ SHORTEST = 0.06
 POSTURES = 40
 """Random postures over which inertia and gravity of a joint are averaged."""
 OFFSET_SHARE = 0.03
-"""Standard deviation of the torque offsets over the torque scale, as of the random arms."""
+"""Standard deviation of the torque offsets over the torque scale."""
+MASS, DECAY = (2.0, 20.0), (0.5, 0.8)
+"""Range of the mass of the first link before scaling, kg, and of that of a link over that of the link before."""
+ROTOR = (0.15, 1.5)
+"""Range of the rotor inertia, joint side, over the inertia of the links at the joint."""
+DRY, VISCOUS = (0.05, 0.6), (0.05, 0.8)
+"""Ranges of dry friction, and of viscous friction at full speed, over the torque scale of the joint."""
 
 
 @dataclass(frozen=True, eq=False)
 class TorqueScale:
     """Typical loads of the joints, joint side.
 
-    Parameters
-    ----------
-    inertia
-        Diagonal of the mass matrix, rotors included, averaged over postures, kg m^2 or kg, shape (n,).
-    gravity
-        Root mean square torque of gravity over postures, N m or N, shape (n,).
-    torque
-        Typical torque of acceleration and gravity, N m or N, shape (n,).
+    ``inertia``: diagonal of the mass matrix, rotors included, averaged over postures, kg m^2 or kg, shape (n,);
+    ``gravity``: root mean square torque of gravity over postures, N m or N, shape (n,); ``torque``: typical torque of
+    acceleration and gravity, N m or N, shape (n,).
     """
 
     inertia: Floats
@@ -53,23 +51,29 @@ class TorqueScale:
     torque: Floats
 
 
+def log_uniform(rng: np.random.Generator, limits: tuple[float, float], size: int | None = None) -> Any:
+    """Draw numbers, or one, between two limits; their logarithm is uniform."""
+    return np.exp(rng.uniform(np.log(limits[0]), np.log(limits[1]), size))
+
+
+def random_body(rng: np.random.Generator, size: float, mass: float) -> tuple[Floats, Floats]:
+    """Draw a body of a length, m, and a mass, kg: centre of mass, m, (3,), and second moments about it, kg m^2, (3, 3).
+
+    Second moments are positive, so that the body exists.
+    """
+    com = rng.normal(size=3) * size * np.array([0.4, 0.15, 0.3])
+    axes = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    return com, mass * axes @ np.diag((size * rng.uniform(0.08, 0.4, 3)) ** 2) @ axes.T
+
+
 def draw_bodies(robot: RobotConfig, seed: int) -> dict[str, float]:
     """Draw the inertial parameters of all links.
 
-    Parameters
-    ----------
-    robot
-        Robot with limits of position, velocity and acceleration.
-    seed
-        Seed.
-
-    Returns
-    -------
-    dict
-        Parameters by name (``xx1`` ... ``m6``), SI.
+    ``robot``: robot with limits of position, velocity and acceleration. Returns parameters by name (``xx1`` ...
+    ``m6``), SI.
     """
-    rng, n, ranges = np.random.default_rng([seed, 1]), robot.n, DEVELOPMENT
-    mass = log_uniform(rng, ranges.mass) * np.cumprod(np.concatenate([[1.0], rng.uniform(*ranges.decay, n - 1)]))
+    rng, n = np.random.default_rng([seed, 1]), robot.n
+    mass = log_uniform(rng, MASS) * np.cumprod(np.concatenate([[1.0], rng.uniform(*DECAY, n - 1)]))
     ends = [_next_origin(robot, j) for j in range(n)]
     lengths = [float(np.linalg.norm(end)) for end in ends]
     typical = float(np.mean([length for length in lengths if length > 0.0] or [2.0 * SHORTEST]))
@@ -87,12 +91,8 @@ def draw_bodies(robot: RobotConfig, seed: int) -> dict[str, float]:
 def needed_torque(robot: RobotConfig, standard: Mapping[str, float]) -> Floats:
     """Torque for gravity and a large acceleration, N m or N, shape (n,).
 
-    Parameters
-    ----------
-    robot
-        Robot with limits of position, velocity and acceleration.
-    standard
-        Inertial parameters of the links by name; others do not count.
+    ``robot``: robot with limits of position, velocity and acceleration. ``standard``: inertial parameters of the links
+    by name; others do not count.
     """
     load = torque_scale(robot, {name: value for name, value in standard.items() if not name.startswith("ia")})
     rise = np.array([min(j.limits.acceleration, RISE_PER_S * j.limits.velocity) for j in robot.joints])
@@ -119,17 +119,8 @@ def _standard(link: int, mass: float, com: Floats, second: Floats) -> dict[str, 
 def torque_scale(robot: RobotConfig, standard: Mapping[str, float]) -> TorqueScale:
     """Typical loads of the joints over postures within their limits.
 
-    Parameters
-    ----------
-    robot
-        Robot with limits of position and velocity.
-    standard
-        Inertial parameters by name, and rotor inertias where there are any.
-
-    Raises
-    ------
-    ConfigError
-        If a joint moves no inertia.
+    ``robot``: robot with limits of position and velocity; ``standard``: inertial parameters by name, and rotor inertias
+    where there are any. Raises ConfigError if a joint moves no inertia.
     """
     n = robot.n
     model = build_model(robot, standard)
@@ -149,23 +140,16 @@ def torque_scale(robot: RobotConfig, standard: Mapping[str, float]) -> TorqueSca
         gravity += np.array(pin.computeGeneralizedGravity(model, data, q)) ** 2 / POSTURES
     speed = np.array([joint.limits.velocity for joint in robot.joints])
     weight = np.sqrt(gravity)
-    # A speed is reached in about a third of a second, as in the random arms.
+    # A speed is reached in about a third of a second.
     return TorqueScale(inertia, weight, np.sqrt((3.0 * inertia * speed) ** 2 + weight**2))
 
 
 def draw_rotors(robot: RobotConfig, standard: Mapping[str, float], seed: int) -> dict[str, float]:
     """Draw the rotor inertias, joint side; zero at joints without ``rotor_inertia``.
 
-    Parameters
-    ----------
-    robot
-        Robot with limits of position and velocity.
-    standard
-        Inertial parameters of the links by name.
-    seed
-        Seed.
+    ``robot``: robot with limits of position and velocity; ``standard``: inertial parameters of the links by name.
     """
-    factors = log_uniform(np.random.default_rng([seed, 2]), DEVELOPMENT.rotor, robot.n)
+    factors = log_uniform(np.random.default_rng([seed, 2]), ROTOR, robot.n)
     links = torque_scale(robot, standard).inertia
     return {
         f"ia{j + 1}": float(factors[j] * links[j]) if joint.rotor_inertia else 0.0
@@ -176,19 +160,12 @@ def draw_rotors(robot: RobotConfig, standard: Mapping[str, float], seed: int) ->
 def draw_friction(robot: RobotConfig, scale: TorqueScale, seed: int) -> dict[str, float]:
     """Draw viscous and Coulomb friction and offset of each joint, and the parameters of couplings.
 
-    Parameters
-    ----------
-    robot
-        The robot.
-    scale
-        Typical loads of its joints.
-    seed
-        Seed.
+    ``scale``: typical loads of its joints.
     """
-    rng, n, ranges = np.random.default_rng([seed, 3]), robot.n, DEVELOPMENT
+    rng, n = np.random.default_rng([seed, 3]), robot.n
     speed = np.array([joint.limits.velocity for joint in robot.joints])
-    viscous = log_uniform(rng, ranges.viscous, n) * scale.torque / speed
-    coulomb = log_uniform(rng, ranges.dry, n) * scale.torque
+    viscous = log_uniform(rng, VISCOUS, n) * scale.torque / speed
+    coulomb = log_uniform(rng, DRY, n) * scale.torque
     offset = OFFSET_SHARE * scale.torque * rng.normal(size=n)
     out: dict[str, float] = {}
     for j in range(n):

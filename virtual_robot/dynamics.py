@@ -7,16 +7,14 @@ effects N = n.
 import math
 
 import numpy as np
-from numba import njit
 
+from armident.compiled import PLAIN, compiled
 from armident.virtual_robot.effects.bristles import bristle_rate
-from armident.virtual_robot.effects.forces import CODES, effect_torque
+from armident.virtual_robot.effects.forces import LOAD_CODE, effect_torque
 from armident.virtual_robot.effects.gears import gear_torque
 
 SUBSTEPS = 6
 """Inner steps per control period of 200 us: 33 us, below the time constant of 50 us of joint 6 at standstill."""
-
-LOAD_CODE = CODES.index("load_dependent_friction")
 
 # ROS3: L-stable Rosenbrock method of order 3 (Sandu et al., Atmospheric Environment 31, 1997), two evaluations.
 GAMMA = 0.43586652150845899941601945119356
@@ -24,7 +22,10 @@ C21, C31, C32 = -1.0156171083877702091975600115545, 4.07599564525376998248058353
 M2, M3 = 6.1697947043828245592553615689730, -0.42772256543218573326238373806514
 
 
-@njit(cache=True, error_model="numpy")
+@compiled(
+    "f8[::1], f8[::1], f8, f8[:, ::1], f8[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[::1], f8[::1], f8[:, ::1]",
+    **PLAIN,
+)
 def friction_torques(q, qd, t, friction, smoothing, pairs, ratio, table, load, out, slope):  # type: ignore[no-untyped-def]
     """Torques of friction, couplings (equation B.1), brakes and hidden effects, and their slopes over the velocities.
 
@@ -32,8 +33,6 @@ def friction_torques(q, qd, t, friction, smoothing, pairs, ratio, table, load, o
     ----------
     q, qd
         Coordinates and velocities, shape (N,).
-    t
-        Time, s.
     friction
         fv, fc, offset and viscous coefficient of the brake by joint, shape (n, 4).
     smoothing
@@ -82,20 +81,13 @@ def friction_torques(q, qd, t, friction, smoothing, pairs, ratio, table, load, o
         slope[j, j] += max(steep, 0.0) if steep > 0.0 else max(steep, -0.9 * slope[j, j])
 
 
-@njit(cache=True, error_model="numpy")
+@compiled("f8[::1], f8[::1], f8[:, ::1], f8[::1], f8[:, ::1], f8[:, ::1]", **PLAIN)
 def gear_torques(q, qd, gears, out, slope, stiff):  # type: ignore[no-untyped-def]
     """Add the torques of elastic gears and their slopes.
 
-    Parameters
-    ----------
-    q, qd
-        Coordinates and velocities, shape (N,).
-    gears
-        Elastic gears (`gear_rows`), shape (G, 6).
-    out
-        Torques, shape (N,), changed in place.
-    slope, stiff
-        Slopes over velocities and coordinates, shape (N, N), changed in place.
+    ``q``, ``qd``: coordinates and velocities, shape (N,); ``gears``: elastic gears (`gear_rows`), shape (G, 6);
+    ``out``: torques, shape (N,), changed in place; ``slope``, ``stiff``: slopes over velocities and coordinates, shape
+    (N, N), changed in place.
     """
     for e in range(gears.shape[0]):
         a, b = int(gears[e, 0]), int(gears[e, 1])
@@ -117,7 +109,7 @@ def gear_torques(q, qd, gears, out, slope, stiff):  # type: ignore[no-untyped-de
             stiff[b, a] -= steep
 
 
-@njit(cache=True, error_model="numpy")
+@compiled(**PLAIN)
 def _factor(a):  # type: ignore[no-untyped-def]
     """Cholesky factor of ``a`` (n, n) in its lower triangle, in place, with inverted diagonal."""
     n = a.shape[0]
@@ -134,7 +126,7 @@ def _factor(a):  # type: ignore[no-untyped-def]
             a[i, j] = s * d
 
 
-@njit(cache=True, error_model="numpy")
+@compiled(**PLAIN)
 def _solve(a, x):  # type: ignore[no-untyped-def]
     """Solve with the factor of ``_factor``, in place."""
     n = x.size
@@ -150,7 +142,11 @@ def _solve(a, x):  # type: ignore[no-untyped-def]
         x[i] = s * a[i, i]
 
 
-@njit(cache=True, error_model="numpy")
+@compiled(
+    "f8, i8, f8, f8[:, ::1], f8[::1], f8[::1], f8[:, ::1], f8[::1], f8[:, ::1], i8[::1], f8[:, ::1], f8[::1], "
+    "f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[::1], f8[:, ::1], f8[:, ::1]",
+    **PLAIN,
+)
 def advance(  # type: ignore[no-untyped-def]
     period, substeps, t, state, z, tau, mass, bias, rotor, link,
     friction, smoothing, pairs, ratio, table, load, gears, bristles,

@@ -14,14 +14,8 @@ from armident.configs.urdf_inertials import INERTIAL
 class Identified:
     """Parameters of an identified arm.
 
-    Parameters
-    ----------
-    standard
-        Standard parameters by name, SI, joint side.
-    sources
-        Remarks for the user.
-    sign_smoothing
-        ``g`` of each joint's smoothed sign, s/rad or s/m; ``None`` in documents without it.
+    ``sources``: remarks for the user. ``sign_smoothing``: ``g`` of each joint's smoothed sign, s/rad or s/m; ``None``
+    in documents without it.
     """
 
     standard: dict[str, float]
@@ -32,17 +26,8 @@ class Identified:
 def read_identified(path: Path, robot: RobotConfig) -> Identified:
     """Read the physically consistent parameters of an identification.
 
-    Parameters
-    ----------
-    path
-        ``identification.json`` of an identification with ``--physical``.
-    robot
-        The robot.
-
-    Raises
-    ------
-    ConfigError
-        If the document cannot be read, is of another robot, or has no physically consistent parameters.
+    ``path``: ``identification.json`` of an identification with ``--physical``. Raises ConfigError if the document
+    cannot be read, is of another robot, or has no physically consistent parameters.
     """
     document = _read(path)
     if document.get("robot") != robot.name:

@@ -64,10 +64,8 @@ MASS_MARGIN = 0.02
 def base_parameters(standard: Mapping[str, float]) -> dict[str, float]:
     """Base inertial parameters of the TX40 from its standard ones (thesis tables B.2 and B.3).
 
-    Parameters
-    ----------
-    standard
-        Standard parameters by name, SI; for an arm of fewer links only the groups with known parameters result.
+    ``standard``: standard parameters by name, SI; for an arm of fewer links only the groups with known parameters
+    result.
     """
     groups = {name: terms for name, terms in regrouping().items() if terms.keys() <= standard.keys()}
     return {name: sum(c * standard[k] for k, c in terms.items()) for name, terms in groups.items()}
@@ -106,12 +104,7 @@ def regrouping() -> dict[str, dict[str, float]]:
 def pseudo_inertia(standard: Mapping[str, float], link: int) -> NDArray[np.float64]:
     """Pseudo-inertia matrix of a link, shape (4, 4): positive definite for a real body (Wensing, Kim, Slotine 2018).
 
-    Parameters
-    ----------
-    standard
-        Standard parameters by name, SI.
-    link
-        Number of the link, from 1.
+    ``standard``: standard parameters by name, SI; ``link``: number of the link, from 1.
     """
     xx, xy, xz, yy, yz, zz, mx, my, mz, m = (standard[f"{k}{link}"] for k in INERTIAL)
     inertia = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
@@ -125,10 +118,7 @@ def pseudo_inertia(standard: Mapping[str, float], link: int) -> NDArray[np.float
 def solve() -> dict[str, float]:
     """Standard parameters of the six links that meet table B.4 (kg, kg m, kg m^2).
 
-    Raises
-    ------
-    ArmidentError
-        If the programme has no solution.
+    Raises ArmidentError if the programme has no solution.
     """
     names = [f"{k}{j}" for j in range(1, JOINTS + 1) for k in INERTIAL] + [f"ia{j}" for j in range(1, JOINTS + 1)]
     at = {name: k for k, name in enumerate(names)}
@@ -204,13 +194,7 @@ def _stored(path: Path) -> dict[str, float]:
 
 
 def has_stored_parameters(robot: RobotConfig) -> bool:
-    """Return True if the robot is the virtual TX40 or EMPS by name, joints and couplings.
-
-    Parameters
-    ----------
-    robot
-        The robot.
-    """
+    """Return True if the robot is the virtual TX40 or EMPS by name, joints and couplings."""
     path = HERE / f"{robot.name}_inertias.yaml"
     expected = {f"{k}{j + 1}" for j in range(robot.n) for k in (*INERTIAL, "ia", "fv", "fc", "off")}
     expected |= {f"{k}{c.name}" for c in robot.couplings for k in ("ia", "fv", "fc")}
@@ -220,15 +204,7 @@ def has_stored_parameters(robot: RobotConfig) -> bool:
 def plant_parameters(robot: RobotConfig) -> dict[str, float]:
     """All standard parameters of the virtual TX40 or EMPS, by name, SI.
 
-    Parameters
-    ----------
-    robot
-        Robot with stored parameters.
-
-    Raises
-    ------
-    ConfigError
-        If there are no stored parameters of that robot.
+    ``robot``: robot with stored parameters. Raises ConfigError if there are no stored parameters of that robot.
     """
     if not has_stored_parameters(robot):
         known = ", ".join(sorted(p.name.removesuffix("_inertias.yaml") for p in HERE.glob("*_inertias.yaml")))
@@ -237,13 +213,7 @@ def plant_parameters(robot: RobotConfig) -> dict[str, float]:
 
 
 def rest_posture(robot: RobotConfig) -> tuple[float, ...]:
-    """Posture of the virtual arm at power-on, joint side, rad or m, length n.
-
-    Parameters
-    ----------
-    robot
-        The TX40 or the EMPS.
-    """
+    """Posture of the virtual arm at power-on, joint side, rad or m, length n. ``robot``: the TX40 or the EMPS."""
     data = yaml.safe_load((HERE / f"{robot.name}_inertias.yaml").read_text(encoding="utf-8"))
     return tuple(float(x) for x in data["rest"])
 

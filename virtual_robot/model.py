@@ -17,17 +17,8 @@ def build_model(robot: RobotConfig, standard: Mapping[str, float]) -> Any:
     ``Rot(z, theta)`` and ``Trans(z, r)`` commute, so offset and ``r`` precede the joint. The frame that moves with the
     joint is then frame j itself, and the standard parameters apply unchanged.
 
-    Parameters
-    ----------
-    robot
-        Geometry and gravity.
-    standard
-        Standard parameters by name (``xx1`` ... ``m6``), inertias about the frame origins, SI.
-
-    Returns
-    -------
-    pinocchio.Model
-        The model with n joints.
+    ``robot``: geometry and gravity. ``standard``: standard parameters by name (``xx1`` ... ``m6``), inertias about the
+    frame origins, SI. Returns the model with n joints.
     """
     model = pin.Model()
     model.name = robot.name

@@ -78,6 +78,8 @@ NEEDED = (
 class Drive(canopen.LocalNode):
     """One virtual CiA 402 drive.
 
+    Raises ConfigError if the EDS cannot be read or lacks an object that the drive needs.
+
     Parameters
     ----------
     node_id, eds
@@ -94,11 +96,6 @@ class Drive(canopen.LocalNode):
         Called when the statusword has changed.
     fd
         ``True`` if its TPDOs are CAN FD frames.
-
-    Raises
-    ------
-    ConfigError
-        If the EDS cannot be read or lacks an object that the drive needs.
     """
 
     def __init__(
@@ -131,13 +128,7 @@ class Drive(canopen.LocalNode):
         self._factory()
 
     def become_odd(self, oddities: Sequence[Oddity]) -> None:
-        """Deviate from an ordinary drive from now on.
-
-        Parameters
-        ----------
-        oddities
-            The deviations.
-        """
+        """Deviate from an ordinary drive from now on."""
         self.oddities = tuple(oddities)
         self._factory()
 
@@ -153,15 +144,7 @@ class Drive(canopen.LocalNode):
             oddity.preset()
 
     def preset(self, index: int, subindex: int, value: int) -> None:
-        """Set an object of the dictionary from inside the drive; objects that the EDS lacks are ignored.
-
-        Parameters
-        ----------
-        index, subindex
-            The object.
-        value
-            Its value.
-        """
+        """Set an object of the dictionary from inside the drive; objects that the EDS lacks are ignored."""
         if index in self.object_dictionary:
             entry = self._find_object(index, subindex)
             self.data_store.setdefault(index, {})[subindex] = entry.encode_raw(value)
@@ -169,10 +152,7 @@ class Drive(canopen.LocalNode):
     def reset(self, communication_only: bool) -> None:
         """Restore the power-on values of the object dictionary.
 
-        Parameters
-        ----------
-        communication_only
-            ``True``: only the communication profile (1000h to 1FFFh).
+        ``communication_only``: ``True``: only the communication profile (1000h to 1FFFh).
         """
         for index in list(self.data_store):
             if not communication_only or index < 0x2000:
@@ -185,12 +165,7 @@ class Drive(canopen.LocalNode):
     def get_data(self, index: int, subindex: int, check_readable: bool = False) -> bytes:
         """Read an object.
 
-        Parameters
-        ----------
-        index, subindex
-            The object.
-        check_readable
-            Refuse write-only objects: a request over SDO, which oddities may answer.
+        ``check_readable``: refuse write-only objects: a request over SDO, which oddities may answer.
         """
         if check_readable:
             for oddity in self.oddities:
@@ -200,17 +175,7 @@ class Drive(canopen.LocalNode):
         return bytes(super().get_data(index, subindex, check_readable))
 
     def set_data(self, index: int, subindex: int, data: bytes, check_writable: bool = False) -> None:
-        """Write an object; a controlword takes effect at once.
-
-        Parameters
-        ----------
-        index, subindex
-            The object.
-        data
-            Its bytes.
-        check_writable
-            Refuse read-only objects.
-        """
+        """Write an object; a controlword takes effect at once. ``check_writable``: refuse read-only objects."""
         if check_writable:
             for oddity in self.oddities:
                 data = oddity.write(index, subindex, bytes(data))
@@ -235,13 +200,7 @@ class Drive(canopen.LocalNode):
         return statusword(self.state)
 
     def apply_controlword(self, control: int) -> None:
-        """Apply a controlword (6040h).
-
-        Parameters
-        ----------
-        control
-            The controlword.
-        """
+        """Apply a controlword (6040h)."""
         state = next_state(self.state, control, self.control)
         self.control = control
         self._enter(state)
@@ -249,10 +208,7 @@ class Drive(canopen.LocalNode):
     def fault(self, code: int, register: int) -> None:
         """Enter the fault state and report it (EMCY, 1001h, 1003h).
 
-        Parameters
-        ----------
-        code, register
-            Emergency error code, and error register.
+        ``code``, ``register``: emergency error code, and error register.
         """
         if self.state is DriveState.FAULT:
             return
@@ -356,10 +312,7 @@ class Drive(canopen.LocalNode):
     def pdos(self, base: int) -> list[tuple[int, int, list[tuple[int, int, int]]]]:
         """Enabled PDOs: COB-ID, transmission type, and mapped objects (index, subindex, bytes) in order.
 
-        Parameters
-        ----------
-        base
-            First communication record: 1400h (RPDO) or 1800h (TPDO).
+        ``base``: first communication record: 1400h (RPDO) or 1800h (TPDO).
         """
         out = []
         for index in range(base, base + MAPPING):

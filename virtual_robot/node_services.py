@@ -40,10 +40,7 @@ class Nmt(NmtSlave):
     def on_command(self, can_id: int, data: bytes, timestamp: float) -> None:
         """Execute a command addressed to this node or to all; malformed commands are ignored.
 
-        Parameters
-        ----------
-        can_id, data, timestamp
-            Identifier, data bytes and receive time of the frame.
+        ``can_id``, ``data``, ``timestamp``: identifier, data bytes and receive time of the frame.
         """
         if len(data) != 2 or data[1] not in (0, self.id):
             return
@@ -58,13 +55,7 @@ class Nmt(NmtSlave):
             self.enter(STATE_AFTER[data[0]])
 
     def enter(self, state: NmtState) -> None:
-        """Enter an NMT state and report it in the heartbeat.
-
-        Parameters
-        ----------
-        state
-            The state.
-        """
+        """Enter an NMT state and report it in the heartbeat."""
         self._state = int(state)
         self.update_heartbeat()
         self._local_node.changed()
@@ -111,13 +102,7 @@ class Nmt(NmtSlave):
 
 
 class Sdo(SdoServer):
-    """SDO server that does not answer while the node is stopped, nor requests of other than eight bytes.
-
-    Parameters
-    ----------
-    node
-        The drive.
-    """
+    """SDO server that does not answer while the node is stopped, nor requests of other than eight bytes."""
 
     def __init__(self, node: "Drive") -> None:
         super().__init__(COB_SDO_REQUEST + node.node_id, COB_SDO_RESPONSE + node.node_id, node)
@@ -126,10 +111,7 @@ class Sdo(SdoServer):
     def on_request(self, can_id: int, data: bytes, timestamp: float) -> None:
         """Serve one request.
 
-        Parameters
-        ----------
-        can_id, data, timestamp
-            Identifier, data bytes and receive time of the frame.
+        ``can_id``, ``data``, ``timestamp``: identifier, data bytes and receive time of the frame.
         """
         if len(data) != 8 or self._node.nmt.stopped:
             return
@@ -137,13 +119,7 @@ class Sdo(SdoServer):
             super().on_request(can_id, data, timestamp)
 
     def send_response(self, response: bytes) -> None:
-        """Send an answer, as the oddities of the drive change it.
-
-        Parameters
-        ----------
-        response
-            Data bytes of the answer.
-        """
+        """Send an answer, as the oddities of the drive change it. ``response``: data bytes of the answer."""
         answers = [bytes(response)]
         for oddity in self._node.oddities:
             answers = [changed for answer in answers for changed in oddity.respond(answer)]

@@ -13,12 +13,7 @@ from armident.configs import RobotConfig
 class NoiseSize:
     """Variances of the joint torque's noise, (N m)^2 or N^2.
 
-    Parameters
-    ----------
-    sampled
-        Variance as sampled, by joint.
-    decimated
-        Variance of the part below 20 Hz, by joint.
+    ``decimated``: variance of the part below 20 Hz, by joint.
     """
 
     sampled: tuple[float, ...]
@@ -50,20 +45,9 @@ class Noise:
     A white part and a slow part together have the variance as sampled; their parts below the cut-off have the
     decimated variance.
 
-    Parameters
-    ----------
-    robot
-        Transmission and drive gains.
-    period
-        Control period, s.
-    seed
-        Seed of the random numbers.
-    level
-        Factor on the amplitudes; 0: no noise.
-    size
-        Variances of the noise; ``None``: those of the TX40 or the EMPS.
-    averaged
-        Number of control periods over which a reported signal is averaged; its mean has the variance as sampled.
+    ``robot``: transmission and drive gains. ``seed``: seed of the random numbers. ``level``: factor on the amplitudes;
+    0: no noise. ``size``: variances of the noise; ``None``: those of the TX40 or the EMPS. ``averaged``: number of
+    control periods over which a reported signal is averaged; its mean has the variance as sampled.
     """
 
     def __init__(
@@ -108,23 +92,10 @@ def amplitudes(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return standard deviations of both parts of the noise.
 
-    Parameters
-    ----------
-    robot
-        Robot with the name of a virtual arm, n joints.
-    period
-        Control period, s.
-    size
-        Variances of the noise; ``None``: those of the TX40 or the EMPS.
-    averaged
-        Number of control periods over which a reported signal is averaged; its mean has the variance as sampled.
-
-    Returns
-    -------
-    white
-        White torque noise of the motors, motor side, (n,), N m or N.
-    slow
-        Disturbance torque of the joints, (n,), N m or N; its spectrum has the corner `DISTURBANCE_HZ`.
+    ``robot``: robot with the name of a virtual arm, n joints. ``size``: variances of the noise; ``None``: those of the
+    TX40 or the EMPS. ``averaged``: number of control periods over which a reported signal is averaged; its mean has the
+    variance as sampled. Returns ``white``: white torque noise of the motors, motor side, (n,), N m or N. ``slow``:
+    disturbance torque of the joints, (n,), N m or N; its spectrum has the corner `DISTURBANCE_HZ`.
     """
     size = SIZES[robot.name] if size is None else size
     total, low = np.array(size.sampled), np.array(size.decimated)

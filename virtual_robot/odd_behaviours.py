@@ -64,15 +64,5 @@ BEHAVIOURS: Mapping[str, Factory] = {
 
 
 def make_oddities(names: Sequence[str], drive: Drive, session: SessionConfig) -> list[Oddity]:
-    """Return the behaviours of the oddities of a drive.
-
-    Parameters
-    ----------
-    names
-        Names of `ODDITIES`.
-    drive
-        The drive.
-    session
-        Session of the drive.
-    """
+    """Return the behaviours of the oddities of a drive. ``names``: names of `ODDITIES`."""
     return [BEHAVIOURS[name](drive, session) for name in names]

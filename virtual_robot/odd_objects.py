@@ -20,14 +20,8 @@ ABORT_VALUE_RANGE = 0x06090030
 class Absent(Oddity):
     """An object that the drive does not have.
 
-    Parameters
-    ----------
-    index
-        Index of the object.
-    subindex
-        Its sub-index; ``None``: all.
-    guarding
-        ``False`` if the drive does not answer node guarding either.
+    ``subindex``: its sub-index; ``None``: all. ``guarding``: ``False`` if the drive does not answer node guarding
+    either.
     """
 
     def __init__(self, index: int, subindex: int | None = None, guarding: bool = True) -> None:
@@ -68,10 +62,7 @@ class InterpolationRounds(Oddity):
 class Bit30(Oddity):
     """Bit 30 of the COB-IDs of TPDOs.
 
-    Parameters
-    ----------
-    demanded
-        ``True``: COB-IDs without the bit are refused; ``False``: the bit is set.
+    ``demanded``: ``True``: COB-IDs without the bit are refused; ``False``: the bit is set.
     """
 
     def __init__(self, demanded: bool) -> None:
@@ -90,12 +81,7 @@ class Bit30(Oddity):
 class PdoFixed(Oddity):
     """Read-only PDO mapping.
 
-    Parameters
-    ----------
-    drive
-        The drive.
-    session
-        Session whose streams and set points are mapped; ``None``: the mapping of the EDS.
+    ``session``: session whose streams and set points are mapped; ``None``: the mapping of the EDS.
     """
 
     def __init__(self, drive: Drive, session: SessionConfig | None) -> None:
@@ -122,15 +108,7 @@ class PdoFixed(Oddity):
 
 
 class CobFixed(Oddity):
-    """Read-only COB-IDs of PDOs.
-
-    Parameters
-    ----------
-    drive
-        The drive.
-    session
-        Session whose streams and set points have the COB-IDs.
-    """
+    """Read-only COB-IDs of PDOs. ``session``: session whose streams and set points have the COB-IDs."""
 
     def __init__(self, drive: Drive, session: SessionConfig) -> None:
         self._drive, node = drive, drive.node_id
@@ -154,15 +132,7 @@ class CobFixed(Oddity):
 
 
 class WriteLate(Oddity):
-    """Written values read back late.
-
-    Parameters
-    ----------
-    drive
-        The drive.
-    delay_s
-        Time until a value reads back as written, s.
-    """
+    """Written values read back late. ``delay_s``: time until a value reads back as written, s."""
 
     def __init__(self, drive: Drive, delay_s: float) -> None:
         self._drive, self._delay = drive, delay_s
@@ -184,14 +154,7 @@ class WriteLate(Oddity):
 class ModeLate(Oddity):
     """Mode of operation that is reported only some time after enabling.
 
-    Parameters
-    ----------
-    drive
-        The drive.
-    before
-        Mode reported until then.
-    delay_s
-        Time after enabling, s.
+    ``before``: mode reported until then; ``delay_s``: time after enabling, s.
     """
 
     def __init__(self, drive: Drive, before: int, delay_s: float) -> None:
@@ -210,13 +173,7 @@ class ModeLate(Oddity):
 
 
 class TargetFollows(Oddity):
-    """Target position that follows the position until the drive is enabled.
-
-    Parameters
-    ----------
-    drive
-        The drive.
-    """
+    """Target position that follows the position until the drive is enabled."""
 
     def __init__(self, drive: Drive) -> None:
         self._drive = drive

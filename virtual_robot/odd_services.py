@@ -23,13 +23,7 @@ BUSY = (0x08000020, 0x08000021, ABORT_DEVICE_STATE)
 
 
 class AbortBusy(Oddity):
-    """Every 7th SDO request is aborted, with another code each time.
-
-    Parameters
-    ----------
-    drive
-        The drive.
-    """
+    """Every 7th SDO request is aborted, with another code each time."""
 
     def __init__(self, drive: Drive) -> None:
         self._drive, self._count = drive, 0
@@ -45,15 +39,7 @@ class AbortBusy(Oddity):
 
 
 class Twice(Oddity):
-    """SDO answers come again.
-
-    Parameters
-    ----------
-    drive
-        The drive.
-    delay_s
-        Time between both, s.
-    """
+    """SDO answers come again. ``delay_s``: time between both, s."""
 
     def __init__(self, drive: Drive, delay_s: float) -> None:
         self._drive, self._delay = drive, delay_s
@@ -90,13 +76,7 @@ class ShortAnswer(Oddity):
 
 
 class OtherClient(Oddity):
-    """Another client on the SDO channel.
-
-    Parameters
-    ----------
-    drive
-        The drive.
-    """
+    """Another client on the SDO channel."""
 
     ANSWER_S = 0.5
     """Longest wait for an answer, s, as in the canopen library and ours."""
@@ -140,13 +120,7 @@ class OtherClient(Oddity):
 
 
 class Autostart(Oddity):
-    """The drive becomes operational by itself.
-
-    Parameters
-    ----------
-    drive
-        The drive.
-    """
+    """The drive becomes operational by itself."""
 
     def __init__(self, drive: Drive) -> None:
         self._drive = drive
@@ -161,15 +135,7 @@ class Autostart(Oddity):
 
 
 class SlowBoot(Oddity):
-    """The drive is silent until some time after the first NMT command.
-
-    Parameters
-    ----------
-    drive
-        The drive.
-    boot_s
-        Time to boot, s.
-    """
+    """The drive is silent until some time after the first NMT command."""
 
     def __init__(self, drive: Drive, boot_s: float) -> None:
         self._drive, self._boot_s = drive, boot_s
@@ -194,13 +160,7 @@ class SlowBoot(Oddity):
 
 
 class EmcyBurst(Oddity):
-    """Thousands of emergency messages after NMT start.
-
-    Parameters
-    ----------
-    drive
-        The drive.
-    """
+    """Thousands of emergency messages after NMT start."""
 
     def __init__(self, drive: Drive) -> None:
         self._drive = drive

@@ -54,71 +54,32 @@ class Oddity:
     def read(self, index: int, subindex: int) -> bytes | None:
         """Return the bytes that an SDO request reads; ``None``: those of the object.
 
-        Parameters
-        ----------
-        index, subindex
-            The object.
-
-        Raises
-        ------
-        SdoAbortedError
-            If the drive refuses.
+        Raises SdoAbortedError if the drive refuses.
         """
         return None
 
     def write(self, index: int, subindex: int, data: bytes) -> bytes:
         """Return the bytes that are stored when an SDO request writes.
 
-        Parameters
-        ----------
-        index, subindex, data
-            The object, and the bytes written.
-
-        Raises
-        ------
-        SdoAbortedError
-            If the drive refuses.
+        ``index``, ``subindex``, ``data``: the object, and the bytes written. Raises SdoAbortedError if the drive
+        refuses.
         """
         return data
 
     def request(self, data: bytes) -> bool:
-        """Return ``True`` if an SDO request is served.
-
-        Parameters
-        ----------
-        data
-            Data bytes of the request.
-        """
+        """Return ``True`` if an SDO request is served."""
         return True
 
     def respond(self, data: bytes) -> list[bytes]:
-        """Return the answers that are sent for one answer of the SDO server.
-
-        Parameters
-        ----------
-        data
-            Data bytes of the answer.
-        """
+        """Return the answers that are sent for one answer of the SDO server."""
         return [data]
 
     def nmt(self, command: int) -> bool:
-        """Return ``True`` if an NMT command is executed.
-
-        Parameters
-        ----------
-        command
-            Command specifier.
-        """
+        """Return ``True`` if an NMT command is executed. ``command``: command specifier."""
         return True
 
     def begin(self, bus: Bus) -> None:
-        """Begin to run on a bus.
-
-        Parameters
-        ----------
-        bus
-            The bus.
-        """
+        """Begin to run on a bus."""
 
     def end(self) -> None:
         """End what was begun."""
@@ -135,19 +96,7 @@ def drive_oddities(
 ) -> dict[str, tuple[str, ...]]:
     """Names of the oddities of each drive, by joint.
 
-    Parameters
-    ----------
-    scenario
-        The scenario; ``None``: no oddities.
-    robot
-        The robot.
-    where
-        Name of the scenario in messages.
-
-    Raises
-    ------
-    ConfigError
-        If a joint or an oddity is unknown.
+    ``scenario``: the scenario; ``None``: no oddities. Raises ConfigError if a joint or an oddity is unknown.
     """
     joints = [joint.name for joint in robot.joints]
     found: dict[str, tuple[str, ...]] = {}

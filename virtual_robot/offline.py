@@ -36,6 +36,9 @@ def simulate_recording(
 ) -> Recording:
     """Simulate a recording of the virtual arm on a trajectory, as ``armident capture`` would write it.
 
+    Returns streams ``samples`` (position, effort, status) and ``demand``, and the marks of the experiment. Raises
+    ConfigError if the trajectory exceeds the robot's limits.
+
     Parameters
     ----------
     robot
@@ -52,16 +55,6 @@ def simulate_recording(
         Time at rest recorded before and after the trajectory, s.
     start_ns
         Time stamp of SYNC 0, ns.
-
-    Returns
-    -------
-    Recording
-        Streams ``samples`` (position, effort, status) and ``demand``, and the marks of the experiment.
-
-    Raises
-    ------
-    ConfigError
-        If the trajectory exceeds the robot's limits.
     """
     trajectory.check(robot)
     every, period = setpoint_every, servo.control_period(robot) if period is None else period
@@ -108,15 +101,7 @@ def simulate_recording(
 
 
 def with_encoder_counts(robot: RobotConfig, counts: float) -> RobotConfig:
-    """Robot with another encoder resolution on every motor.
-
-    Parameters
-    ----------
-    robot
-        The robot.
-    counts
-        Counts per motor turn, or per metre.
-    """
+    """Robot with another encoder resolution on every motor. ``counts``: counts per motor turn, or per metre."""
     joints = tuple(
         joint.model_copy(update={"drive": joint.drive.model_copy(update={"counts_per_unit": float(counts)})})
         for joint in robot.joints
@@ -127,15 +112,7 @@ def with_encoder_counts(robot: RobotConfig, counts: float) -> RobotConfig:
 def effort_of(robot: RobotConfig) -> Effort:
     """Quantity that the robot's drives report as effort.
 
-    Parameters
-    ----------
-    robot
-        The robot.
-
-    Raises
-    ------
-    ConfigError
-        If the drives report different quantities.
+    Raises ConfigError if the drives report different quantities.
     """
     efforts: list[Effort] = sorted({joint.drive.signal for joint in robot.joints})
     if len(efforts) > 1:
@@ -144,13 +121,7 @@ def effort_of(robot: RobotConfig) -> Effort:
 
 
 def sample_fields(robot: RobotConfig) -> dict[str, Field]:
-    """Fields of the ``samples`` stream: motor positions, efforts, statuswords.
-
-    Parameters
-    ----------
-    robot
-        The robot.
-    """
+    """Fields of the ``samples`` stream: motor positions, efforts, statuswords."""
     rated = tuple(joint.drive.rated / 1000.0 for joint in robot.joints)
     effort, metres = effort_of(robot), _position_unit(robot) == "m"
     unit = {"current": "A", "voltage": "V", "torque": "N" if metres else "N m"}[effort]
@@ -162,13 +133,7 @@ def sample_fields(robot: RobotConfig) -> dict[str, Field]:
 
 
 def demand_fields(robot: RobotConfig) -> dict[str, Field]:
-    """Field of the ``demand`` stream: demanded motor positions.
-
-    Parameters
-    ----------
-    robot
-        The robot.
-    """
+    """Field of the ``demand`` stream: demanded motor positions."""
     return {"demand": Field("demand", "demand", _position_unit(robot), "motor", _per_count(robot))}
 
 

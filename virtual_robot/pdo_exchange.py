@@ -4,9 +4,9 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from armident.compiled import PLAIN, compiled
 from armident.drivers.can.frames import BIT_RATE_SWITCH, FD_FLAG, fd_length, frames
 from armident.drivers.canopen.objects import (
     ARRAY_OFFSET,
@@ -48,7 +48,13 @@ HISTORY = 64
 """Number of SYNCs whose live values are kept for packed samples."""
 
 
-@njit(cache=True, error_model="numpy")
+@compiled(
+    "u4[:], u1[:], u1[:, :], i8, i8, i8, f8, i4[::1], i4[::1], i2[::1], i4[::1], i8[:, ::1], i8[:, :, ::1], "
+    "i8[::1], i8[::1], i8[::1], i8[::1], i8[::1], i8[::1], i8[::1], u4[::1], u1[::1], u4[:], u1[:], u1[:, :], "
+    "i8[::1], i8[::1], i8[::1], i8[::1], i8[::1], i8[::1], i8[::1], i8[::1], u1[:, ::1], b1[::1], i8[::1], "
+    "i4[::1], b1[::1], i8[::1], i8[::1]",
+    **PLAIN,
+)
 def _exchange(  # type: ignore[no-untyped-def]
     ids, lengths, data, start, stop, sequence, period, position, before, current, demand, values, history,
     tx_kinds, tx_first, tx_row, tx_drive, tx_offset, tx_size, tx_back, tx_ids, tx_lengths,
@@ -129,14 +135,8 @@ def _exchange(  # type: ignore[no-untyped-def]
 class Exchange:
     """PDO exchange at every SYNC by the present mapping of the drives.
 
-    Parameters
-    ----------
-    drives
-        The drives, in any order.
-    motion
-        Plant or recording behind the drives.
-    period
-        SYNC period, s; velocity actual (606Ch) is the difference of positions over it.
+    ``drives``: in any order. ``motion``: plant or recording behind the drives. ``period``: SYNC period, s; velocity
+    actual (606Ch) is the difference of positions over it.
     """
 
     def __init__(self, drives: Sequence[Drive], motion: DriveBackend, period: float) -> None:
@@ -228,19 +228,9 @@ class Exchange:
     def take(self, ids: Any, lengths: Any, data: Any, start: int, stop: int, sequence: int) -> int:
         """Process frames up to the next SYNC; afterwards `out` holds its answers, and `act` applies its set points.
 
-        Parameters
-        ----------
-        ids, lengths, data
-            Fields of an array of frames, shape (N,), (N,) and (N, 8) or (N, 64).
-        start, stop
-            Range of the frames to process.
-        sequence
-            Counter of a SYNC that carries none.
-
-        Returns
-        -------
-        int
-            Index of the SYNC, or ``stop`` if there is none.
+        ``ids``, ``lengths``, ``data``: fields of an array of frames, shape (N,), (N,) and (N, 8) or (N, 64); ``start``,
+        ``stop``: range of the frames to process; ``sequence``: counter of a SYNC that carries none. Returns the index
+        of the SYNC, or ``stop`` if there is none.
         """
         at = int(_exchange(ids, lengths, data, start, stop, sequence, *self._arguments))
         self.out = self._out[: self._result[0]]

@@ -161,17 +161,8 @@ class Plant:
     def resistance(self, q: NDArray[np.float64], qd: NDArray[np.float64], t: float = 0.0) -> NDArray[np.float64]:
         """Torques of friction, brakes and hidden effects against the motors; bristles slide steadily.
 
-        Parameters
-        ----------
-        q, qd
-            Positions and velocities of the motors, joint side, shape (n,).
-        t
-            Time, s.
-
-        Returns
-        -------
-        ndarray
-            Torques, N m or N, shape (n,).
+        ``q``, ``qd``: positions and velocities of the motors, joint side, shape (n,). Returns torques, N m or N, shape
+        (n,).
         """
         n = q.size
         out, slope = np.empty(n), np.empty((n, n))
@@ -187,19 +178,8 @@ class Plant:
     ) -> NDArray[np.float64]:
         """Accelerations by direct dynamics, without the approximations of `advance`; bristles slide steadily.
 
-        Parameters
-        ----------
-        q, qd
-            Coordinates and velocities, shape (N,).
-        tau
-            Joint torques, N m or N, shape (n,).
-        t
-            Time, s.
-
-        Returns
-        -------
-        ndarray
-            Accelerations of the coordinates, shape (N,).
+        ``q``, ``qd``: coordinates and velocities, shape (N,); ``tau``: joint torques, N m or N, shape (n,). Returns
+        accelerations of the coordinates, shape (N,).
         """
         n, total = self.q.size, self.coordinates.size
         force, slope = np.zeros(total), np.zeros((total, total))
@@ -211,15 +191,7 @@ class Plant:
         return np.asarray(np.linalg.solve(self._inertia(q), -force), np.float64)
 
     def advance(self, tau: NDArray[np.float64], period: float) -> None:
-        """Integrate over one control period with constant torques.
-
-        Parameters
-        ----------
-        tau
-            Joint torques, N m or N, shape (n,).
-        period
-            Control period, s.
-        """
+        """Integrate over one control period with constant torques. ``tau``: joint torques, N m or N, shape (n,)."""
         if self._vibrations.size:
             self._add_base_vibration(self._time + 0.5 * period)
         middle, speed = self._state[2], self._state[3]

@@ -22,12 +22,7 @@ def plausible_trajectory(robot: RobotConfig, seed: int = 0) -> Trajectory:
 
     It is not optimised for identification (``armident trajectory`` does that), and collisions are not checked.
 
-    Parameters
-    ----------
-    robot
-        Robot with limits of position, velocity and acceleration.
-    seed
-        Seed.
+    ``robot``: robot with limits of position, velocity and acceleration.
     """
     rng, n = np.random.default_rng([seed, 4]), robot.n
     order = np.arange(1.0, HARMONICS + 1)

@@ -18,23 +18,10 @@ class Replay:
     The first sample is sent until all drives of ``joints`` are enabled. Sample k is sent on the k-th SYNC after that,
     and the last sample is repeated at the end. Set points are ignored.
 
-    Parameters
-    ----------
-    recording
-        The recording; gaps repeat the sample before them.
-    robot
-        Encoder resolutions, transmission and rated currents of the virtual drives.
-    sync_period
-        SYNC period, s.
-    joints
-        Numbers of the joints whose drives must be enabled.
-
-    Raises
-    ------
-    ConfigError
-        If the recording is of another robot, or its sample rate is not the SYNC rate.
-    DataError
-        If the recording has no positions or no efforts, or if they exceed the range of the drives' numbers.
+    ``recording``: the recording; gaps repeat the sample before them. ``robot``: encoder resolutions, transmission and
+    rated currents of the virtual drives. ``joints``: numbers of the joints whose drives must be enabled. Raises
+    ConfigError if the recording is of another robot, or its sample rate is not the SYNC rate; DataError if the
+    recording has no positions or no efforts, or if they exceed the range of the drives' numbers.
     """
 
     def __init__(self, recording: Recording, robot: RobotConfig, sync_period: float, joints: tuple[int, ...]) -> None:
@@ -76,26 +63,12 @@ class Replay:
         return self._row == len(self._positions) - 1
 
     def enable(self, joint: int, enabled: bool) -> None:
-        """Start the replay when the last drive is enabled.
-
-        Parameters
-        ----------
-        joint
-            Number of the joint.
-        enabled
-            New state of its drive.
-        """
+        """Start the replay when the last drive is enabled. ``enabled``: new state of its drive."""
         if enabled:
             self._waiting.discard(joint)
 
     def set_targets(self, targets: Raw32, fresh: NDArray[np.bool_]) -> None:
-        """Ignore set points.
-
-        Parameters
-        ----------
-        targets, fresh
-            As in `DriveBackend.set_targets`.
-        """
+        """Ignore set points. ``targets``, ``fresh``: as in `DriveBackend.set_targets`."""
 
     def advance(self) -> None:
         """Advance to the next sample."""

@@ -49,6 +49,9 @@ def run_robot(
 ) -> None:
     """Serve the drives of a session until SIGINT or SIGTERM, or for a given time.
 
+    Raises ConfigError if a file is wrong, the bus is missing, or the recording is of another robot; DataError if the
+    recording cannot be replayed; BusDown if the bus goes down.
+
     Parameters
     ----------
     config
@@ -71,15 +74,6 @@ def run_robot(
         Where the parameters of the arm come from.
     write_config
         Folder for the completed robot and session.
-
-    Raises
-    ------
-    ConfigError
-        If a file is wrong, the bus is missing, or the recording is of another robot.
-    DataError
-        If the recording cannot be replayed.
-    BusDown
-        If the bus goes down.
     """
     hidden = load_scenario(scenario) if scenario is not None else None
     if replay is not None:
@@ -121,6 +115,9 @@ def record_robot(
 ) -> None:
     """Write a simulated recording of one trajectory of the virtual arm, without a bus.
 
+    Raises ConfigError if a file is wrong, no trajectory is given, the scenario has oddities of drives, or ``out``
+    exists already.
+
     Parameters
     ----------
     config
@@ -133,11 +130,6 @@ def record_robot(
         Trajectory; ``None``: that of the session.
     encoder_counts
         Counts per motor turn in place of the robot's, also for the control loops.
-
-    Raises
-    ------
-    ConfigError
-        If a file is wrong, no trajectory is given, the scenario has oddities of drives, or ``out`` exists already.
     """
     if out.exists():
         raise ConfigError(f"{out}: the file exists already")

@@ -41,20 +41,9 @@ MOTION_ERROR, COMMUNICATION_ERROR = 0x20, 0x10
 class ServerReport:
     """Timing of the drives' answers.
 
-    Parameters
-    ----------
-    syncs
-        Number of SYNCs answered.
-    delay_p50_us, delay_p99_us, delay_max_us
-        Median, 99th percentile and maximum of the time that a SYNC waited in the kernel, us.
-    backlog_max
-        Largest number of SYNCs received at once.
-    seconds
-        Duration, s.
-    cpu_share
-        CPU time over duration.
-    dropped
-        Number of frames dropped by the kernel.
+    ``syncs``: number of SYNCs answered; ``delay_p50_us``, ``delay_p99_us``, ``delay_max_us``: median, 99th percentile
+    and maximum of the time that a SYNC waited in the kernel, us; ``backlog_max``: largest number of SYNCs received at
+    once; ``cpu_share``: CPU time over duration; ``dropped``: number of frames dropped by the kernel.
     """
 
     syncs: int
@@ -85,19 +74,9 @@ class ServerReport:
 class Server:
     """All virtual drives of a session on its buses; use it in a ``with`` block.
 
-    Parameters
-    ----------
-    session, robot
-        Buses, nodes and SYNC; joints and drives.
-    motion
-        Plant or recording behind the drives.
-    oddities
-        Names of the oddities of drives, by joint.
-
-    Raises
-    ------
-    ConfigError
-        If a bus is missing or an EDS is unusable.
+    ``session``, ``robot``: buses, nodes and SYNC; joints and drives. ``motion``: plant or recording behind the drives.
+    ``oddities``: names of the oddities of drives, by joint. Raises ConfigError if a bus is missing or an EDS is
+    unusable.
     """
 
     def __init__(
@@ -169,17 +148,9 @@ class Server:
     def run(self, stopped: Callable[[], bool], duration: float | None = None) -> ServerReport:
         """Answer every SYNC.
 
-        Parameters
-        ----------
-        stopped
-            Function that returns ``True`` to end.
-        duration
-            Longest duration, s; ``None``: unlimited.
-
-        Raises
-        ------
-        BusDown
-            If the only bus goes down; with several buses the others go on, and a bus that is back is served again.
+        ``stopped``: function that returns ``True`` to end. ``duration``: longest duration, s; ``None``: unlimited.
+        Raises BusDown if the only bus goes down; with several buses the others go on, and a bus that is back is served
+        again.
         """
         begin, cpu = time.monotonic(), time.process_time()
 

@@ -5,9 +5,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from armident.compiled import PLAIN, compiled
 from armident.configs import ConfigError, RobotConfig
 from armident.configs.schema.robot import Controller
 
@@ -33,8 +33,6 @@ class Servo:
 
     Parameters
     ----------
-    period
-        Control period, s.
     kp, kv
         Gains, 1/s and units of the drives' signal per rad/s or m/s, shape (n,).
     velocity_feedback
@@ -59,7 +57,12 @@ class Servo:
         return 1.0 - math.exp(-2 * math.pi * self.filter_hz * self.period)
 
 
-@njit(cache=True, error_model="numpy")
+@compiled(
+    "f8, b1, f8[::1], f8[:, ::1], f8[::1], f8[::1], f8[::1], i8[::1], i8[::1], b1[::1], f8[::1], f8[::1], f8, "
+    "f8[::1], f8[::1], f8[::1], f8[:, ::1], f8[::1], f8[::1], i4[::1], i2[::1], i4[::1], f8[:, ::1], f8[::1], "
+    "f8[::1]",
+    **PLAIN,
+)
 def control(  # type: ignore[no-untyped-def]
     period, feedback, q, ratio, counts_per_rad, origin, target, age, steps, held, kp, kv, smooth, limit, noise,
     permille, past, rate, current, position, reported, demand, torque, disturbance, tau,
@@ -135,12 +138,7 @@ def control(  # type: ignore[no-untyped-def]
 def control_period(robot: RobotConfig, sync_period: float | None = None) -> float:
     """Control period of the robot's drives, s; a SYNC period has a whole number of them.
 
-    Parameters
-    ----------
-    robot
-        The robot.
-    sync_period
-        SYNC period, s; ``None``: any.
+    ``sync_period``: SYNC period, s; ``None``: any.
     """
     if robot.name in OWN_PERIODS or sync_period is None:
         return OWN_PERIODS.get(robot.name, CONTROL_PERIOD)
@@ -158,6 +156,8 @@ def design(
 ) -> Servo:
     """Design the drives of a virtual arm: a known controller, else tuned gains.
 
+    Raises ConfigError if ``velocity_feedback`` is ``False`` with a known controller.
+
     Parameters
     ----------
     robot
@@ -172,11 +172,6 @@ def design(
         Bandwidths of the position loops for tuned gains, Hz; the last one counts for all further joints.
     known
         Known controller, which has velocity feedback; ``None``: that of the robot's configuration, if it has one.
-
-    Raises
-    ------
-    ConfigError
-        If ``velocity_feedback`` is ``False`` with a known controller.
     """
     period = control_period(robot) if period is None else period
     known = robot.controller if known is None else known
@@ -192,19 +187,9 @@ def gains(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Gains ``kp`` (1/s) and ``kv`` (A s/rad), motor side, for two equal poles at the given bandwidths.
 
-    Parameters
-    ----------
-    robot
-        Transmission and drive gains.
-    mass
-        Mass matrix at the posture for which the gains are tuned, joint side, rotors included, shape (n, n).
-    bandwidth_hz
-        Bandwidths of the position loops, Hz; the last one counts for all further joints.
-
-    Returns
-    -------
-    kp, kv
-        Gains, shape (n,) each.
+    ``robot``: transmission and drive gains. ``mass``: mass matrix at the posture for which the gains are tuned, joint
+    side, rotors included, shape (n, n). ``bandwidth_hz``: bandwidths of the position loops, Hz; the last one counts for
+    all further joints. Returns ``kp``, ``kv``: gains, shape (n,) each.
     """
     inverse = np.linalg.inv(robot.transmission_matrix)
     inertia = np.diag(inverse.T @ mass @ inverse)

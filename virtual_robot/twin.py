@@ -63,13 +63,7 @@ class Twin:
     trajectory: Trajectory | None
 
     def with_session(self, session: SessionConfig) -> "Twin":
-        """Return the same arm in another session.
-
-        Parameters
-        ----------
-        session
-            The session.
-        """
+        """Return the same arm in another session."""
         return replace(self, session=session)
 
 
@@ -77,14 +71,8 @@ class Twin:
 class ParameterChoice:
     """Source of the parameters of a virtual arm.
 
-    Parameters
-    ----------
-    model
-        ``identification.json`` with physically consistent parameters; ``None``: not from an identification.
-    seed
-        Seed of what is drawn.
-    draw_masses
-        ``True``: masses are drawn even if the URDF has some.
+    ``model``: ``identification.json`` with physically consistent parameters; ``None``: not from an identification.
+    ``seed``: seed of what is drawn. ``draw_masses``: ``True``: masses are drawn even if the URDF has some.
     """
 
     model: Path | None = None
@@ -99,17 +87,8 @@ STANDARD = ParameterChoice()
 def load_twin(config: Path, choice: ParameterChoice = STANDARD) -> Twin:
     """Load the virtual arm of a session, or of a robot with a session made for it.
 
-    Parameters
-    ----------
-    config
-        Configuration of a session or of a robot.
-    choice
-        Where the parameters of the arm come from.
-
-    Raises
-    ------
-    ConfigError
-        If a file is wrong, or is not of this robot.
+    ``config``: configuration of a session or of a robot; ``choice``: where the parameters of the arm come from. Raises
+    ConfigError if a file is wrong, or is not of this robot.
     """
     path = config_path(config)
     session = load_session(path, "robot") if is_session(path) else None
@@ -128,15 +107,7 @@ def load_twin(config: Path, choice: ParameterChoice = STANDARD) -> Twin:
 
 
 def at_period(session: SessionConfig, period_us: int) -> SessionConfig:
-    """Session at another SYNC period, with all streams and set points on every SYNC.
-
-    Parameters
-    ----------
-    session
-        The session.
-    period_us
-        SYNC period, us.
-    """
+    """Session at another SYNC period, with all streams and set points on every SYNC."""
     return session.model_copy(
         update={
             "sync": session.sync.model_copy(update={"period_us": period_us}),
@@ -149,19 +120,8 @@ def at_period(session: SessionConfig, period_us: int) -> SessionConfig:
 def on_virtual_bus(session: SessionConfig, channel: str, cell: str) -> SessionConfig:
     """Session on one virtual bus, without the cell's Zenoh, metrics and triggers: real drives and services stay apart.
 
-    Parameters
-    ----------
-    session
-        The session.
-    channel
-        Name of the vcan interface.
-    cell
-        Name of the cell in its place.
-
-    Raises
-    ------
-    ConfigError
-        If drives of several buses share a node id.
+    ``channel``: name of the vcan interface; ``cell``: name of the cell in its place. Raises ConfigError if drives of
+    several buses share a node id.
     """
     nodes = [drive.node_id for drive in session.drives]
     if len(set(nodes)) < len(nodes):
@@ -187,17 +147,9 @@ def on_virtual_bus(session: SessionConfig, channel: str, cell: str) -> SessionCo
 def complete(robot: RobotConfig, **choice: Any) -> tuple[RobotConfig, ArmParameters, tuple[str, ...]]:
     """Complete a robot for its virtual arm.
 
-    Parameters
-    ----------
-    robot
-        The robot.
-    choice
-        Keyword arguments of `armident.virtual_robot.arm_parameters.arm_parameters`.
-
-    Returns
-    -------
-    robot, parameters, assumed
-        The robot with limits, transmission and drives, the parameters of the arm, and what was assumed.
+    ``choice``: keyword arguments of `armident.virtual_robot.arm_parameters.arm_parameters`. Returns ``robot``,
+    ``parameters``, ``assumed``: the robot with limits, transmission and drives, the parameters of the arm, and what was
+    assumed.
     """
     robot, limits = with_limits(robot)
     parameters = arm_parameters(robot, **choice)
@@ -207,13 +159,7 @@ def complete(robot: RobotConfig, **choice: Any) -> tuple[RobotConfig, ArmParamet
 
 
 def with_limits(robot: RobotConfig) -> tuple[RobotConfig, tuple[str, ...]]:
-    """Robot with limits of position, velocity and acceleration, and a remark on each that was assumed.
-
-    Parameters
-    ----------
-    robot
-        The robot.
-    """
+    """Robot with limits of position, velocity and acceleration, and a remark on each that was assumed."""
     assumed: dict[str, list[str]] = {}
     joints = []
     for joint in robot.joints:
@@ -319,22 +265,8 @@ def _session_for(path: Path, robot: RobotConfig) -> SessionConfig:
 def write_twin(twin: Twin, folder: Path) -> Path:
     """Write the configuration of a virtual arm for ``armident capture``: robot, session and motion.
 
-    Parameters
-    ----------
-    twin
-        The virtual arm.
-    folder
-        Folder of the files ``robot.yaml``, ``cell.yaml`` and, for a session without set points, ``trajectory.yaml``.
-
-    Returns
-    -------
-    Path
-        The session file.
-
-    Raises
-    ------
-    ConfigError
-        If the files cannot be written.
+    ``twin``: the virtual arm; ``folder``: folder of the files ``robot.yaml``, ``cell.yaml`` and, for a session without
+    set points, ``trajectory.yaml``. Returns the session file. Raises ConfigError if the files cannot be written.
     """
     try:
         return _write_files(twin, folder)

@@ -1,7 +1,7 @@
 """Schema of a session: buses, drives, streams, recording, publication and identification."""
 
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Literal, Self
 
 from pydantic import Field, field_validator, model_validator
 
@@ -10,8 +10,6 @@ from armident.configs.schema.robot import JointName, Name, Positive
 
 ObjectName = Literal["position", "velocity", "current", "torque", "demand", "status"]
 Every = Annotated[int, Field(ge=1, le=240)]
-RENAMED = {"look_hz": "preview_hz"}
-"""Keys of ``recording`` that were renamed after version 0.1, by old name."""
 
 
 class Bus(FrozenModel):
@@ -219,15 +217,6 @@ class RecordingOptions(FrozenModel):
     preview_hz: Annotated[float, Field(ge=0, le=1000)] = 50.0
     trigger: Trigger | None = None
 
-    @model_validator(mode="before")
-    @classmethod
-    def _renamed(cls, data: Any) -> Any:
-        """Accept keys by their names up to version 0.1: recordings of that version hold them."""
-        if not isinstance(data, dict):
-            return data
-        renamed = {old: new for old, new in RENAMED.items() if new not in data}
-        return {renamed.get(key, key): value for key, value in data.items()}
-
 
 class ZenohOptions(FrozenModel):
     """Options of Zenoh; by default a peer on loopback.
@@ -269,33 +258,6 @@ class MetricsOptions(FrozenModel):
     address: str = "127.0.0.1"
 
 
-class IdentificationOptions(FrozenModel):
-    """Options of the identification worker, by the names of the options of ``armident identify``.
-
-    Parameters
-    ----------
-    method
-        Estimator.
-    derivatives
-        Method that estimates velocities and accelerations from positions.
-    controller
-        Source of the controller in the simulated closed loop.
-    nvr
-        Noise variance ratio of IRWSM, or the method that selects it.
-    noise_model
-        Noise model of the estimator.
-    physical
-        ``True`` if the parameters are projected onto the physically consistent ones.
-    """
-
-    method: Literal["idim-piv", "idim-iv", "idim-ls", "didim", "clie", "cloe", "sep-pem"] = "idim-piv"
-    derivatives: Literal["irwsm", "irwsm2", "bandpass"] = "irwsm"
-    controller: Literal["crc", "parametric", "known"] = "crc"
-    nvr: Positive | Literal["automatic", "cross-validation", "likelihood", "tracking-error"] = "automatic"
-    noise_model: Literal["black-box", "grey-box"] = "black-box"
-    physical: bool = False
-
-
 class SessionConfig(WithBlanks):
     """Session of one cell; relative paths are relative to the file that contains them.
 
@@ -325,8 +287,10 @@ class SessionConfig(WithBlanks):
         TPDOs by stream name; ``samples`` is required.
     setpoints
         Reference trajectory that is played; ``None``: none.
-    recording, zenoh, metrics, identification
-        Options of recordings, Zenoh, Prometheus and the identification worker.
+    recording, zenoh, metrics
+        Options of recordings, Zenoh and Prometheus.
+    identification
+        Options of the worker by their names in ``armident.identify``, which the worker checks.
     blanks
         Keys that the file marks as blank.
     """
@@ -347,7 +311,7 @@ class SessionConfig(WithBlanks):
     recording: RecordingOptions = RecordingOptions()
     zenoh: ZenohOptions = ZenohOptions()
     metrics: MetricsOptions = MetricsOptions()
-    identification: IdentificationOptions = IdentificationOptions()
+    identification: dict[str, bool | int | float | str | None] = Field(default_factory=dict)
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:

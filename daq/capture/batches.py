@@ -24,13 +24,7 @@ class SamplesFirst:
         self._gaps: tuple[Gap, ...] = ()
 
     def take(self, batch: Batch) -> Batch:
-        """Return what can be written after a batch.
-
-        Parameters
-        ----------
-        batch
-            Rows and gaps from the assembler.
-        """
+        """Return what can be written after a batch. ``batch``: rows and gaps from the assembler."""
         until, rows, held = batch.certain["samples"], {}, {}
         for name, new in batch.rows.items():
             waiting = self._rows.get(name)
@@ -63,12 +57,7 @@ class FileBoundaries:
     def allow(self, samples: Rows, certain: Mapping[str, int]) -> bool:
         """Return True if a file may begin before these samples.
 
-        Parameters
-        ----------
-        samples
-            Samples, at least one.
-        certain
-            Number of the SYNC, by stream, before which all rows are known.
+        ``samples``: at least one; ``certain``: number of the SYNC, by stream, before which all rows are known.
         """
         t_ns = int(samples.t_ns[0])
         if all(until >= samples.sync[0] for until in certain.values()):
@@ -89,10 +78,7 @@ def pieces(batch: Batch) -> Iterator[Batch]:
     A batch is long if drives lagged and answered all at once. The pieces give blocks the usual size, and let files end
     at their limits. Rows of a stream are in the piece of their SYNC, a gap is in the piece of its first SYNC.
 
-    Parameters
-    ----------
-    batch
-        Rows and gaps.
+    ``batch``: rows and gaps.
     """
     samples = batch.rows["samples"]
     if samples.sync.size == 0 or samples.t_ns[-1] - samples.t_ns[0] < PIECE_NS:

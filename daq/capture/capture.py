@@ -13,7 +13,12 @@ from pathlib import Path
 
 from armident.configs import ArmidentError, SessionConfig
 from armident.configs.schema.session import Bus
-from armident.daq.capture.files import (
+from armident.daq.capture.host_metadata import host_metadata
+from armident.daq.capture.journal import JournalHandler
+from armident.daq.capture.plan import CapturePlan, load_plan
+from armident.daq.capture.publisher import Publisher
+from armident.daq.capture.recorder import Outputs, Recorder
+from armident.daq.capture.recording_files import (
     RecordingRetention,
     capture_stamp,
     chunk_duration_ns,
@@ -22,11 +27,6 @@ from armident.daq.capture.files import (
     next_time,
     open_series,
 )
-from armident.daq.capture.host_metadata import host_metadata
-from armident.daq.capture.journal import JournalHandler
-from armident.daq.capture.plan import CapturePlan, load_plan
-from armident.daq.capture.publisher import Publisher
-from armident.daq.capture.recorder import Outputs, Recorder
 from armident.daq.capture.reload import Change, Reloader
 from armident.daq.capture.sink import Sink
 from armident.daq.logs import log_to
@@ -47,16 +47,8 @@ log = logging.getLogger(__name__)
 class CaptureResult:
     """Result of a capture.
 
-    Parameters
-    ----------
-    paths
-        The finished files, in their order in time.
-    counters
-        All counters of the capture.
-    marks
-        Marks of the recording, such as begin and end of the experiment.
-    failure
-        Error of a bus or a drive that ended the capture early.
+    ``paths``: the finished files, in their order in time; ``marks``: marks of the recording, such as begin and end of
+    the experiment; ``failure``: error of a bus or a drive that ended the capture early.
     """
 
     paths: tuple[Path, ...]
@@ -73,27 +65,11 @@ def capture(
 ) -> CaptureResult:
     """Run one capture from the first SDO to the finished file.
 
-    Parameters
-    ----------
-    plan
-        Session, robot, trajectory and options of the capture.
-    stop
-        Set it to end the capture; the file is finished nevertheless.
-    save
-        Set it to write the last seconds, in a capture with triggers.
-    reload
-        Set it to read the configuration again, if the plan was read from a file.
-
-    Returns
-    -------
-    CaptureResult
-        With ``failure`` if a bus or a drive failed during the capture; the recording is finished in that case, too.
-
-    Raises
-    ------
-    ConfigError
-        If the capture could not start: bus, drives, mapping, disk, another capture. No file is left
-        behind in that case.
+    ``plan``: session, robot, trajectory and options of the capture. ``stop``: set it to end the capture; the file is
+    finished nevertheless. ``save``: set it to write the last seconds, in a capture with triggers. ``reload``: set it to
+    read the configuration again, if the plan was read from a file. Result: with ``failure`` if a bus or a drive failed
+    during the capture; the recording is finished in that case, too. Raises ConfigError if the capture could not start:
+    bus, drives, mapping, disk, another capture. No file is left behind in that case.
     """
     session, robot = plan.session, plan.robot
     now = next_time(plan.directory, robot.name, datetime.datetime.now(datetime.UTC))
@@ -190,27 +166,11 @@ def run_capture(
 ) -> None:
     """Run ``armident capture`` until its end, SIGINT or SIGTERM, and print the paths of the files.
 
-    Parameters
-    ----------
-    config
-        Session configuration.
-    out
-        Directory of recordings; default: that of the session.
-    duration
-        Time after which the capture ends, s.
-    listen_only
-        Send nothing to the buses.
-    as_json
-        Print paths and counters as JSON.
-    sniff_s
-        With ``listen_only``: time to discover the TPDOs of the drives, s.
-
-    Raises
-    ------
-    ConfigError
-        If the capture could not start.
-    ArmidentError
-        If a bus or a drive failed during the capture; the file is finished in that case, too.
+    ``config``: session configuration. ``out``: directory of recordings; default: that of the session. ``duration``:
+    time after which the capture ends, s. ``listen_only``: send nothing to the buses. ``as_json``: print paths and
+    counters as JSON. ``sniff_s``: with ``listen_only``: time to discover the TPDOs of the drives, s. Raises ConfigError
+    if the capture could not start. Raises ArmidentError if a bus or a drive failed during the capture; the file is
+    finished in that case, too.
     """
     handler = JournalHandler()
     with log_to(handler):

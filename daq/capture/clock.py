@@ -28,14 +28,9 @@ class _Timex(ctypes.Structure):
 class ClockState:
     """State of the system clock.
 
-    Parameters
-    ----------
-    offset_us
-        Offset that is still to be corrected, us.
-    error_us, largest_error_us
-        Estimated and largest error, as the process that sets the clock states them, us.
-    synchronised
-        True if a process such as chrony or ntpd sets the clock.
+    ``offset_us``: offset that is still to be corrected, us; ``error_us``, ``largest_error_us``: estimated and largest
+    error, as the process that sets the clock states them, us; ``synchronised``: True if a process such as chrony or
+    ntpd sets the clock.
     """
 
     offset_us: float
@@ -45,13 +40,7 @@ class ClockState:
 
 
 def clock_state() -> ClockState:
-    """Return the state of the system clock; nothing is changed.
-
-    Raises
-    ------
-    OSError
-        If the kernel refuses the call.
-    """
+    """Return the state of the system clock; nothing is changed. Raises OSError if the kernel refuses the call."""
     timex = _Timex()
     state = ctypes.CDLL(None, use_errno=True).adjtimex(ctypes.byref(timex))
     if state < 0:

@@ -22,14 +22,8 @@ log = logging.getLogger(__name__)
 class EventHandler:
     """Handles events in the order in which they are detected.
 
-    Parameters
-    ----------
-    plan
-        Plan of the capture; its session names the events that trigger a recording.
-    assembler
-        Gives the SYNC at which an event happened, and is notified of buses that are down.
-    sink
-        Takes the marks.
+    ``plan``: plan of the capture; its session names the events that trigger a recording. ``assembler``: gives the SYNC
+    at which an event happened, and is notified of buses that are down. ``sink``: takes the marks.
     """
 
     def __init__(self, plan: CapturePlan, assembler: Assembler, sink: Sink) -> None:
@@ -51,13 +45,7 @@ class EventHandler:
         self.triggers = () if trigger is None else trigger.events
 
     def on_drive_event(self, event: DriveEvent) -> None:
-        """Handle the event of a drive.
-
-        Raises
-        ------
-        ArmidentError
-            If the drive failed while it moves the arm.
-        """
+        """Handle the event of a drive. Raises ArmidentError if the drive failed while it moves the arm."""
         kind = event.kind
         if kind in self.counts:
             self.counts[kind] += 1
@@ -72,10 +60,7 @@ class EventHandler:
     def on_bus_event(self, event: BusEvent) -> None:
         """Handle the event of a bus; samples of its axes are gaps while it is down.
 
-        Raises
-        ------
-        ArmidentError
-            If the bus was lost while the capture moves the arm.
+        Raises ArmidentError if the bus was lost while the capture moves the arm.
         """
         if event.kind in self.counts:
             self.counts[event.kind] += 1
@@ -94,23 +79,12 @@ class EventHandler:
     def on_frames_dropped_at_end(self, dropped: int, syncs: int) -> None:
         """Note that the kernel dropped frames after the last received one.
 
-        Parameters
-        ----------
-        dropped
-            Number of frames.
-        syncs
-            Largest number of SYNCs among them.
+        ``syncs``: largest number of SYNCs among them.
         """
         self._note(f"{dropped} frames were dropped by the kernel at the end: up to {syncs} SYNCs may be missing there")
 
     def check_sync(self, now: float) -> None:
-        """Note that SYNC of another master has stopped or is back.
-
-        Parameters
-        ----------
-        now
-            Monotonic time, s.
-        """
+        """Note that SYNC of another master has stopped or is back. ``now``: monotonic time, s."""
         last, silent = self._assembler.last_sync, now - self._last_sync_s
         if last == self._last_sync:
             if last >= 0 and not self.sync_stopped and silent > self._timeout_s:

@@ -9,11 +9,11 @@ from typing import Protocol
 from armident.configs import SessionConfig
 from armident.configs.schema.session import MetricsOptions
 from armident.daq.capture.clock import clock_state
-from armident.daq.capture.files import free_space
 from armident.daq.capture.jitter import SyncJitter, worst
 from armident.daq.capture.metrics import Metrics, Value
 from armident.daq.capture.plan import CapturePlan
 from armident.daq.capture.publisher import Publisher
+from armident.daq.capture.recording_files import free_space
 from armident.daq.capture.sink import Sink
 from armident.daq.matching.assembler import Assembler
 from armident.drivers.can.receiver import Receiver
@@ -45,13 +45,7 @@ class _Writer(Protocol):
 
 
 class DiskCheck:
-    """Logs when the disk refuses rows or leaves too many rows waiting, and when that is over.
-
-    Parameters
-    ----------
-    writer
-        Writer of the rows.
-    """
+    """Logs when the disk refuses rows or leaves too many rows waiting, and when that is over."""
 
     def __init__(self, writer: _Writer) -> None:
         self._writer = writer
@@ -82,16 +76,8 @@ class DiskCheck:
 class Health:
     """Reports on one capture.
 
-    Parameters
-    ----------
-    plan
-        Plan of the capture.
-    assembler, receiver, jitters
-        Sources of the counters.
-    sink
-        Gives the state of the files.
-    publisher
-        Takes the messages.
+    ``assembler``, ``receiver``, ``jitters``: sources of the counters; ``sink``: gives the state of the files;
+    ``publisher``: takes the messages.
     """
 
     def __init__(
@@ -120,10 +106,7 @@ class Health:
     def change(self, session: SessionConfig) -> None:
         """Apply the ``metrics`` options of a reloaded session.
 
-        Raises
-        ------
-        ConfigError
-            If the port cannot be opened; the metrics stay at the former port in that case.
+        Raises ConfigError if the port cannot be opened; the metrics stay at the former port in that case.
         """
         if session.metrics != self._options:
             fresh = self._opened(session.metrics)
@@ -147,12 +130,7 @@ class Health:
     def report(self, seconds: float, events: dict[str, int]) -> None:
         """Publish the state of the capture.
 
-        Parameters
-        ----------
-        seconds
-            Time since the last report, s.
-        events
-            Counts of events since the start.
+        ``seconds``: time since the last report, s; ``events``: counts of events since the start.
         """
         counters = self._assembler.counters
         rate = (counters["frames"] - self._frames_before) / seconds

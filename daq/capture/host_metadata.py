@@ -13,10 +13,7 @@ _GIT_TIMEOUT_S = 2.0
 def host_metadata(now: datetime.datetime) -> dict[str, str]:
     """Return host, kernel, clock source, program version and git revision, as far as they are known.
 
-    Parameters
-    ----------
-    now
-        Start of the recording.
+    ``now``: start of the recording.
     """
     metadata = {
         "started_utc": now.astimezone(datetime.UTC).isoformat(timespec="microseconds"),

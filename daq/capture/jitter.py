@@ -18,14 +18,8 @@ PERCENTILES = (50.0, 99.0, 99.9)
 class SyncJitter:
     """Statistics of the jitter over all SYNCs of one bus.
 
-    Parameters
-    ----------
-    period_ns
-        SYNC period, ns.
-    overflow
-        Overflow of the SYNC counter (CiA 301, 1019h), by which missing SYNCs are detected; 0: SYNC has no counter.
-    sync_id
-        COB-ID of SYNC.
+    ``overflow``: overflow of the SYNC counter (CiA 301, 1019h), by which missing SYNCs are detected; 0: SYNC has no
+    counter. ``sync_id``: COB-ID of SYNC.
     """
 
     def __init__(self, period_ns: int, overflow: int, sync_id: int = 0x80) -> None:
@@ -36,13 +30,7 @@ class SyncJitter:
         self._max = 0
 
     def take(self, frames: NDArray[Any]) -> None:
-        """Add frames of the bus.
-
-        Parameters
-        ----------
-        frames
-            Frames (N,) in the order of reception; all but SYNC are ignored.
-        """
+        """Add frames of the bus. ``frames``: frames (N,) in the order of reception; all but SYNC are ignored."""
         sync = frames[frames["can_id"] == self._sync_id]
         if sync.size == 0:
             return

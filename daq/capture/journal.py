@@ -28,12 +28,8 @@ class JournalHandler(StderrHandler):
     ``log.info("no heartbeat", extra={"event": "heartbeat_lost", "axis": "joint_2"})`` becomes an entry with the fields
     ``ARMIDENT_EVENT`` and ``ARMIDENT_AXIS``.
 
-    Parameters
-    ----------
-    fields
-        Fields of every entry, such as cell and robot; may be exchanged at any time.
-    address
-        Socket of the journal.
+    ``fields``: fields of every entry, such as cell and robot; may be exchanged at any time. ``address``: socket of the
+    journal.
     """
 
     def __init__(self, fields: Mapping[str, object] | None = None, address: Path = SOCKET) -> None:
@@ -77,14 +73,8 @@ def in_journal() -> bool:
 def entry(record: logging.LogRecord, message: str, fields: Mapping[str, object]) -> bytes:
     """Return the datagram of one entry.
 
-    Parameters
-    ----------
-    record
-        The record; its ``extra`` attributes become fields, except those that are ``None``.
-    message
-        The formatted record.
-    fields
-        More fields; those of the record take precedence.
+    ``record``: the record; its ``extra`` attributes become fields, except those that are ``None``. ``message``: the
+    formatted record. ``fields``: more fields; those of the record take precedence.
     """
     own = {key: value for key, value in vars(record).items() if key not in _STANDARD}
     entries: dict[str, object] = {

@@ -33,17 +33,8 @@ COUNTERS = {
 class Metrics:
     """Serves the last health message over HTTP.
 
-    Parameters
-    ----------
-    address, port
-        Address and port of the server; port 0 takes a free one.
-    labels
-        Labels of every metric: cell and robot.
-
-    Raises
-    ------
-    ConfigError
-        If the port cannot be opened.
+    ``address``, ``port``: address and port of the server; port 0 takes a free one. ``labels``: labels of every metric:
+    cell and robot. Raises ConfigError if the port cannot be opened.
     """
 
     def __init__(self, address: str, port: int, labels: dict[str, str]) -> None:

@@ -39,16 +39,7 @@ log = logging.getLogger(__name__)
 class IdentifierStatistics:
     """Statistics of the frames of one identifier.
 
-    Parameters
-    ----------
-    can_id
-        The identifier.
-    frames
-        Number of frames.
-    every
-        Interval in SYNCs; ``None`` if the frames do not follow SYNC.
-    lengths
-        Lengths that occurred, bytes.
+    ``every``: interval in SYNCs; ``None`` if the frames do not follow SYNC. ``lengths``: lengths that occurred, bytes.
     """
 
     can_id: int
@@ -66,14 +57,8 @@ class IdentifierStatistics:
 class BusStatistics:
     """Statistics of the frames of one bus.
 
-    Parameters
-    ----------
-    channel
-        Name of the bus.
-    period_us
-        Median SYNC period, us.
-    identifiers
-        Statistics of every received identifier of the range of PDOs (180h to 57Fh).
+    ``period_us``: median SYNC period, us; ``identifiers``: statistics of every received identifier of the range of PDOs
+    (180h to 57Fh).
     """
 
     channel: str
@@ -84,17 +69,8 @@ class BusStatistics:
 def bus_statistics(channel: str, frames: Frames) -> BusStatistics:
     """Return the statistics of the frames of one bus.
 
-    Parameters
-    ----------
-    channel
-        Name of the bus.
-    frames
-        Its frames (N,) in the order of reception.
-
-    Raises
-    ------
-    ConfigError
-        If there are fewer than `FEWEST_FRAMES` SYNCs among them.
+    ``frames``: its frames (N,) in the order of reception. Raises ConfigError if there are fewer than `FEWEST_FRAMES`
+    SYNCs among them.
     """
     is_sync = frames["can_id"] == COB_SYNC
     if np.count_nonzero(is_sync) < FEWEST_FRAMES:
@@ -126,17 +102,7 @@ def _interval(number: NDArray[np.int64]) -> int | None:
 def with_sent_streams(session: SessionConfig, buses: list[BusStatistics]) -> SessionConfig:
     """Return the session with the streams that the drives send.
 
-    Parameters
-    ----------
-    session
-        The session.
-    buses
-        Statistics of each of its buses.
-
-    Raises
-    ------
-    ConfigError
-        If SYNC has another period, drives send different TPDOs, or the mapping of a TPDO is unknown.
+    Raises ConfigError if SYNC has another period, drives send different TPDOs, or the mapping of a TPDO is unknown.
     """
     for bus in buses:
         if abs(bus.period_us / session.sync.period_us - 1) > PERIOD_TOLERANCE:
@@ -207,22 +173,8 @@ def _stream(session: SessionConfig, drive: DriveNode, tpdo: int, bus: BusStatist
 def default_mapping(drive: DriveNode, tpdo: int) -> tuple[int, tuple[str, ...] | str]:
     """Return COB-ID and objects of a TPDO by the defaults of the drive's EDS.
 
-    Parameters
-    ----------
-    drive
-        Node and EDS of the drive.
-    tpdo
-        Number of the TPDO, 1 to 4.
-
-    Returns
-    -------
-    tuple
-        COB-ID, and the names of the objects; instead of names a message if one of the objects is unknown.
-
-    Raises
-    ------
-    ConfigError
-        If the EDS cannot be read.
+    ``tpdo``: number of the TPDO, 1 to 4. Returns the COB-ID, and the names of the objects; instead of names a message
+    if one of the objects is unknown. Raises ConfigError if the EDS cannot be read.
     """
     known = read_objects(drive.eds, drive.node_id)
     cob_id = _default(known, od.TPDO_COMMUNICATION + tpdo - 1, 1)
@@ -244,17 +196,7 @@ def _default(known: Any, index: int, subindex: int) -> int | None:
 def receive_frames(buses: tuple[Bus, ...], seconds: float) -> list[Frames]:
     """Return the frames of each bus in a time that begins when all have had a SYNC; nothing is sent.
 
-    Parameters
-    ----------
-    buses
-        The buses.
-    seconds
-        Length of the time, s.
-
-    Raises
-    ------
-    ConfigError
-        If a bus does not exist, or has no SYNC within `SYNC_WAIT_S`.
+    ``seconds``: length of the time, s. Raises ConfigError if a bus does not exist, or has no SYNC within `SYNC_WAIT_S`.
     """
     parts: list[list[Frames]] = [[] for _ in buses]
     openers = [lambda bus=bus: open_bus(bus) for bus in buses]
@@ -277,17 +219,8 @@ def receive_frames(buses: tuple[Bus, ...], seconds: float) -> list[Frames]:
 def discover_pdos(session: SessionConfig, seconds: float) -> SessionConfig:
     """Return the session with the streams that its drives send; nothing is sent to them.
 
-    Parameters
-    ----------
-    session
-        The session; its drives send already.
-    seconds
-        Time to listen, s.
-
-    Raises
-    ------
-    ConfigError
-        If the drives send TPDOs whose mapping is unknown.
+    ``session``: the session; its drives send already. ``seconds``: time to listen, s. Raises ConfigError if the drives
+    send TPDOs whose mapping is unknown.
     """
     log.info("listening for %g s on %s", seconds, ", ".join(bus.channel for bus in session.all_buses))
     received = receive_frames(session.all_buses, seconds)

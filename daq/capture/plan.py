@@ -17,29 +17,15 @@ from armident.daq.matching.streams import CapturedStream, bus_numbers, captured_
 from armident.drivers.can.frames import STANDARD_ID_MASK, Filter
 from armident.drivers.canopen.bus_load import check_fits
 from armident.drivers.canopen.objects import COB_SDO_REQUEST, COB_SYNC
-from armident.drivers.compiled import require_compiled
 
 
 @dataclass(frozen=True)
 class CapturePlan:
     """Configuration and options of one capture.
 
-    Parameters
-    ----------
-    session, robot
-        Configuration of cell and robot.
-    streams
-        The captured streams.
-    trajectory
-        Trajectory that the arm follows, if it moves.
-    directory
-        Directory of the recordings.
-    duration
-        Time after which the capture ends, s; default: with the trajectory, or when it is stopped.
-    listen_only
-        Send nothing to the buses.
-    config
-        File of the session, if it may be reloaded.
+    ``trajectory``: trajectory that the arm follows, if it moves. ``directory``: directory of the recordings.
+    ``duration``: time after which the capture ends, s; default: with the trajectory, or when it is stopped.
+    ``listen_only``: send nothing to the buses. ``config``: file of the session, if it may be reloaded.
     """
 
     session: SessionConfig
@@ -69,10 +55,7 @@ class CapturePlan:
     def filters(self, bus: int) -> list[Filter]:
         """Return the filters of a bus: SYNC, the TPDOs of its drives, and SDO requests to them.
 
-        Parameters
-        ----------
-        bus
-            Number of the bus, in the order of the session.
+        ``bus``: number of the bus, in the order of the session.
         """
         wanted = [
             COB_SYNC,
@@ -92,26 +75,11 @@ def load_plan(
 ) -> CapturePlan:
     """Return the checked plan of a capture.
 
-    Parameters
-    ----------
-    config
-        Session configuration.
-    out
-        Directory of the recordings; default: that of the session.
-    duration
-        Time after which the capture ends, s.
-    listen_only
-        Send nothing to the buses.
-    sniff_s
-        With ``listen_only``: time to discover the TPDOs of the drives, s.
-
-    Raises
-    ------
-    ConfigError
-        If the configuration is invalid, the trajectory exceeds the limits of the robot, a bus is overloaded, or the
-        loops of the bus are not compiled.
+    ``config``: session configuration. ``out``: directory of the recordings; default: that of the session. ``duration``:
+    time after which the capture ends, s. ``listen_only``: send nothing to the buses. ``sniff_s``: with ``listen_only``:
+    time to discover the TPDOs of the drives, s. Raises ConfigError if the configuration is invalid, the trajectory
+    exceeds the limits of the robot, or a bus is overloaded.
     """
-    require_compiled()
     session = load_session(config, "capture")
     robot = load_robot(session.robot, "capture")
     check_fits(session, str(config))

@@ -14,7 +14,7 @@ import zenoh.ext
 from armident.configs import ConfigError, SessionConfig
 from armident.daq.capture.remote_commands import Commands
 from armident.daq.streaming import Block, Keys, encode_block, open_session
-from armident.daq.streaming.session import configuration
+from armident.daq.streaming.zenoh_session import configuration
 
 _EVENTS_KEPT = 64
 """Events that late subscribers can query."""
@@ -44,19 +44,8 @@ class Publisher:
     A capture does not depend on Zenoh: if no session can be opened, or it fails, the reason is logged and in
     :attr:`problem`, and the publisher tries again in its thread.
 
-    Parameters
-    ----------
-    session
-        The cell's configuration.
-    keys
-        The key expressions of the robot.
-    exclusive
-        Refuse to run beside another capture of the robot, whose master would command the same drives.
-
-    Raises
-    ------
-    ConfigError
-        If Zenoh's configuration is wrong, or another capture runs.
+    ``keys``: the key expressions of the robot; ``exclusive``: refuse to run beside another capture of the robot, whose
+    master would command the same drives. Raises ConfigError if Zenoh's configuration is wrong, or another capture runs.
     """
 
     def __init__(self, session: SessionConfig, keys: Keys, *, exclusive: bool = True) -> None:

@@ -18,7 +18,7 @@ from armident.daq.capture.jitter import SyncJitter, worst
 from armident.daq.capture.plan import CapturePlan
 from armident.daq.capture.publisher import Publisher
 from armident.daq.capture.remote_commands import Command
-from armident.daq.capture.setpoints import SetpointSchedule, StandstillDetector, plan_setpoints
+from armident.daq.capture.setpoint_source import SetpointSchedule, StandstillDetector, plan_setpoints
 from armident.daq.capture.sink import Sink
 from armident.daq.matching.assembler import LATE_S, Assembler
 from armident.drivers.can.frames import BusDown
@@ -55,14 +55,8 @@ log = logging.getLogger(__name__)
 class Outputs:
     """Destinations of a capture.
 
-    Parameters
-    ----------
-    sink
-        Takes the matched rows.
-    publisher
-        Takes health and status, and gives the commands of others.
-    notifier
-        Takes the progress for the watchdog of systemd.
+    ``sink``: takes the matched rows; ``publisher``: takes health and status, and gives the commands of others;
+    ``notifier``: takes the progress for the watchdog of systemd.
     """
 
     sink: Sink
@@ -73,20 +67,9 @@ class Outputs:
 class Recorder:
     """Main loop of one capture.
 
-    Parameters
-    ----------
-    plan
-        Plan of the capture.
-    receiver
-        Frames of the buses.
-    listener
-        Emergency messages where the capture only listens; a drive master is created otherwise.
-    outputs
-        Destinations of rows and messages.
-    stop
-        Event that ends the capture.
-    save
-        Event that triggers a recording.
+    ``receiver``: frames of the buses. ``listener``: emergency messages where the capture only listens; a drive master
+    is created otherwise. ``outputs``: destinations of rows and messages. ``stop``: event that ends the capture.
+    ``save``: event that triggers a recording.
     """
 
     def __init__(

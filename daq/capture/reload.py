@@ -39,14 +39,8 @@ log = logging.getLogger(__name__)
 class Reloader:
     """Reads the configuration again on request.
 
-    Parameters
-    ----------
-    config
-        File of the session.
-    plan
-        Plan of the running capture.
-    changes
-        Called by :meth:`apply`, in this order. The first that raises ConfigError ends the sequence.
+    ``config``: file of the session. ``plan``: plan of the running capture. ``changes``: called by :meth:`apply`, in
+    this order. The first that raises ConfigError ends the sequence.
     """
 
     def __init__(self, config: str | Path, plan: CapturePlan, changes: Sequence[Change]) -> None:
@@ -93,10 +87,7 @@ class Reloader:
     def _checked(self) -> SessionConfig:
         """Return the session as it is in the file now.
 
-        Raises
-        ------
-        ConfigError
-            If it cannot be read, or a key has changed that may not change during a capture.
+        Raises ConfigError if it cannot be read, or a key has changed that may not change during a capture.
         """
         session = load_session(self._config, "capture")
         fixed = [key for key in differences(self._session, session) if not key.startswith(CHANGEABLE)]
@@ -113,13 +104,7 @@ class Reloader:
 
 
 def differences(one: SessionConfig, other: SessionConfig) -> Iterator[str]:
-    """Yield the keys whose values differ between two sessions, as ``recording.rotate_mb``.
-
-    Parameters
-    ----------
-    one, other
-        The two sessions.
-    """
+    """Yield the keys whose values differ between two sessions, as ``recording.rotate_mb``."""
     yield from _differing(one.model_dump(by_alias=True), other.model_dump(by_alias=True), "")
 
 

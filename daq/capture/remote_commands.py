@@ -24,12 +24,7 @@ ANSWER_S = 5.0
 class Command:
     """A command to a capture.
 
-    Parameters
-    ----------
-    name
-        ``save``, ``mark``, ``reload`` or ``stop``.
-    text
-        Text of a mark, or of the note that a save leaves.
+    ``name``: ``save``, ``mark``, ``reload`` or ``stop``; ``text``: text of a mark, or of the note that a save leaves.
     """
 
     name: CommandName
@@ -39,12 +34,7 @@ class Command:
 class Commands:
     """Receives the commands for a capture.
 
-    Parameters
-    ----------
-    keys
-        Key expressions of the robot.
-    allowed
-        Accept commands (``zenoh.commands`` of the session).
+    ``keys``: key expressions of the robot; ``allowed``: accept commands (``zenoh.commands`` of the session).
     """
 
     def __init__(self, keys: Keys, allowed: bool) -> None:
@@ -86,25 +76,8 @@ class Commands:
 def send_command(session: SessionConfig, robot: str, command: Command, answer_s: float = ANSWER_S) -> None:
     """Send a command to a running capture and wait until it is accepted.
 
-    Parameters
-    ----------
-    session
-        Session of the capture.
-    robot
-        Name of the robot.
-    command
-        The command.
-    answer_s
-        Longest wait for the capture, and for its answer, s.
-
-    Raises
-    ------
-    ConfigError
-        If no capture of the cell answers.
-    DataError
-        If the capture refuses; the message gives the reason.
-    ArmidentError
-        If Zenoh fails.
+    ``answer_s``: longest wait for the capture, and for its answer, s. Raises ConfigError if no capture of the cell
+    answers. Raises DataError if the capture refuses; the message gives the reason. Raises ArmidentError if Zenoh fails.
     """
     with open_session(session, "observer") as zenoh_session:
         key = Keys(session.cell, robot).command(command.name)

@@ -22,16 +22,8 @@ from armident.daq.streaming.codec import end_content, start_content
 class Sink:
     """Writes batches to the recording, publishes them on Zenoh, and places marks at their SYNC.
 
-    Parameters
-    ----------
-    writer
-        Files of the recording.
-    publisher
-        Publisher of the blocks and events.
-    streams
-        Captured streams.
-    capture
-        Name of the capture in all of its events.
+    ``writer``: files of the recording; ``publisher``: publisher of the blocks and events; ``capture``: name of the
+    capture in all of its events.
     """
 
     def __init__(
@@ -82,33 +74,13 @@ class Sink:
     def announce(
         self, robot: RobotConfig, session: SessionConfig, sample_rate_hz: float, metadata: dict[str, str]
     ) -> None:
-        """Publish the start of the capture.
-
-        Parameters
-        ----------
-        robot, session
-            Configuration of the capture.
-        sample_rate_hz
-            Sampling rate, Hz.
-        metadata
-            Metadata of the recording.
-        """
+        """Publish the start of the capture. ``metadata``: metadata of the recording."""
         layouts = [stream.layout for stream in self._streams]
         content = start_content(self._capture, robot, session, sample_rate_hz, layouts, metadata)
         self._publisher.event(encode_event("experiment_start", content))
 
     def mark(self, kind: MarkKind, sync: int, text: str = "") -> None:
-        """Place a mark, at once or when its SYNC has been received.
-
-        Parameters
-        ----------
-        kind
-            Kind of the mark.
-        sync
-            Number of its SYNC.
-        text
-            Text of the mark.
-        """
+        """Place a mark, at once or when its SYNC has been received."""
         self._planned.append((kind, sync, text))
         self._place_marks(False)
 
@@ -117,28 +89,12 @@ class Sink:
         self._writer.trigger(self.last_ns)
 
     def move_mark(self, kind: MarkKind, sync: int, text: str) -> None:
-        """Place a mark at another SYNC than planned.
-
-        Parameters
-        ----------
-        kind
-            Kind of the mark.
-        sync
-            Number of its SYNC.
-        text
-            Text of the mark.
-        """
+        """Place a mark at another SYNC than planned."""
         self._planned = [planned for planned in self._planned if planned[0] != kind]
         self.mark(kind, sync, text)
 
     def take(self, batch: Batch) -> None:
-        """Write and publish matched rows.
-
-        Parameters
-        ----------
-        batch
-            Rows and gaps from the assembler.
-        """
+        """Write and publish matched rows. ``batch``: rows and gaps from the assembler."""
         for piece in pieces(self._samples_first.take(batch)):
             self._take(piece)
 
@@ -174,10 +130,7 @@ class Sink:
     def finish(self, counters: dict[str, int]) -> None:
         """Place the last marks, close the recording, and publish the end of the capture.
 
-        Parameters
-        ----------
-        counters
-            Counters of the capture; those of writer and publisher are added.
+        ``counters``: counters of the capture; those of writer and publisher are added.
         """
         if (rest := self._samples_first.rest()) is not None:
             self._take(rest)

@@ -3,19 +3,19 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
+from armident.compiled import compiled
 from armident.configs import ConfigError, RobotConfig, SessionConfig
 from armident.configs.schema.session import Stream
 from armident.configs.units import counts_per_si
-from armident.daq.guard.limits import (
+from armident.daq.guard.motion_limits import (
     HEARTBEAT_MARGIN_S,
     HEARTBEATS_MISSED,
     TORQUE_PEAK,
     TORQUE_S,
     TORQUE_SAMPLES,
     VELOCITY_S,
-    Limits,
+    MotionLimits,
 )
 from armident.daq.matching.streams import bus_numbers, node_ids
 from armident.drivers.can.frames import Frames
@@ -52,12 +52,7 @@ ARMED_STATE = int(NmtState.OPERATIONAL)
 class Alarm:
     """Reason to stop the drives.
 
-    Parameters
-    ----------
-    text
-        Joint, measured value and limit.
-    frame
-        Index of the frame in its batch; -1 for missing frames.
+    ``text``: joint, measured value and limit. ``frame``: index of the frame in its batch; -1 for missing frames.
     """
 
     text: str
@@ -69,22 +64,11 @@ class MotionMonitor:
 
     The first set point arms it; the NMT command that ends the motion disarms it.
 
-    Parameters
-    ----------
-    session
-        Gives nodes, streams and set points.
-    robot
-        Gives transmission, scales and drive gains.
-    limits
-        Limits of the joints.
-
-    Raises
-    ------
-    ConfigError
-        If the session plays no set points, or its streams carry no position.
+    ``session``: gives nodes, streams and set points; ``robot``: gives transmission, scales and drive gains; ``limits``:
+    limits of the joints. Raises ConfigError if the session plays no set points, or its streams carry no position.
     """
 
-    def __init__(self, session: SessionConfig, robot: RobotConfig, limits: Limits) -> None:
+    def __init__(self, session: SessionConfig, robot: RobotConfig, limits: MotionLimits) -> None:
         if session.setpoints is None:
             raise ConfigError("setpoints: missing, so the arm does not move; the guard needs a session with set points")
         self._robot, self._limits, n = robot, limits, robot.n
@@ -97,7 +81,7 @@ class MotionMonitor:
         period = session.sync_period * pack
         self._per_count = np.linalg.inv(robot.transmission_matrix) / counts_per_si(robot)
         torque = np.array([joint.drive.gain * joint.drive.rated / 1000.0 for joint in robot.joints])
-        self._per_mille = robot.transmission_matrix.T * torque
+        self._per_mille = np.ascontiguousarray(robot.transmission_matrix.T * torque)
         velocity, mean = max(1, round(VELOCITY_S / period)), max(TORQUE_SAMPLES // pack, round(TORQUE_S / period), 1)
         self._positions, self._efforts = np.zeros((velocity + 1, n), np.int64), np.zeros((mean, n))
         self._samples = np.zeros(n, np.int64)
@@ -142,13 +126,7 @@ class MotionMonitor:
             self._offsets[2] = _byte_offsets(stream_of_demand)["demand"]
 
     def identifiers(self, bus: int) -> list[int]:
-        """Return the COB-IDs of a bus that are checked.
-
-        Parameters
-        ----------
-        bus
-            Number of the bus, in the order of the session.
-        """
+        """Return the COB-IDs of a bus that are checked. ``bus``: number of the bus, in the order of the session."""
         return [int(k) for k in np.flatnonzero(self._kind[bus] >= 0)]
 
     @property
@@ -159,14 +137,8 @@ class MotionMonitor:
     def check(self, frames: Frames, now_ns: int, bus: int = 0) -> Alarm | None:
         """Check the next frames of a bus, and return the first reason to stop.
 
-        Parameters
-        ----------
-        frames
-            Frames (N,) since the last call, in the order of the bus; N may be 0.
-        now_ns
-            Monotonic time before they were received, ns.
-        bus
-            Number of the bus, in the order of the session.
+        ``frames``: frames (N,) since the last call, in the order of the bus; N may be 0. ``now_ns``: monotonic time
+        before they were received, ns. ``bus``: number of the bus, in the order of the session.
         """
         limits = self._limits
         code = check_batch(
@@ -211,7 +183,7 @@ def _byte_offsets(stream: Stream) -> dict[str, int]:
     return offsets
 
 
-@njit(cache=True)
+@compiled(nogil=False)
 def _number(data, k, at, size):  # type: ignore[no-untyped-def]
     """Return the signed little-endian number of ``size`` bytes."""
     value = np.int64(0)
@@ -221,7 +193,11 @@ def _number(data, k, at, size):  # type: ignore[no-untyped-def]
     return value - 2 * top if value & top else value
 
 
-@njit(cache=True)
+@compiled(
+    "i8, i8[:, ::1], b1[::1], b1[::1], f8[:, ::1], f8[:, ::1], i8[:, ::1], f8[:, ::1], i8[::1], f8, f8[::1], "
+    "f8[::1], f8[::1], f8[::1], f8[::1], i8[::1], f8[::1]",
+    nogil=False,
+)
 def check_limits(  # type: ignore[no-untyped-def]
     moved, raw, seen, demanded, per_count, per_mille, positions, efforts, samples, velocity_s,
     low, high, velocity, torque, following, state, value,
@@ -249,7 +225,7 @@ def check_limits(  # type: ignore[no-untyped-def]
     velocity_s
         Time between the oldest and the newest of ``positions``, s.
     low, high, velocity, torque, following
-        Limits of the joints, as in `armident.daq.guard.limits.Limits`, shape (n,) each.
+        Limits of the joints, as in `armident.daq.guard.motion_limits.Limits`, shape (n,) each.
     state
         State of the monitor, int64, shape (3,); its element ``JOINT`` is set on an alarm.
     value
@@ -289,7 +265,15 @@ def check_limits(  # type: ignore[no-untyped-def]
     return NO_ALARM
 
 
-@njit(cache=True)
+@compiled(
+    "u4[:], u1[:], u1[:, :], i8, i8, i8[::1], i8[::1], i8[::1], b1, i8, i8[:, ::1], b1[::1], b1[::1], i8[::1], "
+    "i8, f8[:, ::1], f8[:, ::1], i8[:, ::1], f8[:, ::1], i8[::1], f8, f8[::1], f8[::1], f8[::1], f8[::1], "
+    "f8[::1], i8[::1], i8[:, ::1], f8[::1]",
+    "u4[::1], u1[::1], u1[:, ::1], i8, i8, i8[::1], i8[::1], i8[::1], b1, i8, i8[:, ::1], b1[::1], b1[::1], "
+    "i8[::1], i8, f8[:, ::1], f8[:, ::1], i8[:, ::1], f8[:, ::1], i8[::1], f8, f8[::1], f8[::1], f8[::1], "
+    "f8[::1], f8[::1], i8[::1], i8[:, ::1], f8[::1]",
+    nogil=False,
+)
 def check_batch(  # type: ignore[no-untyped-def]
     ids, lengths, data, now, bus, kinds, joints, at, own_demand, every, raw, seen, demanded, beat, silence,
     per_count, per_mille, positions, efforts, samples, velocity_s,
@@ -303,8 +287,6 @@ def check_batch(  # type: ignore[no-untyped-def]
         Fields of an array of N frames: identifiers (N,), numbers of data bytes (N,), and data bytes (N, 8) or (N, 64).
     now
         Monotonic time before the frames were received, ns.
-    bus
-        Number of the bus.
     kinds, joints
         Kind and joint of the frames of each identifier of this bus, int64, shape (IDENTIFIERS,); kind -1: not checked.
     at

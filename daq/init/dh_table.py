@@ -37,12 +37,8 @@ Floats = NDArray[np.float64]
 class DhRow:
     """One row of a table.
 
-    Parameters
-    ----------
-    name, type
-        Name of the joint, and ``revolute`` or ``prismatic``.
-    theta, d, a, alpha
-        Parameters, rad and m; the joint variable is added to ``theta`` or ``d``.
+    ``name``, ``type``: name of the joint, and ``revolute`` or ``prismatic``. ``theta``, ``d``, ``a``, ``alpha``:
+    parameters, rad and m; the joint variable is added to ``theta`` or ``d``.
     """
 
     name: str
@@ -56,6 +52,8 @@ class DhRow:
 def from_dh_table(file: Path, convention: Convention | None) -> Geometry:
     """Geometry of a table of Denavit-Hartenberg parameters.
 
+    Raises ConfigError if the file is no such table; names line and column.
+
     Parameters
     ----------
     file
@@ -64,11 +62,6 @@ def from_dh_table(file: Path, convention: Convention | None) -> Geometry:
     convention
         ``classical`` (x to the next axis) or ``modified``; ``None``: modified if there is a column ``r``, else
         classical.
-
-    Raises
-    ------
-    ConfigError
-        If the file is no such table; names line and column.
     """
     rows, khalil, notes = _read(file)
     if khalil and convention == "classical":
@@ -80,28 +73,14 @@ def from_dh_table(file: Path, convention: Convention | None) -> Geometry:
 
 
 def modified(rows: Sequence[DhRow]) -> list[Mdh]:
-    """Rows of a modified table in the names of the configuration.
-
-    Parameters
-    ----------
-    rows
-        Rows, base to tip.
-    """
+    """Rows of a modified table in the names of the configuration. ``rows``: base to tip."""
     return [Mdh(alpha=row.alpha, d=row.a, theta=row.theta, r=row.d) for row in rows]
 
 
 def of_classical(rows: Sequence[DhRow]) -> list[Mdh]:
     """Modified parameters of a classical table: ``Rot(z, theta) Trans(z, d) Trans(x, a) Rot(x, alpha)``.
 
-    Parameters
-    ----------
-    rows
-        Rows, base to tip; axis j is the z of frame j-1.
-
-    Raises
-    ------
-    ConfigError
-        If two axes are nearly parallel.
+    ``rows``: base to tip; axis j is the z of frame j-1. Raises ConfigError if two axes are nearly parallel.
     """
     frame, axes, points = np.eye(4), [], []
     for row in rows:

@@ -29,16 +29,9 @@ URDF_SUFFIXES = (".urdf", ".xml", ".xacro")
 class Geometry:
     """Geometry of an arm.
 
-    Parameters
-    ----------
-    source
-        Name of the source, for the user.
-    content
-        Keys of the robot configuration; ``joints`` has an entry for every joint, with its ``name``.
-    robot
-        The robot that these keys make.
-    notes
-        Sentences on what was assumed.
+    ``source``: name of the source, for the user. ``content``: keys of the robot configuration; ``joints`` has an entry
+    for every joint, with its ``name``. ``robot``: the robot that these keys make. ``notes``: sentences on what was
+    assumed.
     """
 
     source: str
@@ -50,15 +43,7 @@ class Geometry:
 def from_library(name: str) -> Geometry:
     """Geometry of a robot of the library, or of another configuration.
 
-    Parameters
-    ----------
-    name
-        Name of a robot in ``configs/robots``, or a path.
-
-    Raises
-    ------
-    ConfigError
-        If there is no such robot.
+    ``name``: name of a robot in ``configs/robots``, or a path. Raises ConfigError if there is no such robot.
     """
     path = config_path(name, listed=("robots",))
     robot = load_robot(path, "import")
@@ -77,21 +62,10 @@ def from_urdf(
 ) -> Geometry:
     """Geometry of a URDF.
 
-    Parameters
-    ----------
-    file
-        The URDF.
-    out
-        Folder of the robot configuration, which refers to the URDF.
-    base, tip
-        First and last link of the chain. ``None``: the root; the end of the only chain, or of the one that ``fits``.
-    fits
-        Function that raises if a robot is not the recorded one; decides between several chains.
-
-    Raises
-    ------
-    ConfigError
-        If the URDF is wrong, or several chains remain; lists them.
+    ``out``: folder of the robot configuration, which refers to the URDF. ``base``, ``tip``: first and last link of the
+    chain. ``None``: the root; the end of the only chain, or of the one that ``fits``. ``fits``: function that raises if
+    a robot is not the recorded one; decides between several chains. Raises ConfigError if the URDF is wrong, or several
+    chains remain; lists them.
     """
     if not is_file(file):
         raise ConfigError(f"{file}: no such file")
@@ -180,14 +154,7 @@ def _of_chain(file: Path, out: Path, base: str | None, tip: str | None) -> Geome
 def of_rows(source: str, name: str, rows: list[tuple[str, str, Mdh]]) -> Geometry:
     """Geometry of modified Denavit-Hartenberg rows.
 
-    Parameters
-    ----------
-    source
-        Name of the source, for the user.
-    name
-        Name of the robot.
-    rows
-        Name, type and parameters of each joint, base to tip.
+    ``source``: name of the source, for the user; ``rows``: name, type and parameters of each joint, base to tip.
     """
     names = joint_names([joint for joint, _, _ in rows], Path(source))
     content = {
@@ -202,18 +169,7 @@ def of_rows(source: str, name: str, rows: list[tuple[str, str, Mdh]]) -> Geometr
 
 
 def of_axes(count: int) -> Geometry:
-    """Geometry that is not known yet: joints with blank parameters.
-
-    Parameters
-    ----------
-    count
-        Number of joints.
-
-    Raises
-    ------
-    ConfigError
-        If there is none.
-    """
+    """Geometry that is not known yet: joints with blank parameters. Raises ConfigError if there is none."""
     if count < 1:
         raise ConfigError(f"--axes: expected the number of joints, found {count}")
     content = {
@@ -226,12 +182,6 @@ def of_axes(count: int) -> Geometry:
 
 
 def identifier(text: str) -> str:
-    """Name of a robot or cell: lower-case letters, digits and underscores, beginning with a letter.
-
-    Parameters
-    ----------
-    text
-        Any text.
-    """
+    """Name of a robot or cell: lower-case letters, digits and underscores, beginning with a letter."""
     plain = re.sub(r"[^a-z0-9]+", "_", text.lower()).strip("_")[:60]
     return plain if plain and plain[0].isalpha() else f"arm_{plain}".rstrip("_")

@@ -5,8 +5,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from armident.daq.init.command import InitOptions
 from armident.daq.init.geometry import URDF_SUFFIXES, identifier
+from armident.daq.init.initialize import InitOptions
+from armident.daq.interchange.readers import names_of_formats
 
 Ask = Callable[[str, str], str]
 """Function that shows a question with its default and returns the answer."""
@@ -22,19 +23,13 @@ _POSTURES = {
 def questionnaire(options: InitOptions, ask: Ask, tell: Callable[[str], None]) -> InitOptions:
     """Options completed by the answers to questions.
 
-    Parameters
-    ----------
-    options
-        Options of the command line; what they state is not asked.
-    ask
-        Function that asks: question and default to answer.
-    tell
-        Function that shows a line.
+    ``options``: options of the command line; what they state is not asked. ``ask``: function that asks: question and
+    default to answer. ``tell``: function that shows a line.
     """
     tell("Enter takes the value in brackets. What you do not know stays a blank that is listed at the end.")
     source = ask("URDF, table of DH parameters, or robot of the library (ur5e, panda, ...); empty: none", "")
     options = replace(options, **_source(source, ask))
-    recording = ask("Recording of the arm (CSV, MAT, NPZ, Parquet, bag); empty: none", "")
+    recording = ask(f"Recording of the arm ({names_of_formats()}); empty: none", "")
     changes: dict[str, Any] = {"recording": Path(recording) if recording else None}
     if not recording:
         question = "Effort that the drives report: torque, current or voltage"

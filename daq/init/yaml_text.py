@@ -12,15 +12,7 @@ LONGEST = 130
 
 @dataclass(frozen=True)
 class Noted:
-    """Value with a remark.
-
-    Parameters
-    ----------
-    value
-        The value.
-    note
-        Remark, one line.
-    """
+    """Value with a remark. ``note``: remark, one line."""
 
     value: Any
     note: str
@@ -29,12 +21,7 @@ class Noted:
 def yaml_text(content: dict[str, Any], depth: int = 0) -> str:
     """Return a mapping as YAML: nested mappings and lists of mappings as blocks, other values on one line.
 
-    Parameters
-    ----------
-    content
-        Keys and values; each may be `Noted`.
-    depth
-        Number of spaces of indentation.
+    ``content``: keys and values; each may be `Noted`. ``depth``: number of spaces of indentation.
     """
     return "".join(_entry(key, value, depth) for key, value in content.items())
 

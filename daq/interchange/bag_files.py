@@ -25,16 +25,17 @@ from mcap.records import Channel, Chunk, McapRecord, Message, Schema
 from mcap.stream_reader import breakup_chunk
 
 from armident.configs import ConfigError, DataError
+from armident.daq.interchange.readers import RosBag
 from armident.daq.interchange.text_files import listed as listed_names
 from armident.daq.interchange.text_files import shortened
 from armident.daq.recording.mcap_records import MAGIC, RECORD_HEAD, records
 
-SUFFIXES = (".mcap", ".db3", ".mcap.zstd", ".db3.zstd")
-"""Suffixes of the files of a bag."""
 METADATA = "metadata.yaml"
 """File of a bag folder that lists the other files."""
 ROS_1 = ".bag"
 """Suffix of the bags of ROS 1, which are refused with the command that converts them."""
+SUFFIXES = tuple(suffix for suffix in RosBag.suffixes if suffix != ROS_1)
+"""Suffixes of the files of a bag."""
 
 _CDR = "cdr"
 _NUMBER_AT_END = re.compile(r"[-_.]?\d+$")
@@ -52,14 +53,7 @@ _DAMAGED = (sqlite3.Error, UnicodeDecodeError)
 class BagMessage(NamedTuple):
     """Message of a bag.
 
-    Parameters
-    ----------
-    topic
-        Topic.
-    logged_ns
-        Time at which it was recorded, ns UTC.
-    data
-        Content in CDR, uncompressed.
+    ``logged_ns``: time at which it was recorded, ns UTC; ``data``: content in CDR, uncompressed.
     """
 
     topic: str
@@ -67,29 +61,12 @@ class BagMessage(NamedTuple):
     data: bytes
 
 
-def is_bag(path: Path) -> bool:
-    """Return True if a path has the name of a bag file, one of ROS 1 included, or is a folder.
-
-    Parameters
-    ----------
-    path
-        The file or folder.
-    """
-    return path.name.lower().endswith((*SUFFIXES, ROS_1)) or path.is_dir()
-
-
 def bag_files(path: Path) -> tuple[list[Path], list[str]]:
     """Return the files of a bag in the order of recording, and the names of those that its metadata lists in vain.
 
-    Parameters
-    ----------
-    path
-        A file, or a folder with ``metadata.yaml``; without it, the folder's bag files in the order of their numbers.
-
-    Raises
-    ------
-    ConfigError
-        If there is no such file or folder, or the folder has no bag file, those of several bags, or bags of ROS 1.
+    ``path``: a file, or a folder with ``metadata.yaml``; without it, the folder's bag files in the order of their
+    numbers. Raises ConfigError if there is no such file or folder, or the folder has no bag file, those of several
+    bags, or bags of ROS 1.
     """
     if not path.is_dir():
         if not path.is_file():
@@ -137,12 +114,9 @@ def _of_ros_1(file: Path) -> str:
 class BagReader:
     """Iterates over the messages of one type in a bag, in the order of its files.
 
-    Parameters
-    ----------
-    path
-        File or folder of the bag.
-    message_type
-        Type of the messages, such as ``sensor_msgs/msg/JointState``.
+    ``message_type``: type of the messages, such as ``sensor_msgs/msg/JointState``. Raises ConfigError if there is no
+    such bag, or it cannot be read. The iteration raises it. Raises DataError if no file is a bag file. The iteration
+    raises it.
 
     Attributes
     ----------
@@ -150,13 +124,6 @@ class BagReader:
         Type by topic, of all topics so far.
     losses
         Descriptions of what is missing or damaged, after the iteration.
-
-    Raises
-    ------
-    ConfigError
-        If there is no such bag, or it cannot be read. The iteration raises it.
-    DataError
-        If no file is a bag file. The iteration raises it.
     """
 
     def __init__(self, path: Path, message_type: str) -> None:
@@ -170,7 +137,7 @@ class BagReader:
     def __iter__(self) -> Iterator[BagMessage]:
         """Yield the messages in CDR of the type, of every topic."""
         files, absent = bag_files(self._path)
-        self.losses += [f"{name}, which {METADATA} lists, is not there" for name in absent]
+        self.losses += [f"{name}, which {METADATA} lists, is missing" for name in absent]
         unusable: list[DataError] = []
         for file in files:
             try:
@@ -207,14 +174,14 @@ class BagReader:
                 raise DataError(f"{file}: {error}") from error
 
     def _decompress(self, file: Path, inner: Path, where: str) -> None:
-        """Write the content of a compressed file, as far as it is whole."""
+        """Write the content of a compressed file, up to the first damaged block."""
         with file.open("rb") as packed, inner.open("wb") as plain:
             try:
                 zstandard.ZstdDecompressor().copy_stream(packed, plain)
             except zstandard.ZstdError:
                 self.losses.append(f"{where}the compressed file is damaged after {plain.tell()} bytes of its content")
             if plain.tell() == 0:
-                raise DataError(f"{file}: not a whole zstd file")
+                raise DataError(f"{file}: truncated zstd file")
 
     def _mcap(self, file: Path, where: str) -> Iterator[BagMessage]:
         """Yield the messages of the undamaged records of an MCAP file, in file order."""
@@ -276,7 +243,7 @@ class BagReader:
             self.topics[channel.topic] = schema.name + encoded
 
     def _database(self, file: Path, where: str) -> Iterator[BagMessage]:
-        """Yield the messages of a SQLite file, in the order in which they were written, as far as it is whole."""
+        """Yield the messages of a SQLite file in the order of writing, up to the first damaged page."""
         try:
             with closing(sqlite3.connect(f"file:{quote(str(file.resolve()))}?mode=ro", uri=True)) as database:
                 # Without it, SQLite refuses to read a truncated database at all.

@@ -1,4 +1,4 @@
-"""Frames of Vector BLF logs, as far as the file is whole.
+"""Frames of Vector BLF logs, without damaged blocks.
 
 A BLF file is a header and a sequence of objects; containers hold further objects, compressed or not, and an object may
 continue in the next container. The layout of header and objects is that of the reader of python-can.
@@ -38,17 +38,7 @@ _LARGEST_CONTAINER = 256 * 2**20
 def read_blf(path: Path, into: FrameCollector) -> None:
     """Add the frames of a BLF log, and a note for everything that is damaged or cut off.
 
-    Parameters
-    ----------
-    path
-        The log.
-    into
-        Takes the frames.
-
-    Raises
-    ------
-    DataError
-        If it is not a BLF file.
+    ``into``: takes the frames. Raises DataError if it is not a BLF file.
     """
     with path.open("rb") as file:
         head = file.read(_HEADER.size)
@@ -81,7 +71,7 @@ def read_blf(path: Path, into: FrameCollector) -> None:
                 reader.take(content)
         cut = cut or header[10] > path.stat().st_size
         if not header[12] and into.count and not cut:
-            into.notes.append("its writer did not finish it: frames may be lacking at its end")
+            into.notes.append("not finished by its writer: frames may be missing at its end")
         if cut or reader.unfinished:
             into.notes.append(f"the file is cut off: {_of_total(into, header[12])} are read")
         if damaged or reader.damaged:

@@ -6,7 +6,6 @@ their SYNC, with every SYNC accounted for.
 
 import hashlib
 import logging
-import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -15,16 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armident.configs import ConfigError, DataError, RobotConfig, SessionConfig
-from armident.daq.interchange.log_clock import check_sync_period, clock_steps
-from armident.daq.interchange.log_file import SUFFIXES, read_log
+from armident.daq.interchange.clocks import check_sync_period, clock_steps
+from armident.daq.interchange.log_file import read_log
 from armident.daq.interchange.log_frames import LogFrames
 from armident.daq.matching.assembler import Assembler, Batch
 from armident.daq.matching.streams import CapturedStream, bus_numbers, captured_streams, unknown_phase
 from armident.daq.recording import Gap, Recording, Stream
 from armident.drivers.can.frames import Frames
 from armident.drivers.canopen.objects import COB_SYNC
-
-__all__ = ["SUFFIXES", "recording_from_log", "write_log"]
 
 _BATCH = 4096
 _TURN_NS = 1_000_000_000
@@ -37,22 +34,10 @@ NOTES = "source_remarks"
 def recording_from_log(path: Path, session: SessionConfig, robot: RobotConfig) -> Recording:
     """Return the recording of a log: its frames, matched by the mapping of a session.
 
-    Parameters
-    ----------
-    path
-        Log of one bus, or of several that have the names of the session's buses.
-    session, robot
-        Mapping of the TPDOs, and scales of their objects.
-
-    Lines and blocks that are damaged are left out, counted and named in warnings and in the metadata.
-
-    Raises
-    ------
-    ConfigError
-        If there is no such file, it lacks a bus of the session, or the session's buses carry CAN FD.
-    DataError
-        If it cannot be read as such a log, holds no SYNC, its SYNC period differs from that of the session, or a drive
-        sends no TPDO of the length that the session maps.
+    ``path``: log of one bus, or of several that have the names of the session's buses; ``session``, ``robot``: mapping
+    of the TPDOs, and scales of their objects. Raises ConfigError if there is no such file, it lacks a bus of the
+    session, or the session's buses carry CAN FD; DataError if it cannot be read as such a log, holds no SYNC, its SYNC
+    period differs from that of the session, or a drive sends no TPDO of the length that the session maps.
     """
     _check_classic(session, str(path))
     streams = captured_streams(session, robot)
@@ -164,41 +149,23 @@ def _in_turn(read: Sequence[Frames]) -> Iterator[tuple[int, Frames]]:
 
 
 def write_log(recording: Recording, path: Path) -> None:
-    """Write the SYNCs and TPDOs of a recording as a log; the file appears when it is complete.
+    """Write the SYNCs and TPDOs of a recording as a log.
 
     A recording has the time of every SYNC; its answers follow at intervals of 20 us. SYNCs that were not received or
     not answered by all drives are not in the log, which its SYNC counter shows.
 
-    Parameters
-    ----------
-    recording
-        A recording that comes from a bus.
-    path
-        The file; its suffix selects the format.
-
-    Raises
-    ------
-    ConfigError
-        If the file cannot be written, or the session's buses carry CAN FD.
-    DataError
-        If the recording does not come from a bus.
+    ``recording``: a recording that comes from a bus. ``path``: the file; its suffix selects the format. Raises
+    ConfigError if the session's buses carry CAN FD; DataError if the recording does not
+    come from a bus.
     """
     session = recording.session
     if session is None:
         raise DataError(f"{recording.path}: was not captured from a bus; there are no frames to write")
-    _check_classic(session, str(path))
+    _check_classic(session, str(recording.path or path))
     streams = captured_streams(session, recording.robot)
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with can.Logger(temporary) as logger:
-            for message in _messages(recording, session, streams):
-                logger.on_message_received(message)
-        temporary.replace(path)
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be written: {error.strerror}") from error
-    finally:
-        temporary.unlink(missing_ok=True)
+    with can.Logger(path) as logger:
+        for message in _messages(recording, session, streams):
+            logger.on_message_received(message)
 
 
 def _stream(stream: CapturedStream, parts: Sequence[Batch]) -> Stream:

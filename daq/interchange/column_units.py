@@ -59,10 +59,7 @@ _SHOWN: Mapping[str, str] = {
 def plain_unit(text: str) -> str:
     """Return a unit in lower case without spaces and signs of multiplication; empty if the text is no unit.
 
-    Parameters
-    ----------
-    text
-        Text in brackets after a name, or a cell of a line of units.
+    ``text``: text in brackets after a name, or a cell of a line of units.
     """
     word = unicodedata.normalize("NFKC", text.replace("º", "°")).casefold().replace("μ", "u")
     word = _SIGNS.sub("", word.strip("[]() "))
@@ -72,10 +69,7 @@ def plain_unit(text: str) -> str:
 def time_unit(text: str) -> str:
     """Return ``s``, ``ms``, ``us`` or ``ns`` for a unit of times in any spelling, and other units as they are.
 
-    Parameters
-    ----------
-    text
-        The unit, or nothing.
+    ``text``: the unit, or nothing.
     """
     return _TIMES.get(plain_unit(text), plain_unit(text))
 
@@ -83,19 +77,8 @@ def time_unit(text: str) -> str:
 def check_unit(column: str, quantity: str, unit: str) -> None:
     """Refuse a column whose unit is not one of its quantity.
 
-    Parameters
-    ----------
-    column
-        Name of the column.
-    quantity
-        ``position``, ``demand``, ``torque``, ``current`` or ``voltage``.
-    unit
-        Unit that the file states for it; empty if it states none.
-
-    Raises
-    ------
-    DataError
-        If the unit is not known, or is one of another quantity.
+    ``quantity``: ``position``, ``demand``, ``torque``, ``current`` or ``voltage``. ``unit``: unit that the file states
+    for it; empty if it states none. Raises DataError if the unit is not known, or is one of another quantity.
     """
     if plain_unit(unit) not in ("", *OF_QUANTITY[quantity]):
         raise DataError(

@@ -33,18 +33,9 @@ _UNIT = re.compile(
 class CsvTable:
     """Values of a table in a text file.
 
-    Parameters
-    ----------
-    header
-        Name of each column; ``None`` if there is no header line.
-    units
-        Text of the line of units below the header, one per column; empty if there is none.
-    values
-        Values (N, columns); NaN where a cell is empty, and in the whole row of a damaged line.
-    lines
-        Line number of each row, (N,).
-    notes
-        Sentences on lines that were left out.
+    ``header``: name of each column; ``None`` if there is no header line. ``units``: text of the line of units below the
+    header, one per column; empty if there is none. ``values`` (N, columns); NaN where a cell is empty, and in the whole
+    row of a damaged line. ``lines``: line number of each row, (N,). ``notes``: sentences on lines that were left out.
     """
 
     header: list[str] | None
@@ -73,19 +64,8 @@ def read_csv(path: Path) -> CsvTable:
     Lines of comments are passed over. Lines with another number of columns, or with a cell that is no number, are
     damaged: their rows are NaN. Columns of text are NaN. Columns are separated by commas, semicolons, tabs or spaces;
     decimal commas are read where they are not the separator. The first column, and those named after time, may hold
-    dates (ISO 8601).
-
-    Parameters
-    ----------
-    path
-        The file.
-
-    Raises
-    ------
-    ConfigError
-        If it cannot be opened.
-    DataError
-        If it is no table of numbers, or too many of its lines are damaged.
+    dates (ISO 8601). Raises ConfigError if it cannot be opened; DataError if it is no table of numbers, or too many of
+    its lines are damaged.
     """
     try:
         encoding = encoding_of(path)
@@ -103,12 +83,7 @@ def read_csv(path: Path) -> CsvTable:
 def cells_of(line: str, delimiter: str | None) -> list[str]:
     """Return the cells of a line without quotes and spaces around them.
 
-    Parameters
-    ----------
-    line
-        The line.
-    delimiter
-        Separator of the cells; ``None``: spaces.
+    ``delimiter``: separator of the cells; ``None``: spaces.
     """
     text = line.strip("\r\n\0")
     if delimiter is None:
@@ -126,10 +101,7 @@ def cells_of(line: str, delimiter: str | None) -> list[str]:
 def seconds_of_date(text: str) -> float | None:
     """Return the seconds since 1970 of a date with time of day (ISO 8601), or ``None``.
 
-    Parameters
-    ----------
-    text
-        The date; UTC if it has no zone.
+    ``text``: the date; UTC if it has no zone.
     """
     if len(text) < 10 or text[4:5] != "-":
         return None
@@ -285,15 +257,7 @@ class _DecimalSigns:
     _first: dict[tuple[int, str], tuple[int, str]] = field(default_factory=dict)
 
     def add(self, number: int, cells: Sequence[str]) -> bool:
-        """Take the cells of a line; return ``True`` if one has a decimal comma.
-
-        Parameters
-        ----------
-        number
-            Number of the line.
-        cells
-            Its cells.
-        """
+        """Take the cells of a line; return ``True`` if one has a decimal comma."""
         found = False
         for k, cell in enumerate(cells, start=1):
             sign = "," if _DECIMAL_COMMA.match(cell) else "." if "." in cell and ":" not in cell else ""
@@ -365,7 +329,7 @@ def _slow(path: Path, encoding: str, head: _Head) -> CsvTable:
     if commas:
         notes.append(f"decimal commas are read as decimal points ({commas} lines)")
     if repeated:
-        notes.append(f"header repeated and passed over: {repeated} times")
+        notes.append(f"repeated header ignored: {repeated} times")
     return CsvTable(head.header, head.units, values, np.array(numbers), tuple(notes))
 
 

@@ -23,10 +23,7 @@ _NO_POSITION = re.compile(
 def without_demand(name: str) -> str | None:
     """Return the rest of the name of a demand; ``None`` if no word in it names a demand.
 
-    Parameters
-    ----------
-    name
-        Name of a column, such as ``q1_ref``, ``targetPosition1`` or ``elbow/desired/position``.
+    ``name``: name of a column, such as ``q1_ref``, ``targetPosition1`` or ``elbow/desired/position``.
 
     Examples
     --------
@@ -42,11 +39,5 @@ def without_demand(name: str) -> str | None:
 
 
 def of_another_quantity(name: str) -> bool:
-    """Return ``True`` if a name has a word for a velocity, an acceleration or an effort.
-
-    Parameters
-    ----------
-    name
-        Name of a column.
-    """
+    """Return ``True`` if a name has a word for a velocity, an acceleration or an effort. ``name``: name of a column."""
     return _NO_POSITION.search(name) is not None

@@ -1,15 +1,13 @@
-"""Export of recordings as CSV, NPZ, MAT, Parquet and rosbag2 in SI units at the joints, and as bus logs."""
+"""Export of recordings in SI units at the joints, and as bus logs."""
 
 import os
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from armident.configs import ConfigError, DataError
-from armident.daq.interchange.bus_log import SUFFIXES as LOG_SUFFIXES
-from armident.daq.interchange.bus_log import write_log
+from armident.daq.interchange.readers import writer_of
 from armident.daq.recording import Recording, Stream
 from armident.extras import install_line
 
@@ -18,12 +16,7 @@ def columns(recording: Recording) -> dict[str, NDArray[np.float64]]:
     """Return time ``t`` (s), joint positions ``q1..``, torques ``tau1..`` and references ``qr1..``, (N,) each.
 
     References are given where recorded, linear between set points, as drives interpolate (CiA 402, 60C0h = 0). Rows
-    outside the recorded set points are NaN.
-
-    Raises
-    ------
-    DataError
-        If the recording has no samples.
+    outside the recorded set points are NaN. Raises DataError if the recording has no samples.
     """
     robot, samples = recording.robot, recording.samples
     if samples.sync.size == 0:
@@ -53,41 +46,12 @@ def columns(recording: Recording) -> dict[str, NDArray[np.float64]]:
 
 
 def export_recording(recording: Recording, path: Path) -> None:
-    """Write a recording in the format of the suffix; the file appears when it is complete.
-
-    Parameters
-    ----------
-    recording
-        The recording.
-    path
-        The file: `columns` as .csv, .npz, .mat, .parquet or .mcap (ROS 2), or a log of the bus (`bus_log.SUFFIXES`).
-
-    Raises
-    ------
-    ConfigError
-        If the format is unknown, needs a package that is not installed, or the file cannot be written.
-    DataError
-        If the recording has no samples, or a bus log is requested of one that does not come from a bus.
-    """
-    if path.suffix.lower() in LOG_SUFFIXES:
-        write_log(recording, path)
-        return
-    writers: dict[str, Callable[[Recording, dict[str, NDArray[np.float64]], Path], None]] = {
-        ".csv": _write_csv,
-        ".npz": _write_npz,
-        ".mat": _write_mat,
-        ".parquet": _write_parquet,
-        ".mcap": _write_rosbag,
-    }
-    write = writers.get(path.suffix.lower())
-    if write is None:
-        known = ", ".join([*writers, *LOG_SUFFIXES])
-        raise ConfigError(f"{path}: cannot export {path.suffix or 'without suffix'}; expected {known}")
-    table = columns(recording)
+    """Write a recording in the format of the suffix (`armident.daq.interchange.readers`), all of the file or none."""
+    write = writer_of(path)
     temporary = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        write(recording, table, temporary)
+        write(recording, temporary)
         temporary.replace(path)
     except OSError as error:
         raise ConfigError(f"{path}: cannot be written: {error.strerror}") from error
@@ -107,36 +71,44 @@ def _numbered(base: str, values: NDArray[np.float64]) -> dict[str, NDArray[np.fl
     return {f"{base}{j + 1}": np.ascontiguousarray(values[:, j]) for j in range(values.shape[1])}
 
 
-def _write_csv(_: Recording, table: dict[str, NDArray[np.float64]], path: Path) -> None:
+def export_csv(recording: Recording, path: Path) -> None:
+    """Write the `columns` of a recording as text."""
+    table = columns(recording)
     values = np.stack(list(table.values()), axis=1)
     np.savetxt(path, values, fmt="%.17g", delimiter=",", header=",".join(table), comments="")
 
 
-def _write_npz(_: Recording, table: dict[str, NDArray[np.float64]], path: Path) -> None:
+def export_npz(recording: Recording, path: Path) -> None:
+    """Write the `columns` of a recording as an archive of numpy."""
     with path.open("wb") as file:
-        np.savez_compressed(file, allow_pickle=False, **table)
+        np.savez_compressed(file, allow_pickle=False, **columns(recording))
 
 
-def _write_parquet(_: Recording, table: dict[str, NDArray[np.float64]], path: Path) -> None:
+def export_parquet(recording: Recording, path: Path) -> None:
+    """Write the `columns` of a recording as a table of Apache Parquet."""
     try:
         import pyarrow
         import pyarrow.parquet
     except ImportError as error:
         raise ConfigError(install_line(f"{path}: Parquet", ["parquet"])) from error
-    pyarrow.parquet.write_table(pyarrow.table(table), path)
+    pyarrow.parquet.write_table(pyarrow.table(columns(recording)), path)
 
 
-def _write_mat(_: Recording, table: dict[str, NDArray[np.float64]], path: Path) -> None:
+def export_mat(recording: Recording, path: Path) -> None:
+    """Write the `columns` of a recording as a MAT file."""
     from scipy.io import savemat
 
-    savemat(path, dict(table), do_compression=True, oned_as="column")
+    savemat(path, columns(recording), do_compression=True, oned_as="column")
 
 
-def _write_rosbag(recording: Recording, table: dict[str, NDArray[np.float64]], path: Path) -> None:
+def export_rosbag(recording: Recording, path: Path) -> None:
+    """Write the `columns` of a recording as joint states.
+
+    Stamps are those of the sampling clock: times of reception jitter, and other tools take stamps for sampling times.
+    """
     from armident.daq.interchange.rosbag import write_joint_states
 
-    # Stamps are those of the sampling clock: times of reception jitter, and other tools take stamps for sampling times.
-    samples = recording.samples
+    table, samples = columns(recording), recording.samples
     t_ns = samples.t_ns[0] + np.round((samples.sync - samples.sync[0]) * (1e9 / recording.sample_rate_hz)).astype(
         np.int64
     )

@@ -1,27 +1,29 @@
-"""Import of measured motion from CSV, MAT, NPZ, Parquet, LeRobot data sets and bags of ROS 2."""
+"""Import of measured motion from files of other tools."""
 
 import hashlib
 import logging
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from armident.configs import ConfigError, DataError, RobotConfig
-from armident.daq.interchange.bag_files import bag_files, is_bag
+from armident.configs import ConfigError, DataError, RobotConfig, SessionConfig
+from armident.daq.interchange.bag_files import bag_files
+from armident.daq.interchange.clocks import gaps_and_counters
+from armident.daq.interchange.import_options import ImportOptions
 from armident.daq.interchange.lerobot import data_files
-from armident.daq.interchange.rate_conversion import at_rate
-from armident.daq.interchange.sample_clock import gaps_and_counters
-from armident.daq.interchange.sampling import Sampled, sampled
-from armident.daq.interchange.si_checks import OMITTED, check_units, fast_note, unit_of
+from armident.daq.interchange.readers import check_options, reader_of
+from armident.daq.interchange.resampling import Sampled, at_rate, sampled
+from armident.daq.interchange.si_checks import OMITTED, check_units, fast_note, si_unit_of
 from armident.daq.interchange.stated_units import in_si
 from armident.daq.interchange.table_columns import NAMES
-from armident.daq.interchange.table_files import Source, read_pair, read_table
-from armident.daq.interchange.table_rows import Rows, complete_rows
-from armident.daq.recording import Field, Recording, Stream, is_recording, read_recording
+from armident.daq.interchange.table_files import Source
+from armident.daq.interchange.table_rows import TableRows, complete_rows
+from armident.daq.recording import Field, Recording, Stream, read_recording
 from armident.daq.recording.model import Side
 
 __all__ = ["NAMES", "OMITTED", "import_recording"]
@@ -33,85 +35,83 @@ NOTES = "source_remarks"
 # Numbers of other tools may overflow; the checks refuse what comes of them.
 @np.errstate(over="ignore", invalid="ignore", divide="ignore")
 def import_recording(
-    path: Path,
-    robot: RobotConfig | None,
-    *,
-    effort: Path | None = None,
-    motor_side: bool = False,
-    rate_hz: float | None = None,
-    names: Mapping[str, str] | None = None,
-    polled: bool = False,
-    resample_hz: float | None = None,
-    time_unit: str | None = None,
-    topic: str | None = None,
-    joints: Sequence[str] | None = None,
-    by_position: bool = False,
-    units: Mapping[str, str] | None = None,
+    path: Path, config: RobotConfig | SessionConfig | None, **options: Unpack[ImportOptions]
 ) -> Recording:
     """Return measured motion and effort as a recording, after checks of content, units and clock.
 
-    Parameters
-    ----------
-    path
-        CSV with a header line, MAT (up to version 7), NPZ, Parquet, a LeRobot data set (file or folder), or joint
-        states in a bag of ROS 2 (MCAP, SQLite, or a folder); SI units.
-        A recording of armident is resampled to ``rate_hz`` (`armident.daq.interchange.rate_conversion`).
-    robot
-        The robot that was measured; ``None`` for a recording: the one inside it.
-    effort
-        A second CSV with one effort column per joint; ``path`` then has one position column per joint, and
-        headers of both are free or absent. A file of a single column has the joints one after the other, sample by
-        sample.
-    motor_side
-        Positions and torques are those of the motors; currents and voltages always are.
-    rate_hz
-        Sampling rate, 1/s, if the file has no time column, or if its times are less precise than the clock. Refused if
-        the times contradict it.
-    names
-        Names of this file by quantity (``time, position, torque, current, voltage, demand``); ``-`` leaves one out.
-    polled
-        The rows were polled from a controller of ``rate_hz``, so that some samples are repeated and some missed: they
-        are resampled onto its clock (`armident.daq.interchange.resample`).
-    resample_hz
-        Resample rows whose times jitter, or that were polled from a controller of this rate, 1/s; holes are gaps.
-        Metadata of the recording tell the method.
-    time_unit
-        Unit of the times: ``s``, ``ms``, ``us`` or ``ns``.
-    topic
-        Topic of joint states of a bag.
-    joints
-        Names of the joints in the file, in the robot's order.
-    by_position
-        Take joints of other names in the order of the file.
-    units
-        Units of quantities that are not in SI units (`armident.daq.interchange.stated_units.CHOICES`).
-
-    Raises
-    ------
-    ConfigError
-        If a file or option is wrong.
-    DataError
-        If the content is wrong: missing columns, wrong number of axes, too many damaged rows, times that jitter or
-        contradict the rate, values far outside the limits, or a demand that no joint followed.
+    ``config`` is the robot that was measured, the session of a bus log, or ``None`` for a recording: the robot inside
+    it. Raises ConfigError if a file or option is wrong, DataError if the content is.
     """
-    if is_recording(path):
-        if effort is not None or motor_side or names or polled or time_unit or topic or joints or by_position or units:
-            raise ConfigError(f"{path}: a recording of armident takes no option but --rate, --config and --out")
-        return _resampled(path, robot, rate_hz if rate_hz is not None else resample_hz)
-    if robot is None:
-        raise ConfigError(f"{path}: needs the configuration of the robot")
-    _check_rates(rate_hz, polled, resample_hz)
-    if time_unit is not None and is_bag(path) and not data_files(path):
-        raise ConfigError(f"{path}: --time-unit is an option of tables; the stamps of a bag are in s and ns")
-    source, rows = read_rows(
-        path, robot, effort=effort, names=names, topic=topic, joints=joints, by_position=by_position
-    )
-    rows = in_si(rows, robot, units or {})
+    reader = reader_of(path)
+    check_options(path, reader, options)
+    if not isinstance(config, SessionConfig if reader.session else RobotConfig) and not (config is None and reader.own):
+        raise ConfigError(f"{path}: needs the configuration of the {'session' if reader.session else 'robot'}")
+    _check_rates(options.get("rate_hz"), options.get("polled", False), options.get("resample_hz"))
+    found = reader.read(path, config, options)
+    if isinstance(found, Recording):
+        return found
+    assert isinstance(config, RobotConfig)
+    facts = {"source": path.name, "source_sha256": _digest(path)}
+    effort = options.get("effort")
+    if effort is not None:
+        facts |= {"effort": effort.name, "effort_sha256": _digest(effort)}
+    return _from_table(config, found, options, facts)
+
+
+@np.errstate(over="ignore", invalid="ignore", divide="ignore")
+def recording_of_arrays(
+    t: ArrayLike,
+    position: ArrayLike,
+    torque: ArrayLike,
+    robot: RobotConfig,
+    reference: ArrayLike | None = None,
+    resample_hz: float | None = None,
+) -> Recording:
+    """Return arrays as a recording, after the checks of an import; see `Recording.from_arrays`."""
+    table: dict[str, NDArray[np.float64]] = {"t": np.asarray(t, np.float64).reshape(-1)}
+    for name, label, given in (("q", "position", position), ("tau", "torque", torque), ("qr", "reference", reference)):
+        if given is not None:
+            values = np.asarray(given, np.float64)
+            table[name] = values[:, None] if values.ndim == 1 else values
+            if table[name].shape != (table["t"].size, robot.n):
+                raise DataError(
+                    f"{label}: an array of shape {values.shape}; expected ({table['t'].size}, {robot.n}): one row for "
+                    f"each time and one column for each joint of {robot.name}"
+                )
+    _check_rates(None, False, resample_hz)
+    try:
+        return _from_table(robot, Source(Path("arrays"), table), {"resample_hz": resample_hz}, {"source": "arrays"})
+    except DataError as error:
+        raise type(error)(_as_arguments(str(error))) from error
+
+
+def _as_arguments(message: str) -> str:
+    """Return a message with the options of ``armident import`` as arguments of `Recording.from_arrays`."""
+    for option, argument in (
+        (r"--resample (\S+)", r"resample_hz=\1"),
+        (r"--rate (\S+)( if the samples are even)?", r"t = numpy.arange(len(t)) / \1\2"),
+        (r"--time-unit (m|u|n)s reads it so", r"t has to be in s"),
+        (r"give the sampling rate with --rate, and omit the times: --map time=-", "t has to be in s, at equal steps"),
+        (r" unless --motor-side", ""),
+        (r"--units \w+=\w+ if they are", "convert them if they are"),
+        (rf"--map demand={OMITTED} omits (it|the demand)", r"reference=None omits \1"),
+        (rf", or omit the demand with --map demand={OMITTED}", ", or leave the reference out"),
+    ):
+        message = re.sub(option, argument, message)
+    return message
+
+
+def _from_table(robot: RobotConfig, source: Source, options: ImportOptions, facts: Mapping[str, str]) -> Recording:
+    """Return a table as a recording, after checks of content, units and clock."""
+    path = source.path
+    rate_hz, resample_hz = options.get("rate_hz"), options.get("resample_hz")
+    polled, motor_side = options.get("polled", False), options.get("motor_side", False)
+    rows = in_si(table_rows(source, robot, options), robot, options.get("units") or {})
     _refuse_immense(source, rows)
     side: Side = "motor" if motor_side else "joint"
     fields: dict[str, Field] = {
         name: Field(
-            name, name, unit_of(name, robot), "motor" if name in ("current", "voltage") else side, (1.0,) * robot.n
+            name, name, si_unit_of(name, robot), "motor" if name in ("current", "voltage") else side, (1.0,) * robot.n
         )
         for name in rows.values
     }
@@ -125,7 +125,13 @@ def import_recording(
         )
     try:
         made = sampled(
-            source, rows, robot, rate_hz=rate_hz, polled=polled, resample_hz=resample_hz, time_unit=time_unit
+            source,
+            rows,
+            robot,
+            rate_hz=rate_hz,
+            polled=polled,
+            resample_hz=resample_hz,
+            time_unit=options.get("time_unit"),
         )
     except DataError as error:
         shown = str(error)
@@ -135,52 +141,35 @@ def import_recording(
         notes += fast_note(robot, made.values["position"], made.rate_hz)
     for note in notes:
         logging.getLogger(__name__).warning("%s: %s", path, note)
-    facts = {"source": path.name, "source_sha256": _digest(path), **made.facts}
-    if effort is not None:
-        facts |= {"effort": effort.name, "effort_sha256": _digest(effort)}
-    if notes:
-        facts[NOTES] = "; ".join(notes)
-    recording = _recording(robot, fields, made, known, facts)
+    remarks = {NOTES: "; ".join(notes)} if notes else {}
+    recording = _recording(robot, fields, made, known, {**facts, **made.facts, **remarks})
     if resample_hz is None or abs(made.rate_hz / resample_hz - 1.0) < 1e-9:
         return recording
     return at_rate(recording, resample_hz)
 
 
-def read_rows(
-    path: Path,
-    robot: RobotConfig,
-    *,
-    effort: Path | None = None,
-    names: Mapping[str, str] | None = None,
-    topic: str | None = None,
-    joints: Sequence[str] | None = None,
-    by_position: bool = False,
-) -> tuple[Source, Rows]:
-    """Return a table, and its complete rows in the units of the file.
+def read_rows(path: Path, robot: RobotConfig, **options: Unpack[ImportOptions]) -> tuple[Source, TableRows]:
+    """Return a table, and its complete rows in the units of the file."""
+    reader = reader_of(path)
+    check_options(path, reader, options)
+    source = reader.read(path, robot, options)
+    if not isinstance(source, Source):
+        raise ConfigError(f"{path}: a {reader.name} is no table")
+    return source, table_rows(source, robot, options)
 
-    Parameters
-    ----------
-    path, robot, effort, names, topic, joints, by_position
-        As for `import_recording`.
 
-    Raises
-    ------
-    ConfigError
-        If a file or option is wrong.
-    DataError
-        If columns are missing, or too many rows are damaged.
-    """
-    chosen = dict(names or {})
+def table_rows(source: Source, robot: RobotConfig, options: ImportOptions) -> TableRows:
+    """Return the complete rows of a table in the units of the file."""
+    chosen = dict(options.get("names") or {})
     unknown = sorted(chosen.keys() - NAMES.keys())
     if unknown:
         raise ConfigError(f"--map: no quantity named {unknown[0]!r}; expected one of {', '.join(NAMES)}")
-    if effort is None and is_bag(path) and not data_files(path):
-        source = _bag(path, robot, topic, joints, by_position)
-        return source, complete_rows(source, robot, chosen)
-    if topic is not None:
-        raise ConfigError(f"{path}: --topic is an option of ROS 2 bags")
-    source = read_pair(path, effort, robot) if effort is not None else read_table(path)
-    return source, complete_rows(source, robot, chosen, by_position=by_position, joints=joints)
+    if source.t_ns is not None:
+        # The joints of a bag were chosen when it was read.
+        return complete_rows(source, robot, chosen)
+    return complete_rows(
+        source, robot, chosen, by_position=options.get("by_position", False), joints=options.get("joints")
+    )
 
 
 def _check_rates(rate_hz: float | None, polled: bool, resample_hz: float | None) -> None:
@@ -191,15 +180,6 @@ def _check_rates(rate_hz: float | None, polled: bool, resample_hz: float | None)
         raise ConfigError("--polled: needs --rate, the sampling rate of the controller")
     if rate_hz is not None and resample_hz is not None and rate_hz != resample_hz:
         raise ConfigError(f"--rate {rate_hz:g} and --resample {resample_hz:g} contradict each other; give one of them")
-
-
-def _bag(path: Path, robot: RobotConfig, topic: str | None, joints: Sequence[str] | None, by_position: bool) -> Source:
-    """Return the joint states of a bag of ROS 2."""
-    from armident.daq.interchange.rosbag import read_joint_states
-
-    states = read_joint_states(path, robot, topic=topic, joints=joints, by_position=by_position)
-    times = (states.t_ns - states.t_ns[0]) / 1e9
-    return Source(path, {"t": times, "q": states.q, "tau": states.tau}, notes=states.remarks, t_ns=states.t_ns)
 
 
 def _recording(
@@ -228,8 +208,9 @@ def _digest(path: Path) -> str:
     return digest.hexdigest()
 
 
-def _resampled(path: Path, robot: RobotConfig | None, rate_hz: float | None) -> Recording:
+def resampled_recording(path: Path, robot: RobotConfig | None, options: ImportOptions) -> Recording:
     """Return a recording of armident at another sampling rate, of a configuration with the same joints."""
+    rate_hz = options.get("rate_hz") or options.get("resample_hz")
     if rate_hz is None:
         raise ConfigError(f"{path}: a recording already; --rate resamples it")
     recording = read_recording(path)
@@ -244,7 +225,7 @@ def _resampled(path: Path, robot: RobotConfig | None, rate_hz: float | None) -> 
     return replace(made, path=None, robot=robot or recording.robot, metadata=facts)
 
 
-def _refuse_immense(source: Source, rows: Rows) -> None:
+def _refuse_immense(source: Source, rows: TableRows) -> None:
     """Refuse values whose squares are no numbers: no measurement is so large, and least squares needs them."""
     most = np.sqrt(np.finfo(np.float64).max)
     for name, values in rows.values.items():
@@ -252,10 +233,10 @@ def _refuse_immense(source: Source, rows: Rows) -> None:
         if bad.size:
             row, column = bad[0]
             where = source.place(int(rows.row[row]), rows.labels[name][column])
-            raise DataError(f"{where}: {values[row, column]:.3g} is no measurement")
+            raise DataError(f"{where}: {values[row, column]:.3g} is too large for a measurement")
 
 
-def _rows_with_demand(source: Source, rows: Rows) -> slice:
+def _rows_with_demand(source: Source, rows: TableRows) -> slice:
     """Return the rows from the first to the last with a demand; a capture has none before the first set point."""
     demand = rows.values.get("demand")
     if demand is None:

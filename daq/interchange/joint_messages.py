@@ -39,16 +39,8 @@ _MOST_NS = 2**63 - 1
 class MessageTable:
     """Messages with one list of names, and with the same quantities, M of them.
 
-    Parameters
-    ----------
-    names
-        Names of the m joints.
-    number
-        Number of each message on its topic, from 1, (M,).
-    stamp, logged
-        Stamp in the header and time of recording, ns, (M,).
-    q, tau
-        Positions and efforts, (M, m); ``None`` if the messages have none.
+    ``number``: number of each message on its topic, from 1, (M,). ``stamp``, ``logged``: stamp in the header and time
+    of recording, ns, (M,). ``q``, ``tau``: positions and efforts, (M, m); ``None`` if the messages have none.
     """
 
     names: tuple[str, ...]
@@ -71,11 +63,6 @@ class _Rows:
 class TopicMessages:
     """Collects the messages of a topic.
 
-    Parameters
-    ----------
-    topic
-        Name of the topic.
-
     Attributes
     ----------
     count
@@ -93,12 +80,7 @@ class TopicMessages:
     def add(self, logged_ns: int, data: bytes) -> None:
         """Add a message; one that cannot be used is counted.
 
-        Parameters
-        ----------
-        logged_ns
-            Time of recording, ns.
-        data
-            Its content in CDR.
+        ``logged_ns``: time of recording, ns; ``data``: its content in CDR.
         """
         self.count += 1
         try:
@@ -115,7 +97,7 @@ class TopicMessages:
                 self._refuse(f"has {len(values)} {what} of {len(names)} joints")
                 return
         if len(set(names)) < len(names):
-            self._refuse(f"has a joint twice: {listed(names)}")
+            self._refuse(f"has a duplicate joint: {listed(names)}")
             return
         if not (len(q) or len(tau)):
             self._refuse("has neither positions nor efforts")
@@ -149,13 +131,7 @@ class TopicMessages:
         ]
 
     def refuse_unusable(self) -> None:
-        """Raise if no message can be used.
-
-        Raises
-        ------
-        DataError
-            With the reasons.
-        """
+        """Raise if no message can be used. Raises DataError with the reasons."""
         if not self._rows:
             raise DataError("; ".join(self.remarks()))
 

@@ -20,14 +20,9 @@ Words = tuple[str, ...]
 class JointMatch:
     """Joints of a robot in a file.
 
-    Parameters
-    ----------
-    index
-        Index of each joint among the names of the file, n numbers in the robot's order.
-    names
-        Name of each joint in the file, in the robot's order.
-    remarks
-        Sentences on what was assumed, for the user; empty if all names are equal.
+    ``index``: index of each joint among the names of the file, n numbers in the robot's order. ``names``: name of each
+    joint in the file, in the robot's order. ``remarks``: sentences on what was assumed, for the user; empty if all
+    names are equal.
     """
 
     index: tuple[int, ...]
@@ -48,25 +43,14 @@ def match_joints(
     the configuration, either without regard to case and separators, and either with one prefix common to all joints,
     in the file or in the configuration. A match that is not exact has a remark. Order is no evidence.
 
-    Parameters
-    ----------
-    found
-        Names in the file; those of other devices among them are passed over.
-    wanted
-        Joints of the robot from base to tip, n of them.
-    by_position
-        True to take n names in their order where they do not match.
-    joints
-        Names of the file in the robot's order, n of them: replaces all comparison.
-
-    Raises
-    ------
-    DataError
-        If a joint is not found, several names fit, or ``by_position`` contradicts the names; has both lists of names.
+    ``found``: names in the file; those of other devices among them are passed over. ``wanted``: joints of the robot
+    from base to tip, n of them. ``by_position``: True to take n names in their order where they do not match.
+    ``joints``: names of the file in the robot's order, n of them: replaces all comparison. Raises DataError if a joint
+    is not found, several names fit, or ``by_position`` contradicts the names; has both lists of names.
     """
     twice = sorted({name for name in found if list(found).count(name) > 1})
     if twice:
-        raise DataError(f"joint name {', '.join(twice)} is there twice: {listed(found)}")
+        raise DataError(f"duplicate joint name {', '.join(twice)}: {listed(found)}")
     if joints is not None:
         return _as_chosen(found, wanted, joints)
     if by_position:

@@ -26,23 +26,14 @@ _SUFFIX = re.compile(r"[._](pos|position|goal|eff|effort|torque|tau|current)$", 
 
 
 def is_lerobot(arrays: Mapping[str, Any]) -> bool:
-    """Return ``True`` if the columns are those of a LeRobot data set.
-
-    Parameters
-    ----------
-    arrays
-        Columns by name.
-    """
+    """Return ``True`` if the columns are those of a LeRobot data set."""
     return STATE in arrays or {ACTION, EPISODE} <= set(arrays)
 
 
 def data_files(folder: Path) -> list[Path]:
     """Return the Parquet files of a data set in order; none if the folder is neither a data set nor a part of one.
 
-    Parameters
-    ----------
-    folder
-        A folder with ``data``, or one of the folders in it.
+    ``folder``: a folder with ``data``, or one of the folders in it.
     """
     if not folder.is_dir() or any(file.name.endswith((METADATA, *SUFFIXES)) for file in folder.iterdir()):
         return []
@@ -53,15 +44,7 @@ def data_files(folder: Path) -> list[Path]:
 def joined(parts: Mapping[Path, Mapping[str, Any]]) -> dict[str, Any]:
     """Return the columns of the files of a data set, one after the other.
 
-    Parameters
-    ----------
-    parts
-        Columns by name, by file.
-
-    Raises
-    ------
-    DataError
-        If a file lacks a column of another one.
+    Raises DataError if a file lacks a column of another one.
     """
     every = dict.fromkeys(name for part in parts.values() for name in part)
     for file, part in parts.items():
@@ -76,17 +59,8 @@ def joined(parts: Mapping[Path, Mapping[str, Any]]) -> dict[str, Any]:
 def lerobot_table(path: Path, arrays: Mapping[str, Any]) -> tuple[dict[str, NDArray[np.float64]], list[str]]:
     """Return times, positions, demand and effort of a data set, and notes.
 
-    Parameters
-    ----------
-    path
-        File or folder of the data set, for the names of the joints in ``meta/info.json``.
-    arrays
-        Columns by name.
-
-    Raises
-    ------
-    DataError
-        If it has no effort, or columns of unequal length.
+    ``path``: file or folder of the data set, for the names of the joints in ``meta/info.json``; ``arrays``: columns by
+    name. Raises DataError if it has no effort, or columns of unequal length.
     """
     features = _features(path)
     table: dict[str, NDArray[np.float64]] = {}

@@ -12,11 +12,8 @@ from armident.configs import ConfigError, DataError
 from armident.configs.yaml_loader import is_file
 from armident.daq.interchange.blf import read_blf
 from armident.daq.interchange.log_frames import FrameCollector, LogFrames
-from armident.daq.interchange.log_lines import AscLines, CandumpLines, Line, LineParser, TrcLines
+from armident.daq.interchange.log_lines import AscLines, CandumpLines, LineKind, LineParser, TrcLines
 from armident.daq.interchange.text_files import encoding_of, excerpt
-
-SUFFIXES = (".log", ".asc", ".blf", ".trc")
-"""File name suffixes of logs: candump -l, Vector ASC and BLF, PEAK TRC."""
 
 _SHOW_EVERY = 4096
 _LONGEST_LINE = 4096
@@ -26,17 +23,8 @@ _LONGEST_LINE = 4096
 def read_log(path: Path) -> LogFrames:
     """Return the frames of a bus log.
 
-    Parameters
-    ----------
-    path
-        The log; its suffix tells the format.
-
-    Raises
-    ------
-    ConfigError
-        If there is no such file, or it cannot be opened.
-    DataError
-        If it is not such a log, or holds no frames.
+    ``path``: the log; its suffix tells the format. Raises ConfigError if there is no such file, or it cannot be opened;
+    DataError if it is not such a log, or holds no frames.
     """
     if not is_file(path):
         raise ConfigError(f"{path}: no such file")
@@ -63,19 +51,19 @@ def _read_lines(path: Path, parser: LineParser, frames: FrameCollector) -> None:
     malformed: list[tuple[int, str]] = []
     bad = without_time = number = 0
     line = ""
-    kind: object = Line.COMMENT
+    kind: object = LineKind.COMMENT
     with path.open(encoding=encoding_of(path), errors="replace", newline="\n") as file, _progress(path) as advance:
         while line := file.readline(_LONGEST_LINE):
             number += 1
             kind = parser.parse(line.strip())
             if isinstance(kind, tuple):
                 frames.add(*kind)
-            elif kind is Line.FOREIGN:
+            elif kind is LineKind.FOREIGN:
                 frames.foreign += 1
-            elif kind is Line.MALFORMED:
+            elif kind is LineKind.MALFORMED:
                 bad += 1
                 malformed = malformed or [(number, line)]
-            without_time += kind is Line.WITHOUT_TIME
+            without_time += kind is LineKind.WITHOUT_TIME
             if number % _SHOW_EVERY == 0:
                 advance(frames.count)
             last = line
@@ -87,7 +75,7 @@ def _read_lines(path: Path, parser: LineParser, frames: FrameCollector) -> None:
 
 def _cut(frames: FrameCollector, kind: object, number: int) -> int:
     """Leave out the last line if it is cut off; return 1 if it was counted as malformed."""
-    if kind is Line.MALFORMED:
+    if kind is LineKind.MALFORMED:
         frames.skipped += 1
         frames.notes.append(f"the last line ({number}) is cut off and left out")
         return 1

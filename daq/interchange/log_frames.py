@@ -22,20 +22,9 @@ LATEST_NS = 9_000_000_000 * 1_000_000_000
 class LogFrames:
     """Classic data frames with 11-bit identifiers, in the order of the log.
 
-    Parameters
-    ----------
-    frames
-        The frames, (N,), with times in ns.
-    bus
-        Number of the bus of each frame, (N,).
-    buses
-        Names of the buses.
-    foreign
-        Number of other frames: CAN FD, extended identifiers, remote and error frames.
-    notes
-        One sentence for everything that was left out or interpreted.
-    skipped
-        Number of lines or objects that were left out.
+    ``frames``: the frames, (N,), with times in ns; ``bus``: number of the bus of each frame, (N,); ``foreign``: number
+    of other frames: CAN FD, extended identifiers, remote and error frames; ``notes``: one sentence for everything that
+    was left out or interpreted; ``skipped``: number of lines or objects that were left out.
     """
 
     frames: Frames
@@ -48,14 +37,8 @@ class LogFrames:
     def of(self, path: Path, bus: str, several: bool) -> Frames:
         """Return the frames of one bus.
 
-        Parameters
-        ----------
-        path
-            The log, for messages.
-        bus
-            Name of the bus.
-        several
-            The session has several buses; otherwise the frames of the only bus in the log are returned.
+        ``path``: the log, for messages. ``several``: the session has several buses; otherwise the frames of the only
+        bus in the log are returned.
         """
         if len(self.buses) < 2 and not (self.buses and several):
             return self.frames
@@ -68,13 +51,7 @@ class LogFrames:
         return chosen
 
     def buses_with(self, identifiers: Sequence[int]) -> list[str]:
-        """Return the names of the buses with frames of all identifiers.
-
-        Parameters
-        ----------
-        identifiers
-            The identifiers.
-        """
+        """Return the names of the buses with frames of all identifiers."""
         wanted = np.array(identifiers)
         own = [self.frames["can_id"][self.bus == number] for number in range(len(self.buses))]
         return [name for name, found in zip(self.buses, own, strict=True) if np.isin(wanted, found).all()]
@@ -100,16 +77,7 @@ class FrameCollector:
     def add(self, t_ns: int, can_id: int, data: bytes, channel: str) -> None:
         """Add a classic data frame with an 11-bit identifier.
 
-        Parameters
-        ----------
-        t_ns
-            Time, ns.
-        can_id
-            Identifier.
-        data
-            At most eight bytes.
-        channel
-            Name of its bus.
+        ``data``: at most eight bytes; ``channel``: name of its bus.
         """
         number = self._numbers.setdefault(channel, len(self._numbers))
         self._rows.append((t_ns, can_id, data, number))
@@ -137,17 +105,8 @@ class FrameCollector:
     def finish(self, path: Path, added_up: bool | None = None) -> LogFrames:
         """Return the frames.
 
-        Parameters
-        ----------
-        path
-            The log, for messages.
-        added_up
-            Add up the times, as each is the time since the frame before; ``None``: do so if they say it.
-
-        Raises
-        ------
-        DataError
-            If there are none.
+        ``path``: the log, for messages. ``added_up``: add up the times, as each is the time since the frame before;
+        ``None``: do so if they say it. Raises DataError if there are none.
         """
         self._flush()
         if not self._parts or not sum(part[0].size for part in self._parts):
@@ -212,10 +171,7 @@ def _odd_times(t_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
 def nanoseconds(seconds: str, fraction: str | None) -> int | None:
     """Return a time in ns from its decimal digits, or ``None`` if it is no possible time.
 
-    Parameters
-    ----------
-    seconds, fraction
-        Digits before and after the decimal point.
+    ``seconds``, ``fraction``: digits before and after the decimal point.
     """
     t_ns = int(seconds[:11]) * 1_000_000_000 + int((fraction or "0")[:9].ljust(9, "0"))
     return t_ns if t_ns < LATEST_NS else None

@@ -11,7 +11,7 @@ FrameLine = tuple[int, int, bytes, str]
 """Time, ns; identifier; data; name of the bus."""
 
 
-class Line(Enum):
+class LineKind(Enum):
     """Kind of a line without a classic data frame with an 11-bit identifier."""
 
     COMMENT = "comment, heading or event"
@@ -27,7 +27,7 @@ class LineParser(Protocol):
     notes: list[str]
     added_up: bool | None
 
-    def parse(self, line: str) -> FrameLine | Line:
+    def parse(self, line: str) -> FrameLine | LineKind:
         """Return the frame of a line, or the kind of the line."""
         ...
 
@@ -83,16 +83,10 @@ class CandumpLines:
         self.notes: list[str] = []
         self.added_up: bool | None = None
 
-    def parse(self, line: str) -> FrameLine | Line:
-        """Return the frame of a line, or the kind of the line.
-
-        Parameters
-        ----------
-        line
-            The line, without spaces at its ends.
-        """
+    def parse(self, line: str) -> FrameLine | LineKind:
+        """Return the frame of a line, or the kind of the line. ``line``: without spaces at its ends."""
         if not line or line[0] in "#;/":
-            return Line.COMMENT
+            return LineKind.COMMENT
         if found := _LOG_LINE.match(line):
             time, channel, identifier, mark, digits = found.groups()
             return self._frame(time, channel, identifier, mark == "##", self._log_data(digits))
@@ -100,16 +94,16 @@ class CandumpLines:
             time, channel, identifier, length, _, rest = found.groups()
             fd = length is not None and len(length) == 2
             count = min(_MOST_BYTES, int(length)) if length is not None else _MOST_BYTES
-            data: bytes | Line | None = _octets(rest.split(), count)
+            data: bytes | LineKind | None = _octets(rest.split(), count)
             if rest.startswith("remote"):
-                data = Line.FOREIGN
+                data = LineKind.FOREIGN
             return self._frame(time, channel, identifier, fd, data)
-        return Line.MALFORMED
+        return LineKind.MALFORMED
 
     @staticmethod
-    def _log_data(digits: str) -> bytes | Line | None:
+    def _log_data(digits: str) -> bytes | LineKind | None:
         if digits[:1] in ("R", "r"):
-            return Line.FOREIGN
+            return LineKind.FOREIGN
         data, underscore, raw = digits.partition("_")
         # A classic frame with a DLC of 9 to 15 has eight bytes (ISO 11898-1); candump adds this DLC.
         if underscore and not (len(data) == 2 * _MOST_BYTES and re.fullmatch("[9A-Fa-f]", raw)):
@@ -122,17 +116,17 @@ class CandumpLines:
 
     @staticmethod
     def _frame(
-        time: str | None, channel: str, identifier: str, fd: bool, data: bytes | Line | None
-    ) -> FrameLine | Line:
+        time: str | None, channel: str, identifier: str, fd: bool, data: bytes | LineKind | None
+    ) -> FrameLine | LineKind:
         if time is None:
-            return Line.WITHOUT_TIME
+            return LineKind.WITHOUT_TIME
         t_ns = _stamp(time)
         if t_ns is None or len(identifier) not in (3, 8):
-            return Line.MALFORMED
-        if fd or len(identifier) == 8 or data is Line.FOREIGN:
-            return Line.FOREIGN
+            return LineKind.MALFORMED
+        if fd or len(identifier) == 8 or data is LineKind.FOREIGN:
+            return LineKind.FOREIGN
         if not isinstance(data, bytes) or int(identifier, 16) > 0x7FF:
-            return Line.MALFORMED
+            return LineKind.MALFORMED
         return t_ns, int(identifier, 16), data, channel
 
 
@@ -163,10 +157,7 @@ def _month(word: str) -> int | None:
 def asc_date_ns(text: str) -> int | None:
     """Return the time of a date line of an ASC log in ns, in the zone of this computer; ``None`` if it is not known.
 
-    Parameters
-    ----------
-    text
-        The line, in the language of the computer that wrote it.
+    ``text``: the line, in the language of the computer that wrote it.
     """
     clock = _ASC_CLOCK.search(text)
     if clock is None:
@@ -201,14 +192,8 @@ class AscLines:
         self._start_ns, self._now_ns = 0, 0
         self._trigger = False
 
-    def parse(self, line: str) -> FrameLine | Line:
-        """Return the frame of a line, or the kind of the line.
-
-        Parameters
-        ----------
-        line
-            The line, without spaces at its ends.
-        """
+    def parse(self, line: str) -> FrameLine | LineKind:
+        """Return the frame of a line, or the kind of the line. ``line``: without spaces at its ends."""
         found = _ASC_EVENT.match(line)
         if found is None:
             return self._heading(line)
@@ -216,60 +201,62 @@ class AscLines:
         t_ns = nanoseconds(seconds, fraction)
         # Only the time since the event before may be negative: events of two buses are not in order.
         if t_ns is None or (minus and not self._relative):
-            return Line.MALFORMED
+            return LineKind.MALFORMED
         t_ns = -t_ns if minus else t_ns
         if self._relative:
             self._now_ns = t_ns = max(0, min(self._now_ns + t_ns, LATEST_NS - self._start_ns))
         if what.upper() == "CANFD":
             return self._of_fd_channel(self._start_ns + t_ns, rest.split())
-        return self._frame(self._start_ns + t_ns, what, rest) if what.isdecimal() else Line.COMMENT
+        return self._frame(self._start_ns + t_ns, what, rest) if what.isdecimal() else LineKind.COMMENT
 
-    def _heading(self, line: str) -> Line:
+    def _heading(self, line: str) -> LineKind:
         words = line.lower()
         if base := _ASC_BASE.match(line):
             self._base = 16 if base[1].lower() == "hex" else 10
             self._relative = (base[2] or "").lower() == "relative"
             if self._relative:
                 self.notes.append("times are those since the event before (timestamps relative): added up")
-            return Line.COMMENT
+            return LineKind.COMMENT
         trigger = words.startswith("begin trigger")
         if words.startswith("date") or trigger:
             if self._trigger:
-                return Line.COMMENT
+                return LineKind.COMMENT
             start = asc_date_ns(line)
             if start is not None:
                 self._start_ns = start
             elif trigger and not self._start_ns:
-                self.notes.append("its date is not understood: times begin at zero")
+                self.notes.append("unknown date format: times begin at zero")
             self._trigger = trigger
-            return Line.COMMENT
+            return LineKind.COMMENT
         known = ("//", "internal events", "no internal events", "end trigger", "previous log", "", ";")
-        return Line.COMMENT if any(words == k if not k else words.startswith(k) for k in known) else Line.MALFORMED
+        return (
+            LineKind.COMMENT if any(words == k if not k else words.startswith(k) for k in known) else LineKind.MALFORMED
+        )
 
-    def _frame(self, t_ns: int, channel: str, rest: str) -> FrameLine | Line:
+    def _frame(self, t_ns: int, channel: str, rest: str) -> FrameLine | LineKind:
         words = rest.split()
         if not words:
-            return Line.MALFORMED
+            return LineKind.MALFORMED
         if words[0].lower().startswith("errorframe"):
-            return Line.FOREIGN
+            return LineKind.FOREIGN
         if words[0].endswith(":"):
-            return Line.COMMENT
+            return LineKind.COMMENT
         if len(words) < 4 or words[1].lower() not in ("rx", "tx", "txrq"):
-            return Line.MALFORMED
+            return LineKind.MALFORMED
         extended = words[0][-1] in "xX"
         try:
             can_id = int(words[0][:-1] if extended else words[0], self._base)
             length = int(words[3], 16)
         except ValueError:
-            return Line.FOREIGN if words[2].lower() == "r" and not extended else Line.MALFORMED
+            return LineKind.FOREIGN if words[2].lower() == "r" and not extended else LineKind.MALFORMED
         if extended or words[2].lower() == "r":
-            return Line.FOREIGN
+            return LineKind.FOREIGN
         data = _octets(words[4:], min(_MOST_BYTES, length), self._base)
         if data is None or words[2].lower() != "d" or not 0 <= can_id <= 0x7FF:
-            return Line.MALFORMED
+            return LineKind.MALFORMED
         return t_ns, can_id, data, str(int(channel[:9]) - 1)
 
-    def _of_fd_channel(self, t_ns: int, words: list[str]) -> FrameLine | Line:
+    def _of_fd_channel(self, t_ns: int, words: list[str]) -> FrameLine | LineKind:
         """Return a classic frame of a CAN FD channel; another frame if it is CAN FD, extended, remote or an error.
 
         The words are channel, direction, identifier, perhaps a name, BRS, ESI, DLC, length, data, duration, bits and
@@ -282,10 +269,10 @@ class AscLines:
             flags, can_id = int(words[9 + length], 16), int(identifier, self._base)
             dlc = int(words[5], 16)
         except (ValueError, IndexError):
-            return Line.FOREIGN
+            return LineKind.FOREIGN
         data = _octets(words[7:], length, self._base)
         if flags & (_EDL | _RTR) or can_id > 0x7FF or data is None or length != min(_MOST_BYTES, dlc):
-            return Line.FOREIGN
+            return LineKind.FOREIGN
         return t_ns, can_id, data, str(channel)
 
 
@@ -311,29 +298,23 @@ class TrcLines:
         self._start_ns = 0
         self._columns: list[str] = []
 
-    def parse(self, line: str) -> FrameLine | Line:
-        """Return the frame of a line, or the kind of the line.
-
-        Parameters
-        ----------
-        line
-            The line, without spaces at its ends.
-        """
+    def parse(self, line: str) -> FrameLine | LineKind:
+        """Return the frame of a line, or the kind of the line. ``line``: without spaces at its ends."""
         if not line:
-            return Line.COMMENT
+            return LineKind.COMMENT
         if line.startswith(";"):
             self._heading(line)
-            return Line.COMMENT
+            return LineKind.COMMENT
         if self._columns:
             return self._by_columns(line)
         if _TRC_EVENT.match(line):
-            return Line.COMMENT
+            return LineKind.COMMENT
         found = _TRC_1.match(line)
         if found is None:
-            return Line.MALFORMED
+            return LineKind.MALFORMED
         whole, fraction, bus, kind, identifier, length, data = found.groups()
         if kind not in (None, "Rx", "Tx"):
-            return Line.COMMENT
+            return LineKind.COMMENT
         return self._frame(whole, fraction, bus or "1", identifier, length, data or "")
 
     def _heading(self, line: str) -> None:
@@ -350,30 +331,30 @@ class TrcLines:
                 start = _TRC_ORIGIN + timedelta(days=float(value))
                 self._start_ns = max(0, int(start.timestamp() * 1000)) * 1_000_000
             except (ValueError, OverflowError):
-                self.notes.append("its start time is not understood: times begin at zero")
+                self.notes.append("invalid start time: times begin at zero")
 
-    def _by_columns(self, line: str) -> FrameLine | Line:
+    def _by_columns(self, line: str) -> FrameLine | LineKind:
         words = line.split(None, len(self._columns) - 1)
         column = dict(zip(self._columns, words, strict=False))
         kind = column.get("T", "DT")
         if kind in ("FD", "FB", "FE", "BI", "RR"):
-            return Line.FOREIGN
+            return LineKind.FOREIGN
         if kind in ("ST", "EC", "ER", "EV"):
-            return Line.COMMENT
+            return LineKind.COMMENT
         time = _STAMP.match(column.get("O", ""))
         length = column.get("l", column.get("L", ""))
         identifier = column.get("I", "")
         if kind != "DT" or time is None or not length.isdecimal() or not re.fullmatch("[0-9A-Fa-f]{4,8}", identifier):
-            return Line.MALFORMED
+            return LineKind.MALFORMED
         return self._frame(time[1], time[2], column.get("B", "1"), identifier, length, column.get("D", ""))
 
     def _frame(
         self, whole: str, fraction: str | None, bus: str, identifier: str, length: str, data: str
-    ) -> FrameLine | Line:
+    ) -> FrameLine | LineKind:
         if len(identifier) > 4 or data.startswith("RTR"):
-            return Line.FOREIGN
+            return LineKind.FOREIGN
         octets = _octets(data.split(), min(_MOST_BYTES, int(length[:3])))
         t_ns = nanoseconds(whole, fraction)
         if octets is None or t_ns is None or int(identifier, 16) > 0x7FF:
-            return Line.MALFORMED
+            return LineKind.MALFORMED
         return self._start_ns + t_ns // 1000, int(identifier, 16), octets, bus

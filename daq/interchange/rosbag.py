@@ -10,10 +10,12 @@ from numpy.typing import NDArray
 
 from armident.configs import DataError, RobotConfig
 from armident.daq.interchange.bag_files import BagReader
+from armident.daq.interchange.clocks import FASTEST_HZ, SLOWEST_HZ
+from armident.daq.interchange.import_options import ImportOptions
 from armident.daq.interchange.joint_messages import DEFINITION, MESSAGE_TYPE, MessageTable, TopicMessages
 from armident.daq.interchange.joint_names import JointMatch, match_joints
+from armident.daq.interchange.table_files import Source
 from armident.daq.interchange.text_files import listed, printable, shortened
-from armident.daq.interchange.time_stamps import FASTEST_HZ, SLOWEST_HZ
 
 TOPIC = "/joint_states"
 _NS = 1_000_000_000
@@ -35,14 +37,8 @@ SIMULATED_S = 1e8
 class JointStates:
     """Joint states of a robot.
 
-    Parameters
-    ----------
-    t_ns
-        Times, ns, (N,), increasing.
-    q, tau
-        Positions and efforts, SI units, (N, n), in the robot's order.
-    remarks
-        Sentences on what was assumed, passed over or is missing, for the user.
+    ``t_ns``: times, ns, (N,), increasing; ``q``, ``tau``: positions and efforts, SI units, (N, n), in the robot's
+    order; ``remarks``: sentences on what was assumed, passed over or is missing, for the user.
     """
 
     t_ns: NDArray[np.int64]
@@ -63,7 +59,9 @@ def read_joint_states(
 
     Joints are found by their names in every message (`armident.daq.interchange.joint_names`). Other joints are passed
     over. Messages of one stamp with parts of the robot's joints are one sample. Times are the stamps, or the times of
-    recording if no stamp is set. What is damaged is left out, with a remark.
+    recording if no stamp is set. What is damaged is left out, with a remark. Raises ConfigError if there is no such
+    bag; DataError if it is no bag, has no joint states, those of several robots, no joint of a name, or contradictory
+    times.
 
     Parameters
     ----------
@@ -77,13 +75,6 @@ def read_joint_states(
         Names in the bag of the robot's joints, in the robot's order; ``None``: those of the robot.
     by_position
         True to take joints of other names in the order of the messages.
-
-    Raises
-    ------
-    ConfigError
-        If there is no such bag.
-    DataError
-        If it is no bag, has no joint states, those of several robots, no joint of a name, or contradictory times.
     """
     reader = BagReader(path, MESSAGE_TYPE)
     found: dict[str, TopicMessages] = {}
@@ -96,6 +87,14 @@ def read_joint_states(
         lost = f" ({'; '.join(reader.losses)})" if reader.losses else ""
         raise DataError(f"{path}: {error}{lost}") from error
     return JointStates(t_ns, q, tau, (*match.remarks, *remarks, *passed, *chosen.remarks(), *reader.losses))
+
+
+def joint_state_table(path: Path, robot: RobotConfig, options: ImportOptions) -> Source:
+    """Return the joint states of a bag as a table, with its stamps."""
+    chosen = {name: options.get(name) for name in ("topic", "joints", "by_position") if options.get(name)}
+    states = read_joint_states(path, robot, **chosen)  # type: ignore[arg-type]
+    times = (states.t_ns - states.t_ns[0]) / 1e9
+    return Source(path, {"t": times, "q": states.q, "tau": states.tau}, notes=states.remarks, t_ns=states.t_ns)
 
 
 def _choose(
@@ -150,7 +149,7 @@ def _samples(
     if others:
         names = dict.fromkeys(name for table in others for name in table.names)
         count = sum(table.number.size for table in others)
-        remarks.append(f"{count} messages of other joints passed over: {', '.join(names)}")
+        remarks.append(f"{count} messages of other joints ignored: {', '.join(names)}")
     for what, given in (("positions", [t.q for t in ours]), ("efforts", [t.tau for t in ours])):
         if all(values is None for values in given):
             raise DataError(f"the messages on {messages.topic} have no {what} of {', '.join(match.names)}")
@@ -163,7 +162,7 @@ def _samples(
     for table, t in zip(ours, times, strict=True):
         repeated += _fill(values, known, np.searchsorted(stamps, t), table, match.names, messages.topic)
     if repeated:
-        remarks.append(f"{repeated} messages on {messages.topic} repeat the one before, and are passed over")
+        remarks.append(f"{repeated} messages on {messages.topic} repeat the one before: ignored")
     whole = known.all(axis=(0, 2))
     if not whole.any():
         raise DataError(
@@ -282,16 +281,8 @@ def write_joint_states(
 ) -> None:
     """Write positions and efforts as joint states.
 
-    Parameters
-    ----------
-    path
-        The rosbag2 file.
-    joints
-        Names of the n joints.
-    t_ns
-        Times, ns UTC, (N,).
-    columns
-        Positions ``q1..qn`` and efforts ``tau1..taun``, (N,) each; either may be absent.
+    ``path``: the rosbag2 file. ``joints``: names of the n joints. ``t_ns``: times, ns UTC, (N,). ``columns``: positions
+    ``q1..qn`` and efforts ``tau1..taun``, (N,) each; either may be absent.
     """
     q, tau = (
         np.stack([columns[f"{base}{j + 1}"] for j in range(len(joints))], axis=1) if f"{base}1" in columns else None

@@ -26,17 +26,7 @@ def error_line(error: Exception) -> str:
 def read_in_subprocess(read: Callable[[], Mapping[str, Any]], longest_s: float = LONGEST_S) -> dict[str, NDArray[Any]]:
     """Return the arrays of real numbers of a reader that runs in a subprocess, which may crash.
 
-    Parameters
-    ----------
-    read
-        The reader.
-    longest_s
-        Time limit, s.
-
-    Raises
-    ------
-    ValueError
-        With the reader's error, or the way its process ended.
+    ``longest_s``: time limit, s. Raises ValueError with the reader's error, or the way its process ended.
     """
     with tempfile.TemporaryFile() as file:
         process = os.fork()

@@ -29,15 +29,11 @@ _UNEXPLAINED_SHARE = 0.5
 """Largest share of the power of a joint's motion that its demand may leave unexplained."""
 
 
-def unit_of(quantity: str, robot: RobotConfig) -> str:
+def si_unit_of(quantity: str, robot: RobotConfig) -> str:
     """Return the SI unit of a quantity of a robot's joints.
 
-    Parameters
-    ----------
-    quantity
-        ``position``, ``demand``, ``torque``, ``current`` or ``voltage``.
-    robot
-        The robot, for the types of its joints.
+    ``quantity``: ``position``, ``demand``, ``torque``, ``current`` or ``voltage``; ``robot``: for the types of its
+    joints.
     """
     kinds = {joint.type for joint in robot.joints}
     if quantity in ("position", "demand"):
@@ -56,23 +52,9 @@ def check_units(
 ) -> None:
     """Refuse values far outside the limits in SI units on the stated side.
 
-    Parameters
-    ----------
-    path
-        The file, for messages.
-    robot
-        The robot, for its limits and gears.
-    fields
-        Side of each quantity.
-    raw
-        Values of each quantity, (N, n).
-    known
-        Rows with a demand.
-
-    Raises
-    ------
-    DataError
-        If positions or torques are far beyond their limits, or no joint followed its demand.
+    ``path``: the file, for messages; ``robot``: for its limits and gears; ``fields``: side of each quantity; ``raw``:
+    values of each quantity, (N, n); ``known``: rows with a demand. Raises DataError if positions or torques are far
+    beyond their limits, or no joint followed its demand.
     """
     transmission = robot.transmission_matrix
     for name, values in raw.items():
@@ -114,14 +96,7 @@ def _other_unit(name: str, kind: str, shares: NDArray[np.float64]) -> str:
 def fast_note(robot: RobotConfig, position: NDArray[np.float64], rate_hz: float) -> tuple[str, ...]:
     """Return a sentence on joints that move far beyond their velocity limits; joints without one tell nothing.
 
-    Parameters
-    ----------
-    robot
-        The robot, for its limits.
-    position
-        Positions on the joint side, (N, n).
-    rate_hz
-        Sampling rate, 1/s.
+    ``position``: positions on the joint side, (N, n); ``rate_hz``: sampling rate, 1/s.
     """
     # An odd number of rows, so that the values of two sources in turn show.
     apart = len(position) // _WINDOWS | 1
@@ -134,7 +109,7 @@ def fast_note(robot: RobotConfig, position: NDArray[np.float64], rate_hz: float)
         return ()
     most = float((speeds / limits).max())
     return (
-        f"{', '.join(fast)}: velocities of up to {most:.3g} times the limit, as of positions in degrees "
+        f"{', '.join(fast)}: velocities of up to {most:.3g} times the limit; check for positions in degrees "
         "(--units position=deg), times in another unit (--time-unit), or two sources of one joint",
     )
 

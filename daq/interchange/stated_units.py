@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from armident.configs import ConfigError, RobotConfig
 from armident.daq.interchange.column_units import SCALES
-from armident.daq.interchange.table_rows import Rows
+from armident.daq.interchange.table_rows import TableRows
 from armident.daq.recording.model import Quantity
 
 CHOICES: Mapping[str, tuple[str, ...]] = {
@@ -32,22 +32,12 @@ SUSPICIOUS = 3.0
 Floats = NDArray[np.float64]
 
 
-def in_si(rows: Rows, robot: RobotConfig, units: Mapping[str, str]) -> Rows:
+def in_si(rows: TableRows, robot: RobotConfig, units: Mapping[str, str]) -> TableRows:
     """Rows in SI units.
 
-    Parameters
-    ----------
-    rows
-        Rows of a table in the units of the file.
-    robot
-        The robot, for the types of its joints: ``deg`` is that of revolute joints, ``mm`` that of prismatic ones.
-    units
-        Unit of a quantity (`CHOICES`); quantities that are left out are in SI units.
-
-    Raises
-    ------
-    ConfigError
-        If a quantity has no such unit.
+    ``rows``: rows of a table in the units of the file. ``robot``: for the types of its joints: ``deg`` is that of
+    revolute joints, ``mm`` that of prismatic ones. ``units``: unit of a quantity (`CHOICES`); quantities that are left
+    out are in SI units. Raises ConfigError if a quantity has no such unit.
     """
     values = dict(rows.values)
     notes = list(rows.notes)
@@ -80,15 +70,11 @@ def _factors(robot: RobotConfig, unit: str) -> Floats:
     return factors
 
 
-def suspected(rows: Rows, robot: RobotConfig) -> dict[str, str]:
+def suspected(rows: TableRows, robot: RobotConfig) -> dict[str, str]:
     """Units by magnitude: those in which values beyond the limits of the joints are within them.
 
-    Parameters
-    ----------
-    rows
-        Rows in the units of the file.
-    robot
-        The robot with its limits; joints without limits do not tell a unit.
+    ``rows``: rows in the units of the file. ``robot``: the robot with its limits; joints without limits do not tell a
+    unit.
     """
     found: dict[str, str] = {}
     limits = np.array([max(abs(end) for end in joint.limits.position) for joint in robot.joints])

@@ -43,19 +43,11 @@ Table = Mapping[str, NDArray[np.float64]]
 
 
 @dataclass(frozen=True)
-class Columns:
+class TableColumns:
     """Values of one quantity.
 
-    Parameters
-    ----------
-    values
-        Values (N, n).
-    labels
-        Name of each column in the file.
-    notes
-        Sentences on what was assumed.
-    joints
-        Name of the joint of each column; empty if the columns are numbered.
+    ``values`` (N, n). ``labels``: name of each column in the file. ``notes``: sentences on what was assumed.
+    ``joints``: name of the joint of each column; empty if the columns are numbered.
     """
 
     values: NDArray[np.float64]
@@ -71,17 +63,8 @@ def without_units(
 
     Units that are not known are kept, for `armident.daq.interchange.column_units.check_unit`.
 
-    Parameters
-    ----------
-    table
-        Columns by name, such as ``q1 [deg]`` or ``time_ms``.
-    units
-        A unit for each column, from a line of units; may be empty.
-
-    Raises
-    ------
-    DataError
-        If two names are equal without their units.
+    ``table``: columns by name, such as ``q1 [deg]`` or ``time_ms``. ``units``: a unit for each column, from a line of
+    units; may be empty. Raises DataError if two names are equal without their units.
     """
     made: dict[str, NDArray[np.float64]] = {}
     stated: dict[str, str] = {}
@@ -107,12 +90,7 @@ def without_units(
 def find_time(table: Table, name: str | None = None) -> tuple[str, NDArray[np.float64]] | None:
     """Return name and values (N,) of the column of times, or ``None``.
 
-    Parameters
-    ----------
-    table
-        Columns by name.
-    name
-        Name that the user has given.
+    ``table``: columns by name; ``name``: name that the user has given.
     """
     if name is not None and name not in table:
         raise DataError(f"no array named {name!r}; found {listed(list(table))}")
@@ -135,26 +113,13 @@ def find_columns(
     *,
     by_position: bool = False,
     joints: Sequence[str] | None = None,
-) -> Columns | None:
+) -> TableColumns | None:
     """Return the columns of a quantity in the robot's order, or ``None`` if there are none.
 
-    Parameters
-    ----------
-    table
-        Columns (N,), or arrays (N, n), by name.
-    quantity
-        A key of `NAMES`.
-    robot
-        The robot, for number and names of its joints.
-    name
-        Name that the user has given for this quantity.
-    by_position, joints
-        Choice of the joints by the user (`armident.daq.interchange.joint_names`).
-
-    Raises
-    ------
-    DataError
-        If joints are missing, or there are too many.
+    ``table``: columns (N,), or arrays (N, n), by name; ``quantity``: a key of `NAMES`; ``robot``: for number and names
+    of its joints; ``name``: name that the user has given for this quantity; ``by_position``, ``joints``: choice of the
+    joints by the user (`armident.daq.interchange.joint_names`). Raises DataError if joints are missing, or there are
+    too many.
     """
     for base in (name,) if name is not None else NAMES[quantity]:
         found = _numbered(table, base, robot.n)
@@ -170,10 +135,7 @@ def find_columns(
 def unused_demand(table: Table) -> str:
     """Return a sentence on columns that name a demand, for a table in which no demand was found; empty without any.
 
-    Parameters
-    ----------
-    table
-        Columns by name.
+    ``table``: columns by name.
     """
     named = [name for name in table if without_demand(name) is not None]
     if not named:
@@ -184,7 +146,7 @@ def unused_demand(table: Table) -> str:
     )
 
 
-def _demand(table: Table, robot: RobotConfig, by_position: bool, joints: Sequence[str] | None) -> Columns | None:
+def _demand(table: Table, robot: RobotConfig, by_position: bool, joints: Sequence[str] | None) -> TableColumns | None:
     """Return the positions with a word for a demand in their names, such as ``q1_ref``, ``reference1``, ``elbow_cmd``.
 
     Names alone decide here, so that columns which do not fit the joints are no error (`unused_demand`).
@@ -209,17 +171,17 @@ def _demand(table: Table, robot: RobotConfig, by_position: bool, joints: Sequenc
         columns = [rest for rest, values in positions.items() if values.ndim == 1]
         if found is None and columns:
             match = match_joints(columns, robot.joints, joints=joints)
-            found = Columns(np.stack([positions[one] for one in match.names], axis=1), match.names, match.remarks)
+            found = TableColumns(np.stack([positions[one] for one in match.names], axis=1), match.names, match.remarks)
     except (DataError, ValueError):
         return None
     if found is None:
         return None
     labels = tuple(origin.get(label, label) for label in found.labels)
     notes = [*found.notes] + ([f"demand taken from {listed(labels)}, not from {listed(twice)}"] if twice else [])
-    return Columns(found.values, labels, tuple(notes))
+    return TableColumns(found.values, labels, tuple(notes))
 
 
-def _numbered(table: Table, base: str, n: int) -> Columns | None:
+def _numbered(table: Table, base: str, n: int) -> TableColumns | None:
     """Return an array of a name, or the columns ``base1..basen`` or ``base0..base(n-1)``."""
     found = list(table)
     lower = {each.lower(): each for each in reversed(found)}
@@ -228,7 +190,7 @@ def _numbered(table: Table, base: str, n: int) -> Columns | None:
         values = whole[:, None] if whole.ndim == 1 else whole
         if values.ndim != 2 or values.shape[1] != n:
             raise DataError(f"{base} has {values.shape[-1]} axes, the robot has {n}; found {listed(found)}")
-        return Columns(values, (base,) * n if whole.ndim == 1 else tuple(f"{base}{j + 1}" for j in range(n)))
+        return TableColumns(values, (base,) * n if whole.ndim == 1 else tuple(f"{base}{j + 1}" for j in range(n)))
     numbers = {}
     for key, each in lower.items():
         digits = re.fullmatch(re.escape(base.lower()) + r"[_.\[( ]?(\d{1,2})[\])]?", key)
@@ -246,7 +208,7 @@ def _numbered(table: Table, base: str, n: int) -> Columns | None:
     if any(table[label].ndim != 1 for label in labels):
         raise DataError(f"{labels[0]} has {table[labels[0]].ndim} dimensions, expected a column")
     note = (f"columns are counted from 0: {labels[0]} is {_FIRST}",) if first == 0 else ()
-    return Columns(_side_by_side(table, labels), tuple(labels), note)
+    return TableColumns(_side_by_side(table, labels), tuple(labels), note)
 
 
 _FIRST = "the first joint"
@@ -254,7 +216,7 @@ _FIRST = "the first joint"
 
 def _by_joint(
     table: Table, quantity: str, robot: RobotConfig, by_position: bool, joints: Sequence[str] | None
-) -> Columns | None:
+) -> TableColumns | None:
     """Return the columns that are named after joints and quantity, such as ``/joint_states/elbow/position``."""
     of_joint: dict[str, str] = {}
     for name, values in table.items():
@@ -270,7 +232,7 @@ def _by_joint(
                   for rest, name in of_joint.items()}  # fmt: skip
     match = match_joints(list(chosen), robot.joints, by_position=by_position, joints=joints)
     labels = tuple(chosen[each] for each in match.names)
-    return Columns(_side_by_side(table, labels), labels, match.remarks, match.names)
+    return TableColumns(_side_by_side(table, labels), labels, match.remarks, match.names)
 
 
 def _joint_of(name: str, quantity: str) -> str | None:

@@ -1,6 +1,6 @@
-"""Reading of tables of measurements: CSV, NPZ, MAT, Parquet, and data sets of LeRobot."""
+"""Named arrays of the files of other tools."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from armident.configs import ConfigError, DataError, RobotConfig
 from armident.configs.yaml_loader import is_file
 from armident.daq.interchange.csv_files import read_csv
+from armident.daq.interchange.import_options import ImportOptions
 from armident.daq.interchange.lerobot import data_files, is_lerobot, joined, lerobot_table
 from armident.daq.interchange.sandbox import read_in_subprocess
 from armident.daq.interchange.table_columns import without_units
@@ -25,20 +26,9 @@ _LATER_MAT = b"MATLAB 7.3"
 class Source:
     """Named arrays of a file.
 
-    Parameters
-    ----------
-    path
-        The file.
-    table
-        Arrays by name, (N,) or (N, n).
-    lines
-        Line number of each row in a text file, (N,); ``None`` for other formats.
-    units
-        Units that the file states, by name of the array.
-    notes
-        Sentences on what was left out or assumed.
-    t_ns
-        Stamps of the messages of a bag, ns, (N,).
+    ``table``: arrays by name, (N,) or (N, n). ``lines``: line number of each row in a text file, (N,); ``None`` for
+    other formats. ``units``: units that the file states, by name of the array. ``notes``: sentences on what was left
+    out or assumed. ``t_ns``: stamps of the messages of a bag, ns, (N,).
     """
 
     path: Path
@@ -51,66 +41,20 @@ class Source:
     def place(self, row: int, name: str) -> str:
         """Return the position of a value in the file, for messages.
 
-        Parameters
-        ----------
-        row
-            Row, from 0.
-        name
-            Name of the column.
+        ``row``: row, from 0; ``name``: name of the column.
         """
         where = f"row {row}" if self.lines is None else f"line {self.lines[row]}"
         return f"{self.path}: {where}, column {name}"
 
 
-def read_table(path: Path) -> Source:
-    """Return the arrays of a table, in SI units where the names of columns tell another unit.
-
-    Parameters
-    ----------
-    path
-        File or folder; its suffix tells the format.
-
-    Raises
-    ------
-    ConfigError
-        If there is no such file, or its format is unknown.
-    DataError
-        If it cannot be read.
-    """
-    files = data_files(path)
-    if not files and not is_file(path):
-        raise ConfigError(f"{path}: no such file")
-    kind = path.suffix.lower()
-    if files:
-        return _lerobot_folder(path, files)
-    if kind in (".csv", ".txt", ".tsv"):
-        return _csv(path)
-    readers = {".npz": _npz, ".mat": _mat, ".parquet": _parquet}
-    if kind in readers:
-        return _from_arrays(path, readers[kind](path))
-    raise ConfigError(
-        f"{path}: cannot import {kind or 'a file without suffix'}; expected .csv, .mat, .npz, .parquet, "
-        "the folder of a LeRobot data set, a bag of ROS 2, or the log of a bus (.log, .asc, .blf, .trc)"
-    )
+def read_columns(path: Path, config: RobotConfig, options: ImportOptions) -> Source:
+    """Return the columns of a text file with a header, or of a pair of files."""
+    effort = options.get("effort")
+    return _header_csv(path) if effort is None else _pair(path, effort, config)
 
 
-def read_pair(path: Path, effort: Path, robot: RobotConfig) -> Source:
-    """Return two tables with free or no headers as one; effort is torque or the drive's own signal.
-
-    Parameters
-    ----------
-    path, effort
-        Text files of positions and efforts, with one column per joint, or a single column sample by sample.
-    robot
-        The robot, for the number of its joints.
-
-    Raises
-    ------
-    ConfigError
-        If there is no such file.
-    DataError
-        If the numbers of columns or rows differ.
-    """
+def _pair(path: Path, effort: Path, robot: RobotConfig) -> Source:
+    """Return positions and efforts of two tables with free or no headers: a column per joint, or a single column."""
     columns: Table = {}
     notes: list[str] = []
     lines = None
@@ -136,7 +80,7 @@ def read_pair(path: Path, effort: Path, robot: RobotConfig) -> Source:
     return Source(path, columns, lines, notes=tuple(notes))
 
 
-def _csv(path: Path) -> Source:
+def _header_csv(path: Path) -> Source:
     table = read_csv(path)
     if table.header is None:
         raise DataError(f"{path}: no header line; expected t,q1..,tau1.. (or a pair of files with --effort)")
@@ -149,22 +93,24 @@ def _csv(path: Path) -> Source:
     return _converted(Source(path, columns, table.lines, notes=table.notes), units)
 
 
-def _lerobot_folder(path: Path, files: Sequence[Path]) -> Source:
+def lerobot_folder(path: Path, *_: Any) -> Source:
     """Return the arrays of a data set without the files that cannot be read, which are named."""
+    files = data_files(path)
     parts, damaged = {}, []
     for file in files:
         try:
-            parts[file] = _parquet(file)
+            parts[file] = parquet_arrays(file)
         except DataError:
             damaged.append(shortened(file.name))
     if not parts:
         raise DataError(f"{path}: none of its {len(files)} Parquet files is readable: damaged, or cut off")
-    source = _from_arrays(path, joined(parts))
+    source = from_arrays(path, joined(parts))
     notes = (f"files that are damaged or cut off left out: {', '.join(damaged)}",) if damaged else ()
     return replace(source, notes=(*source.notes, *notes))
 
 
-def _from_arrays(path: Path, arrays: Mapping[str, Any]) -> Source:
+def from_arrays(path: Path, arrays: Mapping[str, Any]) -> Source:
+    """Return named arrays as a table; those of a LeRobot data set by its names."""
     arrays = {printable(name): values for name, values in arrays.items()}
     if is_lerobot(arrays):
         table, notes = lerobot_table(path, arrays)
@@ -194,7 +140,8 @@ def _numeric(arrays: Mapping[str, Any]) -> Table:
     return table
 
 
-def _npz(path: Path) -> dict[str, Any]:
+def npz_arrays(path: Path, *_: Any) -> dict[str, Any]:
+    """Return the arrays of an archive of numpy."""
     try:
         with np.load(path, allow_pickle=False) as archive:
             return {name: archive[name] for name in archive.files}
@@ -202,7 +149,8 @@ def _npz(path: Path) -> dict[str, Any]:
         raise DataError(f"{path}: not a readable NPZ file: damaged, or not an archive of numeric arrays") from error
 
 
-def _parquet(path: Path) -> dict[str, Any]:
+def parquet_arrays(path: Path, *_: Any) -> dict[str, Any]:
+    """Return the columns of a Parquet file."""
     try:
         import pyarrow
         import pyarrow.parquet
@@ -215,7 +163,8 @@ def _parquet(path: Path) -> dict[str, Any]:
         raise DataError(f"{path}: not a readable Parquet file: damaged, or cut off") from error
 
 
-def _mat(path: Path) -> dict[str, Any]:
+def mat_arrays(path: Path, *_: Any) -> dict[str, Any]:
+    """Return the arrays of a MAT file up to version 7."""
     from scipy.io import loadmat
 
     with path.open("rb") as file:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from armident.configs import DataError, RobotConfig
 from armident.daq.interchange.column_units import check_unit, time_unit
 from armident.daq.interchange.si_checks import OMITTED
-from armident.daq.interchange.table_columns import Columns, find_columns, find_time, unused_demand
+from armident.daq.interchange.table_columns import TableColumns, find_columns, find_time, unused_demand
 from armident.daq.interchange.table_files import Source
 from armident.daq.interchange.text_files import listed
 from armident.daq.recording.model import Quantity
@@ -22,7 +22,7 @@ Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Rows:
+class TableRows:
     """Complete rows of a table.
 
     Parameters
@@ -51,14 +51,8 @@ class Rows:
     time_unit: str = ""
     notes: tuple[str, ...] = ()
 
-    def taken(self, chosen: NDArray[np.int64] | NDArray[np.bool_]) -> "Rows":
-        """Return some of the rows.
-
-        Parameters
-        ----------
-        chosen
-            Indices, or one truth value for each row.
-        """
+    def taken(self, chosen: NDArray[np.int64] | NDArray[np.bool_]) -> "TableRows":
+        """Return some of the rows. ``chosen``: indices, or one truth value for each row."""
         times = None if self.times is None else self.times[chosen]
         values = {name: array[chosen] for name, array in self.values.items()}
         return replace(self, values=values, row=self.row[chosen], times=times)
@@ -71,30 +65,18 @@ def complete_rows(
     *,
     by_position: bool = False,
     joints: Sequence[str] | None = None,
-) -> Rows:
+) -> TableRows:
     """Return the rows of a table that have time, all positions and all efforts.
 
     Rows without any of them belong to something else and are passed over. Rows of one time are joined, where one has
     what the other lacks. Others are left out and named.
 
-    Parameters
-    ----------
-    source
-        The table.
-    robot
-        The robot, for its joints.
-    names
-        Names of the file by quantity; ``-`` leaves one out.
-    by_position, joints
-        Choice of the joints by the user.
-
-    Raises
-    ------
-    DataError
-        If a quantity is missing, or too many rows are incomplete.
+    ``robot``: for its joints. ``names``: names of the file by quantity; ``-`` leaves one out. ``by_position``,
+    ``joints``: choice of the joints by the user. Raises DataError if a quantity is missing, or too many rows are
+    incomplete.
     """
     try:
-        found: dict[Quantity, Columns] = {}
+        found: dict[Quantity, TableColumns] = {}
         quantities: tuple[Quantity, ...] = ("position", *EFFORTS, "demand")
         for quantity in quantities:
             if names.get(quantity) == OMITTED or (quantity in EFFORTS and any(e in found for e in EFFORTS)):
@@ -118,7 +100,7 @@ def complete_rows(
     notes = [note for columns in found.values() for note in columns.notes]
     if "demand" not in found and names.get("demand") != OMITTED and (unused := unused_demand(source.table)):
         notes.append(unused)
-    rows = Rows(
+    rows = TableRows(
         {quantity: np.array(columns.values, np.float64) for quantity, columns in found.items()},
         {quantity: columns.labels for quantity, columns in found.items()},
         np.arange(lengths.pop(), dtype=np.int64),
@@ -137,7 +119,7 @@ def _found(
     name: str | None,
     by_position: bool,
     joints: Sequence[str] | None,
-) -> Columns | None:
+) -> TableColumns | None:
     """Return the columns of a quantity; a demand that cannot be found can be omitted."""
     try:
         return find_columns(source.table, quantity, robot, name, by_position=by_position, joints=joints)
@@ -147,7 +129,7 @@ def _found(
         raise DataError(f"demand: {error}; --map demand={OMITTED} omits it") from error
 
 
-def _check_same_joints(found: Mapping[Quantity, Columns]) -> None:
+def _check_same_joints(found: Mapping[Quantity, TableColumns]) -> None:
     """Refuse efforts of other joints than those of the positions."""
     position = found.get("position")
     for quantity in EFFORTS:
@@ -166,7 +148,7 @@ def _check_units(source: Source, quantity: Quantity, labels: Sequence[str]) -> N
         check_unit(label, quantity, source.units.get(label, source.units.get(array, "")))
 
 
-def _without_odd_times(source: Source, rows: Rows) -> Rows:
+def _without_odd_times(source: Source, rows: TableRows) -> TableRows:
     """Return the rows without those whose time is out of order while their neighbours are in order."""
     if rows.times is None or rows.times.size < 4:
         return rows
@@ -181,7 +163,7 @@ def _without_odd_times(source: Source, rows: Rows) -> Rows:
     return replace(rows.taken(~odd), notes=(*rows.notes, note))
 
 
-def _single(rows: Rows) -> Rows:
+def _single(rows: TableRows) -> TableRows:
     """Return the rows without those that repeat time and values of the row before."""
     if rows.times is None or rows.times.size < 2:
         return rows
@@ -190,15 +172,15 @@ def _single(rows: Rows) -> Rows:
     twice = np.append(False, (np.diff(rows.times) == 0) & equal.all(axis=1))
     if not twice.any():
         return rows
-    note = f"{int(twice.sum())} rows are there twice, with the same time: one of each is kept"
+    note = f"{int(twice.sum())} duplicate rows with the same time: one of each is kept"
     return replace(rows.taken(~twice), notes=(*rows.notes, note))
 
 
-def _needed(rows: Rows) -> Floats:
+def _needed(rows: TableRows) -> Floats:
     return np.concatenate([values for name, values in rows.values.items() if name != "demand"], axis=1)
 
 
-def _joined(rows: Rows) -> Rows:
+def _joined(rows: TableRows) -> TableRows:
     """Join rows of one time, one of which has the positions and the other the efforts."""
     if rows.times is None or rows.times.size < 2:
         return rows
@@ -216,7 +198,7 @@ def _joined(rows: Rows) -> Rows:
     return replace(joined, notes=(*rows.notes, f"rows of one time joined: {pairs.size}"))
 
 
-def _complete(source: Source, rows: Rows) -> Rows:
+def _complete(source: Source, rows: TableRows) -> TableRows:
     needed = _needed(rows)
     have = np.isfinite(needed)
     nothing = ~have.any(axis=1)
@@ -236,13 +218,13 @@ def _complete(source: Source, rows: Rows) -> Rows:
         notes.append(f"{of}, the first: {_first_missing(source, rows, first)}")
     zero = [label for name in EFFORTS if name in rows.values for label in _zero(rows, name, whole)]
     if zero:
-        notes.append(f"0 in every row, as of drives that do not measure it: {listed(zero)}")
+        notes.append(f"all zero: probably not measured: {listed(zero)}")
     if passed:
-        notes.append(f"{passed} rows without positions and efforts passed over")
+        notes.append(f"{passed} rows without positions and efforts ignored")
     return replace(rows.taken(whole), notes=tuple(notes))
 
 
-def _incomplete(source: Source, rows: Rows, partial: NDArray[np.bool_], whole: NDArray[np.bool_]) -> str:
+def _incomplete(source: Source, rows: TableRows, partial: NDArray[np.bool_], whole: NDArray[np.bool_]) -> str:
     """Return the message for a table with too many incomplete rows."""
     count = int(partial.sum())
     if empty := _empty(rows):
@@ -256,13 +238,13 @@ def _incomplete(source: Source, rows: Rows, partial: NDArray[np.bool_], whole: N
     return f"{_first_missing(source, rows, first)} (and {count - 1} more of {partial.size} rows)"
 
 
-def _zero(rows: Rows, name: Quantity, whole: NDArray[np.bool_]) -> list[str]:
+def _zero(rows: TableRows, name: Quantity, whole: NDArray[np.bool_]) -> list[str]:
     """Return the labels of the columns of a quantity that are 0 in all complete rows."""
     zero = rows.values[name][whole].T == 0
     return [label for label, is_zero in zip(rows.labels[name], zero, strict=True) if is_zero.all()]
 
 
-def _empty(rows: Rows) -> list[str]:
+def _empty(rows: TableRows) -> list[str]:
     """Return the labels of the columns without any number."""
     return [
         label
@@ -273,7 +255,7 @@ def _empty(rows: Rows) -> list[str]:
     ]
 
 
-def _first_missing(source: Source, rows: Rows, row: int) -> str:
+def _first_missing(source: Source, rows: TableRows, row: int) -> str:
     where = int(rows.row[row])
     for name, values in rows.values.items():
         missing = np.flatnonzero(~np.isfinite(values[row]))

@@ -4,8 +4,6 @@ import codecs
 from collections.abc import Sequence
 from pathlib import Path
 
-from armident.configs import ConfigError
-
 _HEAD = 65536
 """Bytes at the beginning of a file that decide its encoding."""
 _ZEROS_OF_UTF16 = 0.9
@@ -19,15 +17,7 @@ _LISTED = 40
 def encoding_of(path: Path) -> str:
     """Return the encoding of a text file: UTF-8, UTF-16 by its mark or its zeros, or Windows-1252.
 
-    Parameters
-    ----------
-    path
-        The file.
-
-    Raises
-    ------
-    OSError
-        If it cannot be read.
+    Raises OSError if it cannot be read.
     """
     with path.open("rb") as file:
         head = file.read(_HEAD)
@@ -45,68 +35,22 @@ def encoding_of(path: Path) -> str:
 
 
 def excerpt(text: str) -> str:
-    """Return the beginning of a text in quotes, for messages of one line.
-
-    Parameters
-    ----------
-    text
-        Any text.
-    """
+    """Return the beginning of a text in quotes, for messages of one line."""
     return f"'{shortened(text)}'"
 
 
 def shortened(text: str) -> str:
-    """Return a text in one line of limited length, for messages.
-
-    Parameters
-    ----------
-    text
-        Any text.
-    """
+    """Return a text in one line of limited length, for messages."""
     shown = printable(text)
     return shown if len(shown) <= _LONGEST else f"{shown[:_LONGEST]}..."
 
 
 def printable(text: str) -> str:
-    """Return a text in one line, without characters that are not printable.
-
-    Parameters
-    ----------
-    text
-        Any text.
-    """
+    """Return a text in one line, without characters that are not printable."""
     return " ".join("".join(c if c.isprintable() else " " for c in text).split())
 
 
 def listed(names: Sequence[str]) -> str:
-    """Return names for a message.
-
-    Parameters
-    ----------
-    names
-        Any number of names; the first ones are listed.
-    """
+    """Return names for a message. ``names``: any number of names; the first ones are listed."""
     more = f" and {len(names) - _LISTED} more" if len(names) > _LISTED else ""
     return ", ".join(map(shortened, names[:_LISTED])) + more
-
-
-def pairs_of(option: str, text: str) -> dict[str, str]:
-    """Return the pairs of an option, ``QUANTITY=NAME,...``.
-
-    Parameters
-    ----------
-    option
-        Name of the option, for the message.
-    text
-        Its value.
-
-    Raises
-    ------
-    ConfigError
-        If a pair is incomplete.
-    """
-    pairs = [pair.partition("=") for pair in text.split(",") if pair]
-    for key, equals, value in pairs:
-        if not (key and equals and value):
-            raise ConfigError(f"{option}: expected QUANTITY=NAME,..., found {key + equals + value!r}")
-    return {key: value for key, _, value in pairs}

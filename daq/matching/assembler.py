@@ -56,20 +56,8 @@ class TpdoStream:
 
     A frame of ``length`` bytes holds ``pack`` samples of ``size`` bytes, one of every SYNC.
 
-    Parameters
-    ----------
-    name
-        Name of the stream.
-    every
-        Number of SYNCs from one sample to the next.
-    cob_ids
-        COB-ID of each joint's TPDO.
-    length
-        Bytes of a frame.
-    pack
-        Samples in a frame.
-    size
-        Bytes of a sample; 0: all of the frame.
+    ``every``: number of SYNCs from one sample to the next. ``cob_ids``: COB-ID of each joint's TPDO. ``length``: bytes
+    of a frame. ``pack``: samples in a frame. ``size``: bytes of a sample; 0: all of the frame.
     """
 
     name: str
@@ -89,14 +77,8 @@ class TpdoStream:
 class Rows:
     """Complete rows.
 
-    Parameters
-    ----------
-    sync
-        SYNC numbers, (N,).
-    t_ns
-        Receive times of the SYNCs, ns UTC, (N,).
-    data
-        Bytes of each joint's sample, (N, n, 8) or wider.
+    ``sync``: SYNC numbers, (N,); ``t_ns``: receive times of the SYNCs, ns UTC, (N,); ``data``: bytes of each joint's
+    sample, (N, n, 8) or wider.
     """
 
     sync: NDArray[np.int64]
@@ -108,14 +90,8 @@ class Rows:
 class Batch:
     """Result of a batch of frames.
 
-    Parameters
-    ----------
-    rows
-        Complete rows by stream.
-    gaps
-        Gaps that have ended.
-    certain
-        Number of the SYNC, by stream, before which all rows are known: they are complete, or in a gap.
+    ``rows``: complete rows by stream; ``gaps``: gaps that have ended; ``certain``: number of the SYNC, by stream,
+    before which all rows are known: they are complete, or in a gap.
     """
 
     rows: dict[str, Rows]
@@ -136,8 +112,6 @@ class Assembler:
         TPDOs to match, all with the same joints.
     joints
         Names of the joints, in the order of the COB-IDs.
-    period_ns
-        SYNC period, ns.
     overflow
         Synchronous counter overflow value (CiA 301, 1019h); 0: SYNC has no counter.
     first_counter
@@ -247,6 +221,8 @@ class Assembler:
     def push(self, frames: NDArray[Any], sent: int | None = None, dropped: bool = False, bus: int = 0) -> Batch:
         """Match frames of one bus, in the order of reception.
 
+        Returns rows and gaps that are certain now. Raises DataError if the SYNC counters of two buses do not agree.
+
         Parameters
         ----------
         frames
@@ -255,18 +231,6 @@ class Assembler:
             Number of SYNCs sent so far by the own producer, an upper limit for gaps; ``None``: another producer.
         dropped
             Frames of this bus were lost between the last call and the end of these, according to the kernel.
-        bus
-            Number of the bus.
-
-        Returns
-        -------
-        Batch
-            Rows and gaps that are certain now.
-
-        Raises
-        ------
-        DataError
-            If the SYNC counters of two buses do not agree.
         """
         arguments = (*_columns(frames), *self._timing, bus)
         self._lossy[bus] |= dropped
@@ -309,13 +273,6 @@ class Assembler:
         """Mark a bus as down or up.
 
         While a bus is down, its drives have nothing to answer, and other buses do not wait for it.
-
-        Parameters
-        ----------
-        bus
-            Number of the bus.
-        down
-            True if the bus is down.
         """
         self._state.slack[bus] = 0 if down else self._slack
         self._lossy[bus] |= down
@@ -328,12 +285,7 @@ class Assembler:
     def mark_unverified(self, joint: str, since_ns: int, until_ns: int) -> None:
         """Set the time span in which TPDOs of a joint may have another mapping than the session.
 
-        Parameters
-        ----------
-        joint
-            Name of the joint.
-        since_ns, until_ns
-            Begin and end, ns UTC.
+        ``since_ns``, ``until_ns``: begin and end, ns UTC.
         """
         span = self._state.unverified[self._joints.index(joint)]
         if span[0] < span[1] and span[1] == OPEN_END:
@@ -343,12 +295,8 @@ class Assembler:
     def most_unreceived(self, dropped: Sequence[int], now_ns: int) -> int:
         """Return the largest number of SYNCs that may have been sent after the last one received.
 
-        Parameters
-        ----------
-        dropped
-            Frames of each bus lost after the last one received, according to the kernel.
-        now_ns
-            Present time of the kernel's clock, ns UTC.
+        ``dropped``: frames of each bus lost after the last one received, according to the kernel; ``now_ns``: present
+        time of the kernel's clock, ns UTC.
         """
         numbers, times = self._state.bus_state[:, SYNC], self._state.bus_state[:, TIME]
         known = times != NEVER
@@ -359,10 +307,7 @@ class Assembler:
     def finish(self, sent: int | None = None) -> Batch:
         """Return the remaining rows and gaps after the last frame.
 
-        Parameters
-        ----------
-        sent
-            Total number of SYNCs sent; ``None`` if unknown.
+        ``sent``: total number of SYNCs sent; ``None`` if unknown.
         """
         total = self.last_sync + 1 if sent is None else max(sent, self.last_sync + 1)
         out = output_buffers(self._state, total - self.last_sync)

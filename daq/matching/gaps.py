@@ -21,10 +21,7 @@ REASONS = {
 class OpenGaps:
     """Gaps that may still continue, by stream, joint (``None``: all joints) and reason.
 
-    Parameters
-    ----------
-    joints
-        Names of the joints, in the order of the columns.
+    ``joints``: names of the joints, in the order of the columns.
     """
 
     def __init__(self, joints: Sequence[str]) -> None:
@@ -34,16 +31,8 @@ class OpenGaps:
     def add(self, stream: str, every: int, sync: NDArray[np.int64], code: NDArray[np.uint8]) -> list[Gap]:
         """Add incomplete rows and return the gaps that have ended.
 
-        Parameters
-        ----------
-        stream
-            Name of the stream.
-        every
-            Number of SYNCs from one row to the next.
-        sync
-            SYNC numbers of the rows, (N,), increasing.
-        code
-            State of each joint's sample (`state.LOST` and so on), (N, n).
+        ``every``: number of SYNCs from one row to the next; ``sync``: SYNC numbers of the rows, (N,), increasing;
+        ``code``: state of each joint's sample (`state.LOST` and so on), (N, n).
         """
         found: list[tuple[str | None, str, NDArray[np.int64]]] = []
         for value, reason in REASONS.items():
@@ -71,14 +60,8 @@ class OpenGaps:
     def ended(self, stream: str, last: int | None, final: bool) -> list[Gap]:
         """Return the gaps of a stream that have ended.
 
-        Parameters
-        ----------
-        stream
-            Name of the stream.
-        last
-            Last SYNC number known; a gap that ends before it has ended. ``None``: none.
-        final
-            Return all gaps of the stream: no more rows follow.
+        ``last``: last SYNC number known; a gap that ends before it has ended. ``None``: none. ``final``: return all
+        gaps of the stream: no more rows follow.
         """
         gaps = []
         for key, (begin, end) in list(self._open.items()):

@@ -26,6 +26,7 @@ from typing import Any
 
 import numpy as np
 
+from armident.compiled import compiled
 from armident.daq.matching.resolve import settle_all, slot_of
 from armident.daq.matching.state import (
     COUNTER,
@@ -57,13 +58,12 @@ from armident.daq.matching.state import (
 )
 from armident.daq.matching.sync_unwrap import advance
 from armident.drivers.canopen.objects import PDOS, SDO_DOWNLOAD, TPDO_COMMUNICATION, TPDO_MAPPING
-from armident.drivers.compiled import compiled
 
 OPEN_END = int(np.iinfo(np.int64).max)
 """End of a time span that is still open, ns."""
 
 
-@compiled
+@compiled()
 def _add_row(m: MatcherState, bus: int, k: int, s: int) -> None:
     """Add SYNC ``k`` of a bus to the rows to be answered, if the stream sends on it."""
     if (m.bus_state[bus, ORIGIN] + k) % m.config[s, EVERY]:
@@ -83,7 +83,7 @@ def _add_row(m: MatcherState, bus: int, k: int, s: int) -> None:
     m.head[bus, s] += 1
 
 
-@compiled
+@compiled()
 def _add_missing_syncs(m: MatcherState, bus: int, first: int, until: int, out: MatchedSamples) -> None:
     """Count SYNCs ``first`` to before ``until`` of a bus as sent, but not received."""
     if until <= first:
@@ -110,7 +110,7 @@ def _add_missing_syncs(m: MatcherState, bus: int, first: int, until: int, out: M
                     m.newest_row[s, j, i] = m.head[bus, s] - 1
 
 
-@compiled
+@compiled()
 def _pass_silent_buses(
     m: MatcherState, bus: int, k: int, t_ns: int, period_ns: int, overflow: int, out: MatchedSamples
 ) -> None:
@@ -138,7 +138,7 @@ def _pass_silent_buses(
             m.gap_end[other, s] = min(m.gap_end[other, s], m.head[other, s])
 
 
-@compiled
+@compiled()
 def _check_sdo_write(m: MatcherState, j: int, request: Any, t_ns: int) -> None:
     """Mark a joint's TPDOs as unverified if an SDO request writes their parameters (CiA 301, 1800h-1BFFh)."""
     index = np.int64((request >> np.uint64(8)) & np.uint64(0xFFFF))
@@ -148,7 +148,7 @@ def _check_sdo_write(m: MatcherState, j: int, request: Any, t_ns: int) -> None:
         m.unverified[j, 1] = OPEN_END
 
 
-@compiled
+@compiled("i8, u4[:], u1[:], i8[:], u8[:, :], i8, i8, i8, i8, i8, MatcherState")
 def count_sync(
     count: int, can_id: Any, length: Any, t_ns: Any, data: Any, sync_id: int, period_ns: int, overflow: int,
     bus: int, longest: int, m: MatcherState,
@@ -157,24 +157,16 @@ def count_sync(
 
     Parameters
     ----------
-    count
-        Number of frames.
     can_id, length, t_ns
         COB-IDs, data lengths and receive times (ns UTC) of the frames, (count,) or longer.
     data
         Data of the frames as 64-bit words, (count, words).
     sync_id
         COB-ID of SYNC.
-    period_ns
-        SYNC period, ns.
     overflow
         Synchronous counter overflow value (CiA 301, 1019h); 0: SYNC has no counter.
-    bus
-        Number of the bus.
     longest
         Largest advance with whole counter turns, SYNCs.
-    m
-        State of the matcher.
     """
     total, bus_state = 0, m.bus_state.copy()
     for i in range(count):
@@ -184,7 +176,7 @@ def count_sync(
     return int(total)
 
 
-@compiled
+@compiled("i8, u4[:], u1[:], i8[:], u8[:, :], i8, i8, i8, i8, i8, MatcherState, MatchedSamples")
 def match(
     count: int, can_id: Any, length: Any, t_ns: Any, data: Any, sync_id: int, period_ns: int, overflow: int,
     bus: int, longest: int, m: MatcherState, out: MatchedSamples,
@@ -193,24 +185,16 @@ def match(
 
     Parameters
     ----------
-    count
-        Number of frames.
     can_id, length, t_ns
         COB-IDs, data lengths and receive times (ns UTC) of the frames, (count,) or longer.
     data
         Data of the frames as 64-bit words, (count, words).
     sync_id
         COB-ID of SYNC.
-    period_ns
-        SYNC period, ns.
     overflow
         Synchronous counter overflow value (CiA 301, 1019h); 0: SYNC has no counter.
-    bus
-        Number of the bus.
     longest
         Largest advance with whole counter turns, SYNCs.
-    m
-        State of the matcher.
     out
         Output of decided samples.
     """
@@ -268,18 +252,11 @@ def match(
             m.since_sync[s, j] += 1
 
 
-@compiled
+@compiled("i8, MatcherState, MatchedSamples")
 def finish(total: int, m: MatcherState, out: MatchedSamples) -> None:
     """Settle all rows after the last frame: unanswered SYNCs are lost.
 
-    Parameters
-    ----------
-    total
-        Number of SYNCs that were sent.
-    m
-        State of the matcher.
-    out
-        Output of decided samples.
+    ``total``: number of SYNCs that were sent; ``out``: output of decided samples.
     """
     for bus in range(m.bus_state.shape[0]):
         last = m.bus_state[bus, SYNC]

@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 
+from armident.compiled import compiled
 from armident.daq.matching.state import (
     ALIGNED_SYNCS,
     ALL_BEHIND,
@@ -35,32 +36,21 @@ from armident.daq.matching.state import (
     MatchedSamples,
     MatcherState,
 )
-from armident.drivers.compiled import compiled
 
 
-@compiled
+@compiled()
 def slot_of(m: MatcherState, s: int, u: int) -> int:
-    """Return the ring slot of a row.
-
-    Parameters
-    ----------
-    m
-        State of the matcher.
-    s
-        Number of the stream.
-    u
-        Ordinal of the row.
-    """
+    """Return the ring slot of a row. ``s``: number of the stream; ``u``: ordinal of the row."""
     return int((u - m.watermark[s, BASE]) % m.row_sync.shape[1])
 
 
-@compiled
+@compiled()
 def _is_received(m: MatcherState, s: int, j: int, u: int) -> bool:
     """Return True if the SYNC of row ``u`` was received on the bus of a joint."""
     return bool(m.row_t[s, slot_of(m, s, u), m.config[s, PACK] - 1, m.bus_of[j]] != NEVER)
 
 
-@compiled
+@compiled()
 def _assign(m: MatcherState, s: int, j: int, u: int, i: int) -> None:
     """Assign answer ``i`` of a drive to row ``u``."""
     slot = slot_of(m, s, u)
@@ -71,7 +61,7 @@ def _assign(m: MatcherState, s: int, j: int, u: int, i: int) -> None:
         m.counts[TPDO_LATE] += 1
 
 
-@compiled
+@compiled()
 def _are_equal(m: MatcherState, s: int, j: int, i: int, k: int) -> bool:
     """Return True if two answers of a drive have the same bytes."""
     same = m.answer_code[s, j, i] == m.answer_code[s, j, k]
@@ -82,7 +72,7 @@ def _are_equal(m: MatcherState, s: int, j: int, i: int, k: int) -> bool:
     return bool(same)
 
 
-@compiled
+@compiled()
 def _drop_repetitions(m: MatcherState, s: int, j: int, outstanding: int) -> None:
     """Drop repeated frames if there are more answers than SYNCs; mark all as ambiguous if they cannot be identified."""
     count = m.pending[s, j]
@@ -105,7 +95,7 @@ def _drop_repetitions(m: MatcherState, s: int, j: int, outstanding: int) -> None
     m.pending[s, j] = outstanding
 
 
-@compiled
+@compiled()
 def _record_lag(m: MatcherState, s: int, j: int, rows: int) -> None:
     """Record that a drive had this number of outstanding answers."""
     if rows >= m.lag[s, j] or m.head[m.bus_of[j], s] - m.lag_at[s, j] > 2 * m.config[s, WINDOW]:
@@ -113,7 +103,7 @@ def _record_lag(m: MatcherState, s: int, j: int, rows: int) -> None:
         m.lag_at[s, j] = m.head[m.bus_of[j], s]
 
 
-@compiled
+@compiled()
 def _update_progress(m: MatcherState, s: int, j: int) -> None:
     """Update the progress of a drive: its best balance of answers and rows, and for how many rows it has kept it."""
     head = m.head[m.bus_of[j], s]
@@ -135,7 +125,7 @@ def _update_progress(m: MatcherState, s: int, j: int) -> None:
     )
 
 
-@compiled
+@compiled()
 def _is_aligned(m: MatcherState, s: int, j: int, head: int) -> bool:
     """Return True if the surplus of answers is the number of those to discarded rows: a drive never answers early.
 
@@ -147,14 +137,14 @@ def _is_aligned(m: MatcherState, s: int, j: int, head: int) -> bool:
     return bool(lasting and m.progress[s, j, BALANCE_RUN] > 0 and m.progress[s, j, BALANCE_COUNT] >= ALIGNED_SYNCS)
 
 
-@compiled
+@compiled()
 def _close_rows(m: MatcherState, s: int, j: int, until: int, stale: bool) -> None:
     """Settle the rows before ``until``; ``stale``: answers to discarded rows may still arrive."""
     m.settled[s, j], m.pending[s, j] = until, 0
     m.progress[s, j, BALANCE], m.progress[s, j, BALANCE_RUN], m.progress[s, j, STALE] = NEVER, 0, int(stale)
 
 
-@compiled
+@compiled()
 def _drop_stale(m: MatcherState, s: int, j: int, count: int) -> None:
     """Drop the first answers, which belong to discarded rows; with repeated frames, their number is ambiguous."""
     for i in range(1, m.pending[s, j]):
@@ -169,7 +159,7 @@ def _drop_stale(m: MatcherState, s: int, j: int, count: int) -> None:
             m.answer[s, j, i, w] = m.answer[s, j, i + count, w]
 
 
-@compiled
+@compiled()
 def _may_hold_repetition(m: MatcherState, s: int, j: int) -> bool:
     """Return True if one of the late answers may be a repetition; the next SYNC then shows a surplus."""
     found = False
@@ -178,7 +168,7 @@ def _may_hold_repetition(m: MatcherState, s: int, j: int) -> bool:
     return found
 
 
-@compiled
+@compiled()
 def _count_prompt(m: MatcherState, s: int, j: int) -> int:
     """Return the number of answers certainly sent in time; all if no recent lag of the drive is known."""
     count, prompt = m.pending[s, j], 0
@@ -193,7 +183,7 @@ def _count_prompt(m: MatcherState, s: int, j: int) -> int:
     return prompt if lags else count
 
 
-@compiled
+@compiled()
 def _settle(m: MatcherState, s: int, j: int, final: bool, peer_in_step: bool) -> None:
     """Decide the open rows of one TPDO of one drive: match certain answers, discard rows no longer answered."""
     bus = m.bus_of[j]
@@ -261,7 +251,7 @@ def _settle(m: MatcherState, s: int, j: int, final: bool, peer_in_step: bool) ->
     _close_rows(m, s, j, max(keep, answered), keep > answered or (stale and not in_step))
 
 
-@compiled
+@compiled()
 def _discard_near_gap(m: MatcherState, s: int, j: int, count: int) -> None:
     """Discard answers as ambiguous where frames were missing recently: one may be lost and a later one repeated."""
     repeated, differ = -1, False
@@ -274,7 +264,7 @@ def _discard_near_gap(m: MatcherState, s: int, j: int, count: int) -> None:
         m.row_code[s, slot_of(m, s, m.settled[s, j] + i), j] = AMBIGUOUS
 
 
-@compiled
+@compiled()
 def _discard_ambiguous(m: MatcherState, s: int, j: int, count: int) -> None:
     """Discard answers that were taken as prompt but may be late, where one was lost."""
     # Answers in a burst after a pause: with one of them lost, their SYNCs are ambiguous.
@@ -305,7 +295,7 @@ def _discard_ambiguous(m: MatcherState, s: int, j: int, count: int) -> None:
         previous = newest
 
 
-@compiled
+@compiled()
 def _sample(m: MatcherState, s: int, slot: int, j: int, i: int, word: int) -> Any:
     """Return eight bytes of sample ``i`` of a packed answer."""
     value = np.uint64(0)
@@ -316,7 +306,7 @@ def _sample(m: MatcherState, s: int, slot: int, j: int, i: int, word: int) -> An
     return value
 
 
-@compiled
+@compiled()
 def _emit(m: MatcherState, s: int, end: int, out: MatchedSamples) -> None:
     """Output the rows before ``end``; a packed row is several samples."""
     pack, buses = m.config[s, PACK], m.bus_state.shape[0]
@@ -344,22 +334,11 @@ def _emit(m: MatcherState, s: int, end: int, out: MatchedSamples) -> None:
         m.watermark[s, BASE] = m.watermark[s, TOP]
 
 
-@compiled
+@compiled()
 def settle_all(m: MatcherState, bus: int, s: int, final: bool, out: MatchedSamples) -> None:
     """Decide the open rows of the drives on one bus, and output the rows that all drives have settled.
 
-    Parameters
-    ----------
-    m
-        State of the matcher.
-    bus
-        Number of the bus.
-    s
-        Number of the stream.
-    final
-        No more answers follow.
-    out
-        Output of decided samples.
+    ``s``: number of the stream; ``final``: no more answers follow.
     """
     n = m.settled.shape[1]
     head = m.head[bus, s]

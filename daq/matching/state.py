@@ -6,6 +6,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from armident.compiled import structure
+
 LOST, RECEIVED, WRONG_LENGTH, AMBIGUOUS, NO_SYNC, WRONG_MAPPING = range(6)
 """States of one joint's sample at one SYNC."""
 
@@ -70,6 +72,11 @@ SEND_TIMES = 1 << 16
 """Number of SYNCs of the own producer whose send times are kept."""
 
 
+@structure(
+    "i8[:, ::1], i8[::1], i8[:, ::1], *[i8[::1]] * 3, *[i8[:, ::1]] * 2, i8[::1], *[i8[:, ::1]] * 4, "
+    "i8[:, :, ::1], *[i8[:, ::1]] * 8, i8[:, :, ::1], u8[:, :, :, ::1], u1[:, :, ::1], "
+    "i8[:, ::1], i8[:, :, :, ::1], u1[:, :, ::1], u8[:, :, :, ::1]"
+)
 class MatcherState(NamedTuple):
     """Rows to be answered and answers received; B buses, S streams, n joints, rows as ordinals ``u`` per stream.
 
@@ -163,21 +170,13 @@ class MatcherState(NamedTuple):
     row_data: NDArray[np.uint64]
 
 
+@structure("i8[::1], i8[:, ::1], i8[:, ::1], u1[:, :, ::1], u8[:, :, :, ::1]")
 class MatchedSamples(NamedTuple):
     """Decided samples; S streams, n joints, space for N rows.
 
-    Parameters
-    ----------
-    rows
-        Number of rows of each stream, (S,).
-    sync
-        SYNC numbers, (S, N).
-    t_ns
-        Receive time on the first bus that received the SYNC, ns UTC, (S, N).
-    code
-        State of each sample, (S, N, n).
-    data
-        Data as 64-bit words, (S, N, n, words).
+    ``rows``: number of rows of each stream, (S,); ``sync``: SYNC numbers, (S, N); ``t_ns``: receive time on the first
+    bus that received the SYNC, ns UTC, (S, N); ``code``: state of each sample, (S, N, n); ``data``: data as 64-bit
+    words, (S, N, n, words).
     """
 
     rows: NDArray[np.int64]
@@ -190,16 +189,8 @@ class MatchedSamples(NamedTuple):
 class StreamShape(NamedTuple):
     """Frames of a stream.
 
-    Parameters
-    ----------
-    every
-        Number of SYNCs from one frame to the next.
-    pack
-        Samples in a frame.
-    size
-        Bytes of a sample.
-    length
-        Bytes of a frame.
+    ``every``: number of SYNCs from one frame to the next; ``pack``: samples in a frame; ``size``: bytes of a sample;
+    ``length``: bytes of a frame.
     """
 
     every: int
@@ -221,8 +212,6 @@ def new_state(
 
     Parameters
     ----------
-    shapes
-        Frames of each stream.
     window, long_window, short_window
         Of each stream, the rows by which an answer may be late: in general, if all drives are late, and if the drive is
         in step again beside others.
@@ -282,12 +271,7 @@ def new_state(
 def output_buffers(matcher: MatcherState, syncs: int) -> MatchedSamples:
     """Return buffers for all samples that can be decided after more SYNCs.
 
-    Parameters
-    ----------
-    matcher
-        State of the matcher.
-    syncs
-        Largest number of SYNCs to come.
+    ``syncs``: largest number of SYNCs to come.
     """
     streams, _, n = matcher.row_code.shape
     rows = (

@@ -24,14 +24,7 @@ log = logging.getLogger(__name__)
 class CapturedStream:
     """One stream on the bus and in the recording.
 
-    Parameters
-    ----------
-    tpdo
-        Layout of the objects in a TPDO.
-    bus
-        COB-IDs and frame lengths for the matcher.
-    layout
-        Layout in the recording.
+    ``tpdo``: layout of the objects in a TPDO; ``bus``: COB-IDs and frame lengths for the matcher.
     """
 
     tpdo: TpdoLayout
@@ -47,17 +40,8 @@ class CapturedStream:
 def captured_streams(session: SessionConfig, robot: RobotConfig) -> tuple[CapturedStream, ...]:
     """Return the streams of a session, with the joints in the robot's order.
 
-    Parameters
-    ----------
-    session
-        Configuration of the capture.
-    robot
-        The robot, for joints, transmission and encoder scales.
-
-    Raises
-    ------
-    ConfigError
-        If a joint has no drive, a stream does not fit into its TPDO, or a position has no scale.
+    ``robot``: for joints, transmission and encoder scales. Raises ConfigError if a joint has no drive, a stream does
+    not fit into its TPDO, or a position has no scale.
     """
     nodes = node_ids(session, robot)
     fd = all(bus.fd for bus in session.all_buses)
@@ -81,10 +65,7 @@ def unknown_phase(session: SessionConfig) -> str | None:
     In a log, or with another master, drives send these streams by their own count then, which is unknown. ``None`` if
     there is no such stream.
 
-    Parameters
-    ----------
-    session
-        Configuration of the capture.
+    ``session``: configuration of the capture.
     """
     slow = [name for name, stream in session.streams.items() if max(stream.every, stream.pack) > 1]
     if not slow:
@@ -98,17 +79,7 @@ def unknown_phase(session: SessionConfig) -> str | None:
 def node_ids(session: SessionConfig, robot: RobotConfig) -> tuple[int, ...]:
     """Return the node ID of each joint's drive, in the robot's order.
 
-    Parameters
-    ----------
-    session
-        Configuration of the capture, with its drives.
-    robot
-        The robot, for its joints.
-
-    Raises
-    ------
-    ConfigError
-        If a joint has no drive.
+    ``session``: configuration of the capture, with its drives. Raises ConfigError if a joint has no drive.
     """
     by_joint: Mapping[str, int] = {drive.joint: drive.node_id for drive in session.drives}
     for joint in robot.joints:
@@ -120,12 +91,7 @@ def node_ids(session: SessionConfig, robot: RobotConfig) -> tuple[int, ...]:
 def bus_numbers(session: SessionConfig, robot: RobotConfig) -> tuple[int, ...]:
     """Return the number of the bus of each joint's drive, in the robot's order.
 
-    Parameters
-    ----------
-    session
-        Configuration of the capture, with its buses and drives.
-    robot
-        The robot, for its joints.
+    ``session``: configuration of the capture, with its buses and drives.
     """
     buses = session.all_buses
     by_joint = {drive.joint: buses.index(session.bus_of(drive)) for drive in session.drives}
@@ -135,12 +101,7 @@ def bus_numbers(session: SessionConfig, robot: RobotConfig) -> tuple[int, ...]:
 def field_of(name: ObjectName, robot: RobotConfig) -> Field:
     """Return quantity, unit and scale of an object (CiA 402 part 2; 6078h and 6077h in per mille of rated).
 
-    Parameters
-    ----------
-    name
-        Name of the object.
-    robot
-        The robot, for rated values and encoder scales.
+    ``robot``: for rated values and encoder scales.
     """
     one = (1.0,) * robot.n
     if name == "status":

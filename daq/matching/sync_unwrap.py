@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 
+from armident.compiled import compiled
 from armident.daq.matching.state import (
     COUNTER,
     INCOMPLETE,
@@ -15,7 +16,6 @@ from armident.daq.matching.state import (
     SYNC,
     TIME,
 )
-from armident.drivers.compiled import compiled
 
 _EARLY = 0.25
 """Share of a counter turn by which the time between two SYNCs may be too short, by their time stamps."""
@@ -31,23 +31,18 @@ _MISALIGNED = 2.0
 """Largest time between the same SYNC on two buses, periods."""
 
 
-@compiled
+@compiled()
 def turns_in(periods: float, overflow: int) -> int:
     """Return the number of whole counter turns in a time.
 
     SYNCs may be late, when their master was delayed, but at most a quarter of a turn early.
 
-    Parameters
-    ----------
-    periods
-        Time in SYNC periods.
-    overflow
-        Synchronous counter overflow value (CiA 301, 1019h).
+    ``overflow``: synchronous counter overflow value (CiA 301, 1019h).
     """
     return int(np.floor(periods / overflow + _EARLY))
 
 
-@compiled
+@compiled()
 def _is_delayed(counter: int, previous: int, elapsed: float, irregular: bool, overflow: int) -> bool:
     """Return True if the master was delayed between consecutive counters: the time is no multiple of counter turns.
 
@@ -58,22 +53,15 @@ def _is_delayed(counter: int, previous: int, elapsed: float, irregular: bool, ov
     return bool(step == 1 and (irregular or abs(deviation) > _ON_TIME + _DRIFT * elapsed))
 
 
-@compiled
+@compiled()
 def sync_step(counter: int, previous: int, elapsed: float, overflow: int, longest: int) -> int:
     """Return the number of SYNCs by which the counter advanced; zero or less for a repeated SYNC.
 
     The counter gives it modulo ``overflow``, the time the whole turns.
 
-    Parameters
-    ----------
-    counter, previous
-        Counters of this SYNC and the last one.
-    elapsed
-        Time between them, SYNC periods.
-    overflow
-        Synchronous counter overflow value (CiA 301, 1019h).
-    longest
-        Largest advance with whole turns, SYNCs.
+    ``counter``, ``previous``: counters of this SYNC and the last one; ``elapsed``: time between them, SYNC periods;
+    ``overflow``: synchronous counter overflow value (CiA 301, 1019h); ``longest``: largest advance with whole turns,
+    SYNCs.
     """
     step = (counter - previous) % overflow
     turns = turns_in(elapsed - step, overflow)
@@ -84,7 +72,7 @@ def sync_step(counter: int, previous: int, elapsed: float, overflow: int, longes
     return int(step)
 
 
-@compiled
+@compiled()
 def _first_step(buses: Any, sync_times: Any, bus: int, counter: int, t_ns: int, period_ns: int, overflow: int) -> int:
     """Number the first SYNC of a bus: 0, or by the numbers of another bus.
 
@@ -113,7 +101,7 @@ def _first_step(buses: Any, sync_times: Any, bus: int, counter: int, t_ns: int, 
     return 1
 
 
-@compiled
+@compiled()
 def _step_by_other_bus(
     buses: Any, sync_times: Any, bus: int, step: int, t_ns: int, period_ns: int, overflow: int
 ) -> int:
@@ -142,7 +130,7 @@ def _step_by_other_bus(
     return int(best)
 
 
-@compiled
+@compiled()
 def _bus_ahead(buses: Any, bus: int, number: int, t_ns: int, period_ns: int, overflow: int) -> int:
     """Return a bus that is farther ahead of this SYNC's number than the time allows; -1 if there is none."""
     for other in range(buses.shape[0]):
@@ -154,7 +142,7 @@ def _bus_ahead(buses: Any, bus: int, number: int, t_ns: int, period_ns: int, ove
     return -1
 
 
-@compiled
+@compiled()
 def _step_to_bus(buses: Any, bus: int, other: int, counter: int, t_ns: int, period_ns: int, overflow: int) -> int:
     """Return the advance of a bus to the SYNC that is nearest in time to the last one of another bus."""
     elapsed = (t_ns - buses[other, TIME]) / period_ns
@@ -162,7 +150,7 @@ def _step_to_bus(buses: Any, bus: int, other: int, counter: int, t_ns: int, peri
     return int(buses[other, SYNC] + step + overflow * np.rint((elapsed - step) / overflow) - buses[bus, SYNC])
 
 
-@compiled
+@compiled()
 def _step_by_send_time(
     send_times: Any, sent: int, last: int, step: int, t_ns: int, half_turn_ns: int, overflow: int
 ) -> int:
@@ -181,7 +169,7 @@ def _step_by_send_time(
     return int(k - last)
 
 
-@compiled
+@compiled()
 def _step_by_counter(
     buses: Any, m: Any, bus: int, counter: int, t_ns: int, period_ns: int, overflow: int, longest: int
 ) -> int:
@@ -212,30 +200,15 @@ def _step_by_counter(
     return int(found) if found > 0 else int(counted)
 
 
-@compiled
+@compiled()
 def advance(buses: Any, m: Any, bus: int, counter: int, t_ns: int, period_ns: int, overflow: int, longest: int) -> int:
     """Number a received SYNC and update ``buses``; return the number of SYNCs by which its bus advances.
 
     With zero or less, nothing changes: the SYNC is repeated, or the buses do not agree.
 
-    Parameters
-    ----------
-    buses
-        ``MatcherState.bus_state`` of ``m``, or a copy.
-    m
-        State of the matcher.
-    bus
-        Number of the bus.
-    counter
-        Counter of the SYNC; -1 if it has none.
-    t_ns
-        Receive time, ns UTC.
-    period_ns
-        SYNC period, ns.
-    overflow
-        Synchronous counter overflow value (CiA 301, 1019h).
-    longest
-        Largest advance with whole counter turns, SYNCs.
+    ``buses``: ``MatcherState.bus_state`` of ``m``, or a copy. ``m``: state of the matcher. ``counter``: counter of the
+    SYNC; -1 if it has none. ``t_ns``: receive time, ns UTC. ``overflow``: synchronous counter overflow value
+    (CiA 301, 1019h). ``longest``: largest advance with whole counter turns, SYNCs.
     """
     if buses[bus, SYNC] < 0 and buses[bus, COUNTER] < 0:
         step = _first_step(buses, m.sync_times, bus, counter, t_ns, period_ns, overflow)

@@ -161,7 +161,7 @@ class StreamLayout:
                     raise DataError(f"a stream layout with {what} {value!r:.60}; expected {', '.join(known)}")
         names = [f.name for f in fields]
         if len(set(names)) < len(names) or len(set(layout.joints)) < len(layout.joints):
-            raise DataError("a stream layout that names a field or a joint twice")
+            raise DataError("a stream layout that names a duplicate field or joint")
         if type(layout.every) is not int or layout.every < 1 or not fields or not layout.joints:
             raise DataError("a stream layout without fields, joints or interval")
         return layout
@@ -371,10 +371,7 @@ _PYTHON_TYPES = re.compile(r"\bobject\b|literal for|could not convert|argument")
 def short_reason(error: Exception) -> str:
     """Return the reason of an error in damaged JSON, on one line.
 
-    Parameters
-    ----------
-    error
-        Error of the JSON reader, or of a missing or wrong entry.
+    ``error``: error of the JSON reader, or of a missing or wrong entry.
     """
     if isinstance(error, RecursionError):
         return "nested too deeply"

@@ -22,10 +22,7 @@ Event = tuple[str, int, dict[str, Any]]
 class RowRanges:
     """Ranges of rows by stream, as first and last SYNC number; adjacent ranges are merged.
 
-    Parameters
-    ----------
-    every
-        By stream, the number of SYNCs from one row to the next.
+    ``every``: by stream, the number of SYNCs from one row to the next.
     """
 
     def __init__(self, every: Mapping[str, int]) -> None:
@@ -36,29 +33,13 @@ class RowRanges:
         return any(self._spans.values())
 
     def add(self, stream: str, sync: NDArray[np.int64]) -> None:
-        """Add rows.
-
-        Parameters
-        ----------
-        stream
-            Name of the stream.
-        sync
-            SYNC numbers of the rows, (N,), increasing; they may have gaps.
-        """
+        """Add rows. ``sync``: SYNC numbers of the rows, (N,), increasing; they may have gaps."""
         breaks = [0, *(np.flatnonzero(np.diff(sync) != self._every[stream]) + 1).tolist(), len(sync)]
         for begin, end in pairwise(breaks):
             self.add_span(stream, int(sync[begin]), int(sync[end - 1]))
 
     def add_span(self, stream: str, first: int, last: int) -> None:
-        """Add a range of rows.
-
-        Parameters
-        ----------
-        stream
-            Name of the stream.
-        first, last
-            First and last SYNC number, both inclusive.
-        """
+        """Add a range of rows. ``first``, ``last``: first and last SYNC number, both inclusive."""
         spans = self._spans[stream]
         if spans and first == spans[-1][1] + self._every[stream]:
             first = spans.pop()[0]
@@ -94,10 +75,7 @@ class RowRanges:
 class LostRows:
     """Rows and events of chunks that could not be written, and rows of the chunk that is being gathered.
 
-    Parameters
-    ----------
-    every
-        By stream, the number of SYNCs from one row to the next.
+    ``every``: by stream, the number of SYNCs from one row to the next.
     """
 
     def __init__(self, every: Mapping[str, int]) -> None:
@@ -105,15 +83,7 @@ class LostRows:
         self.events: list[Event] = []
 
     def gather(self, stream: str, sync: NDArray[np.int64]) -> None:
-        """Count rows as part of the current chunk.
-
-        Parameters
-        ----------
-        stream
-            Name of the stream.
-        sync
-            SYNC numbers of the rows, (N,).
-        """
+        """Count rows as part of the current chunk. ``sync``: SYNC numbers of the rows, (N,)."""
         self._gathered.add(stream, sync)
 
     def add_lost(self, rows: RowRanges) -> None:

@@ -48,13 +48,7 @@ class _StrictStream(ReadDataStream):
 
 
 def encode(record: McapRecord) -> bytes:
-    """Return the bytes of a record, with opcode and length.
-
-    Parameters
-    ----------
-    record
-        Record of the mcap library.
-    """
+    """Return the bytes of a record, with opcode and length. ``record``: record of the mcap library."""
     builder = RecordBuilder()
     record.write(builder)
     data: bytes = builder.end()
@@ -64,17 +58,8 @@ def encode(record: McapRecord) -> bytes:
 def decode(kind: type[_Decoded], content: memoryview) -> _Decoded:
     """Return the record with this content.
 
-    Parameters
-    ----------
-    kind
-        Class of the record.
-    content
-        Bytes behind opcode and length.
-
-    Raises
-    ------
-    MalformedRecord
-        If the content is too short, or a string is not UTF-8.
+    ``kind``: class of the record; ``content``: bytes behind opcode and length. Raises MalformedRecord if the content is
+    too short, or a string is not UTF-8.
     """
     try:
         record: _Decoded = kind.read(_StrictStream(BytesIO(content)))
@@ -86,31 +71,15 @@ def decode(kind: type[_Decoded], content: memoryview) -> _Decoded:
 
 
 def record(opcode: int, content: bytes) -> bytes:
-    """Return the bytes of a record.
-
-    Parameters
-    ----------
-    opcode
-        MCAP opcode.
-    content
-        Bytes behind opcode and length.
-    """
+    """Return the bytes of a record. ``content``: bytes behind opcode and length."""
     return RECORD_HEAD.pack(opcode, len(content)) + content
 
 
 def message(channel_id: int, sequence: int, t_ns: int, data: bytes) -> bytes:
     """Return a message record.
 
-    Parameters
-    ----------
-    channel_id
-        Channel of the message.
-    sequence
-        Sequence number; its lowest 32 bits are stored.
-    t_ns
-        Log and publish time, ns.
-    data
-        Content of the message.
+    ``sequence``: sequence number; its lowest 32 bits are stored. ``t_ns``: log and publish time, ns. ``data``: content
+    of the message.
     """
     return record(Opcode.MESSAGE, MESSAGE_HEAD.pack(channel_id, sequence & 0xFFFFFFFF, t_ns, t_ns) + data)
 
@@ -118,12 +87,7 @@ def message(channel_id: int, sequence: int, t_ns: int, data: bytes) -> bytes:
 def index_entry(t_ns: int, offset: int) -> bytes:
     """Return the entry of a message in a message index.
 
-    Parameters
-    ----------
-    t_ns
-        Log time of the message, ns.
-    offset
-        Position of its record in the uncompressed chunk, bytes.
+    ``t_ns``: log time of the message, ns; ``offset``: position of its record in the uncompressed chunk, bytes.
     """
     return struct.pack("<QQ", t_ns, offset)
 
@@ -131,12 +95,7 @@ def index_entry(t_ns: int, offset: int) -> bytes:
 def message_index(channel_id: int, entries: bytes) -> bytes:
     """Return the message index record of a channel.
 
-    Parameters
-    ----------
-    channel_id
-        The channel.
-    entries
-        Pairs of u64: log time (ns) and position in the uncompressed chunk (bytes).
+    ``entries``: pairs of u64: log time (ns) and position in the uncompressed chunk (bytes).
     """
     return record(Opcode.MESSAGE_INDEX, struct.pack("<HI", channel_id, len(entries)) + entries)
 
@@ -144,14 +103,8 @@ def message_index(channel_id: int, entries: bytes) -> bytes:
 def chunk(start_ns: int, end_ns: int, raw: bytes, compressed: bytes) -> bytes:
     """Return a zstd chunk record.
 
-    Parameters
-    ----------
-    start_ns, end_ns
-        Earliest and latest log time of its messages, ns.
-    raw
-        Its records; their CRC-32 is stored.
-    compressed
-        The same, compressed.
+    ``start_ns``, ``end_ns``: earliest and latest log time of its messages, ns. ``raw``: its records; their CRC-32 is
+    stored.
     """
     head = _CHUNK_HEAD.pack(start_ns, end_ns, len(raw), zlib.crc32(raw))
     name = COMPRESSION.encode()
@@ -163,18 +116,8 @@ def chunk(start_ns: int, end_ns: int, raw: bytes, compressed: bytes) -> bytes:
 class ChunkContent:
     """Content of a chunk record.
 
-    Parameters
-    ----------
-    start_ns, end_ns
-        Earliest and latest log time of the messages, ns.
-    size
-        Size of the uncompressed records, bytes.
-    crc
-        CRC-32 of the uncompressed records; 0 if there is none.
-    compression
-        Name of the compression.
-    data
-        Compressed records.
+    ``start_ns``, ``end_ns``: earliest and latest log time of the messages, ns. ``size``: size of the uncompressed
+    records, bytes. ``crc``: CRC-32 of the uncompressed records; 0 if there is none. ``data``: compressed records.
     """
 
     start_ns: int
@@ -188,15 +131,8 @@ class ChunkContent:
 def read_chunk(content: memoryview) -> ChunkContent:
     """Decode a chunk record without copying its data.
 
-    Parameters
-    ----------
-    content
-        Bytes behind opcode and length.
-
-    Raises
-    ------
-    MalformedRecord
-        If the content is shorter than the lengths in it.
+    ``content``: bytes behind opcode and length. Raises MalformedRecord if the content is shorter than the lengths in
+    it.
     """
     at = _CHUNK_HEAD.size + 4
     if len(content) < at:
@@ -219,15 +155,7 @@ def read_chunk(content: memoryview) -> ChunkContent:
 def read_message_index(content: memoryview) -> tuple[int, int]:
     """Return channel and number of entries of a message index.
 
-    Parameters
-    ----------
-    content
-        Bytes behind opcode and length.
-
-    Raises
-    ------
-    MalformedRecord
-        If its length does not agree with its content.
+    ``content``: bytes behind opcode and length. Raises MalformedRecord if its length does not agree with its content.
     """
     if len(content) < 6:
         raise MalformedRecord("a message index without a head")
@@ -238,13 +166,7 @@ def read_message_index(content: memoryview) -> tuple[int, int]:
 
 
 def read_footer(data: memoryview) -> Footer:
-    """Return the footer from the bytes of its record.
-
-    Raises
-    ------
-    MalformedRecord
-        If they are no footer record.
-    """
+    """Return the footer from the bytes of its record. Raises MalformedRecord if they are no footer record."""
     if len(data) != FOOTER_SIZE or RECORD_HEAD.unpack_from(data) != (Opcode.FOOTER, _FOOTER_LENGTH):
         raise MalformedRecord("no footer")
     return decode(Footer, data[RECORD_HEAD.size :])
@@ -253,12 +175,7 @@ def read_footer(data: memoryview) -> Footer:
 def records(data: memoryview, start: int) -> Iterator[tuple[int, int, memoryview]]:
     """Yield opcode, position and content of the complete records; stop at the first incomplete one.
 
-    Parameters
-    ----------
-    data
-        Bytes of the file.
-    start
-        Position of the first record, bytes.
+    ``data``: bytes of the file; ``start``: position of the first record, bytes.
     """
     at = start
     while at + RECORD_HEAD.size <= len(data):

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from armident.configs import DataError, RobotConfig, SessionConfig
 
@@ -126,10 +126,7 @@ class Mark:
 def gap_from(entries: object) -> Gap:
     """Return the gap from its JSON entries in a file or an event.
 
-    Raises
-    ------
-    DataError
-        If the entries are not those of a gap.
+    Raises DataError if the entries are not those of a gap.
     """
     if not isinstance(entries, dict) or not {"stream", "first", "last"} <= entries.keys() <= _GAP_ENTRIES:
         raise DataError(f"no gap: {entries!r:.100}")
@@ -144,10 +141,7 @@ def gap_from(entries: object) -> Gap:
 def mark_from(entries: object) -> Mark:
     """Return the mark from its JSON entries in a file or an event.
 
-    Raises
-    ------
-    DataError
-        If the entries are not those of a mark.
+    Raises DataError if the entries are not those of a mark.
     """
     if not isinstance(entries, dict) or not {"kind", "sync", "t_ns"} <= entries.keys() <= _MARK_ENTRIES:
         raise DataError(f"no mark: {entries!r:.100}")
@@ -222,6 +216,13 @@ class Recording:
         Facts about the capture, such as software versions or the source file.
     missing
         Description of the missing parts of a truncated or damaged file; ``None`` if the recording is complete.
+
+    Examples
+    --------
+    >>> import armident, numpy as np
+    >>> t = np.arange(2000) / 1000.0
+    >>> armident.Recording.from_arrays(t, 0.1 * np.sin(9.0 * t), 50.0 * np.cos(9.0 * t), robot="emps")
+    <Recording of emps: 2000 samples at 1000 Hz, position, torque>
     """
 
     path: Path | None
@@ -243,6 +244,75 @@ class Recording:
             f"<Recording of {self.robot.name}: {self.samples.sync.size} samples at {self.sample_rate_hz:g} Hz, "
             f"{', '.join(quantities)}{losses}{', torn' if self.missing else ''}>"
         )
+
+    @classmethod
+    def from_arrays(
+        cls,
+        t: ArrayLike,
+        position: ArrayLike,
+        torque: ArrayLike,
+        robot: RobotConfig | str | Path,
+        reference: ArrayLike | None = None,
+        *,
+        resample_hz: float | None = None,
+    ) -> "Recording":
+        """Make a recording of arrays in memory: SI units, joint side; checked as a file that is imported.
+
+        Parameters
+        ----------
+        t
+            Times (N,), s, at equal steps.
+        position
+            Joint positions (N, n), rad or m; (N,) for a single joint.
+        torque
+            Joint torques or forces (N, n), N m or N; (N,) for a single joint.
+        robot
+            The robot that was measured: a configuration, or the path or shipped name of one.
+        reference
+            Reference positions (N, n) of the controller, rad or m; by default unknown.
+        resample_hz
+            Rate of an even clock, Hz, onto which samples with uneven times are put; holes stay gaps.
+
+        Returns
+        -------
+        Recording
+            The same as that of `armident.import_recording` of these arrays in an NPZ file.
+
+        Raises
+        ------
+        ConfigError
+            If there is no such robot.
+        DataError
+            If shapes do not fit, times are uneven, or values are no numbers or far beyond the limits of the robot.
+        """
+        from armident.configs import load_robot
+        from armident.daq.interchange.importing import recording_of_arrays
+
+        config = robot if isinstance(robot, RobotConfig) else load_robot(robot, "import")
+        return recording_of_arrays(t, position, torque, config, reference, resample_hz)
+
+    def save(self, path: str | Path) -> Path:
+        """Write the recording to an MCAP file, which `armident.read_recording` reads; an existing file is replaced.
+
+        Parameters
+        ----------
+        path
+            The file.
+
+        Returns
+        -------
+        Path
+            The file.
+
+        Raises
+        ------
+        ConfigError
+            If it cannot be written.
+        """
+        from armident.daq.recording.writer import write_recording
+
+        write_recording(self, Path(path))
+        return Path(path)
 
     @property
     def samples(self) -> Stream:

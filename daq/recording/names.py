@@ -29,6 +29,3 @@ ROWS_OF = "rows "
 
 RECOVERED = "armident.recovered"
 """Metadata of a recovered file: a description of the missing parts."""
-
-RECOVERED_OLD = "armident.healed"
-"""Name of `RECOVERED` up to version 0.1, still read."""

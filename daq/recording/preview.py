@@ -25,14 +25,9 @@ JOINT_TORQUE = "joint_torque"
 class PreviewChannel:
     """Preview of one stream.
 
-    Parameters
-    ----------
-    layout
-        Layout of the preview; ``layout.every`` is the number of SYNCs between two samples.
-    matrices
-        Of each field, the matrix (n, n) that maps raw values to SI units.
-    sources
-        Of each field, the name of the raw field of the stream.
+    ``layout``: layout of the preview; ``layout.every`` is the number of SYNCs between two samples. ``matrices``: of
+    each field, the matrix (n, n) that maps raw values to SI units. ``sources``: of each field, the name of the raw
+    field of the stream.
     """
 
     layout: StreamLayout
@@ -45,16 +40,8 @@ class PreviewChannel:
     ) -> "PreviewChannel | None":
         """Return the preview of a stream, ``None`` if it has nothing but status words.
 
-        Parameters
-        ----------
-        stream
-            Layout of the stream.
-        robot
-            The robot, for its transmission.
-        sample_rate_hz
-            Rate of SYNC, 1/s.
-        rate_hz
-            Highest rate of the preview, 1/s.
+        ``robot``: for its transmission; ``sample_rate_hz``: rate of SYNC, 1/s; ``rate_hz``: highest rate of the
+        preview, 1/s.
         """
         every = stream.every * max(1, -(-round(sample_rate_hz) // round(max(rate_hz, 1.0) * stream.every)))
         fields: list[Field] = []
@@ -94,19 +81,8 @@ class PreviewChannel:
     ) -> tuple[NDArray[np.int64], NDArray[np.int64], dict[str, NDArray[np.float64]]]:
         """Return the rows of the preview.
 
-        Parameters
-        ----------
-        sync
-            SYNC numbers, (N,).
-        t_ns
-            Times, ns UTC, (N,).
-        raw
-            Raw values of every field of the stream, (N, n) each.
-
-        Returns
-        -------
-        tuple
-            SYNC numbers and times (M,), and values in SI units, (M, n) by field.
+        ``sync``: SYNC numbers, (N,); ``t_ns``: times, ns UTC, (N,); ``raw``: raw values of every field of the stream,
+        (N, n) each. Returns SYNC numbers and times (M,), and values in SI units, (M, n) by field.
         """
         shown = np.flatnonzero((sync + 1) % self.layout.every == 0)
         values = {

@@ -14,6 +14,7 @@ from pydantic import ValidationError
 from armident.configs import ConfigError, DataError, RobotConfig, SessionConfig
 from armident.configs.yaml_loader import is_file
 from armident.daq.recording import mcap_records as mcap
+from armident.daq.recording.growing_rows import GrowingRows
 from armident.daq.recording.layout import StreamLayout
 from armident.daq.recording.model import Gap, Mark, Recording, Stream, gap_from, mark_from
 from armident.daq.recording.names import (
@@ -24,12 +25,10 @@ from armident.daq.recording.names import (
     MARKS_TOPIC,
     RECORDING,
     RECOVERED,
-    RECOVERED_OLD,
     ROBOT,
     SCHEMA,
     SESSION,
 )
-from armident.daq.recording.rows import Rows
 from armident.daq.recording.scan import ChunkItem, RecordingScan
 
 _LEAST_ROW, _MOST_RESERVED = 2, 1 << 25
@@ -103,12 +102,9 @@ def _is_listed(file: BinaryIO) -> bool:
 def recovered_words(metadata: dict[str, dict[str, str]]) -> list[str]:
     """Return a description of the parts that a recovered file lacks; empty if it was not recovered.
 
-    Parameters
-    ----------
-    metadata
-        Entries of the file's metadata records, by name.
+    ``metadata``: entries of the file's metadata records, by name.
     """
-    entries = metadata.get(RECOVERED) or metadata.get(RECOVERED_OLD) or {}
+    entries = metadata.get(RECOVERED) or {}
     return [entries["missing"]] if "missing" in entries else []
 
 
@@ -118,23 +114,20 @@ class _Content:
 
     scan: RecordingScan
     most_rows: int
-    rows: dict[str, Rows] = field(default_factory=dict)
+    rows: dict[str, GrowingRows] = field(default_factory=dict)
     layouts: dict[str, StreamLayout] = field(default_factory=dict)
     gaps: list[Gap] = field(default_factory=list)
     marks: list[Mark] = field(default_factory=list)
 
-    def rows_of(self, channel: int) -> Rows:
+    def rows_of(self, channel: int) -> GrowingRows:
         """Return the rows of a channel with a layout; channels of one stream share them.
 
-        Raises
-        ------
-        DataError
-            If another channel of the same stream has another layout.
+        Raises DataError if another channel of the same stream has another layout.
         """
         layout = self.scan.layouts[channel]
         if layout.name not in self.rows:
             expected = min((self.scan.expected or {}).get(channel, 0), self.most_rows)
-            self.rows[layout.name], self.layouts[layout.name] = Rows(layout, expected), layout
+            self.rows[layout.name], self.layouts[layout.name] = GrowingRows(layout, expected), layout
         if self.layouts[layout.name] != layout:
             raise DataError(f"topic {layout.topic} has two channels with different layouts")
         return self.rows[layout.name]
@@ -234,7 +227,7 @@ def _by_channel(entry: tuple[str, int]) -> int:
     return entry[1]
 
 
-def _stream(rows: Rows, layout: StreamLayout, rewritten: bool) -> Stream:
+def _stream(rows: GrowingRows, layout: StreamLayout, rewritten: bool) -> Stream:
     """Return the rows of a stream; those of a file that another tool has sorted by time are put in order again."""
     sync, t_ns, raw = rows.arrays()
     if rewritten and np.any(sync[1:] < sync[:-1]):
@@ -243,7 +236,7 @@ def _stream(rows: Rows, layout: StreamLayout, rewritten: bool) -> Stream:
     if np.any(sync[1:] <= sync[:-1]):
         raise DataError(
             f"topic {layout.topic}: SYNC numbers do not increase: "
-            "messages are there twice, or are those of several recordings; give each recording by itself"
+            "duplicate messages, or several recordings in one file; give each recording by itself"
         )
     return Stream(layout.name, layout.every, sync, t_ns, {f.name: f for f in layout.fields}, raw)
 

@@ -13,6 +13,7 @@ from mcap.records import ChunkIndex, Metadata, MetadataIndex
 
 from armident.configs import ArmidentError, ConfigError, DataError
 from armident.daq.recording import mcap_records as mcap
+from armident.daq.recording.mcap_summary import Summary
 from armident.daq.recording.names import COUNTERS, RECORDING, RECOVERED
 from armident.daq.recording.reader import recovered_words
 from armident.daq.recording.scan import (
@@ -23,7 +24,6 @@ from armident.daq.recording.scan import (
     RecordingScan,
     RecordItem,
 )
-from armident.daq.recording.summary import Summary
 from armident.daq.recording.writer import checksum_record
 
 _COPY = 1 << 24
@@ -124,20 +124,8 @@ class _Cut:
 class _Chunk:
     """A valid chunk and its message indexes so far.
 
-    Parameters
-    ----------
-    index
-        Its index record.
-    raw
-        Its records, uncompressed.
-    messages
-        Number of its messages by channel.
-    end
-        End of its last message index, bytes.
-    damaged
-        True if a message index is damaged.
-    indexed
-        Number of entries in its message indexes, by channel.
+    ``index``: its index record; ``raw``: its records, uncompressed; ``messages``: number of its messages by channel;
+    ``end``: end of its last message index, bytes; ``indexed``: number of entries in its message indexes, by channel.
     """
 
     index: ChunkIndex
@@ -155,12 +143,7 @@ class _Chunk:
     def add_index(self, content: MessageIndexContent, start: int, end: int) -> None:
         """Add a message index of the chunk.
 
-        Parameters
-        ----------
-        content
-            Channel and number of entries.
-        start, end
-            Position of the record in the file, bytes.
+        ``content``: channel and number of entries; ``start``, ``end``: position of the record in the file, bytes.
         """
         self.index.message_index_offsets[content.channel_id] = start
         self.index.message_index_length += end - start
@@ -179,10 +162,7 @@ class _Chunk:
 class _Contents:
     """Summary, damaged byte ranges and end of the valid records of a file.
 
-    Parameters
-    ----------
-    data
-        The file.
+    Raises DataError if the file is not a recording of armident; MalformedRecord if its head is damaged.
 
     Attributes
     ----------
@@ -196,13 +176,6 @@ class _Contents:
         Message indexes of the last chunk, if those in the file may be incomplete.
     missing
         Description of the missing parts, ``None`` for a complete file.
-
-    Raises
-    ------
-    DataError
-        If the file is not a recording of armident.
-    MalformedRecord
-        If its head is damaged.
     """
 
     def __init__(self, data: memoryview) -> None:

@@ -30,7 +30,7 @@ def prune(
     """Delete recordings that are too old, then the oldest ones until there is enough free space.
 
     Only finished captures of this robot are deleted, recognised by the names that ``capture`` gives them. A file being
-    written is never deleted.
+    written is never deleted. Returns deleted files, the oldest first.
 
     Parameters
     ----------
@@ -48,11 +48,6 @@ def prune(
         Free space to keep on the file system, bytes; ``None``: no limit.
     free
         Returns the free space, bytes.
-
-    Returns
-    -------
-    list of Path
-        Deleted files, the oldest first.
     """
     deleted = []
     found = [(path, made, is_being_written(path)) for path, made in recordings_of(directory, robot)]
@@ -88,12 +83,8 @@ def _ages(times: list[datetime.datetime], keep: datetime.timedelta) -> dict[date
 def recordings_of(directory: Path, robot: str) -> Iterator[tuple[Path, datetime.datetime]]:
     """Yield the recordings of a robot with the times in their names, the oldest first.
 
-    Parameters
-    ----------
-    directory
-        Directory of the recordings; its subdirectories are not searched.
-    robot
-        Name of the robot, with which the file names begin.
+    ``directory``: directory of the recordings; its subdirectories are not searched. ``robot``: name of the robot, with
+    which the file names begin.
     """
     found = []
     for path in directory.glob(f"{robot}-*.mcap*"):
@@ -107,13 +98,7 @@ def recordings_of(directory: Path, robot: str) -> Iterator[tuple[Path, datetime.
 
 
 def is_being_written(path: Path) -> bool:
-    """Return True if a capture has locked a file for writing.
-
-    Parameters
-    ----------
-    path
-        The file.
-    """
+    """Return True if a capture has locked a file for writing."""
     try:
         with path.open("rb") as file:
             fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
@@ -129,12 +114,7 @@ class RetentionThread:
 
     Every deleted file is logged, and every error once.
 
-    Parameters
-    ----------
-    delete
-        Deletes old recordings and returns their paths.
-    every_s
-        Interval between two calls of it, s.
+    ``delete``: deletes old recordings and returns their paths; ``every_s``: interval between two calls of it, s.
     """
 
     def __init__(self, delete: Callable[[], list[Path]], every_s: float = EVERY_S) -> None:

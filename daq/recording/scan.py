@@ -44,17 +44,7 @@ _IN_DATA = frozenset(
 
 
 class MessageRun(NamedTuple):
-    """Consecutive messages of one channel in a chunk.
-
-    Parameters
-    ----------
-    channel_id
-        The channel.
-    start, end
-        Position in the uncompressed chunk, bytes.
-    number
-        Number of messages.
-    """
+    """Consecutive messages of one channel in a chunk. ``start``, ``end``: position in the uncompressed chunk, bytes."""
 
     channel_id: int
     start: int
@@ -63,15 +53,7 @@ class MessageRun(NamedTuple):
 
 
 class MessageIndexContent(NamedTuple):
-    """Content of a message index record.
-
-    Parameters
-    ----------
-    channel_id
-        The channel.
-    number
-        Number of entries.
-    """
+    """Content of a message index record. ``number``: number of entries."""
 
     channel_id: int
     number: int
@@ -81,14 +63,8 @@ class MessageIndexContent(NamedTuple):
 class RecordItem:
     """Valid record other than a chunk.
 
-    Parameters
-    ----------
-    opcode
-        MCAP opcode.
-    start, end
-        Position in the file, bytes.
-    content
-        The decoded record; ``None`` if it was not decoded.
+    ``opcode``: MCAP opcode. ``start``, ``end``: position in the file, bytes. ``content``: the decoded record; ``None``
+    if it was not decoded.
     """
 
     opcode: int
@@ -101,16 +77,8 @@ class RecordItem:
 class ChunkItem:
     """A valid chunk, in bytes ``start`` to ``end`` of the file.
 
-    Parameters
-    ----------
-    start, end
-        Position in the file, bytes.
-    body
-        Content of the chunk record.
-    raw
-        Its records, uncompressed.
-    runs
-        Its messages in order.
+    ``start``, ``end``: position in the file, bytes; ``body``: content of the chunk record; ``raw``: its records,
+    uncompressed; ``runs``: its messages in order.
     """
 
     start: int
@@ -134,15 +102,7 @@ class LooseMessage(ChunkItem):
 
 @dataclass(frozen=True)
 class DamageItem:
-    """Damaged record.
-
-    Parameters
-    ----------
-    opcode
-        MCAP opcode.
-    start, end
-        Position in the file, bytes.
-    """
+    """Damaged record. ``opcode``: MCAP opcode; ``start``, ``end``: position in the file, bytes."""
 
     opcode: int
     start: int
@@ -158,12 +118,8 @@ class RecordingScan:
 
     A damaged record behind the head is skipped and described in ``damage``. Other threads decompress chunks ahead of
     the iteration. In a file that another MCAP tool has written from a recording, the checksums of bytes say nothing; it
-    is judged by the checksums of its chunks, by the numbers of its messages, and by what its metadata states.
-
-    Parameters
-    ----------
-    data
-        The file.
+    is judged by the checksums of its chunks, by the numbers of its messages, and by what its metadata states. Raises
+    DataError if the file is not MCAP. The iteration raises it if the file is no recording of armident, too.
 
     Attributes
     ----------
@@ -185,11 +141,6 @@ class RecordingScan:
         True if another tool has written the file: its checksum records are not where they were made.
     end
         End of the last complete record, bytes.
-
-    Raises
-    ------
-    DataError
-        If the file is not MCAP. The iteration raises it if the file is no recording of armident, too.
     """
 
     def __init__(self, data: memoryview) -> None:
@@ -209,12 +160,7 @@ class RecordingScan:
     def __iter__(self) -> Iterator[Item]:
         """Yield the records in file order, the data end last.
 
-        Raises
-        ------
-        MalformedRecord
-            If the head is damaged.
-        DataError
-            If messages do not have their channel's layout.
+        Raises MalformedRecord if the head is damaged; DataError if messages do not have their channel's layout.
         """
         with ThreadPoolExecutor(_WORKERS, "zstd") as pool:
             for opcode, start, body, chunk in self._read_ahead(pool):
@@ -249,10 +195,7 @@ class RecordingScan:
     def missing(self, last_sync: int | None) -> list[str]:
         """Return descriptions of the missing parts, after the iteration; empty for a complete file.
 
-        Parameters
-        ----------
-        last_sync
-            SYNC number of the last sample; ``None`` if there is none.
+        ``last_sync``: SYNC number of the last sample; ``None`` if there is none.
         """
         words = list(self.damage)
         if self.finished and not self.damage:
@@ -307,10 +250,8 @@ class RecordingScan:
     def _decoded(self, opcode: int, at: int, body: memoryview) -> Channel | Metadata | MessageIndexContent | None:
         """Check a record at byte ``at``, register its content and return it.
 
-        Raises
-        ------
-        MalformedRecord
-            If it may not precede the summary, is malformed, or states another checksum than that of the bytes before.
+        Raises MalformedRecord if it may not precede the summary, is malformed, or states another checksum than that of
+        the bytes before.
         """
         if opcode not in _IN_DATA:
             raise mcap.MalformedRecord(f"a record of kind {opcode:02X}h before the end of the data")
@@ -394,15 +335,7 @@ class RecordingScan:
 def expected_messages(data: memoryview) -> dict[int, int] | None:
     """Return the number of messages by channel id that a file's summary states.
 
-    Parameters
-    ----------
-    data
-        The file.
-
-    Returns
-    -------
-    dict or None
-        ``None`` if the file has no summary, or its checksum is wrong.
+    Returns ``None`` if the file has no summary, or its checksum is wrong.
     """
     footer_start = len(data) - len(mcap.MAGIC) - mcap.FOOTER_SIZE
     footer_end = footer_start + mcap.FOOTER_SIZE

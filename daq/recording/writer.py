@@ -23,6 +23,7 @@ from armident.configs import ConfigError, RobotConfig, SessionConfig
 from armident.daq.recording import mcap_records as mcap
 from armident.daq.recording.layout import StreamLayout
 from armident.daq.recording.lost_rows import DISK_STALLED, LostRows, RowRanges
+from armident.daq.recording.mcap_summary import Summary
 from armident.daq.recording.model import Gap, Mark, Recording
 from armident.daq.recording.names import (
     CHECK,
@@ -38,7 +39,6 @@ from armident.daq.recording.names import (
     SESSION,
 )
 from armident.daq.recording.preview import PREFIX, PreviewChannel
-from armident.daq.recording.summary import Summary
 
 _ZSTD_LEVEL = 1
 _ROWS_PER_CHUNK = 5000
@@ -414,12 +414,7 @@ def checksum_record(data: bytes, start: int = 0) -> Metadata:
 
     Chunks have checksums of their own, other records have none.
 
-    Parameters
-    ----------
-    data
-        The bytes.
-    start
-        CRC-32 that the checksum continues.
+    ``start``: CRC-32 that the checksum continues.
     """
     return Metadata(CHECK, {"bytes": str(len(data)), "crc32": str(zlib.crc32(data, start))})
 

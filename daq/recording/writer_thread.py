@@ -64,17 +64,7 @@ class _Chunk:
     count: int = 0
 
     def add(self, stream: str, rows: Columns, size: int) -> None:
-        """Add rows of a stream.
-
-        Parameters
-        ----------
-        stream
-            Name of the stream.
-        rows
-            SYNC numbers, times (ns UTC) and raw values of the rows.
-        size
-            Size of the rows, bytes.
-        """
+        """Add rows of a stream. ``rows``: SYNC numbers, times (ns UTC) and raw values of the rows."""
         if not self.rows:
             self.began_ns = time.monotonic_ns()
         if self.since is None:

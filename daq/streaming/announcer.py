@@ -26,14 +26,8 @@ class Announcer:
     Zenoh also forgets a message at once if nobody listens. Listeners that have lost a session try again after the
     longest interval of their configuration, which is taken to be that of this session.
 
-    Parameters
-    ----------
-    session
-        Zenoh session with the settings `SENT_IN_ORDER`, which has just been opened.
-    keys
-        Keys of the robot.
-    retry_s
-        Longest interval between two attempts to connect, s.
+    ``session``: Zenoh session with the settings `SENT_IN_ORDER`, which has just been opened; ``keys``: keys of the
+    robot; ``retry_s``: longest interval between two attempts to connect, s.
     """
 
     def __init__(self, session: zenoh.Session, keys: Keys, retry_s: float) -> None:
@@ -48,15 +42,7 @@ class Announcer:
     def announce(self, *messages: tuple[str, bytes]) -> None:
         """Publish messages, and return when the operating system has taken them.
 
-        Parameters
-        ----------
-        messages
-            Key expressions and contents.
-
-        Raises
-        ------
-        zenoh.ZError
-            If the session fails.
+        ``messages``: key expressions and contents. Raises zenoh.ZError if the session fails.
         """
         for key, content in messages:
             # Express: not batched with later messages. Block: not dropped if the queue is full.
@@ -65,13 +51,7 @@ class Announcer:
 
 
 def longest_retry_s(config: zenoh.Config) -> float:
-    """Return the longest interval between two attempts to connect, s.
-
-    Parameters
-    ----------
-    config
-        Zenoh configuration.
-    """
+    """Return the longest interval between two attempts to connect, s."""
     longest = (json.loads(config.get_json("connect/retry")) or {}).get("period_max_ms")
     # One number, or one for each mode of a node.
     numbers = longest.values() if isinstance(longest, dict) else [longest]

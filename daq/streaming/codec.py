@@ -46,20 +46,9 @@ _MOST_ROWS = 1 << 20
 class Block:
     """Consecutive rows of one stream.
 
-    Parameters
-    ----------
-    layout
-        Layout of the stream.
-    sequence
-        Number of the block in its capture, counted over all streams.
-    sync
-        SYNC numbers, (N,).
-    t_ns
-        Receive times of the SYNCs, ns UTC, (N,).
-    raw
-        Raw values of every field, (N, n) each.
-    capture
-        Name of the capture, as in its events; empty for a block of none.
+    ``sequence``: number of the block in its capture, counted over all streams. ``sync``: SYNC numbers, (N,). ``t_ns``:
+    receive times of the SYNCs, ns UTC, (N,). ``raw``: raw values of every field, (N, n) each. ``capture``: name of the
+    capture, as in its events; empty for a block of none.
     """
 
     layout: StreamLayout
@@ -89,10 +78,7 @@ def encode_block(block: Block) -> bytes:
 def decode_block(data: bytes) -> Block:
     """Return the block in these bytes; every length is checked before use.
 
-    Raises
-    ------
-    DataError
-        If the bytes are not a block of this version.
+    Raises DataError if the bytes are not a block of this version.
     """
     if len(data) < _HEAD.size:
         raise DataError(f"a block of {len(data)} bytes is too short")
@@ -132,25 +118,14 @@ def decode_block(data: bytes) -> Block:
 
 
 def encode_event(kind: str, content: Mapping[str, Any]) -> bytes:
-    """Return the bytes of an event: JSON with ``schema`` and ``kind``.
-
-    Parameters
-    ----------
-    kind
-        Kind of the event.
-    content
-        Other entries.
-    """
+    """Return the bytes of an event: JSON with ``schema`` and ``kind``."""
     return json.dumps({"schema": EVENT_SCHEMA, "kind": kind, **content}).encode()
 
 
 def decode_event(data: bytes) -> dict[str, Any]:
     """Return the entries of the event in these bytes.
 
-    Raises
-    ------
-    DataError
-        If the bytes are not an event of this version.
+    Raises DataError if the bytes are not an event of this version.
     """
     try:
         event = json.loads(data)
@@ -178,18 +153,7 @@ def start_content(
 ) -> dict[str, Any]:
     """Return the content of an ``experiment_start`` event: all that a listener needs to decode the following blocks.
 
-    Parameters
-    ----------
-    capture
-        Name of the capture.
-    robot, session
-        Configurations.
-    sample_rate_hz
-        Rate of SYNC, 1/s.
-    layouts
-        One per stream.
-    metadata
-        Facts about the capture.
+    ``sample_rate_hz``: rate of SYNC, 1/s; ``metadata``: facts about the capture.
     """
     return {
         "capture": capture,
@@ -211,20 +175,8 @@ def end_content(
 ) -> dict[str, Any]:
     """Return the content of an ``experiment_end`` event: the required blocks, and the files.
 
-    Parameters
-    ----------
-    capture
-        Name of the capture.
-    blocks
-        Number of blocks of the capture.
-    counters
-        Counters of the capture.
-    gaps
-        Missing samples.
-    marks
-        Marks of the capture.
-    paths
-        Files of the capture.
+    ``blocks``: number of blocks of the capture; ``counters``: counters of the capture; ``gaps``: missing samples;
+    ``marks``: marks of the capture; ``paths``: files of the capture.
     """
     return {
         "capture": capture,
@@ -239,22 +191,9 @@ def end_content(
 def assemble(start: Mapping[str, Any], blocks: Iterable[Block], end: Mapping[str, Any]) -> Recording:
     """Return the recording of a published capture, with the same samples as its file.
 
-    Parameters
-    ----------
-    start, end
-        The ``experiment_start`` and ``experiment_end`` events of the capture.
-    blocks
-        Its blocks, in any order, duplicates allowed.
-
-    Returns
-    -------
-    Recording
-        ``path`` is that of the file; ``missing`` describes the blocks that did not arrive.
-
-    Raises
-    ------
-    DataError
-        If the events or blocks do not belong together or are malformed.
+    ``start``, ``end``: the ``experiment_start`` and ``experiment_end`` events of the capture; ``blocks``: in any order,
+    duplicates allowed. Result: ``path`` is that of the file; ``missing`` describes the blocks that did not arrive.
+    Raises DataError if the events or blocks do not belong together or are malformed.
     """
     if start.get("capture") != end.get("capture"):
         raise DataError("the start and the end are of different captures")

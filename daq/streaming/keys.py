@@ -5,15 +5,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Keys:
-    """Key expressions of one robot in one cell.
-
-    Parameters
-    ----------
-    cell
-        Name of the cell.
-    robot
-        Name of the robot.
-    """
+    """Key expressions of one robot in one cell."""
 
     cell: str
     robot: str

@@ -1,6 +1,8 @@
-"""Sphinx extension: writes the reference of commands, documents and configuration files from the code."""
+"""Sphinx extension: writes the reference of commands, documents, configuration files and terms from the code."""
 
 import importlib.metadata
+from collections.abc import Iterable
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -8,13 +10,18 @@ import click
 import typer
 from sphinx.application import Sphinx
 
+from armident.configs.schema.base import split_docstring
 from armident.configs.schema.robot import RobotConfig
 from armident.configs.schema.scenario import Scenario
 from armident.configs.schema.session import SessionConfig
 from armident.configs.schema.trajectory import Trajectory
 from armident.daq.cli import GROUP, application
+from armident.daq.interchange.readers import table_of_formats
+from armident.identify.diagnosis.criteria import Criteria
 from armident.identify.documents.diagnosis import DiagnosisDocument
 from armident.identify.documents.identification import IdentificationDocument
+from armident.identify.effects.registry import own_effects
+from armident.identify.report import glossary
 
 Schema = dict[str, Any]
 
@@ -42,7 +49,7 @@ def setup(app: Sphinx) -> dict[str, Any]:
 
 
 def write_reference(app: Sphinx) -> None:
-    """Write `reference/commands.md` and `reference/files.md` into the source folder, if their text has changed.
+    """Write the generated pages of `reference/`, if their text has changed.
 
     Parameters
     ----------
@@ -50,7 +57,11 @@ def write_reference(app: Sphinx) -> None:
         The Sphinx application.
     """
     folder = Path(app.srcdir) / "reference"
-    for name, text in (("commands.md", commands_page()), ("files.md", files_page())):
+    pages = {
+        "commands.md": commands_page, "files.md": files_page, "formats.md": formats_page, "glossary.md": glossary_page,
+    }  # fmt: skip
+    for name, page in pages.items():
+        text = page()
         path = folder / name
         if not path.is_file() or path.read_text(encoding="utf-8") != text:
             path.write_text(text, encoding="utf-8")
@@ -69,6 +80,11 @@ def commands_page() -> str:
     return "\n\n".join(sections) + "\n"
 
 
+def formats_page() -> str:
+    """Return the reference of the files of other tools, from their readers."""
+    return f"# Formats\n\n`armident import` reads, and `armident export` writes:\n\n{table_of_formats()}\n"
+
+
 def files_page() -> str:
     """Return the reference of all documents and configuration files, from their JSON Schemas."""
     sections = [
@@ -83,7 +99,46 @@ def files_page() -> str:
             f"### {heading}: {name}\n\n{part['description']}\n\n{table(part)}"
             for name, part in sorted(schema.get("$defs", {}).items())
         ]
+    descriptions = split_docstring(Criteria.__doc__ or "")[1]
+    rows = [f"| `{f.name}` | {f.default:.4g} | {descriptions[f.name]} |" for f in fields(Criteria)]
+    rows = ["| threshold | value | meaning, with source or reckoning |", "| --- | --- | --- |", *rows]
+    sections.append("## Criteria of a diagnosis\n\n" + "\n".join(rows).replace("``", "`"))
     return "\n\n".join(sections) + "\n"
+
+
+def glossary_page() -> str:
+    """Return the glossary of parameter names and report terms."""
+    parts = [
+        "# Glossary",
+        "Parameter names of robot configurations and results, and terms of the reports. Every report has those that it "
+        "mentions. The keys of the documents are in [files](files.md).",
+        "## Names",
+        listed(glossary.CONVENTIONS),
+        "## Rigid model and friction",
+        "One of each per joint; the joint number follows the name. Section numbers are those of Brunot 2017.",
+        parameter_table(glossary.RIGID),
+        "## Effects",
+        "Parameters of the effects that a diagnosis looks for (`armident effects NAME`). Results append the joint "
+        "number to linear parameters, for example `fva2`.",
+    ]
+    for effect in own_effects():
+        text = f"{effect.description[0].upper()}{effect.description[1:]}."
+        parts += [f"### {effect.key}", text, parameter_table(glossary.effect_entries(effect))]
+    parts += ["## Methods, tests and verdicts", listed([*glossary.TERMS, *glossary.verdict_entries()])]
+    parts += ["## Variables of an unexplained residual", listed(glossary.variable_entries())]
+    return "\n\n".join(parts) + "\n"
+
+
+def listed(entries: Iterable[glossary.GlossaryEntry]) -> str:
+    """Return a Markdown list of entries."""
+    return "\n".join(f"- **{entry.name}**: {entry.text}" for entry in entries)
+
+
+def parameter_table(entries: Iterable[glossary.GlossaryEntry]) -> str:
+    """Return the Markdown table of parameters."""
+    text = {entry: entry.text.replace("|", chr(92) + "|") for entry in entries}
+    rows = [f"| `{entry.name}` | {entry.unit.replace(' | ', ', ')} | {text[entry]} |" for entry in text]
+    return "\n".join(["| parameter | unit | meaning |", "| --- | --- | --- |", *rows])
 
 
 def table(schema: Schema) -> str:

@@ -25,17 +25,8 @@ _CLASSES = {
 def describe(error: Any) -> tuple[BusState | None, str]:
     """Interpret one error frame.
 
-    Parameters
-    ----------
-    error
-        An element of an array of ``FRAME``.
-
-    Returns
-    -------
-    state
-        State that the controller enters; ``None`` if the frame reports no change of state.
-    text
-        Description of the error.
+    ``error``: an element of an array of ``FRAME``. Returns ``state``: state that the controller enters; ``None`` if the
+    frame reports no change of state. ``text``: description of the error.
     """
     classes = int(error["can_id"]) & 0x1FFFFFFF
     detail = int(error["data"][1]) if classes & CONTROLLER else 0
@@ -58,15 +49,7 @@ def describe(error: Any) -> tuple[BusState | None, str]:
 def summarise(errors: Frames) -> list[tuple[BusState | None, str]]:
     """Summarise error frames: every change of state in order, then each kind of other errors with its count.
 
-    Parameters
-    ----------
-    errors
-        Error frames, shape (N,).
-
-    Returns
-    -------
-    list
-        Pairs of state and text, as `describe` returns them.
+    ``errors``: error frames, shape (N,). Returns pairs of state and text, as `describe` returns them.
     """
     changes: list[tuple[BusState | None, str]] = []
     counts: dict[str, int] = {}

@@ -15,19 +15,7 @@ BATCH = 256
 class FilteredSocket:
     """Socket that receives a few identifiers and reopens a bus whose interface was removed and is back.
 
-    Parameters
-    ----------
-    bus
-        The bus.
-    cob_ids
-        Identifiers to receive.
-
-    Raises
-    ------
-    ConfigError
-        If the bus does not exist.
-    BusDown
-        If the bus is down.
+    ``cob_ids``: identifiers to receive. Raises ConfigError if the bus does not exist; BusDown if the bus is down.
     """
 
     def __init__(self, bus: Bus, cob_ids: Sequence[int]) -> None:

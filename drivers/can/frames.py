@@ -66,31 +66,16 @@ class FrameBus(Protocol):
     def receive(self, batch: Frames) -> int:
         """Write received frames to the beginning of ``batch``; return their number, 0 if none.
 
-        Parameters
-        ----------
-        batch
-            Array of ``FRAME`` or ``FD_FRAME``, shape (N,), written in place.
+        ``batch``: array of ``FRAME`` or ``FD_FRAME``, shape (N,), written in place.
         """
         ...
 
     def poll(self, timeout: float) -> bool:
-        """Return True if a frame arrives within the timeout.
-
-        Parameters
-        ----------
-        timeout
-            Longest wait, s.
-        """
+        """Return True if a frame arrives within the timeout. ``timeout``: longest wait, s."""
         ...
 
     def send(self, frames: Frames) -> int:
-        """Send all frames in order; return their number.
-
-        Parameters
-        ----------
-        frames
-            Array of ``FRAME`` or ``FD_FRAME``, shape (N,).
-        """
+        """Send all frames in order; return their number. ``frames``: array of ``FRAME`` or ``FD_FRAME``, shape (N,)."""
         ...
 
     def drops(self) -> int:
@@ -111,30 +96,14 @@ class FrameBus(Protocol):
 
 
 def frames(n: int, fd: bool = False) -> Frames:
-    """Array of empty frames.
-
-    Parameters
-    ----------
-    n
-        Number of frames.
-    fd
-        ``True`` for ``FD_FRAME``, else ``FRAME``.
-    """
+    """Array of empty frames. ``fd``: ``True`` for ``FD_FRAME``, else ``FRAME``."""
     return np.zeros(n, dtype=FD_FRAME if fd else FRAME)
 
 
 def fd_length(size: int) -> int:
     """Number of data bytes of the smallest CAN FD frame that carries a payload; the rest is padding.
 
-    Parameters
-    ----------
-    size
-        Payload, bytes.
-
-    Raises
-    ------
-    ValueError
-        If the payload exceeds the largest frame.
+    Raises ValueError if the payload exceeds the largest frame.
     """
     if size > FD_LENGTHS[-1]:
         raise ValueError(f"{size} bytes do not fit into the {FD_LENGTHS[-1]} of a CAN FD frame")
@@ -142,15 +111,7 @@ def fd_length(size: int) -> int:
 
 
 def frame(can_id: int, data: bytes = b"") -> Frames:
-    """Array with one classic frame to send, shape (1,).
-
-    Parameters
-    ----------
-    can_id
-        Identifier.
-    data
-        Data bytes, at most 8.
-    """
+    """Array with one classic frame to send, shape (1,). ``data``: data bytes, at most 8."""
     one = frames(1)
     one["can_id"] = can_id
     one["length"] = len(data)

@@ -12,13 +12,7 @@ _ARPHRD_CAN = 280
 
 
 def is_up(channel: str) -> bool:
-    """Return True if the interface is administratively up.
-
-    Parameters
-    ----------
-    channel
-        Name of the interface.
-    """
+    """Return True if the interface is administratively up."""
     try:
         return bool(int((SYSFS / channel / "flags").read_text(), 16) & _IFF_UP)
     except (OSError, ValueError):
@@ -26,13 +20,7 @@ def is_up(channel: str) -> bool:
 
 
 def is_can(channel: str) -> bool:
-    """Return True if the interface exists and is a CAN interface (``ARPHRD_CAN``).
-
-    Parameters
-    ----------
-    channel
-        Name of the interface.
-    """
+    """Return True if the interface exists and is a CAN interface (``ARPHRD_CAN``)."""
     try:
         return int((SYSFS / channel / "type").read_text()) == _ARPHRD_CAN
     except (OSError, ValueError):
@@ -42,15 +30,7 @@ def is_can(channel: str) -> bool:
 def check_fd(channel: str) -> None:
     """Refuse an interface that carries classic frames only.
 
-    Parameters
-    ----------
-    channel
-        Name of the interface.
-
-    Raises
-    ------
-    ConfigError
-        If the interface has no CAN FD; contains the command that enables it.
+    Raises ConfigError if the interface has no CAN FD; contains the command that enables it.
     """
     try:
         mtu = int((SYSFS / channel / "mtu").read_text())
@@ -67,15 +47,7 @@ def check_fd(channel: str) -> None:
 
 
 def missing(channel: str, reason: str | None) -> ConfigError:
-    """Error for an interface that does not exist or is not a CAN interface.
-
-    Parameters
-    ----------
-    channel
-        Name of the interface.
-    reason
-        Text of the system's error.
-    """
+    """Error for an interface that does not exist or is not a CAN interface. ``reason``: text of the system's error."""
     hint = f"sudo ip link add dev {channel} type vcan && " if channel.startswith("vcan") else ""
     return ConfigError(
         f"bus {channel}: no such CAN interface ({reason}); "
@@ -86,12 +58,7 @@ def missing(channel: str, reason: str | None) -> ConfigError:
 def down(channel: str, what: str) -> BusDown:
     """Error for an interface that is down, went down or was removed.
 
-    Parameters
-    ----------
-    channel
-        Name of the interface.
-    what
-        Predicate of the message, such as ``is down``.
+    ``what``: predicate of the message, such as ``is down``.
     """
     command = f"sudo ip link set dev {channel} up"
     return BusDown(f"bus {channel}: the interface {what}; an administrator may run: {command}")

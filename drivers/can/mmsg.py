@@ -42,16 +42,8 @@ CLASSIC_MTU, FD_MTU = FRAME.itemsize - 8, FD_FRAME.itemsize - 8
 class Messages:
     """Preallocated ``struct mmsghdr`` for a batch of frames.
 
-    Parameters
-    ----------
-    n
-        Maximum number of frames.
-    control
-        ``True`` with space for time stamps and drop counters.
-    fd
-        ``True`` for ``struct canfd_frame``.
-    hardware
-        ``True`` with space for hardware time stamps.
+    ``n``: maximum number of frames; ``control``: ``True`` with space for time stamps and drop counters; ``fd``:
+    ``True`` for ``struct canfd_frame``; ``hardware``: ``True`` with space for hardware time stamps.
 
     Attributes
     ----------
@@ -80,10 +72,7 @@ class Messages:
     def load(self, frames: Frames) -> None:
         """Copy frames to send; frames with ``FD_FLAG`` are sent as CAN FD, the others as classic frames.
 
-        Parameters
-        ----------
-        frames
-            Array of ``FRAME`` or ``FD_FRAME``, shape (N,), N <= n.
+        ``frames``: array of ``FRAME`` or ``FD_FRAME``, shape (N,), N <= n.
         """
         octets = frame_bytes(frames)[:, 8:]
         width = min(octets.shape[1], self.body.shape[1])
@@ -95,10 +84,7 @@ class Messages:
     def unload(self, batch: Frames) -> None:
         """Copy the bodies of received frames into ``batch``.
 
-        Parameters
-        ----------
-        batch
-            Array of ``FRAME`` or ``FD_FRAME``, shape (N,), written in place except for the times.
+        ``batch``: array of ``FRAME`` or ``FD_FRAME``, shape (N,), written in place except for the times.
         """
         got = batch.size
         frame_bytes(batch)[:, 8:] = self.body[:got]
@@ -109,15 +95,7 @@ class Messages:
 def frame_bytes(batch: Frames) -> "np.ndarray[tuple[int, ...], np.dtype[np.uint8]]":
     """View of a contiguous array of frames as bytes, shape (N, 24) or (N, 80).
 
-    Parameters
-    ----------
-    batch
-        Array of ``FRAME`` or ``FD_FRAME``, shape (N,).
-
-    Raises
-    ------
-    ValueError
-        If the array is not contiguous.
+    ``batch``: array of ``FRAME`` or ``FD_FRAME``, shape (N,). Raises ValueError if the array is not contiguous.
     """
     if not batch.flags.c_contiguous:
         raise ValueError("frames must lie contiguously in memory")

@@ -26,17 +26,7 @@ BusEventKind = Literal["bus_down", "bus_up", "bus_off", "bus_restarted", "bus_st
 
 @dataclass(frozen=True)
 class BusEvent:
-    """Event of a bus.
-
-    Parameters
-    ----------
-    kind
-        Kind of the event.
-    bus
-        Number of the bus.
-    text
-        Message that names the bus.
-    """
+    """Event of a bus. ``text``: message that names the bus."""
 
     kind: BusEventKind
     bus: int
@@ -62,19 +52,8 @@ class Receiver:
     """Reads several buses in turn, each in whole batches.
 
     A bus that goes down or comes back is an event. Its socket is kept, or reopened if the interface was removed. Error
-    frames are removed from the batches, counted, and reported as events.
-
-    Parameters
-    ----------
-    openers
-        Functions that open one bus each.
-
-    Raises
-    ------
-    ConfigError
-        If a bus does not exist.
-    BusDown
-        If a bus is down.
+    frames are removed from the batches, counted, and reported as events. Raises ConfigError if a bus does not exist;
+    BusDown if a bus is down.
     """
 
     def __init__(self, openers: Sequence[Callable[[], FrameBus]]) -> None:
@@ -131,14 +110,8 @@ class Receiver:
     def drain(self) -> Iterator[tuple[int, Frames, bool]]:
         """Yield received frames until none are left.
 
-        Yields
-        ------
-        bus
-            Number of the bus.
-        frames
-            Frames, shape (N,), valid until the next iteration.
-        lost
-            ``True`` if the kernel dropped frames before these.
+        Yields ``bus``: number of the bus; ``frames``: shape (N,), valid until the next iteration; ``lost``: ``True`` if
+        the kernel dropped frames before these.
         """
         # Bounded, so that a bus faster than this loop cannot keep a capture from ending.
         for _ in range(DRAINS):
@@ -157,10 +130,7 @@ class Receiver:
     def events(self, *, last: bool = False) -> list[BusEvent]:
         """Events since the last call; errors are reported once per second.
 
-        Parameters
-        ----------
-        last
-            ``True`` for the last call, which reports all remaining errors.
+        ``last``: ``True`` for the last call, which reports all remaining errors.
         """
         now = time.monotonic()
         for k, entry in enumerate(self._buses):

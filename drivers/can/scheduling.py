@@ -14,15 +14,7 @@ HIGHEST = -20
 def set_realtime_priority(priority: int) -> bool:
     """Request exact timers and a real-time priority for the calling thread.
 
-    Parameters
-    ----------
-    priority
-        Priority of ``SCHED_FIFO``, 1 to 99.
-
-    Returns
-    -------
-    bool
-        ``True`` if the priority was granted.
+    ``priority``: priority of ``SCHED_FIFO``, 1 to 99. Returns ``True`` if the priority was granted.
     """
     ctypes.CDLL(None).prctl(PR_SET_TIMERSLACK, 1, 0, 0, 0)
     try:
@@ -36,10 +28,7 @@ def set_realtime_priority(priority: int) -> bool:
 def raised_priority(steps: int) -> Iterator[None]:
     """Raise the priority of the calling thread in a ``with`` block.
 
-    Parameters
-    ----------
-    steps
-        Steps of the nice value; threads that are started in the block inherit them.
+    ``steps``: steps of the nice value; threads that are started in the block inherit them.
     """
     thread = threading.get_native_id()
     before = os.getpriority(os.PRIO_PROCESS, thread)

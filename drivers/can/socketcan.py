@@ -62,6 +62,9 @@ _sendmmsg.argtypes = [ctypes.c_int, ctypes.c_void_p, ctypes.c_uint, ctypes.c_int
 class RawSocket:
     """Raw socket on one CAN interface that moves batches of frames.
 
+    Raises ConfigError if the kernel has no SocketCAN, or the interface does not exist or has no CAN FD; contains the
+    command for an administrator. Raises BusDown if the interface is down.
+
     Parameters
     ----------
     channel
@@ -80,14 +83,6 @@ class RawSocket:
         Move CAN FD frames too; batches are then arrays of ``FD_FRAME``.
     hardware
         Use the interface's time stamps, if it has any, converted to the machine's time.
-
-    Raises
-    ------
-    ConfigError
-        If the kernel has no SocketCAN, or the interface does not exist or has no CAN FD; contains the command for an
-        administrator.
-    BusDown
-        If the interface is down.
     """
 
     def __init__(
@@ -185,22 +180,9 @@ class RawSocket:
     def receive(self, batch: Frames, wait: bool = False) -> int:
         """Write received frames to the beginning of ``batch``.
 
-        Parameters
-        ----------
-        batch
-            Array of ``FRAME`` (``FD_FRAME`` with ``fd``), shape (N,), written in place.
-        wait
-            Wait up to ``RECEIVE_TIMEOUT`` for the first frame, in the same system call.
-
-        Returns
-        -------
-        int
-            Number of frames, 0 if none had arrived; at most ``min(N, BATCH)``.
-
-        Raises
-        ------
-        BusDown
-            If the interface went down or was removed.
+        ``batch``: array of ``FRAME`` (``FD_FRAME`` with ``fd``), shape (N,), written in place; ``wait``: wait up to
+        ``RECEIVE_TIMEOUT`` for the first frame, in the same system call. Returns the number of frames, 0 if none had
+        arrived; at most ``min(N, BATCH)``. Raises BusDown if the interface went down or was removed.
         """
         if self._in is None:
             self._in = Messages(BATCH, fd=self.fd, hardware=self._clock is not None)
@@ -235,15 +217,7 @@ class RawSocket:
     def poll(self, timeout: float) -> bool:
         """Return True if a frame arrives within the timeout.
 
-        Parameters
-        ----------
-        timeout
-            Longest wait, s.
-
-        Raises
-        ------
-        BusDown
-            If the interface went down or was removed.
+        ``timeout``: longest wait, s. Raises BusDown if the interface went down or was removed.
         """
         for _, event in self._poll.poll(max(0.0, timeout) * 1000):
             if event & (select.POLLERR | select.POLLHUP | select.POLLNVAL):
@@ -254,21 +228,9 @@ class RawSocket:
     def send(self, frames: Frames) -> int:
         """Send frames in order and wait for space in the transmit queue.
 
-        Parameters
-        ----------
-        frames
-            Array of ``FRAME`` or ``FD_FRAME``, shape (N,); ``t_ns`` is ignored.
-
-        Returns
-        -------
-        int
-            Number of frames sent: N.
-
-        Raises
-        ------
-        BusDown
-            If the interface went down or was removed, or if nothing could be sent for half a second. A physical bus
-            without another node acknowledges nothing.
+        ``frames``: array of ``FRAME`` or ``FD_FRAME``, shape (N,); ``t_ns`` is ignored. Returns the number of frames
+        sent: N. Raises BusDown if the interface went down or was removed, or if nothing could be sent for half a
+        second. A physical bus without another node acknowledges nothing.
         """
         if self._out is None:
             self._out = Messages(BATCH, control=False, fd=self.fd)

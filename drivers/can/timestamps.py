@@ -24,10 +24,7 @@ _CLOCK_STEP_NS = 50_000_000
 def has_hardware_timestamps(channel: str) -> bool:
     """Return True if the interface stamps received frames with its own clock.
 
-    Parameters
-    ----------
-    channel
-        Name of the interface; the result is ``False`` if it does not support the query.
+    ``channel``: name of the interface; the result is ``False`` if it does not support the query.
     """
     request = array.array("B", struct.pack("=I", _ETHTOOL_GET_TS_INFO).ljust(_TS_INFO_BYTES, b"\0"))
     address, _ = request.buffer_info()
@@ -55,17 +52,8 @@ class InterfaceClock:
     def to_utc(self, software_ns: NDArray[np.int64], hardware_ns: NDArray[np.int64]) -> NDArray[np.int64]:
         """Convert hardware stamps to the machine's time.
 
-        Parameters
-        ----------
-        software_ns
-            Software stamps, ns UTC, shape (N,).
-        hardware_ns
-            Hardware stamps, ns, shape (N,); 0: none.
-
-        Returns
-        -------
-        ndarray
-            Times, ns UTC, shape (N,); a frame without hardware stamp keeps its software stamp.
+        ``software_ns``: software stamps, ns UTC, shape (N,). ``hardware_ns``: hardware stamps, ns, shape (N,); 0: none.
+        Returns times, ns UTC, shape (N,); a frame without hardware stamp keeps its software stamp.
         """
         times = software_ns.copy()
         stamped = hardware_ns != 0

@@ -35,17 +35,8 @@ class UdpBus:
 
     It receives the frames that it sends itself.
 
-    Parameters
-    ----------
-    channel
-        Multicast address, ``239.74.163.2``.
-    filters
-        Frames to receive; ``None``: all, empty: none.
-
-    Raises
-    ------
-    ConfigError
-        If the address is not a multicast address or the network has no route for it.
+    ``channel``: multicast address, ``239.74.163.2``. ``filters``: frames to receive; ``None``: all, empty: none. Raises
+    ConfigError if the address is not a multicast address or the network has no route for it.
     """
 
     fd = False
@@ -67,15 +58,7 @@ class UdpBus:
     def receive(self, batch: Frames) -> int:
         """Write received frames to the beginning of ``batch`` without waiting; return their number.
 
-        Parameters
-        ----------
-        batch
-            Array of ``FRAME``, shape (N,), written in place.
-
-        Raises
-        ------
-        BusDown
-            If the network went down.
+        ``batch``: array of ``FRAME``, shape (N,), written in place. Raises BusDown if the network went down.
         """
         n = 0
         while n < batch.size and (message := self._next(0.0)) is not None:
@@ -97,15 +80,7 @@ class UdpBus:
     def poll(self, timeout: float) -> bool:
         """Return True if a frame arrives within the timeout.
 
-        Parameters
-        ----------
-        timeout
-            Longest wait, s.
-
-        Raises
-        ------
-        BusDown
-            If the network went down.
+        ``timeout``: longest wait, s. Raises BusDown if the network went down.
         """
         deadline = time.monotonic() + timeout
         while self._ahead is None:
@@ -119,15 +94,7 @@ class UdpBus:
     def send(self, frames: Frames) -> int:
         """Send all frames in order; return their number.
 
-        Parameters
-        ----------
-        frames
-            Array of ``FRAME``, shape (N,).
-
-        Raises
-        ------
-        BusDown
-            If the network refuses a frame.
+        ``frames``: array of ``FRAME``, shape (N,). Raises BusDown if the network refuses a frame.
         """
         for one in frames:
             can_id = int(one["can_id"])
@@ -186,23 +153,9 @@ def open_bus(
 ) -> FrameBus:
     """Open a bus of a session.
 
-    Parameters
-    ----------
-    bus
-        The bus.
-    filters
-        Frames to receive; ``None``: all, empty: none.
-    errors
-        Receive error frames, if the bus has them.
-    hardware
-        Use hardware time stamps, if the interface has them.
-
-    Raises
-    ------
-    ConfigError
-        If the bus does not exist.
-    BusDown
-        If the bus is down.
+    ``filters``: frames to receive; ``None``: all, empty: none. ``errors``: receive error frames, if the bus has them.
+    ``hardware``: use hardware time stamps, if the interface has them. Raises ConfigError if the bus does not exist;
+    BusDown if the bus is down.
     """
     if bus.interface == "udp_multicast":
         return UdpBus(bus.channel, filters=filters)

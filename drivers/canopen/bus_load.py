@@ -35,10 +35,7 @@ def frame_bits(data_bytes: int) -> tuple[int, int]:
 
     ``47 + 8 n`` bits without stuff bits, ``55 + 10 n`` with all possible ones (Davis, Burns, Bril, Lukkien 2007).
 
-    Parameters
-    ----------
-    data_bytes
-        Number of data bytes n, 0 to 8.
+    ``data_bytes``: number of data bytes n, 0 to 8.
     """
     return 47 + 8 * data_bytes, 55 + 10 * data_bytes
 
@@ -49,15 +46,8 @@ def fd_frame_bits(data_bytes: int) -> tuple[tuple[int, int], tuple[int, int]]:
     The bits from start of frame to the last data bit have dynamic stuff bits (none to one in four). The stuff count and
     the CRC, of 17 bits up to 16 bytes and 21 above, have 6 and 7 fixed ones.
 
-    Parameters
-    ----------
-    data_bytes
-        Number of data bytes of the frame, 0 to 64.
-
-    Returns
-    -------
-    fewest, most
-        Bits at the nominal and at the data bit rate.
+    ``data_bytes``: number of data bytes of the frame, 0 to 64. Returns ``fewest``, ``most``: bits at the nominal and at
+    the data bit rate.
     """
     crc, fixed = (17, 6) if data_bytes <= 16 else (21, 7)
     payload = 1 + 4 + 8 * data_bytes
@@ -70,12 +60,7 @@ def fd_frame_bits(data_bytes: int) -> tuple[tuple[int, int], tuple[int, int]]:
 def exact_bits(identifier: int, data: bytes) -> int:
     """Number of bits of a classic frame with known content, stuff bits and interframe space included (ISO 11898-1).
 
-    Parameters
-    ----------
-    identifier
-        11-bit identifier.
-    data
-        Data bytes, at most 8.
+    ``identifier``: 11-bit identifier; ``data``: data bytes, at most 8.
     """
     fields = [(0, 1), (identifier, 11), (0, 3), (len(data), 4), *((byte, 8) for byte in data)]
     bits = [value >> k & 1 for value, width in fields for k in reversed(range(width))]
@@ -97,16 +82,8 @@ def exact_bits(identifier: int, data: bytes) -> int:
 class Load:
     """Load of one kind of message on one bus.
 
-    Parameters
-    ----------
-    message
-        Name of the message.
-    frames_per_s
-        Frames per second.
-    typical, worst
-        Fraction of the bus time without and with all stuff bits.
-    bus
-        Channel of the bus.
+    ``frames_per_s``: frames per second; ``typical``, ``worst``: fraction of the bus time without and with all stuff
+    bits; ``bus``: channel of the bus.
     """
 
     message: str
@@ -119,12 +96,7 @@ class Load:
 def loads(session: SessionConfig, period_us: int | None = None) -> list[Load]:
     """Load of a session by bus and kind of message; ``nan`` on a bus without bit rate.
 
-    Parameters
-    ----------
-    session
-        Buses, drives, streams and set points.
-    period_us
-        SYNC period, us; ``None``: that of the session.
+    ``session``: buses, drives, streams and set points. ``period_us``: SYNC period, us; ``None``: that of the session.
     """
     return [row for bus in session.all_buses for row in bus_loads(session, bus, period_us)]
 
@@ -132,14 +104,8 @@ def loads(session: SessionConfig, period_us: int | None = None) -> list[Load]:
 def bus_loads(session: SessionConfig, bus: Bus, period_us: int | None = None) -> list[Load]:
     """Load of one bus by kind of message; ``nan`` on a bus without bit rate.
 
-    Parameters
-    ----------
-    session
-        Drives, streams and set points.
-    bus
-        A bus of the session.
-    period_us
-        SYNC period, us; ``None``: that of the session.
+    ``session``: drives, streams and set points. ``bus``: a bus of the session. ``period_us``: SYNC period, us;
+    ``None``: that of the session.
     """
     period = (session.sync.period_us if period_us is None else period_us) * 1e-6
     bitrate, data_bitrate = bus.bitrate or float("nan"), bus.data_bitrate or float("nan")
@@ -172,10 +138,7 @@ def bus_loads(session: SessionConfig, bus: Bus, period_us: int | None = None) ->
 def worst_load(session: SessionConfig, bus: Bus, period_us: int | None = None) -> float:
     """Worst-case load of one bus as a fraction of its time; ``nan`` without bit rate.
 
-    Parameters
-    ----------
-    session, bus, period_us
-        As in `bus_loads`.
+    ``session``, ``bus``, ``period_us``: as in `bus_loads`.
     """
     return sum(row.worst for row in bus_loads(session, bus, period_us))
 
@@ -183,10 +146,7 @@ def worst_load(session: SessionConfig, bus: Bus, period_us: int | None = None) -
 def fits(session: SessionConfig, period_us: int | None = None) -> bool:
     """Return True if every bus with a bit rate carries the session in the worst case.
 
-    Parameters
-    ----------
-    session, period_us
-        As in `loads`.
+    ``session``, ``period_us``: as in `loads`.
     """
     return all(worst_load(session, bus, period_us) <= 1.0 for bus in session.all_buses if bus.bitrate is not None)
 
@@ -194,10 +154,7 @@ def fits(session: SessionConfig, period_us: int | None = None) -> bool:
 def fitting_period(session: SessionConfig) -> int | None:
     """Shortest standard SYNC period (us), at least the configured one, whose worst-case load fits all buses.
 
-    Parameters
-    ----------
-    session
-        The session; the result is ``None`` if no standard period fits.
+    ``session``: the session; the result is ``None`` if no standard period fits.
     """
     for period in STANDARD_PERIODS_US:
         if period >= session.sync.period_us and fits(session, period):
@@ -208,17 +165,7 @@ def fitting_period(session: SessionConfig) -> int | None:
 def check_fits(session: SessionConfig, where: str = "session") -> None:
     """Refuse a session whose worst-case load exceeds a bus; a virtual bus has no bit rate and always fits.
 
-    Parameters
-    ----------
-    session
-        The session.
-    where
-        Name of the session in messages.
-
-    Raises
-    ------
-    ConfigError
-        If the load exceeds a bus; contains the load and the nearest configurations that fit.
+    Raises ConfigError if the load exceeds a bus; contains the load and the nearest configurations that fit.
     """
     for bus in session.all_buses:
         if bus.bitrate is None or worst_load(session, bus) <= 1.0:
@@ -236,16 +183,7 @@ def check_fits(session: SessionConfig, where: str = "session") -> None:
 class Option:
     """Change of a session that makes it fit its buses.
 
-    Parameters
-    ----------
-    text
-        Description of the change.
-    session
-        The changed session.
-    kinds
-        Number of kinds of change.
-    size
-        Factor of the largest change.
+    ``text``: description of the change; ``size``: factor of the largest change.
     """
 
     text: str
@@ -259,11 +197,6 @@ def alternatives(session: SessionConfig) -> list[Option]:
 
     Of each combination of kinds (rate, buses, FD, packing) only the smallest change is listed. A change that only adds
     to another one is left out.
-
-    Parameters
-    ----------
-    session
-        The session.
     """
     found = sorted(_all_options(session), key=lambda option: (option.kinds, option.size))
     chosen: list[Option] = []

@@ -27,14 +27,8 @@ LADDER = (DriveState.SWITCH_ON_DISABLED, DriveState.READY, DriveState.SWITCHED_O
 """States on the way to operation enabled, in order; some drives pass several of them at one command."""
 
 
-def read_state(sdo: DriveSdo) -> DriveState | None:
-    """State of the drive from its statusword (6041h); ``None`` for a pattern that CiA 402 does not define.
-
-    Parameters
-    ----------
-    sdo
-        The drive.
-    """
+def read_drive_state(sdo: DriveSdo) -> DriveState | None:
+    """State of the drive from its statusword (6041h); ``None`` for a pattern that CiA 402 does not define."""
     return od.drive_state(sdo.read(od.STATUSWORD, 0, "H"))
 
 
@@ -43,10 +37,7 @@ def hold_position(sdo: DriveSdo) -> None:
 
     The target is not read back: in some drives it follows the position until they are enabled.
 
-    Parameters
-    ----------
-    sdo
-        The drive, before it is enabled.
+    ``sdo``: the drive, before it is enabled.
     """
     sdo.write(od.MODE_OF_OPERATION, 0, od.CYCLIC_SYNCHRONOUS_POSITION, "b")
     sdo.command(od.TARGET_POSITION, 0, sdo.read(od.POSITION_ACTUAL, 0, "i"), "i")
@@ -55,17 +46,9 @@ def hold_position(sdo: DriveSdo) -> None:
 def enable_drive(sdo: DriveSdo) -> None:
     """Bring one drive from any state of CiA 402 to operation enabled.
 
-    Parameters
-    ----------
-    sdo
-        The drive.
-
-    Raises
-    ------
-    ArmidentError
-        If the drive stays in another state; names the state.
+    Raises ArmidentError if the drive stays in another state; names the state.
     """
-    state = read_state(sdo)
+    state = read_drive_state(sdo)
     while state != DriveState.ENABLED:
         if state not in TO_ENABLED:
             state = _await_state(sdo, DriveState.ENABLED, *TO_ENABLED)
@@ -80,7 +63,7 @@ def enable_drive(sdo: DriveSdo) -> None:
 
 def _await_state(sdo: DriveSdo, *wanted: DriveState) -> DriveState:
     deadline = time.monotonic() + ENABLE_TIMEOUT
-    while (state := read_state(sdo)) not in wanted:
+    while (state := read_drive_state(sdo)) not in wanted:
         if time.monotonic() > deadline:
             raise ArmidentError(
                 f"{sdo.label}: cannot be enabled: stays in state '{state or 'unknown'}'{_fault_cause(sdo)}, "

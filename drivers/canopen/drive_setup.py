@@ -15,17 +15,8 @@ MODE_TIMEOUT = 10.0
 def check_drive(sdo: DriveSdo, robot: RobotConfig) -> None:
     """Refuse a node that is not the drive of the robot configuration.
 
-    Parameters
-    ----------
-    sdo
-        The drive.
-    robot
-        Expected encoder resolution and rated current.
-
-    Raises
-    ------
-    ConfigError
-        If the node is not a CiA 402 drive, or if product, encoder resolution or rated current differ.
+    ``robot``: expected encoder resolution and rated current. Raises ConfigError if the node is not a CiA 402 drive, or
+    if product, encoder resolution or rated current differ.
     """
     device = sdo.read(od.DEVICE_TYPE, 0, "I")
     if device & 0xFFFF != od.DEVICE_PROFILE_CIA402:
@@ -41,7 +32,7 @@ def check_drive(sdo: DriveSdo, robot: RobotConfig) -> None:
             sdo.remark(f"has no {what} (1018h:{sub}): it is not checked")
         elif expected and found != expected:
             eds = sdo.drive.eds.name
-            raise ConfigError(f"{sdo.label}: {what} (1018h:{sub}) is {found:X}h, {eds} says {expected:X}h")
+            raise ConfigError(f"{sdo.label}: {what} (1018h:{sub}) is {found:X}h, {eds} has {expected:X}h")
     _check_scales(sdo, robot.name, next(j for j in robot.joints if j.name == sdo.drive.joint))
 
 
@@ -56,7 +47,7 @@ def _check_scales(sdo: DriveSdo, robot: str, joint: Joint) -> None:
         elif not turns or abs(increments / turns - expected) > 0.5:
             raise ConfigError(
                 f"{sdo.label}: encoder has {increments}/{turns} counts per turn (608Fh), "
-                f"robot {robot} says {expected:g}; check drive and robot configuration"
+                f"robot {robot} has {expected:g}; check drive and robot configuration"
             )
     if joint.drive.signal == "current":
         rated = sdo.read_optional(od.RATED_CURRENT, 0, "I")
@@ -64,7 +55,7 @@ def _check_scales(sdo: DriveSdo, robot: str, joint: Joint) -> None:
             sdo.remark(f"has no rated current (6075h): {joint.drive.rated:g} A of {robot} are not checked")
         elif rated != od.rated_milliamperes(joint.drive):
             raise ConfigError(
-                f"{sdo.label}: rated current is {rated} mA (6075h), robot {robot} says "
+                f"{sdo.label}: rated current is {rated} mA (6075h), robot {robot} has "
                 f"{od.rated_milliamperes(joint.drive)} mA; check drive and robot configuration"
             )
 
@@ -72,19 +63,8 @@ def _check_scales(sdo: DriveSdo, robot: str, joint: Joint) -> None:
 def set_heartbeat(sdo: DriveSdo, period_ms: int) -> None:
     """Set the heartbeat (1017h) and store in ``sdo.heartbeat_ms`` the period that the drive reads back.
 
-    Parameters
-    ----------
-    sdo
-        The drive.
-    period_ms
-        Wanted period, ms. A drive may round it; without heartbeat, ``sdo.heartbeat_ms`` is ``None``.
-
-    Raises
-    ------
-    ConfigError
-        If the drive does not answer.
-    BusDown
-        If the bus is down.
+    ``period_ms``: wanted period, ms. A drive may round it; without heartbeat, ``sdo.heartbeat_ms`` is ``None``. Raises
+    ConfigError if the drive does not answer; BusDown if the bus is down.
     """
     try:
         found = sdo.write_rounded(od.HEARTBEAT_PRODUCER, 0, period_ms, "H")
@@ -98,24 +78,9 @@ def set_heartbeat(sdo: DriveSdo, period_ms: int) -> None:
 def set_sync_counter(sdo: DriveSdo, overflow: int) -> str | None:
     """Set the overflow of the SYNC counter (1019h).
 
-    Parameters
-    ----------
-    sdo
-        The drive.
-    overflow
-        Overflow of the counter; 0: SYNC without a counter.
-
-    Returns
-    -------
-    str or None
-        Reason why SYNC with a counter does not suit the drive; ``None`` if it does.
-
-    Raises
-    ------
-    ConfigError
-        If the drive does not answer, or holds another value afterwards.
-    BusDown
-        If the bus is down.
+    ``overflow``: overflow of the counter; 0: SYNC without a counter. Returns the reason why SYNC with a counter does
+    not suit the drive; ``None`` if it does. Raises ConfigError if the drive does not answer, or holds another value
+    afterwards; BusDown if the bus is down.
     """
     try:
         sdo.write(od.SYNC_COUNTER_OVERFLOW, 0, overflow, "B")
@@ -127,19 +92,8 @@ def set_sync_counter(sdo: DriveSdo, overflow: int) -> str | None:
 def await_mode(drives: list[DriveSdo]) -> None:
     """Wait until enabled drives report cyclic synchronous position mode (6061h).
 
-    Some drives report a mode only some time after they have been enabled, and no mode or -1 before.
-
-    Parameters
-    ----------
-    drives
-        The drives, enabled.
-
-    Raises
-    ------
-    ConfigError
-        If a drive reports another mode for `MODE_TIMEOUT`.
-    BusDown
-        If the bus is down.
+    Some drives report a mode only some time after they have been enabled, and no mode or -1 before. Raises ConfigError
+    if a drive reports another mode for `MODE_TIMEOUT`; BusDown if the bus is down.
     """
     until = time.monotonic() + MODE_TIMEOUT
     for sdo in drives:

@@ -80,12 +80,8 @@ log = logging.getLogger(__name__)
 class DataSheet:
     """Contents of an EDS.
 
-    Parameters
-    ----------
-    objects
-        Object dictionary, with the values that depend on the node id.
-    remarks
-        Deviations from CiA 306 that leave something out or undecided, one line each.
+    ``objects``: object dictionary, with the values that depend on the node id; ``remarks``: deviations from CiA 306
+    that leave something out or undecided, one line each.
     """
 
     objects: canopen.ObjectDictionary
@@ -95,17 +91,8 @@ class DataSheet:
 def read_eds(file: Path, node_id: int) -> DataSheet:
     """Read the electronic data sheet of a drive.
 
-    Parameters
-    ----------
-    file
-        Path of an EDS or DCF (or an EPF, which canopen reads as it is).
-    node_id
-        Node id for values that depend on it.
-
-    Raises
-    ------
-    ConfigError
-        If the file cannot be read or describes no object.
+    ``file``: path of an EDS or DCF (or an EPF, which canopen reads as it is); ``node_id``: node id for values that
+    depend on it. Raises ConfigError if the file cannot be read or describes no object.
     """
     if file.suffix.lower() == ".epf":
         return DataSheet(_imported(file, str(file), node_id), ())
@@ -125,17 +112,8 @@ def read_eds(file: Path, node_id: int) -> DataSheet:
 def read_objects(file: Path, node_id: int) -> canopen.ObjectDictionary:
     """Read the object dictionary of a drive, and log what its data sheet leaves out or undecided, once per file.
 
-    Parameters
-    ----------
-    file
-        Path of an EDS or DCF.
-    node_id
-        Node id for values that depend on it.
-
-    Raises
-    ------
-    ConfigError
-        If the file cannot be read or describes no object.
+    ``file``: path of an EDS or DCF; ``node_id``: node id for values that depend on it. Raises ConfigError if the file
+    cannot be read or describes no object.
     """
     sheet = read_eds(file, node_id)
     for remark in sheet.remarks:
@@ -191,14 +169,8 @@ def _flag(text: str | None) -> int | None:
 class _Cleaner:
     """Sections of a file, from which those that canopen reads are made.
 
-    Parameters
-    ----------
-    sections
-        Sections of the file by canonical name.
-    remarks
-        Receives what is left out.
-    configured
-        ``True`` for a DCF, whose values are those of one drive.
+    ``sections``: sections of the file by canonical name; ``remarks``: receives what is left out; ``configured``:
+    ``True`` for a DCF, whose values are those of one drive.
     """
 
     sections: dict[str, Section]
@@ -227,12 +199,7 @@ class _Cleaner:
     def _members(self, index: int, parent: Section, subs: dict[int, Section]) -> Iterator[tuple[str, Section]]:
         """Section of an array or record, and those of its entries.
 
-        Parameters
-        ----------
-        index
-            Index of the object.
-        parent, subs
-            Its section, and those of its entries by subindex.
+        ``parent``, ``subs``: its section, and those of its entries by subindex.
         """
         name = parent.get("ParameterName") or label(index)
         count = parse_number(parent.get("CompactSubObj")) or 0
@@ -246,17 +213,7 @@ class _Cleaner:
             yield from self._variable(values, index, subindex)
 
     def _expanded(self, index: int, count: int, parent: Section) -> dict[int, Section]:
-        """Entries of an array with CompactSubObj: as their parent, with names and values of sections of their own.
-
-        Parameters
-        ----------
-        index
-            Index of the object.
-        count
-            Number of entries.
-        parent
-            Section of the array.
-        """
+        """Entries of an array with CompactSubObj: as their parent, with names and values of sections of their own."""
         names, values = (self.sections.get(f"{section_of(index)}{more}", {}) for more in ("Name", "Value"))
         first = {"ParameterName": "Number of entries", "DataType": str(UNSIGNED8), "AccessType": "ro"}
         entries = {0: first | {"DefaultValue": str(count)}}
@@ -268,15 +225,7 @@ class _Cleaner:
         return entries
 
     def _variable(self, values: Section, index: int, subindex: int | None) -> Iterator[tuple[str, Section]]:
-        """Section of a variable with all key words that canopen needs; none if its data type is unknown.
-
-        Parameters
-        ----------
-        values
-            Section of the variable.
-        index, subindex
-            Index and subindex of the variable.
-        """
+        """Section of a variable with all key words that canopen needs; none if its data type is unknown."""
         kind = parse_number(values.get("DataType"))
         if kind is None and parse_number(values.get("ObjectType")) == DOMAIN_OBJECT:
             kind = DOMAIN_TYPE
@@ -301,10 +250,7 @@ class _Cleaner:
     def _standard_type(self, kind: int) -> int:
         """Data type of CiA 301 behind one that the file defines in a section of its own; without one DOMAIN.
 
-        Parameters
-        ----------
-        kind
-            Data type, larger than `LARGEST_STANDARD_TYPE`.
+        ``kind``: data type, larger than `LARGEST_STANDARD_TYPE`.
         """
         found = parse_number(self.sections.get(section_of(kind, 1), {}).get("DefaultValue"))
         return found if found is not None and 0 < found <= LARGEST_STANDARD_TYPE else DOMAIN_TYPE
@@ -312,12 +258,7 @@ class _Cleaner:
     def _integer(self, text: str, place: str) -> str | None:
         """Integer value as canopen reads it, ``$NODEID`` included; ``None`` if it is no integer.
 
-        Parameters
-        ----------
-        text
-            Value as in the file; empty: none.
-        place
-            Object and key word.
+        ``text``: value as in the file; empty: none. ``place``: object and key word.
         """
         if not text:
             return None

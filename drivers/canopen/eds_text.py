@@ -43,25 +43,14 @@ Section = dict[str, str]
 
 @dataclass
 class Remarks:
-    """Deviations of a file from CiA 306, by kind.
-
-    Parameters
-    ----------
-    places
-        Places of each kind, in the order of the file.
-    """
+    """Deviations of a file from CiA 306, by kind. ``places``: places of each kind, in the order of the file."""
 
     places: dict[str, list[str]] = field(default_factory=dict)
 
     def add(self, kind: str, place: str) -> None:
         """Note a deviation.
 
-        Parameters
-        ----------
-        kind
-            Text that says what was found and what was done.
-        place
-            Line, section or object.
+        ``kind``: text that says what was found and what was done; ``place``: line, section or object.
         """
         self.places.setdefault(kind, []).append(place)
 
@@ -78,15 +67,7 @@ def _listed(places: list[str]) -> str:
 def read_text(file: Path) -> str:
     """Return the text of a file in UTF-8, UTF-16 with byte order mark, or Windows-1252.
 
-    Parameters
-    ----------
-    file
-        Path of the file.
-
-    Raises
-    ------
-    ConfigError
-        If the file cannot be opened, is too large, or is binary.
+    Raises ConfigError if the file cannot be opened, is too large, or is binary.
     """
     try:
         with file.open("rb") as opened:
@@ -114,17 +95,9 @@ def sections_of(text: str, remarks: Remarks) -> dict[str, Section]:
 
     Key words and section names are matched without regard to case. The first value of a key counts.
 
-    Parameters
-    ----------
-    text
-        Text of the file.
-    remarks
-        Receives lines that are neither section, key nor comment, and sections whose second copy differs.
-
-    Returns
-    -------
-    dict
-        Values by key word, by section: ``DeviceInfo``, ``1018``, ``1018sub1``, ``1003Name``, ...
+    ``text``: text of the file; ``remarks``: receives lines that are neither section, key nor comment, and sections
+    whose second copy differs. Returns values by key word, by section: ``DeviceInfo``, ``1018``, ``1018sub1``,
+    ``1003Name``, .
     """
     found: dict[str, Section] = {}
     section: Section = {}
@@ -144,7 +117,7 @@ def sections_of(text: str, remarks: Remarks) -> dict[str, Section]:
             continue
         word, value = _key(key), _value(value)
         if section.setdefault(word, value) != value:
-            kind = "sections that are there twice and differ" if repeated else "keys that are there twice and differ"
+            kind = "duplicate sections that differ" if repeated else "duplicate keys that differ"
             place = f"[{name}] {word}"
             remarks.add(f"{kind}, the first value counts", place)
     return found
@@ -178,23 +151,14 @@ def _section_name(text: str) -> str:
 
 
 def section_of(index: int, subindex: int | None = None) -> str:
-    """Name of the section of an object.
-
-    Parameters
-    ----------
-    index, subindex
-        Index and subindex of the object.
-    """
+    """Name of the section of an object."""
     return f"{index:04X}" if subindex is None else f"{index:04X}sub{subindex:X}"
 
 
 def object_of(section: str) -> tuple[int, int | None] | None:
     """Index and subindex of the object of a section; ``None`` if it describes no object.
 
-    Parameters
-    ----------
-    section
-        Canonical name of the section.
+    ``section``: canonical name of the section.
     """
     match = _OBJECT.fullmatch(section)
     if match is None or match[3] is not None:
@@ -203,23 +167,14 @@ def object_of(section: str) -> tuple[int, int | None] | None:
 
 
 def label(index: int, subindex: int | None = None) -> str:
-    """Index and subindex of an object as in the CiA documents, for messages.
-
-    Parameters
-    ----------
-    index, subindex
-        Index and subindex of the object.
-    """
+    """Index and subindex of an object as in the CiA documents, for messages."""
     return f"{index:04X}h" if subindex is None else f"{index:04X}h:{subindex:02X}"
 
 
 def parse_number(text: str | None) -> int | None:
     """Integer of an EDS: decimal, also with leading zeros, or hexadecimal with 0x; ``None`` if it is none.
 
-    Parameters
-    ----------
-    text
-        Value of a key; ``None`` if the key is missing.
+    ``text``: value of a key; ``None`` if the key is missing.
     """
     word = (text or "").strip()
     if re.fullmatch(r"[-+]?0[xX][0-9a-fA-F]{1,16}", word):
@@ -230,13 +185,7 @@ def parse_number(text: str | None) -> int | None:
 
 
 def rendered(sections: Iterable[tuple[str, Section]]) -> str:
-    """Text of sections, in their order.
-
-    Parameters
-    ----------
-    sections
-        Names and values of the sections.
-    """
+    """Text of sections, in their order."""
     lines: list[str] = []
     for name, values in sections:
         lines += [f"[{name}]", *(f"{key}={value}" for key, value in values.items())]

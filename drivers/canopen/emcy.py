@@ -89,12 +89,7 @@ EMCY_TEXTS: dict[int, str] = {
 def emcy_text(code: int, vendor: Mapping[int, str] | None = None) -> str:
     """Text of an emergency error code: the vendor's, else that of the code, else that of its narrowest group.
 
-    Parameters
-    ----------
-    code
-        Error code.
-    vendor
-        Vendor-specific texts by code.
+    ``vendor``: vendor-specific texts by code.
     """
     if vendor and code in vendor:
         return vendor[code]
@@ -108,16 +103,8 @@ def emcy_text(code: int, vendor: Mapping[int, str] | None = None) -> str:
 class Emergency:
     """Emergency message (CiA 301 section 7.2.7.1).
 
-    Parameters
-    ----------
-    node
-        Node id of the sender.
-    t_ns
-        Receive time, ns UTC.
-    code, register
-        Error code, and error register (1001h).
-    manufacturer
-        Five manufacturer-specific bytes.
+    ``node``: node id of the sender; ``t_ns``: receive time, ns UTC; ``code``, ``register``: error code, and error
+    register (1001h); ``manufacturer``: five manufacturer-specific bytes.
     """
 
     node: int
@@ -127,13 +114,7 @@ class Emergency:
     manufacturer: bytes
 
     def text(self, vendor: Mapping[int, str] | None = None) -> str:
-        """Text of the message.
-
-        Parameters
-        ----------
-        vendor
-            Vendor-specific texts by error code.
-        """
+        """Text of the message. ``vendor``: vendor-specific texts by error code."""
         more = f", manufacturer {self.manufacturer.hex(' ')}" if any(self.manufacturer) else ""
         return f"EMCY {self.code:04X}h, {emcy_text(self.code, vendor)} (error register {self.register:02X}h{more})"
 
@@ -141,10 +122,7 @@ class Emergency:
 def read_emergencies(batch: Frames) -> Iterator[Emergency]:
     """Yield the emergency messages of a batch; missing bytes are zero, and frames without error code are ignored.
 
-    Parameters
-    ----------
-    batch
-        Frames with EMCY identifiers, shape (N,).
+    ``batch``: frames with EMCY identifiers, shape (N,).
     """
     for one in batch[batch["length"] >= 2]:
         data = bytes(one["data"][: int(one["length"])]).ljust(8, b"\0")

@@ -12,17 +12,7 @@ from armident.drivers.canopen.objects import COB_EMCY
 class EmcyListener:
     """Receives the emergency messages of a session's drives and sends nothing; use it in a ``with`` block.
 
-    Parameters
-    ----------
-    session
-        Buses and drives.
-
-    Raises
-    ------
-    ConfigError
-        If a bus does not exist.
-    BusDown
-        If a bus is down.
+    ``session``: buses and drives. Raises ConfigError if a bus does not exist; BusDown if a bus is down.
     """
 
     def __init__(self, session: SessionConfig) -> None:

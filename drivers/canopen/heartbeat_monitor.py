@@ -17,19 +17,7 @@ DELAYED_S = 0.1
 class HeartbeatSocket:
     """Socket for the heartbeats and boot-up messages on one bus.
 
-    Parameters
-    ----------
-    bus
-        The bus.
-    nodes
-        Node ids of its drives.
-
-    Raises
-    ------
-    ConfigError
-        If the bus does not exist.
-    BusDown
-        If the bus is down.
+    ``nodes``: node ids of its drives. Raises ConfigError if the bus does not exist; BusDown if the bus is down.
     """
 
     def __init__(self, bus: Bus, nodes: Sequence[int]) -> None:
@@ -58,12 +46,7 @@ class HeartbeatMonitor:
     A delayed machine stamps frames late or loses them. If the consumer was delayed, the longest pause of all drives in
     that time does not count as silence of any drive. Each silence is shortened in this way only once.
 
-    Parameters
-    ----------
-    drives
-        Names of the drives.
-    now
-        Start time, s, monotonic clock.
+    ``now``: start time, s, monotonic clock.
     """
 
     def __init__(self, drives: Iterable[str], now: float) -> None:
@@ -76,12 +59,7 @@ class HeartbeatMonitor:
     def update(self, heartbeats: Iterable[tuple[str, float]], now: float) -> None:
         """Process the heartbeats since the last update.
 
-        Parameters
-        ----------
-        heartbeats
-            Pairs of drive and time, s.
-        now
-            Present time, s.
+        ``heartbeats``: pairs of drive and time, s; ``now``: present time, s.
         """
         self._ended = dict.fromkeys(self._last, 0.0)
         before, self.updated = self.updated, now
@@ -104,21 +82,9 @@ class HeartbeatMonitor:
             self._shortened.discard(drive)
 
     def silence(self, drive: str) -> float:
-        """Time since the last heartbeat of a drive at the last update, s.
-
-        Parameters
-        ----------
-        drive
-            Name of the drive.
-        """
+        """Time since the last heartbeat of a drive at the last update, s."""
         return self.updated - self._last[drive]
 
     def ended_silence(self, drive: str) -> float:
-        """Longest silence of a drive that ended with a heartbeat of the last update, s; 0 if there was none.
-
-        Parameters
-        ----------
-        drive
-            Name of the drive.
-        """
+        """Longest silence of a drive that ended with a heartbeat of the last update, s; 0 if there was none."""
         return self._ended[drive]

@@ -20,12 +20,7 @@ _FRAME = "=IBBBB8s"
 def setup_message(period_us: int, counter: int) -> bytes:
     """Message that makes the kernel send SYNC cyclically, with counter 1 to its overflow if there is one.
 
-    Parameters
-    ----------
-    period_us
-        SYNC period, us.
-    counter
-        Overflow of the SYNC counter (1019h); 0: none.
+    ``counter``: overflow of the SYNC counter (1019h); 0: none.
     """
     contents = [bytes([k]) for k in range(1, counter + 1)] or [b""]
     head = struct.pack(
@@ -41,14 +36,7 @@ class KernelSync:
     at the end of the last one, so the period is longer by the timer's latency. Therefore the clocks of several buses
     would drift apart. Set points cannot be sent directly after SYNC.
 
-    Parameters
-    ----------
-    bus
-        The bus.
-    period_us
-        SYNC period, us.
-    counter
-        Overflow of the SYNC counter (1019h); 0: none.
+    ``counter``: overflow of the SYNC counter (1019h); 0: none.
     """
 
     sent: int | None = None
@@ -61,12 +49,7 @@ class KernelSync:
     def start(self) -> None:
         """Send the first SYNC one period from now.
 
-        Raises
-        ------
-        ConfigError
-            If the bus does not exist, or the kernel has no CAN_BCM.
-        BusDown
-            If the bus is down.
+        Raises ConfigError if the bus does not exist, or the kernel has no CAN_BCM; BusDown if the bus is down.
         """
         # Raises an error that names the administrator's command if the interface is not usable.
         RawSocket(self._channel, filters=(), receive_buffer=4096).close()

@@ -17,7 +17,7 @@ from armident.configs.schema.robot import RobotConfig
 from armident.configs.schema.session import DriveNode, SessionConfig
 from armident.drivers.can.frames import BusDown
 from armident.drivers.canopen import objects as od
-from armident.drivers.canopen.cia402_enable import POLL_INTERVAL, enable_drive, hold_position, read_state
+from armident.drivers.canopen.cia402_enable import POLL_INTERVAL, enable_drive, hold_position, read_drive_state
 from armident.drivers.canopen.drive_setup import await_mode, check_drive, set_heartbeat, set_sync_counter
 from armident.drivers.canopen.network import NodeNetwork
 from armident.drivers.canopen.node_supervision import NodeSupervision
@@ -46,18 +46,8 @@ log = logging.getLogger(__name__)
 class DriveEvent:
     """Event of a drive.
 
-    Parameters
-    ----------
-    kind
-        Kind of the event.
-    joint, node_id
-        Joint and node id of the drive.
-    t_ns
-        Time of the frame, or of the detection of a loss, ns UTC.
-    text
-        Message that names the drive.
-    code
-        EMCY error code, or NMT state.
+    ``t_ns``: time of the frame, or of the detection of a loss, ns UTC; ``text``: message that names the drive;
+    ``code``: EMCY error code, or NMT state.
     """
 
     kind: EventKind
@@ -75,19 +65,8 @@ class DriveMaster:
     again, or whose PDO mapping another master changes, is configured, started and enabled again automatically. Until
     then its TPDOs may differ from the session; `unverified_mapping` holds these times.
 
-    Parameters
-    ----------
-    session
-        Buses, nodes and streams.
-    robot
-        Expected encoder resolutions and rated currents.
-
-    Raises
-    ------
-    ConfigError
-        If a bus does not exist.
-    BusDown
-        If a bus is down.
+    ``session``: buses, nodes and streams; ``robot``: expected encoder resolutions and rated currents. Raises
+    ConfigError if a bus does not exist; BusDown if a bus is down.
     """
 
     def __init__(self, session: SessionConfig, robot: RobotConfig) -> None:
@@ -130,14 +109,8 @@ class DriveMaster:
         """Check every drive against the robot, then map and enable the TPDOs of the session.
 
         Drives that do not answer yet are waited for (``boot_timeout_s``). What is unusual about a drive, but does not
-        prevent its use, becomes an event ``remark``.
-
-        Raises
-        ------
-        ConfigError
-            If a drive is missing, is not the expected one, or refuses a mapping.
-        BusDown
-            If a bus went down.
+        prevent its use, becomes an event ``remark``. Raises ConfigError if a drive is missing, is not the expected one,
+        or refuses a mapping; BusDown if a bus went down.
         """
         for sdo in self._drives:
             self._command(NmtCommand.PRE_OPERATIONAL, sdo)
@@ -154,17 +127,8 @@ class DriveMaster:
     def start(self, enable: bool = True) -> None:
         """Start the nodes (NMT) and bring the drives to operation enabled.
 
-        Parameters
-        ----------
-        enable
-            ``False``: start the nodes only.
-
-        Raises
-        ------
-        ArmidentError
-            If a drive does not follow; names its state.
-        BusDown
-            If a bus went down.
+        ``enable``: ``False``: start the nodes only. Raises ArmidentError if a drive does not follow; names its state.
+        Raises BusDown if a bus went down.
         """
         for sdo in self._drives:
             self._command(NmtCommand.START, sdo)
@@ -186,12 +150,7 @@ class DriveMaster:
         """Events since the last call: EMCY, lost and returned heartbeats, NMT states, reboots, changed mappings.
 
         Never waits. A bus that went down is reopened when it is back. While other buses are up, the drives of a bus
-        that is down count as lost.
-
-        Raises
-        ------
-        BusDown
-            If all buses are down.
+        that is down count as lost. Raises BusDown if all buses are down.
         """
         alive = {channel: network.reopen() for channel, network in self._networks.items()}
         if not any(alive.values()):
@@ -233,7 +192,7 @@ class DriveMaster:
 
     def states(self) -> list[DriveState | None]:
         """CiA 402 states from the statuswords over SDO, in the order of the session's drives."""
-        return [read_state(sdo) for sdo in self._drives]
+        return [read_drive_state(sdo) for sdo in self._drives]
 
     def quick_stop(self) -> None:
         """Command a quick stop of every drive that is not lost; raises nothing."""
@@ -399,10 +358,7 @@ class DriveMaster:
     def _try_configure(self, sdo: DriveSdo) -> bool:
         """Configure and start a drive once; ``False`` if its bus went down or another master wrote meanwhile.
 
-        Raises
-        ------
-        ArmidentError
-            If the drive does not follow.
+        Raises ArmidentError if the drive does not follow.
         """
         joint = sdo.drive.joint
         while self._started and time.monotonic() - self._written.get(joint, 0.0) < QUIET_S:

@@ -39,22 +39,7 @@ class _QuietListener(MessageListener):
 
 
 class NodeNetwork:
-    """Nodes of one bus.
-
-    Parameters
-    ----------
-    bus
-        The bus.
-    drives
-        Its drives.
-
-    Raises
-    ------
-    ConfigError
-        If the bus does not exist.
-    BusDown
-        If the bus is down.
-    """
+    """Nodes of one bus. Raises ConfigError if the bus does not exist; BusDown if the bus is down."""
 
     def __init__(self, bus: Bus, drives: tuple[DriveNode, ...]) -> None:
         self.bus, self._nodes = bus, [drive.node_id for drive in drives]
@@ -90,18 +75,7 @@ class NodeNetwork:
             raise ConfigError(f"bus {bus.channel}: {error.__cause__ or error}") from error
 
     def add(self, drive: DriveNode) -> canopen.RemoteNode:
-        """Add a drive and return its canopen node.
-
-        Parameters
-        ----------
-        drive
-            The drive.
-
-        Raises
-        ------
-        ConfigError
-            If its EDS cannot be read.
-        """
+        """Add a drive and return its canopen node. Raises ConfigError if its EDS cannot be read."""
         return self._network.add_node(SdoNode(drive.node_id, read_objects(drive.eds, drive.node_id)))
 
     def on_sdo_write(self, node_id: int, callback: Callable[[int, int], None]) -> None:
@@ -109,12 +83,8 @@ class NodeNetwork:
 
         Our own requests are not received by the socket that sent them.
 
-        Parameters
-        ----------
-        node_id
-            Node id of the drive.
-        callback
-            Function of object index and time (ns, UTC), called in canopen's thread.
+        ``node_id``: node id of the drive; ``callback``: function of object index and time (ns, UTC), called in
+        canopen's thread.
         """
 
         def on_request(_: int, data: bytearray, timestamp: float) -> None:
@@ -140,20 +110,7 @@ class NodeNetwork:
             yield from read_emergencies(batch)
 
     def command(self, command: NmtCommand, node_id: int) -> None:
-        """Send an NMT command to one node.
-
-        Parameters
-        ----------
-        command
-            The command.
-        node_id
-            Node id of the drive.
-
-        Raises
-        ------
-        BusDown
-            If the bus is down.
-        """
+        """Send an NMT command to one node. ``node_id``: node id of the drive. Raises BusDown if the bus is down."""
         try:
             self._network.send_message(od.COB_NMT, bytes([command, node_id]))
         except (can.CanError, OSError, RuntimeError) as error:
@@ -162,15 +119,7 @@ class NodeNetwork:
     def guard(self, node_id: int) -> None:
         """Ask a node for its NMT state (node guarding, CiA 301): a remote frame, which it answers as a heartbeat.
 
-        Parameters
-        ----------
-        node_id
-            Node id of the drive.
-
-        Raises
-        ------
-        BusDown
-            If the bus is down.
+        ``node_id``: node id of the drive. Raises BusDown if the bus is down.
         """
         request = can.Message(
             arbitration_id=od.COB_HEARTBEAT + node_id, is_extended_id=False, is_remote_frame=True, dlc=1
@@ -185,13 +134,7 @@ class NodeNetwork:
             raise self._bus_down(error) from error
 
     def check(self) -> None:
-        """Raise the error that ended canopen's receive thread, if any.
-
-        Raises
-        ------
-        BusDown
-            If the bus went down.
-        """
+        """Raise the error that ended canopen's receive thread, if any. Raises BusDown if the bus went down."""
         try:
             self._network.check()
         except Exception as error:

@@ -32,17 +32,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class SupervisionChange:
-    """Loss or return of a drive.
-
-    Parameters
-    ----------
-    kind
-        Loss or return.
-    sdo
-        The drive.
-    text
-        Message without the name of the drive.
-    """
+    """Loss or return of a drive. ``kind``: loss or return; ``text``: message without the name of the drive."""
 
     kind: Literal["heartbeat_lost", "heartbeat_back"]
     sdo: DriveSdo
@@ -52,12 +42,7 @@ class SupervisionChange:
 class NodeSupervision:
     """Supervises the drives of a session by their heartbeats, or by node guarding where a drive has none.
 
-    Parameters
-    ----------
-    session
-        Drives and heartbeat period.
-    networks
-        Network of each bus by channel.
+    ``session``: drives and heartbeat period; ``networks``: network of each bus by channel.
     """
 
     def __init__(self, session: SessionConfig, networks: Mapping[str, NodeNetwork]) -> None:
@@ -79,15 +64,7 @@ class NodeSupervision:
     def add(self, sdo: DriveSdo) -> None:
         """Choose how a started drive is supervised: by heartbeat, by node guarding, or not at all.
 
-        Parameters
-        ----------
-        sdo
-            The drive, with its heartbeat period.
-
-        Raises
-        ------
-        BusDown
-            If the bus is down.
+        ``sdo``: the drive, with its heartbeat period. Raises BusDown if the bus is down.
         """
         joint, period_ms = sdo.drive.joint, sdo.heartbeat_ms or self._session.heartbeat_ms
         limit = HEARTBEATS_MISSED * period_ms * 1e-3 + HEARTBEAT_MARGIN
@@ -111,17 +88,7 @@ class NodeSupervision:
     def await_operational(self, sdo: DriveSdo) -> None:
         """Wait until a drive reports the NMT state operational; a drive that reports no state is not waited for.
 
-        Parameters
-        ----------
-        sdo
-            The drive, started.
-
-        Raises
-        ------
-        ArmidentError
-            If it does not report it.
-        BusDown
-            If the bus went down.
+        ``sdo``: the drive, started. Raises ArmidentError if it does not report it; BusDown if the bus went down.
         """
         if sdo.drive.joint not in self._limits:
             return
@@ -142,10 +109,7 @@ class NodeSupervision:
     def check(self, drives: Sequence[DriveSdo]) -> Iterator[SupervisionChange]:
         """Yield lost and returned drives, by the receive times of heartbeats and answers to node guarding.
 
-        Parameters
-        ----------
-        drives
-            The drives of the session.
+        ``drives``: the drives of the session.
         """
         monitor = self._monitor
         if monitor is None or time.monotonic() - monitor.updated < HEARTBEAT_CHECK_S:

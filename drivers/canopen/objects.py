@@ -77,14 +77,8 @@ CYCLIC_SYNCHRONOUS_POSITION = 8
 class MappedObject:
     """Object that can be mapped into a PDO.
 
-    Parameters
-    ----------
-    name
-        Name of the object in a session.
-    index, subindex
-        Place in the object dictionary.
-    format
-        NumPy format of its bytes.
+    ``name``: name of the object in a session; ``index``, ``subindex``: place in the object dictionary; ``format``:
+    NumPy format of its bytes.
     """
 
     name: str
@@ -105,10 +99,7 @@ class MappedObject:
     def packed(self, sample: int) -> "MappedObject":
         """Element of the object's array that holds one sample of a packed TPDO.
 
-        Parameters
-        ----------
-        sample
-            Number of the sample, from 1 (the oldest) to ``pack``.
+        ``sample``: number of the sample, from 1 (the oldest) to ``pack``.
         """
         return MappedObject(self.name, self.index - ARRAY_OFFSET, sample, self.format)
 
@@ -143,12 +134,7 @@ class TpdoLayout:
 
     A packed TPDO holds several samples, the oldest first, mapped from the objects' arrays (:data:`ARRAY_OFFSET`).
 
-    Parameters
-    ----------
-    objects
-        Mapped objects in order.
-    pack
-        Number of samples per TPDO.
+    ``pack``: number of samples per TPDO.
     """
 
     objects: tuple[MappedObject, ...]
@@ -160,21 +146,8 @@ class TpdoLayout:
     ) -> "TpdoLayout":
         """Layout of a stream's objects.
 
-        Parameters
-        ----------
-        names
-            Names of the objects in mapping order.
-        where
-            Name of the stream in messages.
-        pack
-            Number of samples per TPDO.
-        fd
-            ``True`` on a bus with CAN FD.
-
-        Raises
-        ------
-        ConfigError
-            If an object is unknown or repeated, or the objects exceed the frame.
+        ``names``: names of the objects in mapping order; ``pack``: number of samples per TPDO; ``fd``: ``True`` on a
+        bus with CAN FD. Raises ConfigError if an object is unknown or repeated, or the objects exceed the frame.
         """
         for name in names:
             if name not in OBJECTS:
@@ -227,10 +200,7 @@ class TpdoLayout:
     def decode(self, data: NDArray[np.uint8]) -> NDArray[Any]:
         """Data bytes of samples as records, shape (N,); a view if ``data`` is contiguous.
 
-        Parameters
-        ----------
-        data
-            Data bytes, uint8, shape (N, itemsize of `dtype`).
+        ``data``: data bytes, uint8, shape (N, itemsize of `dtype`).
         """
         return np.ascontiguousarray(data).view(self.dtype)[:, 0]
 
@@ -238,12 +208,7 @@ class TpdoLayout:
 def tpdo_cob(tpdo: int, node: int) -> int:
     """COB-ID of a TPDO in the predefined connection set (CiA 301 section 7.3.5).
 
-    Parameters
-    ----------
-    tpdo
-        Number of the TPDO, 1 to 4.
-    node
-        Node id.
+    ``tpdo``: number of the TPDO, 1 to 4.
     """
     return 0x180 + 0x100 * (tpdo - 1) + node
 
@@ -251,34 +216,20 @@ def tpdo_cob(tpdo: int, node: int) -> int:
 def rpdo_cob(rpdo: int, node: int) -> int:
     """COB-ID of an RPDO in the predefined connection set (CiA 301 section 7.3.5).
 
-    Parameters
-    ----------
-    rpdo
-        Number of the RPDO, 1 to 4.
-    node
-        Node id.
+    ``rpdo``: number of the RPDO, 1 to 4.
     """
     return 0x200 + 0x100 * (rpdo - 1) + node
 
 
 def stop_rpdo(setpoints: int) -> int:
-    """Number of the RPDO for the controlword: 2, or 1 if the set points use 2.
-
-    Parameters
-    ----------
-    setpoints
-        Number of the RPDO of the set points.
-    """
+    """Number of the RPDO for the controlword: 2, or 1 if the set points use 2."""
     return 1 if setpoints == 2 else 2
 
 
 def rated_milliamperes(drive: Drive) -> int:
     """Rated current for 6075h, mA, so that 1000 per mille of 6078h is ``drive.rated``.
 
-    Parameters
-    ----------
-    drive
-        Drive of the robot configuration.
+    ``drive``: drive of the robot configuration.
     """
     return round(drive.rated * 1000)
 
@@ -342,10 +293,7 @@ STATE_CODES: dict[DriveState, tuple[int, int]] = {
 def drive_state(statusword: int) -> DriveState | None:
     """CiA 402 state of a statusword; ``None`` for a pattern that the standard does not define.
 
-    Parameters
-    ----------
-    statusword
-        Value of 6041h.
+    ``statusword``: value of 6041h.
     """
     for state, (mask, value) in STATE_CODES.items():
         if statusword & mask == value:

@@ -14,19 +14,8 @@ def map_drive(sdo: DriveSdo, session: SessionConfig) -> None:
 
     A PDO that is right already is not written. Other TPDOs are disabled.
 
-    Parameters
-    ----------
-    sdo
-        The drive, in pre-operational.
-    session
-        SYNC, streams and set points.
-
-    Raises
-    ------
-    ConfigError
-        If the drive refuses an object or a mapping; names both, with the text of the SDO abort.
-    BusDown
-        If the bus is down.
+    ``sdo``: the drive, in pre-operational; ``session``: SYNC, streams and set points. Raises ConfigError if the drive
+    refuses an object or a mapping; names both, with the text of the SDO abort. Raises BusDown if the bus is down.
     """
     node = sdo.drive.node_id
     streams = {s.tpdo: (name, s) for name, s in session.streams.items()}
@@ -50,17 +39,7 @@ def map_drive(sdo: DriveSdo, session: SessionConfig) -> None:
 def mapping_differs(sdo: DriveSdo, session: SessionConfig) -> str | None:
     """Description of the first difference between a drive's TPDO mapping and the session; ``None`` if there is none.
 
-    Parameters
-    ----------
-    sdo
-        The drive.
-    session
-        Expected streams.
-
-    Raises
-    ------
-    ConfigError
-        If the drive does not answer.
+    ``session``: expected streams. Raises ConfigError if the drive does not answer.
     """
     for name, stream in session.streams.items():
         entries = od.TpdoLayout.of(stream.objects, f"streams.{name}", stream.pack, sdo.fd).entries
@@ -141,19 +120,8 @@ def _write_cob(sdo: DriveSdo, communication: int, cob: int) -> None:
 def read_mapping(sdo: DriveSdo, mapping: int) -> tuple[int, ...]:
     """Return the mapping entries of a PDO.
 
-    Parameters
-    ----------
-    sdo
-        The drive.
-    mapping
-        Index of the mapping record (1600h, 1A00h and following).
-
-    Raises
-    ------
-    ConfigError
-        If the drive does not answer, or has no such PDO.
-    BusDown
-        If the bus is down.
+    ``mapping``: index of the mapping record (1600h, 1A00h and following). Raises ConfigError if the drive does not
+    answer, or has no such PDO; BusDown if the bus is down.
     """
     count = min(sdo.read(mapping, 0, "B"), od.MAPPED_OBJECTS)
     return tuple(sdo.read(mapping, k, "I") for k in range(1, count + 1))
@@ -190,17 +158,8 @@ def _set_interpolation(sdo: DriveSdo, period_us: int, sync_us: int) -> None:
 def interpolation_period(period_us: int, where: str = "setpoints") -> tuple[int, int]:
     """Value and exponent of 60C2h for a set point period: ``value * 10**exponent`` seconds.
 
-    Parameters
-    ----------
-    period_us
-        Period, us.
-    where
-        Name of the set points in messages.
-
-    Raises
-    ------
-    ConfigError
-        If the period cannot be expressed with a value up to 255.
+    ``where``: name of the set points in messages. Raises ConfigError if the period cannot be expressed with a value up
+    to 255.
     """
     value, exponent = period_us, -6
     while value % 10 == 0 and exponent < -3:

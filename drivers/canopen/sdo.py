@@ -41,12 +41,7 @@ log = logging.getLogger(__name__)
 class SdoRefusedError(ConfigError):
     """A drive refuses an SDO transfer.
 
-    Parameters
-    ----------
-    message
-        Message that names drive, object and reason.
-    code
-        Abort code (CiA 301, SDO abort codes).
+    ``message``: message that names drive, object and reason; ``code``: abort code (CiA 301, SDO abort codes).
     """
 
     def __init__(self, message: str, code: int) -> None:
@@ -66,14 +61,7 @@ class NoAnswerError(ConfigError):
 class DriveSdo:
     """Access to the object dictionary of one drive.
 
-    Parameters
-    ----------
-    node
-        Remote node of a connected network.
-    drive
-        Drive of the session.
-    session
-        Bus and SDO timeout.
+    ``node``: remote node of a connected network; ``drive``: drive of the session; ``session``: bus and SDO timeout.
     """
 
     def __init__(self, node: canopen.RemoteNode, drive: DriveNode, session: SessionConfig) -> None:
@@ -97,10 +85,7 @@ class DriveSdo:
     def remark(self, text: str) -> None:
         """Report once what is unusual about the drive, but does not prevent its use.
 
-        Parameters
-        ----------
-        text
-            Message without the name of the drive.
+        ``text``: message without the name of the drive.
         """
         if text not in self._remarks:
             self._remarks.add(text)
@@ -109,19 +94,8 @@ class DriveSdo:
     def read(self, index: int, sub: int, code: str) -> int:
         """Read an object.
 
-        Parameters
-        ----------
-        index, sub
-            Index and sub-index.
-        code
-            Type as a format of `struct` (``B``, ``h``, ``I``).
-
-        Raises
-        ------
-        ConfigError
-            If the drive does not answer (`NoAnswerError`) or refuses (`SdoRefusedError`).
-        BusDown
-            If the bus is down.
+        ``code``: type as a format of `struct` (``B``, ``h``, ``I``). Raises ConfigError if the drive does not answer
+        (`NoAnswerError`) or refuses (`SdoRefusedError`); BusDown if the bus is down.
         """
         return self._read(index, sub, code, BUSY_S)
 
@@ -134,15 +108,7 @@ class DriveSdo:
     def read_optional(self, index: int, sub: int, code: str) -> int | None:
         """Read an object; ``None`` if the drive does not have it.
 
-        Parameters
-        ----------
-        index, sub, code
-            As in `read`.
-
-        Raises
-        ------
-        ConfigError, BusDown
-            As `read` does.
+        ``index``, ``sub``, ``code``: as in `read`. Raises ConfigError or BusDown as `read` does.
         """
         try:
             return self.read(index, sub, code)
@@ -177,17 +143,8 @@ class DriveSdo:
     def poll(self, index: int, sub: int, code: str, answer_s: float) -> int | None:
         """Read an object unless another SDO transfer is in progress; ``None`` in that case.
 
-        Parameters
-        ----------
-        index, sub, code
-            As in `read`.
-        answer_s
-            Longest wait for the answer, s.
-
-        Raises
-        ------
-        ConfigError, BusDown
-            As `read` does.
+        ``index``, ``sub``, ``code``: as in `read`; ``answer_s``: longest wait for the answer, s. Raises ConfigError or
+        BusDown as `read` does.
         """
         if not self._lock.acquire(blocking=False):
             return None
@@ -209,26 +166,15 @@ class DriveSdo:
         if not (stated == len(data) >= size or (stated is None and len(data) in (size, max(size, _EXPEDITED)))):
             raise ConfigError(
                 f"{self.label}: {_name(index, sub)} has {'more than ' * (len(data) > _LARGEST)}"
-                f"{min(len(data), _LARGEST)} bytes{'' if stated is None else f', says {stated}'}; expected {size}"
+                f"{min(len(data), _LARGEST)} bytes{'' if stated is None else f', states {stated}'}; expected {size}"
             )
         return data[:size]
 
     def command(self, index: int, sub: int, value: int, code: str) -> None:
         """Write an object without reading it back.
 
-        Parameters
-        ----------
-        index, sub, code
-            As in `read`.
-        value
-            Value to write.
-
-        Raises
-        ------
-        ConfigError
-            If the drive does not answer, or refuses the value.
-        BusDown
-            If the bus is down.
+        ``index``, ``sub``, ``code``: as in `read`. Raises ConfigError if the drive does not answer, or refuses the
+        value; BusDown if the bus is down.
         """
         data = struct.pack("<" + code, value)
         what = f"refuses {_name(index, sub)} = {_hex(value, code)}"
@@ -237,21 +183,8 @@ class DriveSdo:
     def write(self, index: int, sub: int, value: int, code: str, ignored: int = 0) -> None:
         """Write an object and read it back; a read-only object that holds the value already is accepted.
 
-        Parameters
-        ----------
-        index, sub, code
-            As in `read`.
-        value
-            Value to write.
-        ignored
-            Bits that may read back otherwise.
-
-        Raises
-        ------
-        ConfigError
-            If the drive does not answer, refuses the value, or holds another one afterwards.
-        BusDown
-            If the bus is down.
+        ``index``, ``sub``, ``code``: as in `read`; ``ignored``: bits that may read back otherwise. Raises ConfigError
+        if the drive does not answer, refuses the value, or holds another one afterwards; BusDown if the bus is down.
         """
         found = self.write_rounded(index, sub, value, code, ignored)
         if (found ^ value) & ~ignored:
@@ -261,17 +194,8 @@ class DriveSdo:
     def write_rounded(self, index: int, sub: int, value: int, code: str, ignored: int = 0) -> int:
         """Write an object and return the value that it reads back, which the drive may have rounded.
 
-        Parameters
-        ----------
-        index, sub, code, value, ignored
-            As in `write`.
-
-        Raises
-        ------
-        ConfigError
-            If the drive does not answer, or refuses the value and holds another one.
-        BusDown
-            If the bus is down.
+        ``index``, ``sub``, ``code``, ``value``, ``ignored``: as in `write`. Raises ConfigError if the drive does not
+        answer, or refuses the value and holds another one; BusDown if the bus is down.
         """
         try:
             self.command(index, sub, value, code)
@@ -292,10 +216,7 @@ class DriveSdo:
     def no_answer(self, within_s: float | None = None) -> ArmidentError:
         """Return the error of a drive that does not answer, or of its bus if that is down.
 
-        Parameters
-        ----------
-        within_s
-            Time that was waited, s; default: the SDO timeout.
+        ``within_s``: time that was waited, s; default: the SDO timeout.
         """
         if self._bus.interface == "socketcan":
             # A bus that is down looks like a silent drive; opening it distinguishes the two.

@@ -24,12 +24,7 @@ class MatchingSdoClient(SdoClient):
 
     On the default SDO channel, answers to other clients of the drive arrive too, and some drives repeat theirs.
 
-    Parameters
-    ----------
-    rx_cobid, tx_cobid
-        Identifiers of requests and of answers.
-    od
-        Object dictionary.
+    ``rx_cobid``, ``tx_cobid``: identifiers of requests and of answers.
     """
 
     def __init__(self, rx_cobid: int, tx_cobid: int, od: Any) -> None:
@@ -39,19 +34,8 @@ class MatchingSdoClient(SdoClient):
     def request_response(self, sdo_request: bytes) -> bytes:
         """Send a request and return its answer.
 
-        Parameters
-        ----------
-        sdo_request
-            The eight bytes of the request.
-
-        Raises
-        ------
-        SdoAbortedError
-            If the drive aborts the transfer.
-        OtherAnswersError
-            If there were answers to other requests only.
-        SdoCommunicationError
-            If there was no answer.
+        ``sdo_request``: the eight bytes of the request. Raises SdoAbortedError if the drive aborts the transfer;
+        OtherAnswersError if there were answers to other requests only; SdoCommunicationError if there was no answer.
         """
         if sdo_request[0] >> 5 in (_DOWNLOAD, _UPLOAD):
             self._object = bytes(sdo_request[1:4])
@@ -89,13 +73,7 @@ class SdoNode(canopen.RemoteNode):
     """Remote node whose SDO client matches answers to requests."""
 
     def add_sdo(self, rx_cobid: int, tx_cobid: int) -> MatchingSdoClient:
-        """Add an SDO channel.
-
-        Parameters
-        ----------
-        rx_cobid, tx_cobid
-            Identifiers of requests and of answers.
-        """
+        """Add an SDO channel. ``rx_cobid``, ``tx_cobid``: identifiers of requests and of answers."""
         client = MatchingSdoClient(rx_cobid, tx_cobid, self.object_dictionary)
         self.sdo_channels.append(client)
         return client

@@ -10,21 +10,9 @@ from numpy.typing import NDArray
 class SetpointPlan:
     """Position set points of all drives, one row per ``every`` SYNCs.
 
-    Parameters
-    ----------
-    rows
-        Targets, counts, int32, shape (M, n), one column per drive.
-    cob_ids
-        COB-ID of each drive's set point RPDO, in the order of the columns, length n.
-    every
-        Number of SYNCs between two rows.
-    bus_of
-        Number of each drive's bus, length n; empty: all drives are on one bus.
-
-    Raises
-    ------
-    ValueError
-        If shapes or types do not match.
+    ``rows``: targets, counts, int32, shape (M, n), one column per drive. ``cob_ids``: COB-ID of each drive's set point
+    RPDO, in the order of the columns, length n. ``every``: number of SYNCs between two rows. ``bus_of``: number of each
+    drive's bus, length n; empty: all drives are on one bus. Raises ValueError if shapes or types do not match.
     """
 
     rows: NDArray[np.int32]

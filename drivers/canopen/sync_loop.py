@@ -5,11 +5,12 @@ import socket
 from typing import Any
 
 import numpy as np
+from numba import carray, types
 from numpy.typing import NDArray
 
+from armident.compiled import compiled
 from armident.drivers.can.socketcan import Messages
 from armident.drivers.canopen.objects import COB_SYNC
-from armident.drivers.compiled import MODE, compiled
 
 MAX_LATE_PERIODS = 10
 """Delay, in periods, beyond which the time grid moves instead of being caught up with."""
@@ -38,26 +39,18 @@ _ABSOLUTE = 1
 _EINTR, _EAGAIN, _ENOBUFS = errno.EINTR, errno.EAGAIN, errno.ENOBUFS
 _DONTWAIT = int(socket.MSG_DONTWAIT)
 
-if MODE == "by numba":
-    from numba import carray, types
-
-    _clock_nanosleep: Any = types.ExternalFunction(
-        "clock_nanosleep", types.int32(types.int32, types.int32, types.intp, types.intp)
-    )
-    _clock_gettime: Any = types.ExternalFunction("clock_gettime", types.int32(types.int32, types.intp))
-    _sendmmsg: Any = types.ExternalFunction("sendmmsg", types.int32(types.int32, types.intp, types.uint32, types.int32))
-    _errno_location: Any = types.ExternalFunction("__errno_location", types.voidptr())
+_clock_nanosleep: Any = types.ExternalFunction(
+    "clock_nanosleep", types.int32(types.int32, types.int32, types.intp, types.intp)
+)
+_clock_gettime: Any = types.ExternalFunction("clock_gettime", types.int32(types.int32, types.intp))
+_sendmmsg: Any = types.ExternalFunction("sendmmsg", types.int32(types.int32, types.intp, types.uint32, types.int32))
+_errno_location: Any = types.ExternalFunction("__errno_location", types.voidptr())
 
 
 def is_knot(k: int, every: int) -> bool:
     """Return True if set points become targets at a SYNC: its counter is a multiple of ``every``.
 
-    Parameters
-    ----------
-    k
-        Number of the SYNC, from 0.
-    every
-        Number of SYNCs between two set points.
+    ``k``: number of the SYNC, from 0; ``every``: number of SYNCs between two set points.
     """
     return (k + 1) % every == 0
 
@@ -104,14 +97,8 @@ class Loop:
     ) -> None:
         """Send SYNCs and set points until ``state[STOP]``, ``state[RETURN]`` or ``state[WANTED]``.
 
-        Parameters
-        ----------
-        rows
-            Set points, counts, shape (M, n); sent from row ``state[ROW]`` on.
-        cob_ids, bus_of
-            Identifier and bus number of each drive's set point frame, shape (n,).
-        every
-            Number of SYNCs between two rows.
+        ``rows``: set points, counts, shape (M, n); sent from row ``state[ROW]`` on. ``cob_ids``, ``bus_of``: identifier
+        and bus number of each drive's set point frame, shape (n,). ``every``: number of SYNCs between two rows.
         """
         self._call(self._state, rows, cob_ids, bus_of, every)
 
@@ -138,64 +125,37 @@ class Loop:
         _run(*self._fixed, state, *self._shared, messages.address, body, first, place, rows, every, self._spec)
 
 
-@compiled
+@compiled()
 def monotonic_ns(spec: NDArray[np.int64]) -> int:
-    """Read CLOCK_MONOTONIC, ns.
-
-    Parameters
-    ----------
-    spec
-        Memory of a ``struct timespec``, int64, shape (2,).
-    """
+    """Read CLOCK_MONOTONIC, ns. ``spec``: memory of a ``struct timespec``, int64, shape (2,)."""
     _clock_gettime(_MONOTONIC, spec.ctypes.data)
     return int(spec[0] * 1_000_000_000 + spec[1])
 
 
-@compiled
+@compiled()
 def utc_ns(spec: NDArray[np.int64]) -> int:
     """Read CLOCK_REALTIME, ns: the clock of the kernel's frame stamps.
 
-    Parameters
-    ----------
-    spec
-        Memory of a ``struct timespec``, int64, shape (2,).
+    ``spec``: memory of a ``struct timespec``, int64, shape (2,).
     """
     _clock_gettime(_REALTIME, spec.ctypes.data)
     return int(spec[0] * 1_000_000_000 + spec[1])
 
 
-@compiled
+@compiled()
 def sleep_until(deadline: int, spec: NDArray[np.int64]) -> None:
-    """Sleep until CLOCK_MONOTONIC reaches a deadline.
-
-    Parameters
-    ----------
-    deadline
-        Time, ns.
-    spec
-        Memory of a ``struct timespec``, int64, shape (2,).
-    """
+    """Sleep until CLOCK_MONOTONIC reaches a deadline. ``spec``: memory of a ``struct timespec``, int64, shape (2,)."""
     spec[0], spec[1] = deadline // 1_000_000_000, deadline % 1_000_000_000
     while _clock_nanosleep(_MONOTONIC, _ABSOLUTE, spec.ctypes.data, 0) == _EINTR:
         pass
 
 
-@compiled
+@compiled()
 def send_messages(descriptor: int, address: int, count: int, attempts: int, spec: NDArray[np.int64]) -> int:
     """Send messages by ``sendmmsg``; return 0, or errno if the kernel refuses them.
 
-    Parameters
-    ----------
-    descriptor
-        Socket.
-    address
-        Address of the first ``struct mmsghdr``.
-    count
-        Number of messages.
-    attempts
-        Maximum number of system calls.
-    spec
-        Memory of a ``struct timespec``, int64, shape (2,).
+    ``address``: address of the first ``struct mmsghdr``; ``attempts``: maximum number of system calls; ``spec``: memory
+    of a ``struct timespec``, int64, shape (2,).
     """
     sent, code = 0, 0
     for _ in range(attempts):
@@ -212,7 +172,10 @@ def send_messages(descriptor: int, address: int, count: int, attempts: int, spec
     return int(code)
 
 
-@compiled
+@compiled(
+    "i8[::1], i8, i8, i8[::1], i8[::1], i8[::1], i8[::1], i8[::1], i8, i4[:, ::1], i8[::1], i8[::1], "
+    "i4[:, ::1], i8, i8[::1]"
+)
 def _run(
     descriptors: Any, period: int, counter: int, state: Any, late: Any, errors: Any, unsent: Any, times: Any,
     address: int, body: Any, first: Any, place: Any, rows: Any, every: int, spec: Any,

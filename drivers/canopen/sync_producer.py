@@ -59,8 +59,6 @@ class SyncStats:
 
     Parameters
     ----------
-    sent
-        Number of SYNCs sent.
     late_p50_us, late_p99_us, late_max_us
         Median, 99th percentile and maximum of the delay from the grid until all buses took the SYNC, us.
     overruns
@@ -86,16 +84,9 @@ class SyncStats:
 class SyncProducer:
     """Sends SYNC k = 0, 1, 2, ... with counter ``k % counter + 1`` in a separate thread.
 
-    Parameters
-    ----------
-    buses
-        One bus or several; the producer opens its own sockets, so that other sockets receive the SYNC.
-    period_us
-        SYNC period, us.
-    counter
-        Overflow of the SYNC counter (1019h); 0: SYNC has no counter.
-    setpoints
-        Set points to play from the start; :meth:`play` sets others later.
+    ``buses``: one bus or several; the producer opens its own sockets, so that other sockets receive the SYNC.
+    ``counter``: overflow of the SYNC counter (1019h); 0: SYNC has no counter. ``setpoints``: set points to play from
+    the start; :meth:`play` sets others later.
 
     Notes
     -----
@@ -128,12 +119,7 @@ class SyncProducer:
     def start(self) -> None:
         """Open the buses and send the first SYNC one period from now.
 
-        Raises
-        ------
-        ConfigError
-            If a bus does not exist.
-        BusDown
-            If a bus is down.
+        Raises ConfigError if a bus does not exist; BusDown if a bus is down.
         """
         with ExitStack() as opened:
             for bus in self._configured:
@@ -160,30 +146,15 @@ class SyncProducer:
     def stop_after(self, count: int) -> None:
         """Limit the total number of SYNCs; :meth:`stop` is still required.
 
-        Parameters
-        ----------
-        count
-            Total number of SYNCs; if more were sent already, no other follows.
+        ``count``: total number of SYNCs; if more were sent already, no other follows.
         """
         self._state[WANTED] = count
 
     def play(self, plan: SetpointPlan) -> int:
         """Play set points from the next possible knot on, in place of the present ones.
 
-        Parameters
-        ----------
-        plan
-            The set points.
-
-        Returns
-        -------
-        int
-            Number of the SYNC at which row 0 becomes the target.
-
-        Raises
-        ------
-        BusDown
-            If no bus takes SYNC.
+        ``plan``: the set points. Returns the number of the SYNC at which row 0 becomes the target. Raises BusDown if no
+        bus takes SYNC.
         """
         self._taken.clear()
         self._pending = plan
@@ -195,13 +166,7 @@ class SyncProducer:
         return int(self._state[FIRST])
 
     def check(self) -> None:
-        """Raise an error if SYNC cannot be sent.
-
-        Raises
-        ------
-        BusDown
-            If no bus takes SYNC.
-        """
+        """Raise an error if SYNC cannot be sent. Raises BusDown if no bus takes SYNC."""
         code = int(self._state[ERROR])
         if code:
             raise BusDown(f"bus {self._names}: SYNC cannot be sent: {os.strerror(code)}")
@@ -218,17 +183,8 @@ class SyncProducer:
     def sent_at(self, first: int) -> tuple[int, NDArray[np.int64]]:
         """Send times of the SYNCs from ``first`` on, as far as they are kept (``TIMES``).
 
-        Parameters
-        ----------
-        first
-            Number of the first SYNC.
-
-        Returns
-        -------
-        number
-            Number of the first SYNC whose time is known.
-        times
-            Times just after sending, ns UTC, shape (N,).
+        Returns ``number``: number of the first SYNC whose time is known; ``times``: times just after sending, ns UTC,
+        shape (N,).
         """
         sent = self.sent
         first = min(max(first, sent - TIMES + 1, 0), sent)

@@ -20,12 +20,8 @@ class TemperaturePoll:
 
     A drive with another SDO transfer in progress is skipped until its next turn.
 
-    Parameters
-    ----------
-    drives
-        Drives; those with a configured temperature object are polled.
-    rest_s
-        Pause after a drive did not answer, s.
+    ``drives``: drives; those with a configured temperature object are polled. ``rest_s``: pause after a drive did not
+    answer, s.
     """
 
     def __init__(self, drives: Sequence[DriveSdo], rest_s: float = REST_S) -> None:

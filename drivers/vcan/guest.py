@@ -33,7 +33,7 @@ NICENESS = -10
 """Nice value of the guest."""
 MALLOC_TUNABLES = "glibc.malloc.mmap_threshold=1073741824:glibc.malloc.trim_threshold=1073741824"
 """Tunables of glibc that keep freed memory in the process, because page faults are slow in a guest."""
-CACHES = {"NUMBA_CACHE_DIR": "numba", "MPLCONFIGDIR": "matplotlib", "XDG_CACHE_HOME": "guest"}
+CACHES = {"MPLCONFIGDIR": "matplotlib", "XDG_CACHE_HOME": "guest"}
 """Environment variables of cache folders, and their default folders in the cache of armident. The user's own caches are
 read-only in the guest, which Matplotlib and Fontconfig report on stderr."""
 MAPPINGS = Path("/proc/sys/vm/max_map_count")
@@ -55,12 +55,7 @@ def launcher_obstacle() -> str | None:
 def launcher_command(command: Sequence[str], buses: int = 1) -> list[str]:
     """Command line that runs a command with vcan buses.
 
-    Parameters
-    ----------
-    command
-        Program and arguments.
-    buses
-        Number of buses: ``vcan0`` to ``vcan{buses - 1}``.
+    ``command``: program and arguments; ``buses``: number of buses: ``vcan0`` to ``vcan{buses - 1}``.
     """
     return [sys.executable, "-m", "armident.drivers.vcan", "-n", str(buses), "--", *command]
 
@@ -68,22 +63,10 @@ def launcher_command(command: Sequence[str], buses: int = 1) -> list[str]:
 def run(command: Sequence[str], buses: int = 1, memory: str = "4096M", writable: Sequence[Path] = ()) -> int:
     """Run ``command`` in a guest and return its exit status.
 
-    Parameters
-    ----------
-    command
-        Program and arguments, started in the current directory.
-    buses
-        Number of vcan interfaces.
-    memory
-        Memory of the guest in the format of the kernel's ``mem=``; only used pages take memory of the host.
-    writable
-        Further folders that are writable in the guest.
-
-    Raises
-    ------
-    ArmidentError
-        If the memory is no size, or the guest cannot be set up or ends without a status; contains the end of its
-        kernel log.
+    ``command``: program and arguments, started in the current directory. ``buses``: number of vcan interfaces.
+    ``memory``: memory of the guest in the format of the kernel's ``mem=``; only used pages take memory of the host.
+    ``writable``: further folders that are writable in the guest. Raises ArmidentError if the memory is no size, or the
+    guest cannot be set up or ends without a status; contains the end of its kernel log.
     """
     if not re.fullmatch(r"\d+[KMG]?", memory):
         raise ArmidentError(f"{memory!r}: expected the memory of a guest as a number with K, M or G, such as 4096M")

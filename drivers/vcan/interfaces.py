@@ -20,13 +20,7 @@ def have_socketcan() -> bool:
 
 
 def is_up(name: str) -> bool:
-    """Return True if the network interface exists and is administratively up.
-
-    Parameters
-    ----------
-    name
-        Name of the interface.
-    """
+    """Return True if the network interface exists and is administratively up."""
     try:
         flags = int((NETWORK / name / "flags").read_text(), 16)
     except (OSError, ValueError):
@@ -37,15 +31,7 @@ def is_up(name: str) -> bool:
 def ensure_vcan(name: str = "vcan0") -> None:
     """Bring a vcan interface up, and create it first if it does not exist.
 
-    Parameters
-    ----------
-    name
-        Name of the interface.
-
-    Raises
-    ------
-    ConfigError
-        If rights are missing; contains the command for an administrator.
+    Raises ConfigError if rights are missing; contains the command for an administrator.
     """
     if is_up(name):
         return
@@ -62,18 +48,7 @@ def ensure_vcan(name: str = "vcan0") -> None:
 
 
 def remove_vcan(name: str) -> None:
-    """Delete a vcan interface if it exists.
-
-    Parameters
-    ----------
-    name
-        Name of the interface.
-
-    Raises
-    ------
-    ConfigError
-        If it cannot be deleted.
-    """
+    """Delete a vcan interface if it exists. Raises ConfigError if it cannot be deleted."""
     if not (NETWORK / name).exists():
         return
     problem = _run(["ip", "link", "delete", "dev", name])

@@ -47,23 +47,14 @@ def obstacle() -> str | None:
 
 
 def kernel(root: Path) -> Path:
-    """Path of the kernel's executable.
-
-    Parameters
-    ----------
-    root
-        Folder of the unpacked packages.
-    """
+    """Path of the kernel's executable. ``root``: folder of the unpacked packages."""
     return root / "usr" / "bin" / "linux.uml"
 
 
 def provide() -> Path:
     """Folder with kernel, ``modules/`` and ``bin/``; fetched and unpacked if it does not exist yet.
 
-    Raises
-    ------
-    ArmidentError
-        If the packages cannot be found or unpacked; names the log.
+    Raises ArmidentError if the packages cannot be found or unpacked; names the log.
     """
     cache = cache_folder()
     root = cache / "root"

@@ -30,8 +30,8 @@ def recordings_of(recordings: Recorded | Sequence[Recorded]) -> tuple[Recording,
     return tuple(one if isinstance(one, Recording) else read_recording(Path(one)) for one in given)
 
 
-def robot_of(robot: Robot | None, recordings: Sequence[Recording]) -> RobotConfig:
-    """Return the configuration to use.
+def robot_of(robot: Robot | None, recordings: Sequence[Recording], command: str = "identify") -> RobotConfig:
+    """Return the configuration to use, with all values that a command needs.
 
     Parameters
     ----------
@@ -39,12 +39,11 @@ def robot_of(robot: Robot | None, recordings: Sequence[Recording]) -> RobotConfi
         Configuration, or the path or shipped name of one; ``None``: the one inside the first recording.
     recordings
         Recordings, at least one if ``robot`` is ``None``.
-
-    Raises
-    ------
-    ConfigError
-        If there is no such configuration, or it lacks what an identification needs.
+    command
+        Command whose values may not be blank.
     """
-    if robot is None:
-        return recordings[0].robot
-    return robot if isinstance(robot, RobotConfig) else load_robot(robot, "identify")
+    if isinstance(robot, str | Path):
+        return load_robot(robot, command)
+    config = recordings[0].robot if robot is None else robot
+    config.check_filled(command)
+    return config

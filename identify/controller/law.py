@@ -108,14 +108,8 @@ class Structure:
 class Stretch:
     """Uninterrupted samples of one motor.
 
-    Parameters
-    ----------
-    q, r
-        Measured position and reference, rad or m, shape (N,).
-    nu
-        Recorded torque, N m or N, shape (N,).
-    added
-        Known torque in the record that does not come from the controller, N m or N, shape (N,).
+    ``q``, ``r``: measured position and reference, rad or m, shape (N,); ``nu``: recorded torque, N m or N, shape (N,);
+    ``added``: known torque in the record that does not come from the controller, N m or N, shape (N,).
     """
 
     q: Array
@@ -131,12 +125,7 @@ class Stretch:
 def loop_ratios(structure: Structure, theta: Array) -> tuple[float, float]:
     """Position gain ``kp`` (1/s) and share of the reference's velocity that is fed forward; zeros before the first fit.
 
-    Parameters
-    ----------
-    structure
-        Structure of the law.
-    theta
-        Parameters (size,).
+    ``theta``: parameters (size,).
     """
     value = _levels(structure, theta)
     kv = sum(value[f"v{i}"] for i in range(structure.velocity_taps))
@@ -152,16 +141,8 @@ def columns(stretch: Stretch, structure: Structure, theta: Array, dt: float) -> 
 
     The input of the integral contains the gain ratios of ``theta``, see `loop_ratios`.
 
-    Parameters
-    ----------
-    stretch
-        Motor position, reference and torque, N samples.
-    structure
-        Structure of the law, with m linear parameters.
-    theta
-        Parameters (size,).
-    dt
-        Sampling period, s.
+    ``stretch``: motor position, reference and torque, N samples; ``structure``: structure of the law, with m linear
+    parameters; ``theta``: parameters (size,).
     """
     e = stretch.r - stretch.q
     v, speed = (np.diff(x, prepend=x[0]) / dt for x in (stretch.q, stretch.r))
@@ -182,16 +163,8 @@ def integral_slopes(stretch: Stretch, structure: Structure, theta: Array, dt: fl
     The columns of `columns` plus these are the Jacobian of the torque. Their product with ``theta`` is zero, so a
     regression on the sum is a Gauss-Newton step.
 
-    Parameters
-    ----------
-    stretch
-        Motor position, reference and torque, N samples.
-    structure
-        Structure of the law, with integral action and m linear parameters.
-    theta
-        Parameters (size,).
-    dt
-        Sampling period, s.
+    ``stretch``: motor position, reference and torque, N samples; ``structure``: structure of the law, with integral
+    action and m linear parameters; ``theta``: parameters (size,).
     """
     names, past = structure.names, 1.0 / (1.0 - structure.pole(theta))
     level = {name: 1.0 if i < structure.unfiltered else past for i, name in enumerate(names)}
@@ -216,16 +189,7 @@ def simulate_law(stretch: Stretch, structure: Structure, theta: Array, dt: float
 
     The initial value of an integral is unknown; the value that fits the stretch best is used.
 
-    Parameters
-    ----------
-    stretch
-        Motor position, reference and torque, N samples.
-    structure
-        Structure of the law.
-    theta
-        Parameters (size,).
-    dt
-        Sampling period, s.
+    ``stretch``: motor position, reference and torque, N samples; ``theta``: parameters (size,).
     """
     m, split = len(structure.names), structure.unfiltered
     u = columns(stretch, structure, theta, dt)
@@ -238,12 +202,7 @@ def simulate_law(stretch: Stretch, structure: Structure, theta: Array, dt: float
 def low_pass(x: Array, pole: float) -> Array:
     """``x / (1 - pole z^-1)`` along the first axis, from the steady state of its first sample.
 
-    Parameters
-    ----------
-    x
-        Series, shape (N,) or (N, k).
-    pole
-        Pole of the filter; 0 returns ``x``.
+    ``x``: series, shape (N,) or (N, k). ``pole``: pole of the filter; 0 returns ``x``.
     """
     if pole == 0.0 or x.size == 0:
         return x
@@ -254,21 +213,8 @@ def low_pass(x: Array, pole: float) -> Array:
 def taps(structure: Structure, theta: Array, dt: float) -> tuple[Array, Array, Array]:
     """Taps of the discrete controller on tracking error, position and own output; the reference is error plus position.
 
-    Parameters
-    ----------
-    structure
-        Structure of the law.
-    theta
-        Parameters (size,).
-    dt
-        Sampling period, s.
-
-    Returns
-    -------
-    error, position
-        Taps on tracking error and motor position, N m/rad or N/m.
-    output
-        Taps on the past outputs, from one sampling period ago.
+    ``theta``: parameters (size,). Returns ``error``, ``position``: taps on tracking error and motor position,
+    N m/rad or N/m; ``output``: taps on the past outputs, from one sampling period ago.
     """
     pole = structure.pole(theta)
     kp, forward = loop_ratios(structure, theta)
@@ -317,23 +263,10 @@ UNITS = {
 def gains(structure: Structure, theta: Array, dt: float, unit: float) -> dict[str, float]:
     """Gains of the law by the names of a drive's data sheet, in the units of `UNITS`.
 
-    Parameters
-    ----------
-    structure
-        Structure of the law.
-    theta
-        Parameters (size,).
-    dt
-        Sampling period, s.
-    unit
-        Motor torque per unit of the drive's signal.
-
-    Returns
-    -------
-    dict
-        ``kp``, ``kv`` and ``stiffness`` (their product). ``error_delay`` and ``velocity_delay``: mean age of the
-        inputs; a backward difference is half a sample old. Where the structure has them: ``ti`` (reset time),
-        ``corner`` of the filter, ``velocity_feedforward`` (share), ``acceleration_feedforward``, ``added`` (share).
+    ``theta``: parameters (size,); ``unit``: motor torque per unit of the drive's signal. Returns ``kp``, ``kv`` and
+    ``stiffness`` (their product). ``error_delay`` and ``velocity_delay``: mean age of the inputs; a backward difference
+    is half a sample old. Where the structure has them: ``ti`` (reset time), ``corner`` of the filter,
+    ``velocity_feedforward`` (share), ``acceleration_feedforward``, ``added`` (share).
     """
     value, pole = _levels(structure, theta), structure.pole(theta)
     lags = range(structure.velocity_taps)

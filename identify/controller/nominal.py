@@ -24,17 +24,7 @@ def saturation(robot: RobotConfig) -> NDArray[np.float64]:
 def known_controller(robot: RobotConfig, dt: float) -> DiscreteController:
     """Cascade controller with the gains of the configuration.
 
-    Parameters
-    ----------
-    robot
-        Configuration with ``controller`` (``kp``, ``kv``).
-    dt
-        Sampling period, s.
-
-    Raises
-    ------
-    ConfigError
-        If the configuration has none.
+    ``robot``: configuration with ``controller`` (``kp``, ``kv``). Raises ConfigError if the configuration has none.
     """
     if robot.controller is None:
         raise ConfigError(f"controller known: the configuration of {robot.name} has no controller (kp, kv)")
@@ -57,23 +47,9 @@ def nominal_controller(
 
     Its derivative acts on the error, not on the velocity, so that it follows a moving reference without lag.
 
-    Parameters
-    ----------
-    model
-        Model of the arm, with n joints.
-    theta
-        Base parameters (b,), SI units.
-    q
-        Postures over which the inertia is averaged, rad or m, shape (N, n).
-    dt
-        Sampling period, s.
-    bandwidth_hz
-        Closed-loop bandwidth of the robot, Hz.
-
-    Raises
-    ------
-    DataError
-        If these parameters give a motor no positive inertia.
+    ``model``: model of the arm, with n joints; ``theta``: base parameters (b,), SI units; ``q``: postures over which
+    the inertia is averaged, rad or m, shape (N, n); ``bandwidth_hz``: closed-loop bandwidth of the robot, Hz. Raises
+    DataError if these parameters give a motor no positive inertia.
     """
     ratios = model.robot.transmission_matrix
     mass = model.mass_matrix(theta, q).mean(axis=0)

@@ -60,18 +60,9 @@ class Gain:
 class ControlLaw(JointResponse):
     """Identified control law of one drive; ``prewhitening_order`` is the order of its AR noise model.
 
-    Parameters
-    ----------
-    output_taps
-        From past torque to torque, (m,).
-    structure
-        Structure of the law.
-    gains
-        Gains by name, see :func:`armident.identify.controller.law.gains`.
-    saturated
-        Number of saturated samples, which were left out.
-    iterations, converged
-        Number of refined-IV iterations; True if they converged.
+    ``output_taps``: from past torque to torque, (m,). ``gains``: gains by name, see
+    :func:`armident.identify.controller.law.gains`. ``saturated``: number of saturated samples, which were left out.
+    ``iterations``, ``converged``: number of refined-IV iterations; True if they converged.
     """
 
     output_taps: Array
@@ -97,15 +88,15 @@ def identify_parametric(
 
     Without a given structure, a stepwise search starts from a cascade or a PD on the error. Each step takes the change
     of the structure that reduces the held-out error most. The search ends when no change reduces it by a relevant and
-    significant amount (`WORTH`, `WORTH_OF_REST`, `SIGNIFICANT`).
+    significant amount (`WORTH`, `WORTH_OF_REST`, `SIGNIFICANT`). Result: its responses are :class:`ControlLaw`. Raises
+    DataError if a motor never deviates from its reference, is always saturated, or its law is not determined by the
+    data.
 
     Parameters
     ----------
     q_motor, reference_motor, torque_motor
         Measured position (rad or m), reference (rad or m) and torque (N m or N) at the motor shafts, one (N, n) array
         per experiment.
-    dt
-        Sampling period, s.
     structure
         Structure for all drives or for each; ``None``: by stepwise search.
     saturation
@@ -115,16 +106,6 @@ def identify_parametric(
     added_motor
         Known torques in ``torque_motor`` that do not come from the controller, such as test pulses, one (N, n) array
         per experiment. Their share in the record is estimated, too. ``None``: none.
-
-    Returns
-    -------
-    IdentifiedController
-        Its responses are :class:`ControlLaw`.
-
-    Raises
-    ------
-    DataError
-        If a motor never deviates from its reference, is always saturated, or its law is not determined by the data.
     """
     n = q_motor[0].shape[1]
     given = [structure] * n if structure is None or isinstance(structure, Structure) else list(structure)

@@ -41,14 +41,7 @@ MISFIT = 1.5
 class LawFit:
     """Fitted control law.
 
-    Parameters
-    ----------
-    theta, covariance
-        Parameters (size,) of the structure and their covariance (size, size).
-    noise
-        Noise model.
-    iterations, converged
-        Number of iterations; True if they converged.
+    ``theta``, ``covariance``: parameters (size,) of the structure and their covariance (size, size).
     """
 
     theta: Array
@@ -71,19 +64,8 @@ class _Rows:
 def fit_law(stretches: Sequence[Stretch], structure: Structure, dt: float) -> LawFit:
     """Fit the law by refined IV, or by simplified refined IV if the noise model contains model error (`MISFIT`).
 
-    Parameters
-    ----------
-    stretches
-        Samples of one motor without saturation.
-    structure
-        Structure of the law.
-    dt
-        Sampling period, s.
-
-    Raises
-    ------
-    DataError
-        If the motion does not determine a law of this structure.
+    ``stretches``: samples of one motor without saturation. Raises DataError if the motion does not determine a law of
+    this structure.
     """
     refined = refined_iv(stretches, structure, dt)
     simplified = refined_iv(stretches, structure, dt, noise_model=False)
@@ -105,24 +87,10 @@ def refined_iv(
     ``1 / (1 - a' z^-1)``. Then ``nu + a' w_f(k-1) = U0 k + U1_f b + a w_f(k-1)`` is linear in ``k``, ``b`` and ``a``.
     The regressor contains the measured ``w``, the instruments the simulated ``w``.
 
-    Parameters
-    ----------
-    stretches
-        Samples of one motor without saturation.
-    structure
-        Structure of the law.
-    dt
-        Sampling period, s.
-    noise_model
-        True: an AR model of the noise filters regressor, instruments and target. False: the simplified method (SRIV),
-        with a sandwich covariance for the autocorrelation of its errors.
-    iterations
-        Largest number of iterations.
-
-    Raises
-    ------
-    DataError
-        If the motion does not determine a law of this structure.
+    ``stretches``: samples of one motor without saturation. ``noise_model``: True: an AR model of the noise filters
+    regressor, instruments and target. False: the simplified method (SRIV), with a sandwich covariance for the
+    autocorrelation of its errors. ``iterations``: largest number of iterations. Raises DataError if the motion does not
+    determine a law of this structure.
     """
     size, noise, converged = structure.size, WHITE, False
     theta = _integral_start(stretches, structure, dt) if structure.integral else np.zeros(size)

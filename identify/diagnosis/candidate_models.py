@@ -3,8 +3,8 @@
 import numpy as np
 
 from armident.configs.schema.robot import Effect as Entry
+from armident.identify.diagnosis.candidate_comparison import FittedCandidate, gain
 from armident.identify.diagnosis.candidates import Candidate, Shapes
-from armident.identify.diagnosis.comparison import Made, gain
 from armident.identify.diagnosis.model_state import Fitter, ModelState, viscous_friction_rises, with_entries
 from armident.identify.diagnosis.shortlist import Starts
 from armident.identify.effects.registry import known
@@ -14,19 +14,14 @@ CORRECTIONS = 3
 """Values of a correction from each start, each refined by the expansion that remains."""
 
 
-def model_with(state: ModelState, candidate: Candidate, shapes: Shapes, starts: Starts, fitter: Fitter) -> Made | None:
+def model_with(
+    state: ModelState, candidate: Candidate, shapes: Shapes, starts: Starts, fitter: Fitter
+) -> FittedCandidate | None:
     """Return a candidate in the model; ``None`` if the motion does not determine the parameters.
 
-    Parameters
-    ----------
-    state
-        Model without it.
-    candidate, shapes
-        The effect with its place, and its nonlinear parameters.
-    starts
-        Values from which the correction of a recorded torque starts; empty for a term of the model.
-    fitter
-        Fits a model.
+    ``state``: model without it. ``candidate``, ``shapes``: the effect with its place, and its nonlinear parameters.
+    ``starts``: values from which the correction of a recorded torque starts; empty for a term of the model. ``fitter``:
+    fits a model.
     """
     effect, whole = candidate.effect, known(candidate.effect.key)
     spared = (*(p.name for p in whole.linear if p not in effect.linear), *candidate.without)
@@ -38,34 +33,26 @@ def model_with(state: ModelState, candidate: Candidate, shapes: Shapes, starts: 
     values, std = made.values_of(term)
     allowed = whole.allows(term.of_effect(values), term.of_effect(std), dict(term.shapes))
     allowed = allowed and viscous_friction_rises(made, term)
-    one = Made(candidate, shapes, entry, made, allowed)
+    one = FittedCandidate(candidate, shapes, entry, made, allowed)
     if not starts:
         return one
     corrected = _corrected(state, candidate, entry, (float(values[0]), *starts) if allowed else starts, fitter)
     return one if corrected is None else max((one, corrected), key=lambda m: (m.allowed, gain(m.state, state)))
 
 
-def _corrected(state: ModelState, candidate: Candidate, entry: Entry, starts: Starts, fitter: Fitter) -> Made | None:
+def _corrected(
+    state: ModelState, candidate: Candidate, entry: Entry, starts: Starts, fitter: Fitter
+) -> FittedCandidate | None:
     """Model in which the recordings are corrected for an effect on a recorded torque.
 
     The first-order expansion beside the corrected torque refines the value, until what remains is within its
     standard deviation. Where that does not come about, the value with the largest gain is chosen.
 
-    Parameters
-    ----------
-    state
-        Model without the effect.
-    candidate
-        The effect.
-    entry
-        Its entry without a value: the first-order expansion.
-    starts
-        Values to start from.
-    fitter
-        Fits a model.
+    ``state``: model without the effect; ``entry``: its entry without a value: the first-order expansion; ``fitter``:
+    fits a model.
     """
     name = candidate.effect.linear[0].name
-    found: list[Made] = []
+    found: list[FittedCandidate] = []
     for start in starts:
         value = start
         for _ in range(CORRECTIONS):
@@ -75,7 +62,7 @@ def _corrected(state: ModelState, candidate: Candidate, entry: Entry, starts: St
             if exact is None:
                 break
             allowed = candidate.effect.allows(np.array([value]), np.zeros(1), {})
-            found.append(Made(candidate, (), right, exact, allowed))
+            found.append(FittedCandidate(candidate, (), right, exact, allowed))
             if further is None:
                 break
             rest, std = (float(x[0]) for x in further.values_of(further.term_of(entry)))

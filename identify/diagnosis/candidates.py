@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from armident.identify.diagnosis.stretch import Stretch
+from armident.identify.diagnosis.stretch import MotionStretch
 from armident.identify.diagnosis.study import Study
 from armident.identify.effects.effect import Effect, Place
 from armident.identify.effects.effect import Shapes as Shapes
@@ -29,14 +29,8 @@ Kept = tuple[Array, bool]
 class Candidate:
     """An effect at a place, with the grid of its nonlinear parameters.
 
-    Parameters
-    ----------
-    effect, place
-        Effect and its place.
-    grid
-        Combinations of nonlinear parameters to try, as pairs of name and value.
-    without
-        Linear parameters that it leaves out, because the model has others with the same torque.
+    ``grid``: combinations of nonlinear parameters to try, as pairs of name and value; ``without``: linear parameters
+    that it leaves out, because the model has others with the same torque.
     """
 
     effect: Effect
@@ -54,60 +48,33 @@ class Candidate:
 class ColumnCache:
     """Cache of the columns of candidates.
 
-    Parameters
-    ----------
-    study
-        The stretches.
-    theta
-        Parameters (b,) that predict the torques on which effects depend.
-    kept
-        Columns computed so far, by effect, place, nonlinear parameters, part and signals.
+    ``theta``: parameters (b,) that predict the torques on which effects depend; ``kept``: columns computed so far, by
+    effect, place, nonlinear parameters, part and signals.
     """
 
     study: Study
     theta: Array
     kept: dict[Cached, tuple[Kept, ...]] = field(default_factory=dict)
-    _motions: dict[tuple[int, str], Motion] = field(default_factory=dict)
+    _motions: dict[tuple[MotionStretch, str], Motion] = field(default_factory=dict)
 
     def instruments(
         self, effect: Effect, place: Place, shapes: Shapes, noise: Sequence[ArModel], *, keep: bool = True
     ) -> Array:
         """Whitened columns (R, k) at the simulated signals of the training data, as the search uses them.
 
-        Parameters
-        ----------
-        effect, place, shapes
-            Effect, its place and nonlinear parameters.
-        noise
-            Noise model of each joint.
-        keep
-            True to keep the columns in the cache.
+        ``effect``, ``place``, ``shapes``: effect, its place and nonlinear parameters; ``noise``: noise model of each
+        joint.
         """
         return whitened(self.band(effect, place, shapes, "train", "simulated", keep=keep), noise)
 
-    def motion(self, stretch: Stretch, kind: str) -> Motion:
-        """Signals of a stretch on which the columns of effects depend.
-
-        Parameters
-        ----------
-        stretch
-            A stretch of the study.
-        kind
-            ``measured`` or ``simulated``.
-        """
-        key = (id(stretch), kind)
-        if key not in self._motions:
-            self._motions[key] = self.study.motion(stretch, kind, self.theta)
-        return self._motions[key]
+    def motion(self, stretch: MotionStretch, kind: str) -> Motion:
+        """Signals of a stretch on which the columns of effects depend. ``kind``: ``measured`` or ``simulated``."""
+        if (stretch, kind) not in self._motions:
+            self._motions[stretch, kind] = self.study.motion(stretch, kind, self.theta)
+        return self._motions[stretch, kind]
 
     def joints(self, candidate: Candidate) -> list[int]:
-        """Joints on whose torques a candidate acts.
-
-        Parameters
-        ----------
-        candidate
-            The candidate.
-        """
+        """Joints on whose torques a candidate acts."""
         effect, place = candidate.effect, candidate.place
         if not candidate.grid:
             return [place.joint]
@@ -121,14 +88,8 @@ class ColumnCache:
     ) -> tuple[Array, ...]:
         """Columns in the band of the comparison, (M, n, k) of every stretch.
 
-        Parameters
-        ----------
-        effect, place, shapes
-            Effect, its place and nonlinear parameters.
-        part, kind
-            ``train`` or ``held``; ``measured`` or ``simulated``.
-        keep
-            True to keep the columns in the cache.
+        ``effect``, ``place``, ``shapes``: effect, its place and nonlinear parameters. ``part``, ``kind``: ``train`` or
+        ``held``; ``measured`` or ``simulated``.
         """
         (made,) = self._bands(effect, place, (shapes,), part, kind, keep=keep)
         return tuple(self._of_all_joints(columns, place) for columns in made)
@@ -140,16 +101,7 @@ class ColumnCache:
 
         Whitened columns at the simulated signals of the training data, one combination of the grid after the other.
 
-        Parameters
-        ----------
-        effect, place
-            Effect and its place.
-        grid
-            Combinations of nonlinear parameters, G of them.
-        noise
-            Noise model of each joint.
-        keep
-            True to keep the columns in the cache.
+        ``grid``: combinations of nonlinear parameters, G of them.
         """
         made = self._bands(effect, place, grid, "train", "simulated", keep=keep)
         stretches = range(len(self.study.train))
@@ -177,7 +129,7 @@ class ColumnCache:
         return [made[key(shapes)] if key(shapes) in made else self.kept[key(shapes)] for shapes in grid]
 
     def _filtered(
-        self, effect: Effect, place: Place, grid: Sequence[Shapes], stretch: Stretch, kind: str
+        self, effect: Effect, place: Place, grid: Sequence[Shapes], stretch: MotionStretch, kind: str
     ) -> list[Kept]:
         """Columns of one stretch in the band of the comparison, of every shape."""
         motion, moving = self.motion(stretch, kind), stretch.moving

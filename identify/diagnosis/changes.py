@@ -6,30 +6,19 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import stats
 
-from armident.identify.diagnosis.baseline import Change, Comparison
+from armident.identify.diagnosis.baseline_comparison import BaselineComparison, Change
 from armident.identify.diagnosis.candidates import ColumnCache
-from armident.identify.diagnosis.criteria import Criteria
-from armident.identify.effects.numbers import ParameterChange
+from armident.identify.effects.parameter_change import ParameterChange
 from armident.identify.effects.registry import catalogue
 from armident.identify.regression.whitening import whitened
 
-USUAL = Criteria.close
-"""Prior log-odds of common changes (friction, loads, offsets) against rare ones of the structure: where the torque of a
-joint is nearly all friction, more friction and another torque constant are ambiguous."""
-
 
 @dataclass(frozen=True, eq=False)
-class Standing:
+class RankedChange:
     """Score of a candidate among others.
 
-    Parameters
-    ----------
-    change
-        The candidate.
-    p_value
-        Probability that a candidate without merit reduces the chi-square as much.
-    score
-        Gain in log-likelihood, less the number of its parameters (Akaike), plus the logarithm of its prior odds.
+    ``p_value``: probability that a candidate without merit reduces the chi-square as much; ``score``: gain in
+    log-likelihood, less the number of its parameters (Akaike), plus the logarithm of its prior odds.
     """
 
     change: Change
@@ -37,15 +26,10 @@ class Standing:
     score: float
 
 
-def changes(comparison: Comparison, column_cache: ColumnCache) -> Iterator[Change]:
+def changes(comparison: BaselineComparison, column_cache: ColumnCache) -> Iterator[Change]:
     """All effects that change parameters of the model, at all their places.
 
-    Parameters
-    ----------
-    comparison
-        Fit and baseline.
-    column_cache
-        Cache of the columns of the same study.
+    ``comparison``: fit and baseline; ``column_cache``: cache of the columns of the same study.
     """
     fit = comparison.fit
     motion = column_cache.motion(fit.study.train[0], "measured")
@@ -66,17 +50,10 @@ def changes(comparison: Comparison, column_cache: ColumnCache) -> Iterator[Chang
                 yield Change(effect, place, directions)
 
 
-def p_value(comparison: Comparison, others: Sequence[Change], change: Change) -> float:
+def p_value_of_change(comparison: BaselineComparison, others: Sequence[Change], change: Change) -> float:
     """Probability that a change without merit, added to others, reduces the chi-square as much.
 
-    Parameters
-    ----------
-    comparison
-        Fit and baseline.
-    others
-        Changes already present.
-    change
-        The tested change.
+    ``comparison``: fit and baseline; ``others``: changes already present; ``change``: the tested change.
     """
     _, _, _, before, free_before = comparison.solved(others)
     _, _, _, after, free_after = comparison.solved([*others, change])
@@ -85,24 +62,15 @@ def p_value(comparison: Comparison, others: Sequence[Change], change: Change) ->
     return float(stats.chi2.sf(before - after, free_before - free_after))
 
 
-def ranked(comparison: Comparison, found: Sequence[Change], pool: Sequence[Change]) -> list[Standing]:
-    """Candidates by score, the best first.
-
-    Parameters
-    ----------
-    comparison
-        Fit and baseline.
-    found
-        Changes already present.
-    pool
-        Candidates.
-    """
+def ranked(comparison: BaselineComparison, found: Sequence[Change], pool: Sequence[Change]) -> list[RankedChange]:
+    """Candidates by score, the best first. ``comparison``: fit and baseline; ``found``: changes already present."""
     _, _, _, before, free_before = comparison.solved(found)
-    standings = []
+    prior = comparison.fit.study.criteria.close
+    found_changes = []
     for change in pool:
         _, _, _, after, free_after = comparison.solved([*found, change])
         if free_before > free_after:
             gain, size = before - after, free_before - free_after
-            score = 0.5 * gain - size + (USUAL if isinstance(change.effect, ParameterChange) else 0.0)
-            standings.append(Standing(change, float(stats.chi2.sf(gain, size)), score))
-    return sorted(standings, key=lambda standing: -standing.score)
+            score = 0.5 * gain - size + (prior if isinstance(change.effect, ParameterChange) else 0.0)
+            found_changes.append(RankedChange(change, float(stats.chi2.sf(gain, size)), score))
+    return sorted(found_changes, key=lambda one: -one.score)

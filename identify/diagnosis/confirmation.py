@@ -1,4 +1,4 @@
-"""Confirmation of a finding by the report part of the data, which chose nothing."""
+"""Confirmation of a finding by the report part of the data, which is not used for selection."""
 
 from dataclasses import dataclass
 
@@ -85,10 +85,7 @@ def confirmed(with_it: ModelState, without: ModelState) -> Confirmation:
     coefficient comes from what the projection leaves, summed over blocks of time: whatever the serial correlation, and
     also if the effect is strong in a part of the recording only.
 
-    Parameters
-    ----------
-    with_it, without
-        Models with and without the effect.
+    ``with_it``, ``without``: models with and without the effect.
     """
     before, after = (state.fit.errors(state.fit.theta, held=True) for state in (without, with_it))
     if with_it.study.recorded == without.study.recorded:

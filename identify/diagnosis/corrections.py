@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy import optimize
 
 from armident.identify.diagnosis.candidates import Candidate, ColumnCache
-from armident.identify.diagnosis.regression import Fit
+from armident.identify.diagnosis.regression import IvFit
 from armident.identify.diagnosis.study import NOISE_ORDER, PERTURBATION
 from armident.identify.effects.drive import Correction, motor_limit
 from armident.identify.regression.ar_noise import ar_models
@@ -23,7 +23,9 @@ REFINEMENTS = 10
 """Evaluations of the refinement between two values of the grid."""
 
 
-def screened_correction(fit: Fit, candidate: Candidate, column_cache: ColumnCache) -> tuple[float, tuple[float, float]]:
+def screened_correction(
+    fit: IvFit, candidate: Candidate, column_cache: ColumnCache
+) -> tuple[float, tuple[float, float]]:
     """Score statistic of an effect on the recorded torque of a motor, and two values of its parameter to start from.
 
     The statistic is the reduction of the squared whitened residual by the change of the torque that the model predicts
@@ -32,14 +34,8 @@ def screened_correction(fit: Fit, candidate: Candidate, column_cache: ColumnCach
     therefore no evidence of an effect. It gives the second value, for effects that are so large that the predicted
     torque is far from the true one.
 
-    Parameters
-    ----------
-    fit
-        Fit of the model without the effect.
-    candidate
-        Effect on a recorded torque, and its motor.
-    column_cache
-        Cache of the columns of the same fit.
+    ``fit``: fit of the model without the effect; ``candidate``: effect on a recorded torque, and its motor;
+    ``column_cache``: cache of the columns of the same fit.
     """
     study, effect, motor = fit.study, candidate.effect, candidate.place.joint
     assert isinstance(effect, Correction)
@@ -53,7 +49,7 @@ def screened_correction(fit: Fit, candidate: Candidate, column_cache: ColumnCach
 
 
 def _at_simulated(
-    fit: Fit, effect: Correction, motor: int, limit: float, column_cache: ColumnCache, values: Sequence[float]
+    fit: IvFit, effect: Correction, motor: int, limit: float, column_cache: ColumnCache, values: Sequence[float]
 ) -> Array:
     """Reduction of the squared whitened residual by the change of the predicted torque at each value, (k,)."""
     study, transmission = fit.study, fit.study.robot.transmission_matrix[motor]
@@ -66,11 +62,11 @@ def _at_simulated(
         changes.append(at_joints * s.moving[:, joints, None])
     series = whitened_series(changes, [fit.noise[j] for j in joints])
     columns = [(int(j), np.concatenate(parts)) for j, parts in zip(joints, series, strict=True)]
-    gram, score = fit.regression.products_beside(columns, len(values))
+    gram, score = fit.regression.orthogonal_products(columns, len(values))
     return np.asarray(2.0 * score[:, 0] - gram[:, 0, 0])
 
 
-def _likelihoods(fit: Fit, effect: Correction, motor: int, limit: float, values: Sequence[float]) -> Array:
+def _likelihoods(fit: IvFit, effect: Correction, motor: int, limit: float, values: Sequence[float]) -> Array:
     """Twice the log-likelihood of the torques that are corrected for each value, (k,), without a constant.
 
     The other parameters are estimated again, and the noise model of the joint of the motor: a strong correction changes

@@ -1,4 +1,4 @@
-"""All thresholds of a diagnosis, each with its unit and source."""
+"""All thresholds by which a diagnosis decides, each with its unit and its source or reckoning."""
 
 from dataclasses import dataclass
 
@@ -22,13 +22,14 @@ class Criteria:
         Least share of the power of a joint's predicted errors that a finding removes. A smaller one changes the error
         by less than 2 %, which is no cause of a gap.
     confirmation_level
-        Significance level of the report part alone, which chose nothing: as the usual false-alarm rate. A finding
-        that training data overrate, or that holds for one recording only, does not pass.
+        Significance level of the report part alone, which is not used for selection: as the usual false-alarm rate. A
+        finding that training data overrate, or that holds for one recording only, does not pass.
     named_share
         Least share of the errors' power that an effect with a name removes, over that of the best term without one.
         The name explains most of the regularity then, and the rest is found beside it.
     close
-        Difference of log-likelihood below which two explanations are ambiguous: odds of 20 to 1.
+        Difference of log-likelihood below which two explanations are ambiguous, nats: odds of 20 to 1. As prior odds of
+        common changes (friction, loads, offsets) against rare ones, it decides where the data are ambiguous.
     set_up_doubtful_pct
         Relative error of a joint, percent, above which nothing is named there: the rigid model leaves more than a third
         of its torque, so that the set-up is in question.
@@ -39,6 +40,61 @@ class Criteria:
         closed loop. In that loop an effect may gain more.
     shortlist, unnamed
         Numbers of named and unnamed candidates that are tested in their own closed loop, in each step.
+    alternatives
+        Most alternatives that are listed for a finding.
+    doubtful
+        Confidence below which another experiment is recommended: the alternatives together have odds of 2 to 3.
+    held_out_share
+        Share at the end of every recording for the report part, where no recording is given for it. A finding needs
+        about 10 nats of the rest; of this share it has 5 nats, a p-value of 0.001, under `confirmation_level`.
+    band
+        Frequency up to which model and data are compared, in closed-loop bandwidths (thesis section B.2).
+    stiff_loop
+        Most squared error of simulated velocities with an effect over that without, where a nominal controller follows
+        the motion whatever the arm: with up to 22 % more error such a loop is as good.
+    largest_transition
+        Largest transition of dry friction at a reversal over the dry friction of the joint. Dry friction breaks away at
+        up to twice the level of slow motion (Armstrong-Helouvry, Dupont, Canudas de Wit 1994, Automatica 30(7)), and a
+        joint that sticks looks like that.
+    noisy_motion
+        Share of a torque beyond the simulated motion from which it counts as measurement noise: more than half.
+    weighted_errors
+        Most errors with weighted equations over those with white weights: efficient weights change an estimate by less
+        than its standard deviation, and the errors by a few percent.
+    beyond_model
+        Least norm of the torque of an effect orthogonal to the model, over its own, for a test. Below it the effect
+        would be a thousand times as large as what the data show of it.
+    beyond_model_limit
+        The same of one parameter, for a detection limit: a hundred times.
+    beyond_model_function
+        The same of a free function, for the lack of fit. Below it the standard deviation of the curve would be more
+        than ten times as large as that of the residual, and distort the curve.
+    detection_power
+        Probability of a finding at the detection limit: nine diagnoses of ten.
+    held_out_level
+        Significance level of the held-out data alone for a dependence of the residual: usual 5 %.
+    robust_deviations
+        Limit of whitened residuals, robust standard deviations: normal noise exceeds it once in 16 000 samples.
+    rows_per_function
+        Least number of equations per free function: with 12 the functions take 8 % of the noise power.
+    functions_in_noise
+        Most sets of functions taken out of the residual of one joint for its noise model, against overfitting.
+    most_unexplained
+        Most unexplained dependences of one joint.
+    motion_share
+        Share of the dependence on the motion altogether that single variables have to explain, so that it is not
+        listed beside them: the greater part.
+    line_level
+        Significance level from which a spectral line is searched in the references: as the usual false-alarm rate.
+    reference_line
+        Power of a line of the references over that around it: of 1000 frequencies without a line, the largest exceeds
+        14 times once in 1000 recordings; a line of a set-point generator is stronger by orders.
+    modulated_line
+        Width to either side of a line that the motion modulates, in bandwidths of the motion: sidebands of slow motion
+        lie within a tenth.
+    estimable
+        Share of a parameter in the observed directions above which its change is reported by itself: the other
+        directions hold 3 % of it at most.
     """
 
     false_alarm_rate: float = 0.01
@@ -52,12 +108,39 @@ class Criteria:
     promising: float = 0.25
     shortlist: int = 10
     unnamed: int = 4
+    alternatives: int = 3
+    doubtful: float = 0.6
+    held_out_share: float = 0.35
+    band: float = 5.0
+    stiff_loop: float = 1.5
+    largest_transition: float = 2.0
+    noisy_motion: float = 0.5
+    weighted_errors: float = 1.1
+    beyond_model: float = 1e-3
+    beyond_model_limit: float = 1e-2
+    beyond_model_function: float = 0.1
+    detection_power: float = 0.9
+    held_out_level: float = 0.05
+    robust_deviations: float = 4.0
+    rows_per_function: int = 12
+    functions_in_noise: int = 3
+    most_unexplained: int = 2
+    motion_share: float = 0.5
+    line_level: float = 0.01
+    reference_line: float = 100.0
+    modulated_line: float = 0.1
+    estimable: float = 0.999
 
     @property
     def alpha(self) -> dict[str, float]:
         """Division of the false-alarm rate: selection of effects, lack of fit, and changed parameters."""
         rate = self.false_alarm_rate
         return {"selection": 0.5 * rate, "lack_of_fit": 0.25 * rate, "changed_parameters": 0.25 * rate}
+
+    @property
+    def ambiguous_odds(self) -> float:
+        """Odds up to which another explanation is ambiguous."""
+        return float(np.exp(self.close))
 
     def selection_level(self, tests: int) -> float:
         """Significance level of the selection for one of a number of candidates."""

@@ -4,39 +4,26 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
+from armident.identify.diagnosis.candidate_comparison import SelectionStep
 from armident.identify.diagnosis.candidates import Candidate, ColumnCache, Shapes, candidates
-from armident.identify.diagnosis.comparison import Step
-from armident.identify.diagnosis.criteria import Criteria
 from armident.identify.diagnosis.model_state import ModelState
 from armident.identify.diagnosis.precision import variance_of_sum
-from armident.identify.diagnosis.screening import directions_beside
+from armident.identify.diagnosis.screening import orthogonal_directions
 from armident.identify.documents.diagnosis import DetectionLimit
 from armident.identify.effects.transmission import MotorOrder
 from armident.identify.effects.unnamed import NAME as UNNAMED
 
 Array = NDArray[np.float64]
 
-POWER = 0.9
-"""Probability of detection at the detection limit."""
-CONTAINED = 1e-2
-"""Share of a column in the directions orthogonal to the model below which the model contains it."""
 
-
-def detection_limits(state: ModelState, step: Step | None, criteria: Criteria) -> list[DetectionLimit]:
+def detection_limits(state: ModelState, step: SelectionStep | None) -> list[DetectionLimit]:
     """Return the detection limits of the effects that are not in the model.
 
     Each linear parameter is treated by itself, at the nonlinear parameters that fit best. At the limit, the gain of
-    log-likelihood reaches the threshold of the selection with probability `POWER`. The error of the joint falls by the
-    share that a finding requires.
+    log-likelihood reaches the threshold of the selection with the probability `Criteria.detection_power`, and the error
+    of the joint falls by the share that a finding requires.
 
-    Parameters
-    ----------
-    state
-        Model with all findings.
-    step
-        Comparison of all effects in that model; ``None`` if it was not made.
-    criteria
-        Thresholds.
+    ``state``: model with all findings. ``step``: comparison of all effects in that model; ``None`` if it was not made.
     """
     column_cache = ColumnCache(state.study, state.fit.theta)
     shapes = {} if step is None else {a.candidate.key: a.shapes for a in reversed(step.ranked)}
@@ -47,26 +34,26 @@ def detection_limits(state: ModelState, step: Step | None, criteria: Criteria) -
         if isinstance(candidate.effect, MotorOrder) and candidate.key not in shapes:
             continue
         middle = candidate.grid[len(candidate.grid) // 2] if candidate.grid else ()
-        sizes = _smallest(state, column_cache, candidate, shapes.get(candidate.key, middle), len(every), criteria)
+        sizes = _smallest(state, column_cache, candidate, shapes.get(candidate.key, middle), len(every))
         if sizes is not None and np.isfinite(sizes).any():
             found.append(_entry(state, candidate, sizes))
     return found
 
 
 def _smallest(
-    state: ModelState, column_cache: ColumnCache, candidate: Candidate, shapes: Shapes, tests: int, criteria: Criteria
+    state: ModelState, column_cache: ColumnCache, candidate: Candidate, shapes: Shapes, tests: int
 ) -> Array | None:
     """Smallest detectable size (k,) of each linear parameter; infinite where it is not detectable."""
-    fit = state.fit
+    fit, criteria = state.fit, state.study.criteria
     z = column_cache.instruments(candidate.effect, candidate.place, shapes, fit.noise, keep=False)
-    basis = directions_beside(fit, z)
+    basis = orthogonal_directions(fit, z)
     if basis is None:
         return None
     u, right, scale = basis
-    able = np.linalg.norm(right, axis=1) > CONTAINED
+    able = np.linalg.norm(right, axis=1) > criteria.beyond_model_limit
     # Coordinates of each column in orthonormal directions beside the model.
     along = u.T @ z
-    score = np.sqrt(2.0 * np.log(max(tests, 1) / criteria.alpha["selection"])) + float(stats.norm.ppf(POWER))
+    score = np.sqrt(2.0 * criteria.needed_gain(tests)) + float(stats.norm.ppf(criteria.detection_power))
     residual = fit.residual
     rows = fit.regression.rows_of
     sizes = np.full(scale.size, np.inf)

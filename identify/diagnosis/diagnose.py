@@ -1,4 +1,4 @@
-"""Diagnosis of a model: set-up, missing effects, confirmation on data that chose nothing, and the unexplained rest."""
+"""Diagnosis of a model: set-up, missing effects, confirmation on data not used for selection, unexplained residual."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -10,6 +10,7 @@ from threadpoolctl import threadpool_limits
 
 from armident.configs import RobotConfig
 from armident.identify.diagnosis.candidates import ColumnCache
+from armident.identify.diagnosis.changed_parameters import stale_numbers
 from armident.identify.diagnosis.criteria import Criteria
 from armident.identify.diagnosis.detection_limits import detection_limits
 from armident.identify.diagnosis.findings import (
@@ -22,10 +23,9 @@ from armident.identify.diagnosis.findings import (
     noise_floor,
     undetectable,
 )
-from armident.identify.diagnosis.lack_of_fit import Dependence, unexplained
+from armident.identify.diagnosis.lack_of_fit import ResidualDependence, unexplained
 from armident.identify.diagnosis.lack_of_fit import dependences as dependences_of
 from armident.identify.diagnosis.model_state import ModelState, with_report_part
-from armident.identify.diagnosis.numbers import stale_numbers
 from armident.identify.diagnosis.selected import Selected
 from armident.identify.diagnosis.selection import StepwiseSelection
 from armident.identify.diagnosis.setup_stage import set_up
@@ -35,17 +35,17 @@ from armident.identify.documents.base import RecordingReference, versions
 from armident.identify.documents.diagnosis import BeforeAfter, DiagnosisDocument, Finding, Gaps, Unexplained, Verdict
 from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.effects.friction import TRANSITION
-from armident.identify.effects.recorded import of_recording
+from armident.identify.effects.recording_corrections import of_recording
 from armident.identify.effects.unnamed import NAME as UNNAMED
-from armident.identify.experiment import Experiment
 from armident.identify.regression.equations import applied
+from armident.identify.signals.experiments import Experiment
 
 Array = NDArray[np.float64]
 Progress = Callable[[str, float], None]
 
 
 @dataclass(frozen=True)
-class Diagnosis:
+class DiagnosisResult:
     """Result of a diagnosis, with the curves of its report.
 
     Parameters
@@ -83,12 +83,12 @@ class Diagnosis:
     own: tuple[Array | None, ...]
     q: Array
     qd: Array
-    where: tuple[Dependence, ...]
-    left: tuple[Dependence, ...]
+    where: tuple[ResidualDependence, ...]
+    left: tuple[ResidualDependence, ...]
     simulated: SimulatedErrors
 
 
-def diagnose(
+def run_diagnosis(
     training: Sequence[Experiment],
     validation: Sequence[Experiment],
     robot: RobotConfig,
@@ -98,8 +98,11 @@ def diagnose(
     progress: Progress | None = None,
     criteria: Criteria | None = None,
     time_limit_s: float | None = None,
-) -> Diagnosis:
+) -> DiagnosisResult:
     """Find the effects that a model lacks by stepwise selection.
+
+    Returns the document, configuration with the findings, and curves. Raises DataError if the recordings cannot support
+    a diagnosis.
 
     Parameters
     ----------
@@ -107,8 +110,6 @@ def diagnose(
         Experiments to fit and to select effects by.
     validation
         Experiments of the report part; without them the last part of the training experiments is the report part.
-    robot
-        Configuration of the model to diagnose.
     recordings
         References to the recordings of the experiments, for the document.
     baseline
@@ -121,16 +122,6 @@ def diagnose(
         Thresholds; ``None``: the defaults.
     time_limit_s
         Wall-clock time after which the selection ends with what it has found, s; ``None``: without limit.
-
-    Returns
-    -------
-    Diagnosis
-        Document, configuration with the findings, and curves.
-
-    Raises
-    ------
-    DataError
-        If the recordings cannot support a diagnosis.
     """
     deadline = float("inf") if time_limit_s is None else time.monotonic() + time_limit_s
     # Threads gain little on tall and narrow matrices, and round otherwise.
@@ -208,13 +199,13 @@ def _diagnose(
     steps: _Steps,
     criteria: Criteria,
     deadline: float,
-) -> Diagnosis:
+) -> DiagnosisResult:
     steps("set-up")
-    stage = set_up(training, validation, robot)
+    stage = set_up(training, validation, robot, criteria)
     steps("derivatives and closed loop")
-    study = build_study(stage.training, stage.validation, stage.robot)
+    study = build_study(stage.training, stage.validation, stage.robot, criteria=criteria)
     steps("base fit")
-    selection = StepwiseSelection(study, criteria, steps, deadline, steps.tested, shifts=stage.shifts)
+    selection = StepwiseSelection(study, steps, deadline, steps.tested, shifts=stage.shifts)
     first = selection.start()
     steps("comparison of effects")
     chosen, every = selection.run(first)
@@ -224,16 +215,17 @@ def _diagnose(
     selected = [one for one in every if one not in conventional]
     after = gap_of(final, held=True)
     steps("unexplained dependences")
-    dependences = unexplained(final, criteria)
+    dependences = unexplained(final)
     rest = [
         Unexplained(joint=d.joint, share_of_residual=d.share, varies_with=d.varies_with, hint=d.hint)
         for d in dependences
     ]
     named = less_certain(findings_of(final, selected), rest)
-    places = {id(f): k for k, f in enumerate(named)}
-    findings = stage.named(named, after)
     stopped = _stopped(selection, len(named))
-    chosen_for = [selected[places[id(f)]] if id(f) in places else None for f in findings]
+    doubtful = {entry.joint for entry in stage.doubtful(after)}
+    explained = [(f, one) for f, one in zip(named, selected, strict=True) if f.joint not in doubtful]
+    findings = [*stage.findings, *(f for f, _ in explained)]
+    chosen_for = [*(None for _ in stage.findings), *(one for _, one in explained)]
     left = stage.left(rest, after)
     if baseline is not None:
         steps("changed parameters")
@@ -244,7 +236,7 @@ def _diagnose(
     simulated = simulated_errors(first, final)
     steps("detection limits")
     last = selection.last(chosen)
-    limits = detection_limits(final, last, criteria)
+    limits = detection_limits(final, last)
     document = DiagnosisDocument(
         robot=robot.name,
         recordings=list(recordings),
@@ -256,7 +248,7 @@ def _diagnose(
             validation=BeforeAfter(before=stage.as_configured(gap_of(first, held=True)), after=after),
         ),
         noise_floor=noise_floor(final, left),
-        recommended_experiment=experiment_to_separate(findings),
+        recommended_experiment=experiment_to_separate(findings, criteria),
         model=None,
         timing_s=steps.finish(),
         versions=versions(),
@@ -264,25 +256,25 @@ def _diagnose(
         not_visible=undetectable(first, selection.hidden),
         detection_limits=limits,
         simulated=simulated.document(),
-        negligible=negligible(final, conventional, last, criteria, selection.immaterial),
+        negligible=negligible(final, conventional, last, selection.immaterial),
         sign_smoothing=dict(zip(study.joints, map(float, first.robot.sign_smoothing), strict=True)),
         transitions={e.joint: e.parameters["velocity"] for e in final.robot.effects if e.effect == TRANSITION},
         criteria=asdict(criteria),
         alpha=criteria.alpha,
     )
     held = final.study.held
-    return Diagnosis(
+    return DiagnosisResult(
         document=document,
         robot=final.with_values(),
         t=_continued([s.t for s in held]),
         measured=np.concatenate([s.y for s in held]),
-        before=_beside(final, first),
+        before=_predicted_for_final(final, first),
         after=_predicted(final),
         lacking=_of_findings(_lacking, final, chosen_for, len(findings)),
         own=_of_findings(_own, final, chosen_for, len(findings)),
         q=_sampled(final, "q"),
         qd=_sampled(final, "qd"),
-        where=dependences_of(first, criteria),
+        where=dependences_of(first),
         left=dependences,
         simulated=simulated,
     )
@@ -313,7 +305,7 @@ def _predicted(state: ModelState) -> Array:
     return np.concatenate([applied(e.x, state.fit.theta) for e in state.fit.equations.held])
 
 
-def _beside(final: ModelState, state: ModelState) -> Array:
+def _predicted_for_final(final: ModelState, state: ModelState) -> Array:
     """Torques (M, n) of another model, with its residuals referred to the corrected recordings of the final one."""
     pairs = zip(final.study.held, state.study.held, strict=True)
     return np.asarray(_predicted(state) + np.concatenate([right.y - own.y for right, own in pairs]))
@@ -321,7 +313,7 @@ def _beside(final: ModelState, state: ModelState) -> Array:
 
 def _lacking(final: ModelState, one: Selected) -> Array | None:
     """Torques (M, n) of the model without one finding."""
-    return None if one.without is None else _beside(final, one.without)
+    return None if one.without is None else _predicted_for_final(final, one.without)
 
 
 def _own(final: ModelState, one: Selected) -> Array | None:

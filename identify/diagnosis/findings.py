@@ -5,42 +5,27 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from armident.identify.diagnosis.candidate_comparison import Addition, SelectionStep
 from armident.identify.diagnosis.candidates import ColumnCache, Key
-from armident.identify.diagnosis.comparison import Addition, Step
+from armident.identify.diagnosis.changed_parameters import NumbersFinding
 from armident.identify.diagnosis.criteria import Criteria
-from armident.identify.diagnosis.experiment import recommended_experiment
 from armident.identify.diagnosis.model_state import ModelState
-from armident.identify.diagnosis.numbers import NumbersFinding
+from armident.identify.diagnosis.next_experiment import recommended_experiment
 from armident.identify.diagnosis.precision import standard_deviations
-from armident.identify.diagnosis.regression import relative_errors
+from armident.identify.diagnosis.regression import relative_fit_errors
 from armident.identify.diagnosis.selected import Selected
 from armident.identify.documents.diagnosis import Alternative, Finding, Gap, Negligible, NotVisible, Unexplained
 from armident.identify.effects.effect import Effect
-from armident.identify.effects.numbers import ParameterChange
+from armident.identify.effects.parameter_change import ParameterChange
 from armident.identify.effects.registry import catalogue, known, of_entry
 from armident.identify.effects.unnamed import NAME as UNNAMED
 from armident.identify.effects.wiring import Wiring
 
 Array = NDArray[np.float64]
 
-ALTERNATIVES = 3
-"""Most alternatives named beside a finding."""
-STRONG = float(np.exp(Criteria.close))
-"""Odds beyond which an explanation is no longer ambiguous."""
-DOUBTFUL = 0.6
-"""Confidence below which another experiment is recommended."""
-
 
 def findings_of(final: ModelState, selected: Sequence[Selected]) -> list[Finding]:
-    """Return the findings of a selection, in its order.
-
-    Parameters
-    ----------
-    final
-        Model with all of them.
-    selected
-        Effects of the selection.
-    """
+    """Return the findings of a selection, in its order. ``selected``: effects of the selection."""
     deviations = standard_deviations(final)
     entries = list(final.robot.effects)
     values = final.with_values().effects
@@ -62,6 +47,7 @@ def _finding(final: ModelState, one: Selected, parameters: Mapping[str, float], 
     chance = min(1.0, one.step.tests * float(np.exp(-addition.gain)))
     rivals = one.step.rivals(addition)
     odds = tempered_odds(one.step, addition)
+    ambiguous = final.study.criteria.ambiguous_odds
     return Finding(
         effect=effect.name,
         law=effect.law,
@@ -75,7 +61,7 @@ def _finding(final: ModelState, one: Selected, parameters: Mapping[str, float], 
         gap_after=float(report.best[joint]),
         evidence={
             "title": effect.title,
-            "description": effect.says,
+            "description": effect.description,
             "reference": effect.reference,
             "score": addition.gain,
             "p_value": report.p_value,
@@ -88,7 +74,7 @@ def _finding(final: ModelState, one: Selected, parameters: Mapping[str, float], 
             "change_of_torque_pct": addition.material_pct,
             "std": std,
             "units": _units(effect, final.robot.joints[place.joint].type == "prismatic"),
-            "ambiguous_with": [key[0] for key, ratio in odds.items() if addition.named and ratio * STRONG > 1.0],
+            "ambiguous_with": [key[0] for key, ratio in odds.items() if addition.named and ratio * ambiguous > 1.0],
         },
     )
 
@@ -100,12 +86,7 @@ def less_certain(findings: Sequence[Finding], left: Sequence[Unexplained]) -> li
     effect, of which a finding has taken a part. Of the power of its joint's error that is known not to be noise, the
     finding explains a share. That share limits the probability of its name; a term without a name claims no cause.
 
-    Parameters
-    ----------
-    findings
-        Findings of the selection.
-    left
-        Unexplained dependences of the residual of the final model.
+    ``findings``: findings of the selection; ``left``: unexplained dependences of the residual of the final model.
     """
     known_shares = _known_shares(left)
     found = []
@@ -126,18 +107,13 @@ def _known_shares(left: Sequence[Unexplained]) -> dict[str, float]:
     return shares
 
 
-def tempered_odds(step: Step, one: Addition) -> dict[Key, float]:
+def tempered_odds(step: SelectionStep, one: Addition) -> dict[Key, float]:
     """Return the posterior odds of each other effect in place of one, whatever its law, with equal prior odds.
 
     Differences of log-likelihood are reduced by the serial correlation that the noise models leave: the gain of the
     effect with it over that without it.
 
-    Parameters
-    ----------
-    step
-        Step of the selection.
-    one
-        The effect.
+    ``step``: step of the selection.
     """
     factor = float(np.clip(one.gain / one.raw_gain, 0.0, 1.0)) if one.raw_gain > 0.0 else 1.0
     odds: dict[Key, float] = {}
@@ -155,35 +131,24 @@ def _alternatives(final: ModelState, one: Addition, rivals: Sequence[Addition]) 
             joint = final.study.joints[rival.candidate.place.joint]
             entry = Alternative(effect=rival.family[0], joint=joint, score=rival.log_likelihood - one.log_likelihood)
             found.setdefault(rival.family, entry)
-    return list(found.values())[:ALTERNATIVES]
+    return list(found.values())[: final.study.criteria.alternatives]
 
 
 def negligible(
     final: ModelState,
     conventional: Sequence[Selected],
-    step: Step | None,
-    criteria: Criteria,
+    step: SelectionStep | None,
     immaterial: Sequence[Addition] = (),
 ) -> list[Negligible]:
     """Return the effects that are significant, and no cause: too small, or within the sampling convention of drives.
 
-    Parameters
-    ----------
-    final
-        Model with the findings.
-    conventional
-        Effects of the selection within the sampling convention.
-    step
-        Comparison of all effects in it; ``None`` if it was not made.
-    criteria
-        Thresholds.
-    immaterial
-        Effects that change too little of the report part.
+    ``conventional``: effects of the selection within the sampling convention. ``step``: comparison of all effects in
+    it; ``None`` if it was not made. ``immaterial``: effects that change too little of the report part.
     """
     found: dict[Key, Negligible] = {}
     small = [*(one.addition for one in conventional), *immaterial]
     if step is not None:
-        needed = np.log(max(step.tests, 1) / criteria.alpha["selection"])
+        needed = final.study.criteria.needed_gain(step.tests)
         small += [a for a in step.ranked if a.gain > needed and a not in step.passing]
     for addition in small:
         if addition.allowed and addition.named:
@@ -199,16 +164,8 @@ def negligible(
 
 
 def gap_of(state: ModelState, *, held: bool) -> Gap:
-    """Relative torque errors of a model.
-
-    Parameters
-    ----------
-    state
-        The model.
-    held
-        True for the held-out data, false for the training data.
-    """
-    overall, each = relative_errors(state.fit, held=held)
+    """Relative torque errors of a model. ``held``: True for the held-out data, false for the training data."""
+    overall, each = relative_fit_errors(state.fit, held=held)
     errors = np.concatenate(state.fit.errors(state.fit.theta, held=held))
     rms = np.sqrt(np.mean(errors**2, axis=0))
     joints = state.study.joints
@@ -222,12 +179,7 @@ def gap_of(state: ModelState, *, held: bool) -> Gap:
 def noise_floor(final: ModelState, left: Sequence[Unexplained]) -> Gap:
     """Return the remaining error on the held-out data, less the shares that are known not to be noise.
 
-    Parameters
-    ----------
-    final
-        Model with the findings.
-    left
-        Dependences of its residual.
+    ``left``: dependences of its residual.
     """
     gap = gap_of(final, held=True)
     known_shares = {name: 0.0 for name in gap.by_joint} | _known_shares(left)
@@ -241,12 +193,8 @@ def noise_floor(final: ModelState, left: Sequence[Unexplained]) -> Gap:
 def undetectable(state: ModelState, hidden: frozenset[Key]) -> list[NotVisible]:
     """Return the effects of the catalogue that this motion cannot show at some joint, with the reason.
 
-    Parameters
-    ----------
-    state
-        Model as configured.
-    hidden
-        Effects and places that the model contains or the motion does not excite.
+    ``state``: model as configured; ``hidden``: effects and places that the model contains or the motion does not
+    excite.
     """
     study = state.study
     motion = ColumnCache(study, state.fit.theta).motion(study.train[0], "measured")
@@ -261,20 +209,14 @@ def undetectable(state: ModelState, hidden: frozenset[Key]) -> list[NotVisible]:
             elif (effect.key, place.joint, place.other) in hidden:
                 reason = "the motion does not excite it, or the model already contains it"
             if reason is not None:
-                joint = study.joints[place.joint]
-                entry = NotVisible(effect=effect.name, joint=joint, reason=reason, required_motion=effect.needs)
-                found.setdefault((effect.name, joint), entry)
+                name, joint, motion_text = effect.name, study.joints[place.joint], effect.required_motion
+                entry = NotVisible(effect=name, joint=joint, reason=reason, required_motion=motion_text)
+                found.setdefault((name, joint), entry)
     return list(found.values())
 
 
 def changed_parameters(numbers: Sequence[NumbersFinding]) -> list[Finding]:
-    """Return the changed parameters of a baseline as findings.
-
-    Parameters
-    ----------
-    numbers
-        Changes against the baseline.
-    """
+    """Return the changed parameters of a baseline as findings. ``numbers``: changes against the baseline."""
     return [
         Finding(
             effect=n.effect,
@@ -298,25 +240,17 @@ def changed_parameters(numbers: Sequence[NumbersFinding]) -> list[Finding]:
     ]
 
 
-def experiment_to_separate(findings: Sequence[Finding]) -> str | None:
+def experiment_to_separate(findings: Sequence[Finding], criteria: Criteria) -> str | None:
     """Return the experiment that separates a finding from a close rival or raises a low confidence.
 
-    Parameters
-    ----------
-    findings
-        Findings of a diagnosis.
-
-    Returns
-    -------
-    str or None
-        ``None`` if none is needed.
+    ``findings``: findings of a diagnosis. Returns ``None`` if none is needed.
     """
     named = [f for f in findings if f.effect in catalogue()]
     for finding in named:
         rivals = [known(name) for name in finding.evidence.get("ambiguous_with", [])]
         if rivals:
             return recommended_experiment(known(finding.effect), finding.joint, rivals)
-    doubtful = [f for f in named if f.kind == "structure" and f.confidence < DOUBTFUL]
+    doubtful = [f for f in named if f.kind == "structure" and f.confidence < criteria.doubtful]
     return recommended_experiment(known(doubtful[0].effect), doubtful[0].joint) if doubtful else None
 
 

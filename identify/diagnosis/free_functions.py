@@ -2,24 +2,16 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from armident.identify.diagnosis.study import Study
+from armident.identify.diagnosis.variables import VARIABLES, Kind
+from armident.identify.effects.free_shapes import hats
 from armident.identify.robot.motion import Motion
 
 Array = NDArray[np.float64]
-
-Kind = Literal[
-    "velocity", "position", "position and direction", "motor angle", "load", "load and direction", "torque",
-    "acceleration", "time", "time and direction", "position of another joint", "velocity of another joint",
-    "torque of another joint", "frequency", "motion", "transients",
-]  # fmt: skip
-"""Variables; those with a direction have the opposite sign in the negative direction. The last three have no free
-functions of their own: a frequency independent of the motion, all functions of the motion together, and ``transients``
-of documents of former versions."""
 
 SIDE = (0.0, 0.05, 0.15, 0.35, 0.65, 1.0)
 """Speeds of the knots of either direction, over the top speed: close at low speeds, where friction is curved."""
@@ -41,18 +33,9 @@ POINTS = 121
 class FreeFunction:
     """Set of basis functions of one variable, for the residual of one joint (thesis 7.3.2).
 
-    Parameters
-    ----------
-    joint
-        Number of the joint of the residual.
-    kind
-        Kind of the variable.
-    other
-        Joint or motor to which the variable belongs, if it is another one.
-    knots
-        Knots of the hat functions, increasing; for an angle the wave numbers; for the time the time constant, s.
-    low, high
-        Range of the curve.
+    ``other``: joint or motor to which the variable belongs, if it is another one. ``knots``: knots of the hat
+    functions, increasing; for an angle the wave numbers; for the time the time constant, s. ``low``, ``high``: range of
+    the curve.
     """
 
     joint: int
@@ -77,39 +60,14 @@ class FreeFunction:
         return self.kind.removesuffix(" of another joint"), at, side, self.knots
 
     def variable(self, motion: Motion) -> Array:
-        """Values of the variable, (N,).
-
-        Parameters
-        ----------
-        motion
-            Motion of the arm, N samples.
-        """
-        at = self.joint if self.other is None else self.other
-        match self.kind:
-            case "velocity" | "velocity of another joint":
-                return motion.qd[:, at]
-            case "position" | "position and direction" | "position of another joint":
-                return motion.q[:, at]
-            case "motor angle":
-                return motion.motor[:, at]
-            case "load" | "load and direction":
-                return motion.transmitted[:, at]
-            case "torque" | "torque of another joint":
-                return motion.torque[:, at]
-            case "acceleration":
-                return motion.qdd[:, at]
-            case _:
-                return motion.t
+        """Values of the variable, (N,). ``motion``: motion of the arm, N samples."""
+        signal: Array = getattr(motion, VARIABLES[self.kind].signal)
+        return signal if signal.ndim == 1 else signal[:, self.joint if self.other is None else self.other]
 
     def basis(self, x: Array, side: Array) -> Array:
         """Basis functions, (N, k).
 
-        Parameters
-        ----------
-        x
-            Values of the variable, (N,).
-        side
-            Smoothed sign of the velocity of the joint, (N,).
+        ``x``: values of the variable, (N,); ``side``: smoothed sign of the velocity of the joint, (N,).
         """
         if self.kind == "velocity":
             speed = hats(np.abs(x), self.knots)
@@ -125,13 +83,7 @@ class FreeFunction:
         return functions * side[:, None] if self.directed else functions
 
     def columns(self, motion: Motion) -> Array:
-        """Basis functions along a motion, without its lead, (N, k).
-
-        Parameters
-        ----------
-        motion
-            Motion of the arm.
-        """
+        """Basis functions along a motion, without its lead, (N, k). ``motion``: motion of the arm."""
         return self.basis(self.variable(motion), motion.sign[:, self.joint])[motion.lead :]
 
     def on_grid(self) -> tuple[Array, Array, list[Array]]:
@@ -145,36 +97,10 @@ class FreeFunction:
         return x, basis, [basis]
 
 
-def hats(x: Array, knots: Sequence[float] | Array) -> Array:
-    """Piecewise linear functions (N, k), one at each knot, constant beyond the outermost.
-
-    Parameters
-    ----------
-    x
-        Values, (N,).
-    knots
-        Increasing knots, (k,).
-    """
-    at = np.asarray(knots, dtype=np.float64)
-    left = np.clip(np.searchsorted(at, x, side="right") - 1, 0, at.size - 2)
-    share = np.clip((x - at[left]) / (at[left + 1] - at[left]), 0.0, 1.0)
-    out, rows = np.zeros((x.size, at.size)), np.arange(x.size)
-    out[rows, left] = 1.0 - share
-    out[rows, left + 1] = share
-    return out
-
-
 def free_functions(study: Study, motions: Sequence[Motion], joint: int) -> Iterator[FreeFunction]:
     """All sets of functions for the residual of one joint.
 
-    Parameters
-    ----------
-    study
-        Data with the robot.
-    motions
-        The training stretches at simulated signals.
-    joint
-        Number of the joint.
+    ``study``: data with the robot; ``motions``: the training stretches at simulated signals.
     """
     top = max(float(np.abs(m.qd[:, joint]).max()) for m in motions)
     if top > 0:
@@ -229,14 +155,8 @@ def _of_angle(study: Study, joint: int, motor: int, motions: Sequence[Motion]) -
 def in_band(study: Study, motion: Motion, functions: Sequence[FreeFunction]) -> dict[tuple[object, ...], Array]:
     """Basis functions along a motion in the band of the comparison, (M, k) of every key.
 
-    Parameters
-    ----------
-    study
-        Data with the filter.
-    motion
-        Motion of the arm, at the working rate.
-    functions
-        Sets of functions of all joints.
+    ``study``: data with the filter; ``motion``: motion of the arm, at the working rate; ``functions``: sets of
+    functions of all joints.
     """
     unique = {f.key: f for f in functions}
     made = [f.columns(motion) for f in unique.values()]

@@ -18,36 +18,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armident.identify.diagnosis.criteria import Criteria
-from armident.identify.diagnosis.free_functions import FINE, FreeFunction, Kind, free_functions, in_band
-from armident.identify.diagnosis.hints import hint_of, unit_of
+from armident.identify.diagnosis.free_functions import FINE, FreeFunction, free_functions, in_band
 from armident.identify.diagnosis.noise_beyond import noise_beyond
 from armident.identify.diagnosis.projection import JointResidual, Projection
-from armident.identify.diagnosis.regression import Fit
-from armident.identify.diagnosis.spectral_lines import Line, bandwidth_of_motion, lines_of_joints
-from armident.identify.diagnosis.stretch import Stretch
+from armident.identify.diagnosis.regression import IvFit
+from armident.identify.diagnosis.spectral_lines import SpectralLine, bandwidth_of_motion, lines_of_joints
+from armident.identify.diagnosis.stretch import MotionStretch
+from armident.identify.diagnosis.variables import Kind, hint_of, unit_of_variable
 from armident.identify.regression.whitening import rows_of_joints
 from armident.identify.robot.motion import Motion
 from armident.identify.signals.periodogram import hann_window, periodogram
 
 Array = NDArray[np.float64]
 
-HELD_OUT_LEVEL = 0.05
-"""Significance level of the held-out data alone: an effect must predict data that did not fit it."""
-
-ROWS_PER_COLUMN = 12
-"""Least number of equations per function of all functions together, against overfitting of short recordings."""
-
-MOST_DEVIATIONS = 4.0
-"""Limit of whitened residuals, robust standard deviations: normal noise exceeds it once in 16 000 samples."""
-
 NORMAL = 1.4826
 """Standard deviation of a normal variable over the median of its absolute value."""
-
-MOST_TAKEN = 3
-"""Most sets of functions taken out of the residual of one joint for its noise model."""
-
-MOST = 2
-"""Most unexplained dependences of one joint."""
 
 OCTAVES = (0.0, 0.125, 0.25, 0.5, 1.0, 2.0, 4.0)
 """Edges of the frequencies of the spectrum of a dependence on the motion, over the bandwidth of the motion."""
@@ -57,7 +42,7 @@ class Fitted(Protocol):
     """A fitted model: `armident.identify.diagnosis.model_state.ModelState`."""
 
     @property
-    def fit(self) -> Fit:
+    def fit(self) -> IvFit:
         """Fit of the model."""
 
 
@@ -65,14 +50,8 @@ class Fitted(Protocol):
 class Curve:
     """A shape with its uncertainty.
 
-    Parameters
-    ----------
-    x
-        Values of the variable, (G,).
-    value
-        Missing torque of the model there, N m or N, (G,).
-    band
-        Two standard deviations, (G,).
+    ``x``: values of the variable, (G,); ``value``: missing torque of the model there, N m or N, (G,); ``band``: two
+    standard deviations, (G,).
     """
 
     x: Array
@@ -81,17 +60,13 @@ class Curve:
 
 
 @dataclass(frozen=True)
-class Dependence:
+class ResidualDependence:
     """Dependence of one joint's residual on one variable.
 
     Parameters
     ----------
-    joint
-        Its name.
     kind, other
         Variable; the joint or motor to which it belongs, if it is another one.
-    unit
-        Unit of the variable.
     share
         Share of the power of the joint's held-out residual that the dependence, fitted on the training data, predicts.
         For a frequency: share of the residual at the working rate.
@@ -134,48 +109,34 @@ class Dependence:
         return hint_of(self.kind, self.joint, self.other, f"{at:.3g} {self.unit}")
 
 
-def dependences(state: Fitted, criteria: Criteria | None = None) -> tuple[Dependence, ...]:
+def dependences(state: Fitted) -> tuple[ResidualDependence, ...]:
     """Significant dependences of the residual, at most one for each joint and variable, largest share first.
 
-    Parameters
-    ----------
-    state
-        Fitted model.
-    criteria
-        Thresholds.
+    ``state``: fitted model.
     """
-    return LackOfFit(state.fit, criteria or Criteria()).dependences
+    return LackOfFit(state.fit).dependences
 
 
-def unexplained(state: Fitted, criteria: Criteria | None = None) -> tuple[Dependence, ...]:
+def unexplained(state: Fitted) -> tuple[ResidualDependence, ...]:
     """Significant and material dependences, each in addition to the ones before it, largest share first.
 
     A variable that is merely correlated with a stronger one (speed with torque, for example) is not listed again.
 
-    Parameters
-    ----------
-    state
-        Fitted model.
-    criteria
-        Thresholds.
+    ``state``: fitted model.
     """
-    return LackOfFit(state.fit, criteria or Criteria()).unexplained
+    return LackOfFit(state.fit).unexplained
 
 
 @dataclass(frozen=True, eq=False)
 class LackOfFit:
-    """All tests of the residual of one fit.
+    """All tests of the residual of one fit. ``fit``: fit of the model."""
 
-    Parameters
-    ----------
-    fit
-        Fit of the model.
-    criteria
-        Thresholds.
-    """
+    fit: IvFit
 
-    fit: Fit
-    criteria: Criteria
+    @property
+    def criteria(self) -> Criteria:
+        """Thresholds."""
+        return self.fit.study.criteria
 
     @property
     def level(self) -> float:
@@ -183,7 +144,7 @@ class LackOfFit:
         return self.criteria.alpha["lack_of_fit"] / max(self.tests, 1)
 
     @property
-    def dependences(self) -> tuple[Dependence, ...]:
+    def dependences(self) -> tuple[ResidualDependence, ...]:
         """Significant dependences, at most one for each joint and variable, largest share first."""
         best: dict[tuple[int, Kind | None, int | None], Projection] = {}
         for p in sorted(filter(self._significant, self.projections), key=lambda p: p.p_value):
@@ -193,14 +154,14 @@ class LackOfFit:
         return _by_share([*found, *(self._of_line(*line) for line in self.lines if self._significant(line[1]))])
 
     @property
-    def unexplained(self) -> tuple[Dependence, ...]:
+    def unexplained(self) -> tuple[ResidualDependence, ...]:
         """Significant and material dependences, each in addition to the ones before it, largest share first."""
-        found: list[Dependence] = []
+        found: list[ResidualDependence] = []
         for j, own in enumerate(self.joints):
             mine = [p for p in self.projections if p.joint == j and self._reported(p)]
             rivals = [p for p in mine if p.function is not None]
-            here: list[Dependence] = []
-            while rivals and len(here) < MOST:
+            here: list[ResidualDependence] = []
+            while rivals and len(here) < self.criteria.most_unexplained:
                 best = max(rivals, key=lambda p: p.share)
                 here.append(self._dependence(best, own))
                 own = own.beyond(best.columns)
@@ -209,14 +170,15 @@ class LackOfFit:
             named = sum(d.share for d in here)
             found += here
             # The motion altogether, where no variable explains the greater part of what it does.
-            found += [self._dependence(p, own) for p in mine if p.function is None and named < 0.5 * p.share]
+            least = named / self.criteria.motion_share
+            found += [self._dependence(p, own) for p in mine if p.function is None and least < p.share]
             found += [self._of_line(k, line) for k, line in self.lines if k == j and self._reported(line, j)]
         return _by_share(found)
 
-    def _significant(self, test: Projection | Line) -> bool:
-        return test.p_value < self.level and test.p_held < HELD_OUT_LEVEL and test.share > 0
+    def _significant(self, test: Projection | SpectralLine) -> bool:
+        return test.p_value < self.level and test.p_held < self.criteria.held_out_level and test.share > 0
 
-    def _reported(self, test: Projection | Line, joint: int | None = None) -> bool:
+    def _reported(self, test: Projection | SpectralLine, joint: int | None = None) -> bool:
         """True if a dependence is significant and material."""
         j = test.joint if isinstance(test, Projection) else joint
         torque = np.concatenate([s.y[:, j] for s in self.fit.study.train])
@@ -224,28 +186,32 @@ class LackOfFit:
         material = test.share >= self.criteria.least_share and size >= self.criteria.material_pct
         return material and self._significant(test)
 
-    def _dependence(self, p: Projection, own: JointResidual) -> Dependence:
+    def _dependence(self, p: Projection, own: JointResidual) -> ResidualDependence:
         """Dependence with its curve."""
         study, share = self.fit.study, min(p.share, 1.0)
         joint = study.joints[p.joint]
         if p.function is None:
-            return Dependence(joint, "motion", None, unit_of("motion", ""), share, p.p_value, self._spectrum(p, own))
+            return ResidualDependence(
+                joint, "motion", None, unit_of_variable("motion", ""), share, p.p_value, self._spectrum(p, own)
+            )
         x, basis, _ = p.function.on_grid()
         band = 2.0 * np.sqrt(np.maximum(np.einsum("gk,kl,gl->g", basis, p.covariance, basis), 0.0))
         at = p.joint if p.function.other is None else p.function.other
-        return Dependence(
+        return ResidualDependence(
             joint,
             p.function.kind,
             None if p.function.other is None else study.joints[p.function.other],
-            unit_of(p.function.kind, study.robot.joints[at].type),
+            unit_of_variable(p.function.kind, study.robot.joints[at].type),
             share,
             p.p_value,
             Curve(x, basis @ p.values, band),
         )
 
-    def _of_line(self, joint: int, line: Line) -> Dependence:
+    def _of_line(self, joint: int, line: SpectralLine) -> ResidualDependence:
         name, curve = self.fit.study.joints[joint], Curve(line.f, line.amplitude, line.noise)
-        return Dependence(name, "frequency", None, unit_of("frequency", ""), line.share, line.p_value, curve)
+        return ResidualDependence(
+            name, "frequency", None, unit_of_variable("frequency", ""), line.share, line.p_value, curve
+        )
 
     def _spectrum(self, p: Projection, own: JointResidual) -> Curve:
         """Root of the spectral density of the held-out residual, with that of the rest as band."""
@@ -262,7 +228,7 @@ class LackOfFit:
         return Curve(*np.array(shown).T)
 
     @cached_property
-    def lines(self) -> tuple[tuple[int, Line], ...]:
+    def lines(self) -> tuple[tuple[int, SpectralLine], ...]:
         """Strongest spectral line of each joint that has one, with the number of the joint."""
         return tuple(lines_of_joints(self.fit.study, self.fit.theta))
 
@@ -295,7 +261,7 @@ class LackOfFit:
             changed = False
             for own, known in zip(joints, taken, strict=True):
                 found = self._clearest(own, known)
-                if found is None or len(known) == MOST_TAKEN:
+                if found is None or len(known) == self.criteria.functions_in_noise:
                     continue
                 known.add(found)
                 changed = True
@@ -325,12 +291,13 @@ class LackOfFit:
         """Number of all tests: every set of functions, and of each joint all functions together and its spectrum."""
         return sum(len(own) + 2 for own in self.functions)
 
-    def _whitened(self, fit: Fit) -> tuple[JointResidual, ...]:
+    def _whitened(self, fit: IvFit) -> tuple[JointResidual, ...]:
         blocks, rows = fit.equations.held, fit.regression.rows_of
         held_rows = rows_of_joints(sum(e.y.shape[0] - ar.order for e in blocks) for ar in fit.noise)
         regressor, instruments, _ = fit.held
         errors = fit.errors(fit.theta, held=True)
-        residual, held_residual = limited(fit.residual, rows), limited(fit.held_residual, held_rows)
+        most = self.criteria.robust_deviations
+        residual, held_residual = limited(fit.residual, rows, most), limited(fit.held_residual, held_rows, most)
         out = []
         for j, (own, unseen) in enumerate(zip(*self.columns, strict=True)):
             d = np.concatenate([fit.noise[j].whiten(c) for c in own])
@@ -342,8 +309,9 @@ class LackOfFit:
             band = np.concatenate([c - e.z[:, j] @ away for c, e in zip(unseen, blocks, strict=True)])
             out.append(
                 JointResidual(
-                    j, rows[j], held_rows[j], d, fit.regression.beside(full), change, residual, held_residual,
+                    j, rows[j], held_rows[j], d, fit.regression.orthogonalized(full), change, residual, held_residual,
                     band, np.concatenate([e[:, j] for e in errors]), held_rows, regressor, fit.covariance,
+                    self.criteria.beyond_model_function,
                 )
             )  # fmt: skip
         return tuple(out)
@@ -353,10 +321,10 @@ class LackOfFit:
         """Functions of each joint in the training and in the held-out data, (M, K) of every stretch."""
         return self._columns(self.fit.study.train), self._columns(self.fit.study.held)
 
-    def _motion(self, stretch: Stretch) -> Motion:
+    def _motion(self, stretch: MotionStretch) -> Motion:
         return self.fit.study.motion(stretch, "simulated", self.fit.theta)
 
-    def _columns(self, stretches: Sequence[Stretch]) -> list[list[Array]]:
+    def _columns(self, stretches: Sequence[MotionStretch]) -> list[list[Array]]:
         """Functions of each joint at the simulated motion in the band of the comparison, (M, K) of every stretch."""
         every = [f for own in self.functions for f in own]
         out: list[list[Array]] = [[] for _ in self.functions]
@@ -374,7 +342,7 @@ class LackOfFit:
 
     def _all_together(self, joint: int) -> NDArray[np.int64]:
         """Columns of the wide functions of the motion of a joint, as many as the data determine."""
-        left = sum(np.count_nonzero(e.y[:, joint]) for e in self.fit.equations.train) // ROWS_PER_COLUMN
+        left = sum(np.count_nonzero(e.y[:, joint]) for e in self.fit.equations.train) // self.criteria.rows_per_function
         chosen: list[NDArray[np.int64]] = []
         for f, own in zip(self.functions[joint], self._sets(joint), strict=True):
             if f.kind != "motor angle" and len(f.knots) < FINE and own.size <= left:
@@ -383,28 +351,23 @@ class LackOfFit:
         return np.concatenate(chosen) if chosen else np.arange(0)
 
 
-def limited(residual: Array, joints: Sequence[slice]) -> Array:
-    """Return whitened residuals (R,) limited to `MOST_DEVIATIONS` robust standard deviations of each joint.
+def limited(residual: Array, joints: Sequence[slice], deviations: float) -> Array:
+    """Return whitened residuals (R,) limited to a number of robust standard deviations of each joint.
 
     About a reversal the sign of a measured velocity is uncertain, and with it the whole dry friction. A few samples
     there would outweigh all others.
 
-    Parameters
-    ----------
-    residual
-        Whitened residuals of all joints, (R,).
-    joints
-        Rows of each joint.
+    ``residual``: whitened residuals of all joints, (R,); ``joints``: rows of each joint.
     """
     found = residual.copy()
     for rows in joints:
         own = residual[rows]
         used = own[own != 0.0]
         if used.size:
-            most = MOST_DEVIATIONS * NORMAL * float(np.median(np.abs(used)))
+            most = deviations * NORMAL * float(np.median(np.abs(used)))
             found[rows] = np.clip(own, -most, most)
     return found
 
 
-def _by_share(found: Sequence[Dependence]) -> tuple[Dependence, ...]:
+def _by_share(found: Sequence[ResidualDependence]) -> tuple[ResidualDependence, ...]:
     return tuple(sorted(found, key=lambda d: -d.share))

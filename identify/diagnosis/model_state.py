@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 from armident.configs import DataError, RobotConfig
 from armident.configs.schema.robot import Effect as Entry
 from armident.identify.diagnosis.candidates import ColumnCache
+from armident.identify.diagnosis.noise_beyond import noise_beyond_shapes
 from armident.identify.diagnosis.predictive_score import PredictiveScore, references_of
-from armident.identify.diagnosis.regression import MAX_AR_ORDER, Fit, fit, safe
-from armident.identify.diagnosis.screening import noise_beyond_shapes
+from armident.identify.diagnosis.regression import MAX_AR_ORDER, IvFit, fit_model, safe
 from armident.identify.diagnosis.study import Study
 from armident.identify.effects.effect import SIGN_TOLERANCE
-from armident.identify.effects.recorded import of_recording
+from armident.identify.effects.recording_corrections import of_recording
 from armident.identify.effects.terms import Term, arm_model, effect_terms
 from armident.identify.regression.ar_noise import ArModel
 from armident.identify.robot.arm import ArmModel
@@ -30,18 +30,18 @@ CONVERGED = 0.1
 
 @dataclass(frozen=True, eq=False)
 class ModelState:
-    """Model of one step of the selection.
+    """Model of one step of the selection: its fit to the data, with the motion of its closed loop."""
 
-    Parameters
-    ----------
-    study
-        Data with the model and the motion of its closed loop.
-    fit
-        Fit of the model.
-    """
+    fit: IvFit
 
-    study: Study
-    fit: Fit
+    @property
+    def study(self) -> Study:
+        """Data with the model and the motion of its closed loop."""
+        return self.fit.study
+
+    def of_study(self, study: Study) -> "ModelState":
+        """Return the model with another study of the same training stretches."""
+        return ModelState(self.fit.of_study(study))
 
     @property
     def robot(self) -> RobotConfig:
@@ -80,21 +80,16 @@ class ModelState:
     def under(self, noise: tuple[ArModel, ...]) -> "ModelState":
         """The model fitted under given noise models, so that it can be compared with another one fitted under them.
 
-        Parameters
-        ----------
-        noise
-            Noise model of each joint.
+        ``noise``: noise model of each joint.
         """
         if all(one is own for one, own in zip(noise, self.fit.noise, strict=True)):
             return self
-        key = tuple(id(one) for one in noise)
-        if key not in self._under:
-            # The fit keeps the noise models, so that their identities stay theirs.
-            self._under[key] = replace(self, fit=safe(self.fit.renoised(noise)))
-        return self._under[key]
+        if noise not in self._under:
+            self._under[noise] = ModelState(safe(self.fit.renoised(noise)))
+        return self._under[noise]
 
     @cached_property
-    def _under(self) -> dict[tuple[int, ...], "ModelState"]:
+    def _under(self) -> dict[tuple[ArModel, ...], "ModelState"]:
         return {}
 
     @property
@@ -103,33 +98,21 @@ class ModelState:
         return effect_terms(self.study.model)
 
     def values_of(self, term: Term) -> tuple[Array, Array]:
-        """Linear parameters of a term and their standard deviations, (k,) each.
-
-        Parameters
-        ----------
-        term
-            Term of the model.
-        """
+        """Linear parameters of a term and their standard deviations, (k,) each."""
         own = [self.study.model.base.names.index(name) for name in term.names]
         return self.fit.theta[own], np.sqrt(np.maximum(np.diag(self.fit.covariance)[own], 0.0))
 
     def term_of(self, entry: Entry) -> Term:
         """Term of an entry of the configuration.
 
-        Parameters
-        ----------
-        entry
-            Entry that is a term of the model, and no correction of the recordings.
+        ``entry``: entry that is a term of the model, and no correction of the recordings.
         """
         return self.terms[[e for e in self.robot.effects if not of_recording(e)].index(entry)]
 
     def with_values(self, shapes: Mapping[int, Mapping[str, float]] | None = None) -> RobotConfig:
         """Configuration with the estimated values in its effect entries.
 
-        Parameters
-        ----------
-        shapes
-            Other nonlinear parameters, by number of the entry and name.
+        ``shapes``: other nonlinear parameters, by number of the entry and name.
         """
         entries: list[Entry] = list(self.robot.effects)
         for k, entry in enumerate(entries):
@@ -150,20 +133,10 @@ Fitter = Callable[[RobotConfig, ModelState], ModelState | None]
 def fitted(study: Study, robot: RobotConfig, before: ModelState | None) -> ModelState:
     """Fit the model of a configuration in the closed loop that it makes.
 
-    Parameters
-    ----------
-    study
-        Data with another model of the same recordings.
-    robot
-        Configuration of the model.
-    before
-        Earlier model. Its rigid parameters predict the torques on which terms depend, and its residual gives the noise
-        models. ``None``: fit a rigid model first, and alternate between parameters and noise models.
-
-    Raises
-    ------
-    DataError
-        If the motion does not determine the parameters of the model.
+    ``study``: data with another model of the same recordings. ``before``: earlier model. Its rigid parameters predict
+    the torques on which terms depend, and its residual gives the noise models. ``None``: fit a rigid model first, and
+    alternate between parameters and noise models. Raises DataError if the motion does not determine the parameters of
+    the model.
     """
     changed = study.of_robot(robot)
     model = changed.model
@@ -171,66 +144,41 @@ def fitted(study: Study, robot: RobotConfig, before: ModelState | None) -> Model
     if before is not None:
         first_motions = before.study.auxiliary.first_motions
         changed = replace(changed, auxiliary=replace(changed.auxiliary, first_motions=first_motions))
-        theta = padded(before.fit, model)
+        theta = rigid_parameters(before.fit, model)
     elif any(term.depends_on_torque for term in effect_terms(model)):
         bare = robot.model_copy(update={"effects": ()})
-        rigid = fit(replace(changed, robot=bare, model=arm_model(bare)))
+        rigid = fit_model(replace(changed, robot=bare, model=arm_model(bare)))
         theta = np.concatenate([rigid.theta, np.zeros(model.e)])
     noise = None if before is None else before.weights
-    first = fit(changed, theta, noise)
+    first = fit_model(changed, theta, noise)
     moved = changed.resimulated(first.theta)
     if moved is not changed:
-        first = fit(moved, first.theta if model.e else None, noise or first.noise)
+        first = fit_model(moved, first.theta if model.e else None, noise or first.noise)
     if any(term.scales_torque for term in effect_terms(model)):
         first = _iterated(first)
-    return ModelState(moved, first)
+    return ModelState(first)
 
 
 def fitted_in_loop_of(before: ModelState, robot: RobotConfig) -> ModelState | None:
     """Fit the model of a configuration with the simulated motion of another one: quick, for small changes of the model.
 
-    Parameters
-    ----------
-    before
-        Model of the same recordings, with its loop.
-    robot
-        Configuration of the model.
-
-    Returns
-    -------
-    ModelState
-        ``None`` if the motion does not determine the parameters of the model.
+    ``before``: model of the same recordings, with its loop. Returns ``None`` if the motion does not determine the
+    parameters of the model.
     """
     study = before.study.of_robot(robot)
     try:
-        return ModelState(study, fit(study, padded(before.fit, study.model), before.weights))
+        return ModelState(fit_model(study, rigid_parameters(before.fit, study.model), before.weights))
     except (DataError, np.linalg.LinAlgError):
         return None
 
 
 def with_entries(robot: RobotConfig, entries: Sequence[Entry]) -> RobotConfig:
-    """Return a configuration with further effect entries.
-
-    Parameters
-    ----------
-    robot
-        The configuration.
-    entries
-        Entries to add.
-    """
+    """Return a configuration with further effect entries. ``entries``: entries to add."""
     return robot.model_copy(update={"effects": (*robot.effects, *entries)})
 
 
 def without_entry(robot: RobotConfig, entry: Entry) -> RobotConfig:
-    """Return a configuration without one of its effect entries.
-
-    Parameters
-    ----------
-    robot
-        The configuration.
-    entry
-        The entry.
-    """
+    """Return a configuration without one of its effect entries."""
     effects = list(robot.effects)
     effects.remove(entry)
     return robot.model_copy(update={"effects": tuple(effects)})
@@ -242,64 +190,38 @@ def with_own_noise(state: ModelState) -> ModelState:
     If something is missing all the same, they take it for noise. The model stays as it is if it predicts with smaller
     errors: the mean of their logarithms, as joints differ in size.
 
-    Parameters
-    ----------
-    state
-        Model of the selection, fitted with the noise models of an earlier one.
+    ``state``: model of the selection, fitted with the noise models of an earlier one.
     """
-    own = replace(state, fit=safe(state.fit.renoised(state.own_noise)))
+    own = ModelState(safe(state.fit.renoised(state.own_noise)))
     sizes = (float(np.log(np.maximum(one.score.rms, 1e-300)).sum()) for one in (own, state))
     return own if next(sizes) < next(sizes) else state
 
 
 def with_first_motions(state: ModelState) -> ModelState:
-    """Return a model from whose loop the simulations of its successors begin.
-
-    Parameters
-    ----------
-    state
-        Model of the selection.
-    """
-    study = state.study.with_first_motions(state.fit.theta)
-    return ModelState(study, replace(state.fit, study=study))
+    """Return a model from whose loop the simulations of its successors begin. ``state``: model of the selection."""
+    return state.of_study(state.study.with_first_motions(state.fit.theta))
 
 
 def with_references(state: ModelState) -> ModelState:
     """Return a model with whose rigid parameters its successors are compared at joints with much measurement noise.
 
-    Parameters
-    ----------
-    state
-        Model to which nothing is added yet.
+    ``state``: model to which nothing is added yet.
     """
-    study = replace(state.study, references=references_of(state.fit))
-    return ModelState(study, replace(state.fit, study=study))
+    return state.of_study(replace(state.study, references=references_of(state.fit)))
 
 
 def with_report_part(state: ModelState) -> ModelState:
-    """Return a model whose loop is simulated for the report part, too; the selection simulates the training part alone.
+    """Return a model whose loop is simulated for the report part, too.
 
-    Parameters
-    ----------
-    state
-        Model of the selection.
+    The selection simulates the training part alone.
     """
-    moved = state.study.with_report_part(state.fit.theta)
-    equations = state.fit.equations.with_held(moved)
-    return ModelState(moved, replace(state.fit, study=moved, equations=equations))
+    return state.of_study(state.study.with_report_part(state.fit.theta))
 
 
 def viscous_friction_rises(state: ModelState, term: Term) -> bool:
     """False if a term makes the viscous friction of its joint fall with the speed, beyond two standard deviations.
 
     Friction that falls with the speed is Stribeck friction; a viscous friction never does.
-
-    Parameters
-    ----------
-    state
-        Model with the term.
-    term
-        The term.
     """
     slopes, names = term.effect.viscous_slope(term.shapes)[list(term.kept)], state.study.model.base.names
     viscous = f"fv{term.place.joint + 1}"
@@ -317,10 +239,7 @@ def acted_on(with_it: ModelState, without: ModelState) -> NDArray[np.bool_]:
 
     All joints if the models differ in a correction of the recordings.
 
-    Parameters
-    ----------
-    with_it, without
-        Models with and without an effect.
+    ``with_it``, ``without``: models with and without an effect.
     """
     known = set(without.study.model.base.names)
     added = [k for k, name in enumerate(with_it.study.model.base.names) if name not in known]
@@ -330,7 +249,7 @@ def acted_on(with_it: ModelState, without: ModelState) -> NDArray[np.bool_]:
     return np.array([bool(np.isin(added, joint.x).any()) for joint in joints])
 
 
-def _iterated(found: Fit) -> Fit:
+def _iterated(found: IvFit) -> IvFit:
     """Fit whose terms scale the torques predicted by the model itself, by iteration.
 
     A drive that gives half its torque scales another torque than the model without it predicts.
@@ -338,21 +257,13 @@ def _iterated(found: Fit) -> Fit:
     terms = slice(found.study.model.base.b - found.study.model.e, None)
     for _ in range(ITERATIONS):
         before, std = found.theta[terms], np.sqrt(np.diag(found.covariance)[terms])
-        found = fit(found.study, found.theta, found.noise)
+        found = fit_model(found.study, found.theta, found.noise)
         if np.all(np.abs(found.theta[terms] - before) <= CONVERGED * std):
             break
     return found
 
 
-def padded(before: Fit, model: ArmModel) -> Array:
-    """Rigid parameters of an earlier fit, zeros for the terms, (b,).
-
-    Parameters
-    ----------
-    before
-        Earlier fit.
-    model
-        Model with terms.
-    """
+def rigid_parameters(before: IvFit, model: ArmModel) -> Array:
+    """Rigid parameters of an earlier fit, zeros for the terms, (b,)."""
     rigid = before.theta[: before.study.model.base.b - before.study.model.e]
     return np.concatenate([rigid, np.zeros(model.e)])

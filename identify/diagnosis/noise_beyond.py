@@ -1,8 +1,9 @@
-"""Noise model of a residual of which regressor and missing effects have been taken out.
+"""Noise models of a residual of which functions that a missing effect may follow have been taken out.
 
-An autoregressive model of a residual that contains a missing effect takes the effect for noise and whitens it away.
-Least squares on the functions that the effect follows removes it, and noise with it. The expected autocovariances of
-that noise are added.
+An autoregressive model of a residual that contains a missing effect takes the effect for noise and whitens it away. The
+weight of a spring, for example, is forty times too small. The selection takes out smooth functions of each joint's own
+motion (`noise_beyond_shapes`). The lack of fit takes out the dependences that it finds (`noise_beyond`); there, the
+expected autocovariances of the noise that least squares removes with them are added.
 """
 
 from collections.abc import Sequence
@@ -11,10 +12,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-from armident.identify.diagnosis.regression import MAX_AR_ORDER
-from armident.identify.regression.ar_noise import ArModel, lagged_sums, levinson_durbin, lowest_aic
+from armident.identify.diagnosis.candidates import ColumnCache
+from armident.identify.diagnosis.regression import MAX_AR_ORDER, IvFit
+from armident.identify.effects.free_shapes import hats
+from armident.identify.regression.ar_noise import ArModel, ar_models, lagged_sums, levinson_durbin, lowest_aic
+from armident.identify.robot.motion import Motion
 
 Array = NDArray[np.float64]
+
+KNOTS = 7
+"""Knots of each smooth function of the selection."""
 
 PASSES = 4
 """Iterations between the noise model and the noise that the functions take away."""
@@ -29,12 +36,8 @@ def noise_beyond(errors: Sequence[Array], functions: Sequence[Array]) -> ArModel
     Least squares removes noise in the directions of the functions, which are those of low frequency. The expected
     autocovariances of this part, by the noise model itself, are added.
 
-    Parameters
-    ----------
-    errors
-        Residual, (M,) of every stretch, zero where the joint stands still.
-    functions
-        Instruments of the model and functions of the effects, (M, k) of every stretch.
+    ``errors``: residual, (M,) of every stretch, zero where the joint stands still; ``functions``: instruments of the
+    model and functions of the effects, (M, k) of every stretch.
     """
     span = _orthonormal(functions)
     inside = sum(q.T @ e for q, e in zip(span, errors, strict=True))
@@ -81,3 +84,45 @@ def _taken(noise: ArModel, span: Sequence[Array], highest: int) -> Array:
         other = fft.rfft(2.0 * w - q @ gram, size, axis=0)
         total += np.sum((other * a.conj()).real, axis=1)
     return np.asarray(fft.irfft(total, size)[: highest + 1])
+
+
+def noise_beyond_shapes(fit: IvFit, column_cache: ColumnCache) -> list[ArModel]:
+    """Noise models of the residual of a fit without smooth functions of each joint's own motion."""
+    errors = fit.errors(fit.theta, held=False)
+    columns = [
+        _smooth_functions(column_cache, column_cache.motion(s, "measured"), sum(e.shape[0] for e in errors))
+        for s in fit.study.train
+    ]
+    left = [e.copy() for e in errors]
+    used = 0
+    for j in range(fit.study.robot.n):
+        stacked = np.concatenate([c[j] for c in columns])
+        shapes = np.linalg.lstsq(stacked, np.concatenate([e[:, j] for e in errors]), rcond=1e-8)[0]
+        for e, c in zip(left, columns, strict=True):
+            e[:, j] -= c[j] @ shapes
+        used += shapes.size
+    return ar_models(left, MAX_AR_ORDER, parameters=fit.theta.size + used)
+
+
+def _smooth_functions(column_cache: ColumnCache, motion: Motion, rows: int) -> list[Array]:
+    """Hat functions of position, of position by direction, of velocity and of time, (M, k) for each joint."""
+    knots = max(3, min(KNOTS, rows // (4 * column_cache.study.criteria.rows_per_function)))
+    out = []
+    for j in range(motion.n):
+        q, qd, side = motion.q[:, j], motion.qd[:, j], motion.sign[:, j, None]
+        place = _quantile_hats(q, knots)
+        when = _quantile_hats(motion.t, knots)
+        out.append(
+            column_cache.study.decimation(
+                np.concatenate([place, place * side, _quantile_hats(qd, knots), when, when * side], axis=1)
+            )
+        )
+    return out
+
+
+def _quantile_hats(values: Array, knots: int) -> Array:
+    """Piecewise linear functions, one at their own knot and zero at the others; knots at quantiles of the values."""
+    places = np.unique(np.quantile(values, np.linspace(0, 1, knots)))
+    if places.size < 2:
+        return np.ones((values.size, 1))
+    return hats(values, places)

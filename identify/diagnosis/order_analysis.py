@@ -33,21 +33,9 @@ def strongest_orders(
 ) -> list[tuple[float, float]]:
     """Return the strongest orders of a residual over an angle, with their power over the background, strongest first.
 
-    Parameters
-    ----------
-    angle
-        Angles of every stretch, rad (m for a prismatic joint), (N,) each.
-    residual
-        Residual torques, N m or N, (N,) each.
-    highest
-        Highest order, cycles per 2 pi of the angle.
-    lowest
-        Lowest order.
-
-    Returns
-    -------
-    list of tuple
-        Orders (cycles per 2 pi), and power over the median of the neighbourhood; at most `PEAKS`.
+    ``angle``: angles of every stretch, rad (m for a prismatic joint), (N,) each; ``residual``: residual torques,
+    N m or N, (N,) each; ``highest``: highest order, cycles per 2 pi of the angle. Returns orders (cycles per 2 pi), and
+    power over the median of the neighbourhood; at most `PEAKS`.
     """
     low = min(float(a.min()) for a in angle)
     span = max(float(a.max()) for a in angle) - low
@@ -82,14 +70,7 @@ def strongest_orders(
 def motor_orders(study: Study, theta: Array, motor: int) -> tuple[Shapes, ...]:
     """Return the orders of the strongest ripples of a residual over the angle of a motor, as a grid of an effect.
 
-    Parameters
-    ----------
-    study
-        Data with the model.
-    theta
-        Parameters of the model, (b,).
-    motor
-        Index of the motor, from 0.
+    ``theta``: parameters of the model, (b,); ``motor``: index of the motor, from 0.
     """
     ratios = study.robot.transmission_matrix[motor]
     joint = int(np.argmax(np.abs(ratios)))
@@ -109,14 +90,7 @@ def motor_orders(study: Study, theta: Array, motor: int) -> tuple[Shapes, ...]:
 def nearby_orders(study: Study, motor: int, order: float) -> tuple[Shapes, ...]:
     """Return orders close to one order, at a sixteenth of the resolution of the motion.
 
-    Parameters
-    ----------
-    study
-        Data with the model.
-    motor
-        Index of the motor, from 0.
-    order
-        Order, cycles per 2 pi of the angle of the motor.
+    ``motor``: index of the motor, from 0; ``order``: cycles per 2 pi of the angle of the motor.
     """
     apart = _resolution(study, motor)
     return tuple((("harmonic", order + k * apart / 16),) for k in range(-3, 4))

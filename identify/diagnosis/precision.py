@@ -9,10 +9,10 @@ from scipy import stats
 from armident.configs.schema.robot import Effect as Entry
 from armident.identify.diagnosis.candidates import ColumnCache
 from armident.identify.diagnosis.model_state import ModelState
-from armident.identify.diagnosis.regression import Fit
+from armident.identify.diagnosis.regression import IvFit
 from armident.identify.effects.drive import Correction
 from armident.identify.effects.effect import Place
-from armident.identify.effects.recorded import of_recording
+from armident.identify.effects.recording_corrections import of_recording
 from armident.identify.effects.registry import of_entry
 from armident.identify.effects.terms import Term
 from armident.identify.regression.ar_noise import ArModel
@@ -35,11 +35,6 @@ def standard_deviations(state: ModelState) -> dict[int, dict[str, float]]:
     first-order term. Parameters from a set of whole numbers count as known. The residual
     is no white noise where an effect is only approximately right. The variances are then those of the residual along
     the influence of each parameter, if they are larger (Newey, West 1987, Econometrica 55(3)).
-
-    Parameters
-    ----------
-    state
-        The model.
     """
     fit, terms = state.fit, _terms(state)
     slopes, owners = _further_columns(state)
@@ -53,19 +48,14 @@ def standard_deviations(state: ModelState) -> dict[int, dict[str, float]]:
     return found
 
 
-def p_value(state: ModelState, entry: Entry) -> float:
+def p_value_of_effect(state: ModelState, entry: Entry) -> float:
     """Probability of linear parameters of an effect so far from zero if it is not there (Wald's test).
 
     Their covariance is that of `standard_deviations` with the nonlinear parameters of the effect as they are: without
     it, they mean nothing. The nonlinear parameters of all others are free. The likelihood of a model can rise without
     such evidence: corrected torques have other noise, and the time at which dry friction reverses is uncertain.
 
-    Parameters
-    ----------
-    state
-        Model with the effect.
-    entry
-        Its entry in the configuration.
+    ``entry``: its entry in the configuration.
     """
     number = list(state.robot.effects).index(entry)
     every, owners = _further_columns(state)
@@ -137,7 +127,7 @@ def _slope(column_cache: ColumnCache, noise: Sequence[ArModel], term: Term, name
     return slope
 
 
-def _deviations(fit: Fit, slopes: list[Array]) -> Array:
+def _deviations(fit: IvFit, slopes: list[Array]) -> Array:
     """Standard deviations of the model's own parameters and of further ones with columns ``slopes``, (b + s,).
 
     Those of the rigid model stay as they are (4.34).
@@ -150,7 +140,7 @@ def _deviations(fit: Fit, slopes: list[Array]) -> Array:
     return variances**0.5
 
 
-def _covariances(fit: Fit, slopes: list[Array], own: list[int]) -> tuple[Array, Array]:
+def _covariances(fit: IvFit, slopes: list[Array], own: list[int]) -> tuple[Array, Array]:
     """Covariances (k, k) of some parameters beside further ones with columns ``slopes``.
 
     The first is that of white innovations, the second that of the residual along the influence of each parameter.
@@ -174,9 +164,6 @@ def _covariances(fit: Fit, slopes: list[Array], own: list[int]) -> tuple[Array, 
 def variance_of_sum(products: Array) -> float:
     """Variance of the sum of serially correlated terms (R,), their mean removed.
 
-    Parameters
-    ----------
-    products
-        Terms of the sum, (R,).
+    ``products``: terms of the sum, (R,).
     """
     return float(newey_west([products - products.mean()], NEWEY_WEST_LAGS))

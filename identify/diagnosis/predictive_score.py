@@ -19,8 +19,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from armident.identify.diagnosis.regression import MAX_AR_ORDER, Fit
-from armident.identify.effects.tables import FreeShape
+from armident.identify.diagnosis.regression import MAX_AR_ORDER, IvFit
+from armident.identify.effects.free_shapes import FreeShape
 from armident.identify.effects.terms import effect_terms
 from armident.identify.regression.ar_noise import ArModel, ar_models
 from armident.identify.regression.iv import JointEquations
@@ -36,24 +36,16 @@ FOLDS = 10
 
 LAGS = 5
 """Samples to either side in the filter between simulated and measured motion: half a period of the loop's bandwidth,
-see `armident.identify.diagnosis.study.BAND`."""
-NOISE_SHARE = 0.5
-"""Share of the torque beyond the simulated motion from which it counts as measurement noise: more than half."""
+see `Criteria.band`."""
 LEAST_ROWS = 10 * (2 * LAGS + 1)
 """Rows of a stretch from which that filter is estimated: ten for each of its coefficients."""
 
 
 @dataclass(frozen=True, eq=False)
 class PredictiveScore:
-    """Cross-validated errors of a fitted model.
+    """Cross-validated errors of a fitted model. ``fit``: the fit of all training data, with its noise models."""
 
-    Parameters
-    ----------
-    fit
-        The fit of all training data, with its noise models.
-    """
-
-    fit: Fit
+    fit: IvFit
 
     @cached_property
     def folds(self) -> Array:
@@ -130,13 +122,7 @@ class PredictiveScore:
         return [None if r is None or r.size != rigid else self.folds[:, :rigid] - r for r in references]
 
     def innovations(self, noise: Sequence[ArModel]) -> Array:
-        """Mean squares of the innovations of each joint under noise models, (N m)^2 or N^2, (n,).
-
-        Parameters
-        ----------
-        noise
-            Noise model of each joint.
-        """
+        """Mean squares of the innovations of each joint under noise models, (N m)^2 or N^2, (n,)."""
         return np.array(
             [
                 ar.variance * float(np.mean(np.concatenate([ar.whiten(part) for part in parts]) ** 2))
@@ -174,24 +160,12 @@ class PredictiveScore:
         return self.fit.study.volume
 
     def log_likelihoods_under(self, noise: Sequence[ArModel]) -> Array:
-        """Log-likelihood of the data of each joint under noise models, without constants of these data, (n,).
-
-        Parameters
-        ----------
-        noise
-            Noise model of each joint.
-        """
+        """Log-likelihood of the data of each joint under noise models, without constants of these data, (n,)."""
         own = np.maximum(self.innovations(noise), 1e-300)
         return np.asarray(self.rows * (self.volume - 0.5 * np.log(own)))
 
     def log_likelihood_under(self, noise: Sequence[ArModel]) -> float:
-        """Log-likelihood of the data of all joints, see `log_likelihoods_under`.
-
-        Parameters
-        ----------
-        noise
-            Noise model of each joint.
-        """
+        """Log-likelihood of the data of all joints, see `log_likelihoods_under`."""
         return float(self.log_likelihoods_under(noise).sum())
 
     def inflation_over(self, other: "PredictiveScore", noise: Sequence[ArModel]) -> Array:
@@ -200,12 +174,7 @@ class PredictiveScore:
         Noise that changes slowly leaves correlation in the innovations which an autoregressive model of limited order
         does not take. Block sums contain it, whatever its form (Kuensch 1989, Annals of Statistics 17(3)). At least 1.
 
-        Parameters
-        ----------
-        other
-            Score of the model without the effect in question.
-        noise
-            Noise model of each joint.
+        ``other``: score of the model without the effect in question.
         """
         found = []
         for ar, own, less in zip(noise, self._parts, other._parts, strict=True):
@@ -219,13 +188,8 @@ class PredictiveScore:
     def gain_over(self, other: "PredictiveScore", noise: Sequence[ArModel]) -> float:
         """Gain of log-likelihood over another model, both under the same noise models.
 
-        Parameters
-        ----------
-        other
-            Score of the model without the effect in question.
-        noise
-            Noise model of each joint: of a model in which nothing is missing, as far as known. Others would take what
-            is missing for noise.
+        ``other``: score of the model without the effect in question. ``noise``: noise model of each joint: of a model
+        in which nothing is missing, as far as known. Others would take what is missing for noise.
         """
         own, less = self.innovations(noise), other.innovations(noise)
         rows = self.rows
@@ -235,27 +199,18 @@ class PredictiveScore:
 
 
 def fold_of(rows: int) -> NDArray[np.int64]:
-    """Return the fold of each row, (R,).
-
-    Parameters
-    ----------
-    rows
-        Number of rows, R.
-    """
+    """Return the fold of each row, (R,)."""
     return np.arange(rows) * BLOCKS // max(rows, 1) % FOLDS
 
 
-def references_of(fit: Fit) -> tuple[Array | None, ...]:
+def references_of(fit: IvFit) -> tuple[Array | None, ...]:
     """Rigid parameters of a fit, (b - e,), for each joint whose motion has much measurement noise; ``None`` for others.
 
     Measured motion beyond the simulated one is measurement noise, or motion that disturbances caused. Measurement noise
     appears in the errors of a fit with the opposite sign. Real motion does not appear there (errors in variables:
     Fuller 1987, section 1.2).
 
-    Parameters
-    ----------
-    fit
-        Fit of the model to which nothing is added yet.
+    ``fit``: fit of the model to which nothing is added yet.
     """
     theta = fit.theta[: fit.theta.size - fit.study.model.e]
     found: list[Array | None] = []
@@ -266,7 +221,7 @@ def references_of(fit: Fit) -> tuple[Array | None, ...]:
             noise = ar.whiten(noise_of_motion(joint, rows, theta[None])[:, 0])
             along -= float(noise @ ar.whiten(rows[:, -1] - rows[:, : joint.x.size] @ fit.theta[joint.x]))
             power += float(noise @ noise)
-        found.append(theta if along > NOISE_SHARE * power else None)
+        found.append(theta if along > fit.study.criteria.noisy_motion * power else None)
     return tuple(found)
 
 
@@ -276,14 +231,7 @@ def noise_of_motion(joint: JointEquations, rows: Array, theta: Array) -> Array:
     Simulated torques follow the measured ones through a short filter, as simulated and real loop differ a little. What
     that filter does not give is noise of the measured motion, or motion that disturbances caused.
 
-    Parameters
-    ----------
-    joint
-        Equations of the joint.
-    rows
-        Their rows in one stretch, (M, x + z + 1).
-    theta
-        Sets of rigid parameters, (k, b - e).
+    ``rows``: their rows in one stretch, (M, x + z + 1); ``theta``: sets of rigid parameters, (k, b - e).
     """
     if rows.shape[0] < LEAST_ROWS:
         return np.zeros((rows.shape[0], theta.shape[0]))

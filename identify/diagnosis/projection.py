@@ -14,15 +14,9 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from armident.identify.diagnosis.free_functions import FreeFunction
+from armident.identify.diagnosis.predictive_score import SUMS
 
 Array = NDArray[np.float64]
-
-BLOCKS = 20
-"""Blocks of the block sums, as in `armident.identify.diagnosis.predictive_score`."""
-
-RANK_TOLERANCE = 0.1
-"""Relative norm orthogonal to the model below which the model contains a direction: 1 % of its power. Coefficients
-along such directions would have ten times the standard deviation, and distort the curve."""
 
 UNPENALISED = 1e-9
 """Roughness, relative to the roughest direction, below which a direction counts as smooth altogether."""
@@ -39,8 +33,6 @@ class Projection:
     ----------
     function, columns
         Set of functions, ``None`` for all functions of the motion together; numbers of the columns.
-    joint
-        Number of the joint.
     p_train
         Probability of so large a projection of the training residual on all directions of the set, from noise alone.
     p_held
@@ -79,8 +71,6 @@ class JointResidual:
 
     Parameters
     ----------
-    joint
-        Number of the joint.
     rows, held_rows
         Its rows among those of all joints.
     d
@@ -99,6 +89,8 @@ class JointResidual:
         Held-out rows of every joint.
     regressor, covariance
         Held-out regressor of the model, (R', b), and the covariance of its parameters, (b, b).
+    least
+        Least norm of a direction orthogonal to the model, over its own: see `Criteria.beyond_model_function`.
     """
 
     joint: int
@@ -114,20 +106,18 @@ class JointResidual:
     held_joints: Sequence[slice]
     regressor: Array
     covariance: Array
+    least: float
 
     def directions(self, columns: NDArray[np.int64]) -> tuple[Array, Array, Array] | None:
         """Orthonormal directions (R, r) of some functions beyond the model, their coefficients (k, r), and powers (r,).
 
-        Parameters
-        ----------
-        columns
-            Numbers of the functions, (k,).
+        ``columns``: numbers of the functions, (k,).
         """
         d, z = self.d[:, columns], self.z[:, columns]
         scale = np.linalg.norm(d, axis=0)
         scale = np.where(scale > 0, scale, np.inf)
         power, right = np.linalg.eigh((z / scale).T @ (z / scale))
-        kept = power > RANK_TOLERANCE**2
+        kept = power > self.least**2
         if not kept.any():
             return None
         right, power = right[:, kept], power[kept]
@@ -139,10 +129,7 @@ class JointResidual:
     def beyond(self, columns: NDArray[np.int64]) -> "JointResidual":
         """Residual and functions orthogonal to some of the functions, too.
 
-        Parameters
-        ----------
-        columns
-            Numbers of the functions that the model takes in, (k,).
+        ``columns``: numbers of the functions that the model takes in, (k,).
         """
         found = self.directions(columns)
         if found is None:
@@ -166,12 +153,8 @@ class JointResidual:
     def projection(self, function: FreeFunction | None, columns: NDArray[np.int64]) -> Projection | None:
         """Projection of the residual on one set of functions; ``None`` if the model contains it.
 
-        Parameters
-        ----------
-        function
-            Set of functions; ``None`` for all functions of the motion together.
-        columns
-            Numbers of its columns, (k,).
+        ``function``: set of functions; ``None`` for all functions of the motion together. ``columns``: numbers of its
+        columns, (k,).
         """
         found = self.directions(columns) if columns.size else None
         if found is None:
@@ -205,7 +188,7 @@ class JointResidual:
         )
         through = self.regressor.T @ change
         variance = variance * max(1.0, inflation_of_sums(here, after)) + float(through @ self.covariance @ through)
-        return float(stats.t.sf(float(change @ self.held_e) / np.sqrt(max(variance, 1e-300)), BLOCKS - 1))
+        return float(stats.t.sf(float(change @ self.held_e) / np.sqrt(max(variance, 1e-300)), SUMS - 1))
 
 
 def significance(u: Array, e: Array, estimate: Array) -> tuple[float, float]:
@@ -214,16 +197,10 @@ def significance(u: Array, e: Array, estimate: Array) -> tuple[float, float]:
     The power of correlated normal variables is approximated by a scaled chi-square (Box 1954, Annals of Mathematical
     Statistics 25(2)) whose scale comes from block sums.
 
-    Parameters
-    ----------
-    u
-        Directions, (R, r).
-    e
-        Whitened residual, (R,).
-    estimate
-        Projection of the residual on the directions, (r,).
+    ``u``: directions, (R, r); ``e``: whitened residual, (R,); ``estimate``: projection of the residual on the
+    directions, (r,).
     """
-    edges = np.arange(BLOCKS + 1) * e.size // BLOCKS
+    edges = np.arange(SUMS + 1) * e.size // SUMS
     sums, white = [], 0.0
     for begin, end in pairwise(edges):
         part = u[begin:end]
@@ -232,7 +209,7 @@ def significance(u: Array, e: Array, estimate: Array) -> tuple[float, float]:
         white += float(np.trace(gram) - np.sum(gram**2))
     spread = np.array(sums)
     covariance = spread.T @ spread
-    r, free = estimate.size, BLOCKS - 1
+    r, free = estimate.size, SUMS - 1
     trace = float(np.trace(covariance))
     squared = free**2 / ((free - 1) * (free + 2)) * (float(np.sum(covariance**2)) - trace**2 / free)
     equivalent = float(np.clip(trace**2 / max(squared, 1e-300), 1.0, r))
@@ -244,14 +221,9 @@ def significance(u: Array, e: Array, estimate: Array) -> tuple[float, float]:
 def inflation_of_sums(change: Array, e: Array) -> float:
     """Variance of block sums of ``change * e`` over that of white noise.
 
-    Parameters
-    ----------
-    change
-        Change of prediction, (R,).
-    e
-        Whitened residual orthogonal to it, (R,).
+    ``change``: change of prediction, (R,); ``e``: whitened residual orthogonal to it, (R,).
     """
-    edges = np.arange(BLOCKS) * e.size // BLOCKS
+    edges = np.arange(SUMS) * e.size // SUMS
     sums, weights = np.add.reduceat(change * e, edges), np.add.reduceat(change**2, edges)
     total = float(weights.sum())
     white = _mean_square(e) * (total - float(weights @ weights) / max(total, 1e-300))
@@ -270,16 +242,9 @@ def smoothing(estimate: Array, through: Array, power: Array, function: FreeFunct
     likelihood (thesis section 7.3.2; Young, McKenna, Bruun 2001, Int. J. Control 74(18)). That is a spline penalised on
     its second differences. All functions together are penalised on the size of their coefficients.
 
-    Parameters
-    ----------
-    estimate
-        Estimate of unit variance in every direction, (r,).
-    through
-        Coefficients of the directions, (k, r).
-    power
-        Power of each direction beyond the model over that of the functions, (r,).
-    function
-        Set of functions; ``None`` for all functions of the motion together.
+    ``estimate``: estimate of unit variance in every direction, (r,). ``through``: coefficients of the directions,
+    (k, r). ``power``: power of each direction beyond the model over that of the functions, (r,). ``function``: set of
+    functions; ``None`` for all functions of the motion together.
     """
     if function is None:
         roughness, axes = 1.0 / power, np.eye(power.size)

@@ -1,14 +1,14 @@
 """Instrumental-variable fit of the model of a diagnosis, whitened joint by joint (thesis 2.3.3 and 6.1.3)."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from armident.configs import DataError
-from armident.identify.diagnosis.equations import Equations
+from armident.identify.diagnosis.model_equations import Equations
 from armident.identify.diagnosis.study import Study
 from armident.identify.regression.ar_noise import WHITE, ArModel, ar_models
 from armident.identify.regression.equations import joint_variances, residuals, stacked_parts
@@ -19,11 +19,10 @@ from armident.identify.regression.whitening import whitened
 Array = NDArray[np.float64]
 
 MAX_AR_ORDER = 30
+"""Highest order of noise models: three periods of the closed-loop bandwidth at the rate of the comparison. Akaike's
+criterion chooses one below."""
 SINGULAR = 1e-13
 """Singular value of the normalised equations over the largest below which they are singular: rounding errors."""
-MOST_WEIGHTED = 1.1
-"""Largest ratio of the errors with weighted equations to those with white weights: efficient weights change an estimate
-by less than its standard deviation, and the errors by a few percent."""
 LOWER_ORDERS = (10, 3, 1)
 """Highest orders of noise models in turn, where those of higher order make the instruments weak."""
 UNDETERMINED = "the motion does not determine all parameters of the model"
@@ -32,22 +31,23 @@ PASSES = 3
 
 
 @dataclass(frozen=True, eq=False)
-class Fit:
+class IvFit:
     """Parameters, noise models, and the whitened rows of both parts of the data.
 
-    Parameters
-    ----------
-    study
-        Data with the model.
-    equations
-        Rows before whitening.
-    regression
-        Regression of the training rows.
+    ``equations``: rows before whitening; ``regression``: regression of the training rows.
     """
 
-    study: Study
     equations: Equations
     regression: IvRegression
+
+    @property
+    def study(self) -> Study:
+        """Data with the model."""
+        return self.equations.study
+
+    def of_study(self, study: Study) -> "IvFit":
+        """Return the fit with another study of the same training stretches."""
+        return replace(self, equations=self.equations.of_study(study))
 
     @property
     def theta(self) -> Array:
@@ -71,30 +71,17 @@ class Fit:
         for name in ("left", "instruments", "held", "held_residual"):
             self.__dict__.pop(name, None)
 
-    def renoised(self, noise: Sequence[ArModel]) -> "Fit":
+    def renoised(self, noise: Sequence[ArModel]) -> "IvFit":
         """The fit with other noise models.
 
-        Parameters
-        ----------
-        noise
-            Noise model of each joint.
-
-        Raises
-        ------
-        DataError
-            If the equations are singular with them.
+        ``noise``: noise model of each joint. Raises DataError if the equations are singular with them.
         """
-        return solved(self.study, self.equations, noise, self.regression)
+        return solved(self.equations, noise, self.regression)
 
     def errors(self, theta: Array, *, held: bool) -> list[Array]:
         """``y - X theta`` at measured signals in the band of the comparison, (M, n) of every stretch, N m or N.
 
-        Parameters
-        ----------
-        theta
-            Parameters, (b,).
-        held
-            True for the held-out data, false for the training data.
+        ``theta``: parameters, (b,); ``held``: True for the held-out data, false for the training data.
         """
         return residuals(self.equations.held if held else self.equations.train, theta)
 
@@ -104,13 +91,7 @@ class Fit:
         return self.errors(self.theta, held=False)
 
     def own_noise(self, max_order: int) -> tuple[ArModel, ...]:
-        """Noise models of the residual of the training rows, one for each joint.
-
-        Parameters
-        ----------
-        max_order
-            Highest order tried.
-        """
+        """Noise models of the residual of the training rows, one for each joint. ``max_order``: highest order tried."""
         return tuple(ar_models(self.left, max_order, parameters=self.theta.size))
 
     @cached_property
@@ -136,22 +117,12 @@ class Fit:
         return whitened(self.errors(self.theta, held=True), self.noise)
 
 
-def fit(study: Study, theta0: Array | None = None, noise: Sequence[ArModel] | None = None) -> Fit:
+def fit_model(study: Study, theta0: Array | None = None, noise: Sequence[ArModel] | None = None) -> IvFit:
     """Alternate instrumental variables and AR noise models (thesis sections 2.3.3 and 6.1.3).
 
-    Parameters
-    ----------
-    study
-        Data with the model.
-    theta0
-        Parameters (b,) that predict the torques on which terms depend; ``None`` if no term does.
-    noise
-        Noise models; ``None``: start with white noise, and alternate.
-
-    Raises
-    ------
-    DataError
-        If the training motion leaves parameters undetermined.
+    ``theta0``: parameters (b,) that predict the torques on which terms depend; ``None`` if no term does. ``noise``:
+    noise models; ``None``: start with white noise, and alternate. Raises DataError if the training motion leaves
+    parameters undetermined.
     """
     equations = Equations(study, theta0)
     if noise is None:
@@ -161,26 +132,21 @@ def fit(study: Study, theta0: Array | None = None, noise: Sequence[ArModel] | No
         passes = PASSES
     else:
         passes = 1
-    found = solved(study, equations, noise)
+    found = solved(equations, noise)
     require_solution(found)
     for _ in range(passes - 1):
         found = found.renoised(found.own_noise(MAX_AR_ORDER))
     return safe(found)
 
 
-def safe(found: Fit) -> Fit:
+def safe(found: IvFit) -> IvFit:
     """Return the fit, or one with noise models of lower order if its errors are much larger than with white weights.
 
     Weights of a strongly coloured noise emphasise frequencies at which the simulated and the measured motion may have
     little in common. The instruments are weak there, and the estimate is far from any that fits the data.
-
-    Parameters
-    ----------
-    found
-        The fit.
     """
     white = found.renoised([ArModel(np.empty(0), ar.variance, 0.0) for ar in found.noise])
-    most = MOST_WEIGHTED * _rms(white)
+    most = found.study.criteria.weighted_errors * _rms(white)
     for order in (*LOWER_ORDERS, 0):
         if np.all(_rms(found) <= most):
             break
@@ -188,49 +154,29 @@ def safe(found: Fit) -> Fit:
     return found
 
 
-def _rms(found: Fit) -> Array:
+def _rms(found: IvFit) -> Array:
     """Root mean square of the residual of each joint, N m or N, (n,)."""
     return np.asarray(np.sqrt(np.mean(np.concatenate(found.left) ** 2, axis=0)))
 
 
-def require_solution(found: Fit) -> None:
+def require_solution(found: IvFit) -> None:
     """Refuse a model whose parameters the motion leaves undetermined.
 
-    Parameters
-    ----------
-    found
-        Fit of the model.
-
-    Raises
-    ------
-    DataError
-        If the instruments do not determine all parameters.
+    Raises DataError if the instruments do not determine all parameters.
     """
     values = np.linalg.svd(found.regression.solution.cross, compute_uv=False)
     if not np.isfinite(found.theta).all() or values[-1] < SINGULAR * values[0]:
         raise DataError(UNDETERMINED)
 
 
-def solved(study: Study, equations: Equations, noise: Sequence[ArModel], known: IvRegression | None = None) -> Fit:
+def solved(equations: Equations, noise: Sequence[ArModel], known: IvRegression | None = None) -> IvFit:
     """Parameters by instrumental variables under given noise models.
 
-    Parameters
-    ----------
-    study
-        Data with the model.
-    equations
-        Equations of all stretches.
-    noise
-        Noise model of each joint.
-    known
-        Regression of the same equations under other noise models.
-
-    Raises
-    ------
-    DataError
-        If the equations are singular: a parameter has no effect on the torques, for example.
+    ``equations``: equations of all stretches; ``noise``: noise model of each joint; ``known``: regression of the same
+    equations under other noise models. Raises DataError if the equations are singular: a parameter has no effect on the
+    torques, for example.
     """
-    found = Fit(study, equations, IvRegression.of(equations, noise, known))
+    found = IvFit(equations, IvRegression.of(equations, noise, known))
     try:
         _ = found.theta
     except np.linalg.LinAlgError as error:
@@ -238,17 +184,11 @@ def solved(study: Study, equations: Equations, noise: Sequence[ArModel], known: 
     return found
 
 
-def relative_errors(fit: Fit, theta: Array | None = None, *, held: bool) -> tuple[float, Array]:
+def relative_fit_errors(fit: IvFit, theta: Array | None = None, *, held: bool) -> tuple[float, Array]:
     """``|y - X theta| / |y|`` in percent in the band of the comparison, overall and of each joint (n,).
 
-    Parameters
-    ----------
-    fit
-        Fit with data and model.
-    theta
-        Parameters (b,); ``None``: those of the fit.
-    held
-        True for the held-out data, false for the training data.
+    ``fit``: fit with data and model. ``theta``: parameters (b,); ``None``: those of the fit. ``held``: True for the
+    held-out data, false for the training data.
     """
     y = np.concatenate([s.y for s in (fit.study.held if held else fit.study.train)])
     error = np.concatenate(fit.errors(fit.theta if theta is None else theta, held=held))

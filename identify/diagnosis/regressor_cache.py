@@ -14,39 +14,26 @@ MOST_BYTES = 2**28
 
 @dataclass
 class RegressorCache:
-    """Arrays computed from signals, the most recently used ones.
-
-    Parameters
-    ----------
-    most_bytes
-        Memory for the arrays, bytes.
-    """
+    """Arrays computed from signals, the most recently used ones. ``most_bytes``: memory for the arrays, bytes."""
 
     most_bytes: int = MOST_BYTES
-    _kept: dict[Hashable, tuple[object, Arrays]] = field(default_factory=dict)
+    _kept: dict[Hashable, Arrays] = field(default_factory=dict)
     _bytes: int = 0
 
-    def get(self, key: Hashable, signals: object, made: Callable[[], Arrays]) -> Arrays:
+    def get(self, key: Hashable, made: Callable[[], Arrays]) -> Arrays:
         """Return the arrays of a key; computed where the cache does not have them.
 
-        Parameters
-        ----------
-        key
-            All that the arrays depend on, with the identity of the signals.
-        signals
-            The signals. The cache keeps them: their identity is theirs only while they exist.
-        made
-            Computes the arrays.
+        ``key``: all that the arrays depend on, among them the signals, which are equal only to themselves.
         """
         kept = self._kept.pop(key, None)
         if kept is None:
-            kept = signals, made()
-            self._bytes += _size(kept[1])
+            kept = made()
+            self._bytes += _size(kept)
         self._kept[key] = kept
         while self._bytes > self.most_bytes and len(self._kept) > 1:
             # The one that was not used for the longest time: of a simulation of a model that was rejected.
-            self._bytes -= _size(self._kept.pop(next(iter(self._kept)))[1])
-        return kept[1]
+            self._bytes -= _size(self._kept.pop(next(iter(self._kept))))
+        return kept
 
 
 def _size(arrays: Arrays) -> int:

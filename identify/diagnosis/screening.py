@@ -1,9 +1,4 @@
-"""Screening of candidates: score statistics of training data, with noise models that a missing effect does not bias.
-
-An autoregressive model of a residual that contains a missing effect takes the effect for noise and whitens it away. The
-weight of a spring, for example, is forty times too small. So the noise models of the screening come from a residual
-without smooth functions of position, speed and time.
-"""
+"""Screening of candidates by score statistics of the training data."""
 
 from collections.abc import Sequence
 
@@ -12,34 +7,18 @@ from numpy.typing import NDArray
 from scipy import optimize
 
 from armident.identify.diagnosis.candidates import Candidate, ColumnCache, Shapes
-from armident.identify.diagnosis.regression import MAX_AR_ORDER, Fit
-from armident.identify.effects.tables import hats
-from armident.identify.regression.ar_noise import ArModel, ar_models
-from armident.identify.robot.motion import Motion
+from armident.identify.diagnosis.regression import IvFit
 
 Array = NDArray[np.float64]
 
-KNOTS = 7
-"""Knots of each smooth function."""
-ROWS_PER_COLUMN = 12
-"""Least number of equations per column of these functions, against overfitting of short recordings."""
-RANK_TOLERANCE = 1e-3
-"""Relative norm orthogonal to the model below which columns cannot be tested."""
 REFINEMENTS = 12
 """Evaluations of the golden-section search of a continuous shape between its neighbours on the grid."""
 
 
-def screened(fit: Fit, candidate: Candidate, column_cache: ColumnCache) -> tuple[float, Shapes] | None:
+def screened(fit: IvFit, candidate: Candidate, column_cache: ColumnCache) -> tuple[float, Shapes] | None:
     """Best score statistic of a candidate on its grid, by the training data, and the nonlinear parameters there.
 
-    Parameters
-    ----------
-    fit
-        Fit of the model.
-    candidate
-        Candidate with its grid.
-    column_cache
-        Cache of the columns of the same fit.
+    ``fit``: fit of the model; ``column_cache``: cache of the columns of the same fit.
     """
     if not candidate.grid:
         return None
@@ -53,24 +32,12 @@ def screened(fit: Fit, candidate: Candidate, column_cache: ColumnCache) -> tuple
     return float(statistics[best]), candidate.grid[best]
 
 
-def score_statistics(fit: Fit, columns: Sequence[tuple[int, Array]], count: int, sign: int = 0) -> Array:
+def score_statistics(fit: IvFit, columns: Sequence[tuple[int, Array]], count: int, sign: int = 0) -> Array:
     """Power of the training residual along groups of instruments orthogonal to the model's own, (G,).
 
-    Parameters
-    ----------
-    fit
-        Fit of the model.
-    columns
-        Whitened instruments (R, G k) of each joint on which they act, with its number, group after group.
-    count
-        Number of groups, G.
-    sign
-        +1 or -1: sign of the parameter of a group of one, which physics determines; 0: none.
-
-    Returns
-    -------
-    ndarray
-        Zero where the parameter would have the wrong sign. Not a number where the model contains a group.
+    ``columns``: whitened instruments (R, G k) of each joint on which they act, with its number, group after group.
+    ``sign``: +1 or -1: sign of the parameter of a group of one, which physics determines; 0: none. Returns zero where
+    the parameter would have the wrong sign. Not a number where the model contains a group.
     """
     if not columns:
         return np.full(count, np.nan)
@@ -78,9 +45,9 @@ def score_statistics(fit: Fit, columns: Sequence[tuple[int, Array]], count: int,
     able = np.isfinite(size) & (size > 0.0)
     scale = np.where(able, size, np.inf)
     scaled = [(j, np.where(able, own, 0.0) / scale) for j, own in columns]
-    gram, score = fit.regression.products_beside(scaled, count)
+    gram, score = fit.regression.orthogonal_products(scaled, count)
     power, right = np.linalg.eigh(gram)
-    kept = power > RANK_TOLERANCE**2
+    kept = power > fit.study.criteria.beyond_model**2
     along = np.einsum("gij,gi->gj", right, score)
     statistics = np.sum(np.where(kept, along**2 / np.where(kept, power, 1.0), 0.0), axis=1)
     if sign:
@@ -89,87 +56,59 @@ def score_statistics(fit: Fit, columns: Sequence[tuple[int, Array]], count: int,
     return np.where(usable, statistics, np.nan)
 
 
-def score_statistic(fit: Fit, columns: Sequence[tuple[int, Array]], sign: int = 0) -> float | None:
+def score_statistic(fit: IvFit, columns: Sequence[tuple[int, Array]], sign: int = 0) -> float | None:
     """Score statistic of one group of instruments; ``None`` if the model contains it.
 
-    Parameters
-    ----------
-    fit
-        Fit of the model.
-    columns
-        Whitened instruments (R, k) of each joint on which they act, with its number.
-    sign
-        See `score_statistics`.
+    ``columns``: whitened instruments (R, k) of each joint on which they act, with its number; ``sign``: see
+    `score_statistics`.
     """
     found = float(score_statistics(fit, columns, 1, sign)[0])
     return None if np.isnan(found) else found
 
 
-def contained(fit: Fit, candidate: Candidate, column_cache: ColumnCache, shapes: Shapes) -> tuple[str, ...]:
+def contained(fit: IvFit, candidate: Candidate, column_cache: ColumnCache, shapes: Shapes) -> tuple[str, ...]:
     """Linear parameters of a candidate whose torque the model can give without it, such as an inertia of two joints.
 
     None if these are all: an effect keeps one parameter, which is then zero.
 
-    Parameters
-    ----------
-    fit
-        Fit of the model.
-    candidate
-        The candidate.
-    column_cache
-        Cache of the columns of the same fit.
-    shapes
-        Nonlinear parameters of the candidate.
+    ``column_cache``: cache of the columns of the same fit; ``shapes``: nonlinear parameters of the candidate.
     """
     columns = column_cache.grid(candidate.effect, candidate.place, (shapes,), fit.noise, keep=False)
     size = np.sqrt(np.sum([np.einsum("ij,ij->j", own, own) for _, own in columns], axis=0))
     size = np.where(size > 0.0, size, 1.0)
-    gram = fit.regression.products_beside([(j, own / size) for j, own in columns], 1)[0][0]
+    gram = fit.regression.orthogonal_products([(j, own / size) for j, own in columns], 1)[0][0]
     kept: list[int] = []
     present = candidate.effect.present(dict(shapes))
     for k in present:
         along = gram[np.ix_(kept, [k])][:, 0]
         rest = gram[k, k] - along @ np.linalg.solve(gram[np.ix_(kept, kept)], along)
-        kept += [k] if rest > RANK_TOLERANCE**2 else []
+        kept += [k] if rest > fit.study.criteria.beyond_model**2 else []
     return tuple(candidate.effect.linear[k].name for k in present if kept and k not in kept)
 
 
-def directions_beside(fit: Fit, instruments: Array) -> tuple[Array, Array, Array] | None:
+def orthogonal_directions(fit: IvFit, instruments: Array) -> tuple[Array, Array, Array] | None:
     """Orthonormal directions (R, r) of instruments orthogonal to the model's, and their map (k, r) with scales (k,).
 
-    Parameters
-    ----------
-    fit
-        Fit of the model.
-    instruments
-        Whitened instruments, (R, k).
+    ``instruments``: whitened instruments, (R, k).
     """
     scale = np.linalg.norm(instruments, axis=0)
     if np.any(scale == 0) or not np.isfinite(scale).all():
         return None
-    beside = fit.regression.beside(instruments / scale)
+    free = fit.regression.orthogonalized(instruments / scale)
     # Through the small Gram matrix: candidates have a few columns and many rows.
-    power, right = np.linalg.eigh(beside.T @ beside)
-    kept = power > RANK_TOLERANCE**2
+    power, right = np.linalg.eigh(free.T @ free)
+    kept = power > fit.study.criteria.beyond_model**2
     if not kept.any():
         return None
     right = right[:, kept]
-    return (beside @ right) / np.sqrt(power[kept]), right, scale
+    return (free @ right) / np.sqrt(power[kept]), right, scale
 
 
-def refined(fit: Fit, candidate: Candidate, column_cache: ColumnCache, best: tuple[float, Shapes]) -> Shapes:
+def refined(fit: IvFit, candidate: Candidate, column_cache: ColumnCache, best: tuple[float, Shapes]) -> Shapes:
     """Nonlinear parameters between those of the grid, one continuous parameter after the other, on a logarithmic scale.
 
-    Parameters
-    ----------
-    fit
-        Fit of the model.
-    candidate
-        Candidate with its grid.
-    column_cache
-        Cache of the columns of the same fit.
-    best
-        Score statistic and nonlinear parameters of the grid, the start.
+    ``fit``: fit of the model; ``column_cache``: cache of the columns of the same fit; ``best``: score statistic and
+    nonlinear parameters of the grid, the start.
     """
     found = best
     for k, free in enumerate(candidate.effect.refinable(fit.study.robot, candidate.place)):
@@ -198,61 +137,6 @@ def refined(fit: Fit, candidate: Candidate, column_cache: ColumnCache, best: tup
 def replaced(shapes: Shapes, k: int, value: float) -> Shapes:
     """Nonlinear parameters with another value of the k-th.
 
-    Parameters
-    ----------
-    shapes
-        Pairs of name and value.
-    k, value
-        Number of the parameter, and its new value.
+    ``shapes``: pairs of name and value; ``k``, ``value``: number of the parameter, and its new value.
     """
     return (*shapes[:k], (shapes[k][0], value), *shapes[k + 1 :])
-
-
-def noise_beyond_shapes(fit: Fit, column_cache: ColumnCache) -> list[ArModel]:
-    """Noise models of the residual without smooth functions of each joint's own motion.
-
-    Parameters
-    ----------
-    fit
-        Fit of the model.
-    column_cache
-        Cache of the columns of the same fit.
-    """
-    errors = fit.errors(fit.theta, held=False)
-    columns = [
-        _smooth_functions(column_cache, column_cache.motion(s, "measured"), sum(e.shape[0] for e in errors))
-        for s in fit.study.train
-    ]
-    left = [e.copy() for e in errors]
-    used = 0
-    for j in range(fit.study.robot.n):
-        stacked = np.concatenate([c[j] for c in columns])
-        shapes = np.linalg.lstsq(stacked, np.concatenate([e[:, j] for e in errors]), rcond=1e-8)[0]
-        for e, c in zip(left, columns, strict=True):
-            e[:, j] -= c[j] @ shapes
-        used += shapes.size
-    return ar_models(left, MAX_AR_ORDER, parameters=fit.theta.size + used)
-
-
-def _smooth_functions(column_cache: ColumnCache, motion: Motion, rows: int) -> list[Array]:
-    """Hat functions of position, of position by direction, of velocity and of time, (M, k) for each joint."""
-    knots = max(3, min(KNOTS, rows // (4 * ROWS_PER_COLUMN)))
-    out = []
-    for j in range(motion.n):
-        q, qd, side = motion.q[:, j], motion.qd[:, j], motion.sign[:, j, None]
-        place = _hats(q, knots)
-        when = _hats(motion.t, knots)
-        out.append(
-            column_cache.study.decimation(
-                np.concatenate([place, place * side, _hats(qd, knots), when, when * side], axis=1)
-            )
-        )
-    return out
-
-
-def _hats(values: Array, knots: int) -> Array:
-    """Piecewise linear functions, one at their own knot and zero at the others; knots at quantiles of the values."""
-    places = np.unique(np.quantile(values, np.linspace(0, 1, knots)))
-    if places.size < 2:
-        return np.ones((values.size, 1))
-    return hats(values, places)

@@ -5,10 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from armident.configs.schema.robot import Effect as Entry
-from armident.identify.diagnosis.comparison import Addition, Step
+from armident.identify.diagnosis.candidate_comparison import Addition, SelectionStep
 from armident.identify.diagnosis.confirmation import Confirmation
 from armident.identify.diagnosis.model_state import ModelState
-from armident.identify.effects.recorded import of_recording
+from armident.identify.effects.recording_corrections import of_recording
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,7 +32,7 @@ class Selected:
     """
 
     entry: Entry
-    step: Step
+    step: SelectionStep
     addition: Addition
     confirmation: Confirmation | None = None
     without: ModelState | None = None
@@ -41,12 +41,7 @@ class Selected:
     def conventional(self, state: ModelState, uncertain: float) -> bool:
         """True if the effect is a part of every model, or within the sampling convention of drives: no finding.
 
-        Parameters
-        ----------
-        state
-            Final model.
-        uncertain
-            Time by which the common instant of all torques is uncertain, s.
+        ``state``: final model; ``uncertain``: time by which the common instant of all torques is uncertain, s.
         """
         effect = self.addition.candidate.effect
         if of_recording(self.entry):

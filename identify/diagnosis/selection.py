@@ -4,11 +4,12 @@
    (`armident.identify.diagnosis.shortlist`).
 2. Closed loop: each of the best candidates is added to the model, and the loop with it is simulated. All parameters are
    estimated with instruments from that loop (`armident.identify.diagnosis.candidate_models`).
-3. Ranking by cross-validated log-likelihood (`armident.identify.diagnosis.comparison`).
+3. Ranking by cross-validated log-likelihood (`armident.identify.diagnosis.candidate_comparison`).
 4. Admission of the best one that is significant, material and physically possible; then the next step.
 5. Findings that later ones made superfluous are removed. Each finding competes once more with the effects that act on a
    joint on which it acts.
-6. Report part: a finding stays if the data that chose nothing confirm it (`armident.identify.diagnosis.confirmation`).
+6. Report part: a finding stays if data that are not used for selection confirm it
+   (`armident.identify.diagnosis.confirmation`).
 """
 
 import contextlib
@@ -21,9 +22,17 @@ from numpy.typing import NDArray
 
 from armident.configs import DataError, RobotConfig
 from armident.configs.schema.robot import Effect as Entry
+from armident.identify.diagnosis.candidate_comparison import (
+    Addition,
+    FittedCandidate,
+    SelectionStep,
+    advantage,
+    compared_candidates,
+    gain,
+    materiality,
+)
 from armident.identify.diagnosis.candidate_models import model_with
 from armident.identify.diagnosis.candidates import Key
-from armident.identify.diagnosis.comparison import Addition, Made, Step, advantage, compared, gain, materiality
 from armident.identify.diagnosis.confirmation import confirmed
 from armident.identify.diagnosis.criteria import Criteria
 from armident.identify.diagnosis.model_state import (
@@ -37,16 +46,14 @@ from armident.identify.diagnosis.model_state import (
     with_report_part,
     without_entry,
 )
-from armident.identify.diagnosis.precision import p_value
+from armident.identify.diagnosis.precision import p_value_of_effect
 from armident.identify.diagnosis.selected import Selected
-from armident.identify.diagnosis.shortlist import Contested, shortlist
+from armident.identify.diagnosis.shortlist import Incumbent, shortlist
 from armident.identify.diagnosis.study import Study
 from armident.identify.diagnosis.transitions import with_transitions
-from armident.identify.effects.tables import FreeShape
+from armident.identify.effects.free_shapes import FreeShape
 
 Array = NDArray[np.float64]
-CLEAR = 3.0
-"""Gain of log-likelihood from which another shift of all torques is chosen: odds of 20 to 1."""
 
 
 @dataclass
@@ -57,8 +64,6 @@ class StepwiseSelection:
     ----------
     study
         Data with the model as configured.
-    criteria
-        Thresholds.
     progress
         Called with the name of each step.
     deadline
@@ -70,7 +75,6 @@ class StepwiseSelection:
     """
 
     study: Study
-    criteria: Criteria = field(default_factory=Criteria)
     progress: Callable[[str], None] = lambda stage: None
     deadline: float = float("inf")
     tested: Callable[[float], None] = lambda share: None
@@ -79,16 +83,18 @@ class StepwiseSelection:
     hidden: frozenset[Key] = frozenset()
     immaterial: tuple[Addition, ...] = ()
     _states: dict[str, ModelState | None] = field(default_factory=dict)
-    _steps: dict[str, Step] = field(default_factory=dict)
+    _steps: dict[str, SelectionStep] = field(default_factory=dict)
     _visited: set[str] = field(default_factory=set)
+
+    @property
+    def criteria(self) -> Criteria:
+        """Thresholds."""
+        return self.study.criteria
 
     def start(self) -> ModelState:
         """Model as configured, with the transition of dry friction at reversals where the configuration leaves it free.
 
-        Raises
-        ------
-        DataError
-            If the motion does not determine the parameters of the model.
+        Raises DataError if the motion does not determine the parameters of the model.
         """
         state = self._aligned(fitted(self.study, self.study.robot, None))
         self.study = state.study
@@ -102,15 +108,8 @@ class StepwiseSelection:
     def run(self, first: ModelState) -> tuple[ModelState, tuple[Selected, ...]]:
         """Select effects.
 
-        Parameters
-        ----------
-        first
-            Model to start from, of `start`.
-
-        Returns
-        -------
-        tuple
-            Model with the effects, and the effects: those with a name first, then by reduction of the errors.
+        ``first``: model to start from, of `start`. Returns the model with the effects, and the effects: those with a
+        name first, then by reduction of the errors.
         """
         state = first
         found: tuple[Selected, ...] = ()
@@ -146,32 +145,27 @@ class StepwiseSelection:
                 state = fitted(state.study.with_own_controller(), state.robot, state)
         return with_own_noise(state)
 
-    def step(self, state: ModelState, contested: Contested | None = None) -> Step:
+    def step(self, state: ModelState, incumbent: Incumbent | None = None) -> SelectionStep:
         """Compare all candidates in a model.
 
-        Parameters
-        ----------
-        state
-            Model without them.
-        contested
-            Finding that the model is without, if only effects that could take its place are compared: those that act
-            on a joint on which it acts, and do not promise much less.
+        ``state``: model without them; ``incumbent``: finding that the model is without, if only effects that could take
+        its place are compared: those that act on a joint on which it acts, and do not promise much less.
         """
         key = _key(state.robot)
         if key in self._steps:
             return self._steps[key]
-        found = shortlist(state, self.criteria, contested)
+        found = shortlist(state, incumbent)
         if not self._steps:
             self.hidden = found.hidden
-        made: list[Made] = []
+        made: list[FittedCandidate] = []
         for k, one in enumerate(found.chosen):
             self.tested(k / len(found.chosen))
             if self._late():
                 # An effect is admitted only against all others.
-                return Step(state, (), (), (), found.tests)
+                return SelectionStep(state, (), (), (), found.tests)
             made += [m for m in (model_with(state, *one, self._state),) if m is not None]
-        step = compared(state, made, found.tests, self.passes)
-        if contested is None:
+        step = compared_candidates(state, made, found.tests, self.passes)
+        if incumbent is None:
             self._steps[key] = step
         self._release()
         return step
@@ -187,14 +181,8 @@ class StepwiseSelection:
         """Number of models in which all candidates were compared."""
         return len(self._steps)
 
-    def last(self, state: ModelState) -> Step | None:
-        """Comparison of all candidates in a model, if it has been made.
-
-        Parameters
-        ----------
-        state
-            The model.
-        """
+    def last(self, state: ModelState) -> SelectionStep | None:
+        """Comparison of all candidates in a model, if it has been made."""
         return self._steps.get(_key(state.robot))
 
     def passes(self, addition: Addition, tests: int) -> bool:
@@ -204,12 +192,7 @@ class StepwiseSelection:
         no null distribution is needed. The parameters of the effect differ from zero at the same level by their own
         standard deviations.
 
-        Parameters
-        ----------
-        addition
-            The addition.
-        tests
-            Number of candidates among which it was found.
+        ``tests``: number of candidates among which it was found.
         """
         return (
             addition.allowed
@@ -219,18 +202,13 @@ class StepwiseSelection:
             and addition.p_value < self.criteria.selection_level(tests)
         )
 
-    def admitted(self, step: Step) -> Addition | None:
+    def admitted(self, step: SelectionStep) -> Addition | None:
         """Addition that the step admits: the best law of the best effect; ``None`` if there is none.
 
         An effect with a name is admitted only if no other explanation of the same joint is clearly better. Even one
         that is too small to be a finding counts. A term without a name claims no cause. An effect with a name comes
         first if it explains most of what the best term without a name does. Of the laws of one effect that predict as
         well, that with the fewest parameters comes first, and a free shape last.
-
-        Parameters
-        ----------
-        step
-            The step.
         """
         able = [a for a in step.passing if not (a.named and self._superseded(a, step))]
         if not able:
@@ -243,7 +221,7 @@ class StepwiseSelection:
         same = [a for a in able if a.family == best.family and a.log_likelihood > close]
         return min(same, key=lambda a: (isinstance(a.candidate.effect, FreeShape), len(a.candidate.effect.linear)))
 
-    def _superseded(self, addition: Addition, step: Step) -> bool:
+    def _superseded(self, addition: Addition, step: SelectionStep) -> bool:
         """True if an explanation of the same joint that does not pass is clearly better than an addition.
 
         It has to reduce the errors of a joint. Corrections of recorded torques may only make them whiter.
@@ -265,16 +243,17 @@ class StepwiseSelection:
             return state
         models = [fitted(state.study.with_torque_shift(shift), state.robot, state) for shift in self.shifts]
         scores = np.array([model.score.log_likelihoods_under(state.weights) for model in models])
-        evidence = np.clip(scores - scores[0], -CLEAR, CLEAR).sum(axis=1)
+        close = self.criteria.close
+        evidence = np.clip(scores - scores[0], -close, close).sum(axis=1)
         best = int(np.argmax(evidence))
-        if evidence[best] <= CLEAR:
+        if evidence[best] <= close:
             return state
         line = (
             f"all torques are late by {self.shifts[best]:.2f} samples against torques held until the next sample: the "
             "base fit shows it, the check of the set-up does not decide; the diagnosis aligns its equations with it"
         )
         study = models[best].study
-        return replace(models[best], study=replace(study, warnings=(*study.warnings, line)))
+        return models[best].of_study(replace(study, warnings=(*study.warnings, line)))
 
     def _state(self, robot: RobotConfig, before: ModelState) -> ModelState | None:
         """Fit of a model in its own closed loop, cached; ``None`` if the motion does not determine its parameters."""
@@ -309,12 +288,7 @@ class StepwiseSelection:
     def _superfluous(self, state: ModelState, less: ModelState, tests: int) -> bool:
         """True if a finding is insignificant or immaterial beside the others of a model.
 
-        Parameters
-        ----------
-        state, less
-            Models with and without it.
-        tests
-            Number of candidates among which it was found.
+        ``state``, ``less``: models with and without it; ``tests``: number of candidates among which it was found.
         """
         share, changed = materiality(less, state)
         material = share >= self.criteria.least_share and changed >= self.criteria.material_pct
@@ -328,12 +302,7 @@ class StepwiseSelection:
         A rival makes the finding superfluous; an effect beside which it stays explains something else. No exchange
         returns to an earlier model: each could prefer its own noise models.
 
-        Parameters
-        ----------
-        state, found
-            Model with the findings, and the findings.
-        changed
-            Joints whose models changed since the findings last competed, (n,); ``None`` for all.
+        ``changed``: joints whose models changed since the findings last competed, (n,); ``None`` for all.
         """
         self._visited.add(_key(state.robot))
         for one in found:
@@ -344,13 +313,13 @@ class StepwiseSelection:
             if changed is not None and not joints[changed].any():
                 continue
             self.progress(f"exchanging {one.entry.effect.replace('_', ' ')} of {one.entry.joint}")
-            step = self.step(less, Contested(gain(state, less), joints))
+            step = self.step(less, Incumbent(gain(state, less), joints))
             best = self.admitted(step)
             if best is None or best.family == one.addition.family or _key(best.state.robot) in self._visited:
                 continue
             both = self._state(with_entries(best.state.robot, [one.entry]), best.state)
             rival = both is None or self._superfluous(both, best.state, one.step.tests)
-            if rival and advantage(best.made.state, state) > self.criteria.close:
+            if rival and advantage(best.fitted.state, state) > self.criteria.close:
                 other = Selected(best.entry, step, best)
                 state, found = with_first_motions(best.state), tuple(other if f is one else f for f in found)
                 self._visited.add(_key(state.robot))
@@ -370,7 +339,9 @@ class StepwiseSelection:
                 if less is not None:
                     final = with_own_noise(less)
                     report = confirmed(held, with_report_part(final))
-                    tested = replace(one, confirmation=report, without=final, p_value=p_value(held, one.entry))
+                    tested = replace(
+                        one, confirmation=report, without=final, p_value=p_value_of_effect(held, one.entry)
+                    )
                     checked.append((tested, less))
             failed = [(one, less) for one, less in checked if not self._holds(one)]
             if not failed:

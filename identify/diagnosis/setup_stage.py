@@ -1,16 +1,16 @@
 """First stage of a diagnosis: mistakes of the set-up are corrected and reported before any effect is looked for."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from armident.configs import DataError, RobotConfig
+from armident.identify.diagnosis.criteria import Criteria
 from armident.identify.documents.diagnosis import Finding, Gap, Unexplained
-from armident.identify.experiment import Experiment
 from armident.identify.setup.check import check_setup
 from armident.identify.setup.result import CONVENTIONS, SetupCheck, SetupFinding, with_torque_shift
-from armident.identify.setup.search import NOT_UNDERSTOOD
+from armident.identify.signals.experiments import Experiment
 
 SIGNALS = {"position_sign": "position", "torque_sign": "torque"}
 
@@ -51,14 +51,12 @@ class SetupStage:
     errors: tuple[float, ...]
     shifts: tuple[float, ...] = ()
     shift_known: bool = False
+    criteria: Criteria = field(default_factory=Criteria)
 
     def as_configured(self, gap: Gap) -> Gap:
         """Gap of the model in the set-up as configured, from that in the corrected one.
 
-        Parameters
-        ----------
-        gap
-            Relative errors of the model in the corrected set-up.
+        ``gap``: relative errors of the model in the corrected set-up.
         """
         if not self.findings:
             return gap
@@ -74,57 +72,30 @@ class SetupStage:
         )
 
     def doubtful(self, gap: Gap) -> list[Unexplained]:
-        """Entries of the joints that are not understood with the effects found, either.
+        """Entries of the joints that the model with the effects found does not explain, either.
 
-        Parameters
-        ----------
-        gap
-            Held-out errors of the model with the effects found.
+        ``gap``: held-out errors of the model with the effects found.
         """
-        return [entry for entry in self.unexplained if gap.by_joint[entry.joint] > 100 * NOT_UNDERSTOOD]
-
-    def named(self, findings: Sequence[Finding], gap: Gap) -> list[Finding]:
-        """Findings of the set-up, then those at joints that are understood.
-
-        Parameters
-        ----------
-        findings
-            Effects found in the corrected set-up.
-        gap
-            Held-out errors of the model with them.
-        """
-        joints = {entry.joint for entry in self.doubtful(gap)}
-        return [*self.findings, *(f for f in findings if f.joint not in joints)]
+        return [entry for entry in self.unexplained if gap.by_joint[entry.joint] > self.criteria.set_up_doubtful_pct]
 
     def left(self, unexplained: Sequence[Unexplained], gap: Gap) -> list[Unexplained]:
-        """Joints that are not understood, then the dependences at the others.
+        """Joints that the rigid model does not explain, then the dependences at the others.
 
-        Parameters
-        ----------
-        unexplained
-            Remaining dependences of the residual.
-        gap
-            Held-out errors of the model with the effects found.
+        ``unexplained``: remaining dependences of the residual; ``gap``: held-out errors of the model with the effects
+        found.
         """
         doubtful = self.doubtful(gap)
         joints = {entry.joint for entry in doubtful}
         return [*doubtful, *(entry for entry in unexplained if entry.joint not in joints)]
 
 
-def set_up(training: Sequence[Experiment], validation: Sequence[Experiment], robot: RobotConfig) -> SetupStage:
+def set_up(
+    training: Sequence[Experiment], validation: Sequence[Experiment], robot: RobotConfig, criteria: Criteria
+) -> SetupStage:
     """Check the set-up and correct its mistakes.
 
-    Parameters
-    ----------
-    training, validation
-        Experiments of a diagnosis.
-    robot
-        The configuration.
-
-    Raises
-    ------
-    DataError
-        If nothing moves, or the recordings do not fit together.
+    ``training``, ``validation``: experiments of a diagnosis. Raises DataError if nothing moves, or the recordings do
+    not fit together.
     """
     check = check_setup([*training, *validation], robot)
     shift = check.torque_shift
@@ -150,6 +121,7 @@ def set_up(training: Sequence[Experiment], validation: Sequence[Experiment], rob
         check.relative_error_pct,
         CONVENTIONS if shift is not None and shift.undetermined else (),
         shift is not None and shift.known,
+        criteria,
     )
 
 

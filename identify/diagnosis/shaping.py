@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from scipy import optimize
 
 from armident.identify.diagnosis.candidates import Candidate, ColumnCache, Shapes
-from armident.identify.diagnosis.regression import Fit
-from armident.identify.diagnosis.screening import directions_beside, replaced
+from armident.identify.diagnosis.regression import IvFit
+from armident.identify.diagnosis.screening import orthogonal_directions, replaced
 from armident.identify.regression.whitening import whitened
 
 Array = NDArray[np.float64]
@@ -24,42 +24,28 @@ REFINEMENTS = 8
 """Evaluations of that refinement."""
 
 
-def both_ends(fit: Fit, candidate: Candidate, column_cache: ColumnCache, shapes: Shapes) -> tuple[Shapes, ...]:
+def shapes_of_both_signals(
+    fit: IvFit, candidate: Candidate, column_cache: ColumnCache, shapes: Shapes
+) -> tuple[Shapes, ...]:
     """Nonlinear parameters by measured signals and by simulated ones, where these differ; either may be wrong.
 
     Simulated signals are those of a loop without the effect, and measured ones contain noise that it amplifies.
 
-    Parameters
-    ----------
-    fit
-        Fit of the model.
-    candidate
-        Candidate with its grid.
-    column_cache
-        Cache of the columns of the same fit.
-    shapes
-        Nonlinear parameters by simulated signals.
+    ``fit``: fit of the model; ``candidate``: candidate with its grid; ``column_cache``: cache of the columns of the
+    same fit; ``shapes``: nonlinear parameters by simulated signals.
     """
-    found = instrumented(fit, candidate, column_cache, shapes)
+    found = instrumented_shapes(fit, candidate, column_cache, shapes)
     return (shapes,) if found == shapes else (found, shapes)
 
 
-def instrumented(fit: Fit, candidate: Candidate, column_cache: ColumnCache, shapes: Shapes) -> Shapes:
+def instrumented_shapes(fit: IvFit, candidate: Candidate, column_cache: ColumnCache, shapes: Shapes) -> Shapes:
     """Continuous nonlinear parameters, one after the other, between their neighbours on the grid.
 
     Those of effects that depend on the motion alone stay. That motion is simulated well, and measured velocities are
     least accurate around standstill, where friction changes most.
 
-    Parameters
-    ----------
-    fit
-        Fit of the model.
-    candidate
-        Candidate with its grid.
-    column_cache
-        Cache of the columns of the same fit.
-    shapes
-        Start: the best values at simulated signals.
+    ``fit``: fit of the model; ``column_cache``: cache of the columns of the same fit; ``shapes``: start: the best
+    values at simulated signals.
     """
     found = shapes
     if not candidate.effect.depends_on_torque:
@@ -77,12 +63,12 @@ def instrumented(fit: Fit, candidate: Candidate, column_cache: ColumnCache, shap
 
 
 def _explained(
-    fit: Fit, candidate: Candidate, column_cache: ColumnCache, shapes: Shapes, k: int, probes: tuple[float, ...]
+    fit: IvFit, candidate: Candidate, column_cache: ColumnCache, shapes: Shapes, k: int, probes: tuple[float, ...]
 ) -> Callable[[float], float] | None:
     """Power of the training residual that measured columns explain along the directions of simulated ones."""
     effect, place = candidate.effect, candidate.place
     instruments = [column_cache.instruments(effect, place, replaced(shapes, k, v), fit.noise) for v in probes]
-    basis = directions_beside(fit, np.concatenate(instruments, axis=1))
+    basis = orthogonal_directions(fit, np.concatenate(instruments, axis=1))
     if basis is None:
         return None
     u = basis[0]

@@ -7,11 +7,10 @@ from numpy.typing import NDArray
 
 from armident.identify.diagnosis.candidates import Candidate, ColumnCache, Key, Shapes, candidates
 from armident.identify.diagnosis.corrections import screened_correction
-from armident.identify.diagnosis.criteria import Criteria
 from armident.identify.diagnosis.model_state import ModelState
 from armident.identify.diagnosis.order_analysis import motor_orders, nearby_orders
 from armident.identify.diagnosis.screening import contained, refined, screened
-from armident.identify.diagnosis.shaping import both_ends
+from armident.identify.diagnosis.shaping import shapes_of_both_signals
 from armident.identify.effects.drive import Correction
 from armident.identify.effects.transmission import MotorOrder
 from armident.identify.effects.unnamed import NAME as UNNAMED
@@ -21,15 +20,11 @@ Starts = tuple[float, ...]
 
 
 @dataclass(frozen=True, eq=False)
-class Contested:
+class Incumbent:
     """A finding with which other effects compete.
 
-    Parameters
-    ----------
-    gain
-        Its gain of log-likelihood beside the other findings, nats.
-    joints
-        Joints on whose torques it acts, (n,). An effect that acts on none of them cannot take its place.
+    ``gain``: its gain of log-likelihood beside the other findings, nats. ``joints``: joints on whose torques it acts,
+    (n,). An effect that acts on none of them cannot take its place.
     """
 
     gain: float
@@ -40,15 +35,8 @@ class Contested:
 class Shortlist:
     """Candidates of a step that are tested in their own closed loops.
 
-    Parameters
-    ----------
-    chosen
-        The candidates, each with its nonlinear parameters, or with the values from which its correction of recorded
-        torques starts.
-    tests
-        Number of all candidates.
-    hidden
-        Candidates that the motion does not show.
+    ``chosen``: the candidates, each with its nonlinear parameters, or with the values from which its correction of
+    recorded torques starts; ``hidden``: candidates that the motion does not show.
     """
 
     chosen: list[tuple[Candidate, Shapes, Starts]]
@@ -56,26 +44,20 @@ class Shortlist:
     hidden: frozenset[Key]
 
 
-def shortlist(state: ModelState, criteria: Criteria, contested: Contested | None) -> Shortlist:
+def shortlist(state: ModelState, incumbent: Incumbent | None) -> Shortlist:
     """Return the candidates with the highest statistics less their numbers of parameters.
 
-    Parameters
-    ----------
-    state
-        Model without them.
-    criteria
-        Thresholds.
-    contested
-        Finding that the model is without, if only effects that could take its place are compared.
+    ``state``: model without them; ``incumbent``: finding that the model is without, if only effects that could take its
+    place are compared.
     """
-    column_cache = ColumnCache(state.study, state.fit.theta)
+    criteria, column_cache = state.study.criteria, ColumnCache(state.study, state.fit.theta)
     noise = state.fit.renoised(state.weights)
     looks: list[tuple[float, Candidate, tuple[float, Shapes], Starts]] = []
     tests, hidden = 0, set()
     for every in candidates(column_cache):
         candidate = every
         tests += 1
-        if contested is not None and not contested.joints[column_cache.joints(candidate)].any():
+        if incumbent is not None and not incumbent.joints[column_cache.joints(candidate)].any():
             continue
         if isinstance(candidate.effect, MotorOrder):
             candidate = replace(candidate, grid=motor_orders(state.study, state.fit.theta, candidate.place.joint))
@@ -93,7 +75,7 @@ def shortlist(state: ModelState, criteria: Criteria, contested: Contested | None
     # A score statistic is twice the gain of log-likelihood that it promises. A correction needs all of it: its
     # likelihood also rewards smaller noise.
     needed, promising = criteria.needed_gain(tests), criteria.promising
-    present = 0.0 if contested is None else contested.gain
+    present = 0.0 if incumbent is None else incumbent.gain
     looks = [x for x in looks if 0.5 * x[2][0] > max(needed * (1.0 if x[3] else promising), promising * present)]
     looks.sort(key=lambda look: -look[0])
     named = [x for x in looks if x[1].effect.name != UNNAMED][: criteria.shortlist]
@@ -109,7 +91,7 @@ def shortlist(state: ModelState, criteria: Criteria, contested: Contested | None
             candidate = replace(candidate, grid=near)
             found = screened(noise, candidate, column_cache) or found
         shapes = refined(noise, candidate, column_cache, found)
-        for ends in both_ends(noise, candidate, column_cache, shapes):
+        for ends in shapes_of_both_signals(noise, candidate, column_cache, shapes):
             without = contained(noise, candidate, column_cache, ends)
             chosen.append((replace(candidate, without=without), ends, ()))
     return Shortlist(chosen, tests, frozenset(hidden))

@@ -19,14 +19,8 @@ class SimulatedErrors:
 
     NaN where a simulated loop diverges or the difference is undefined.
 
-    Parameters
-    ----------
-    joints
-        Names of the joints.
-    velocity_before, velocity_after
-        Errors of the simulated velocities with the model as configured, and with the findings.
-    torque_before, torque_after
-        Errors of the simulated torques with both models.
+    ``velocity_before``, ``velocity_after``: errors of the simulated velocities with the model as configured, and with
+    the findings; ``torque_before``, ``torque_after``: errors of the simulated torques with both models.
     """
 
     joints: tuple[str, ...]
@@ -47,10 +41,7 @@ class SimulatedErrors:
 def simulated_errors(first: ModelState, final: ModelState) -> SimulatedErrors:
     """Errors of the closed loops of two models, simulated along the references.
 
-    Parameters
-    ----------
-    first, final
-        Model as configured, and with the findings.
+    ``first``, ``final``: model as configured, and with the findings.
     """
     before, after = _errors(first), _errors(final)
     if before is None or after is None:

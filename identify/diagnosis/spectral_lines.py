@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from armident.identify.diagnosis.stretch import Stretch
-from armident.identify.diagnosis.study import BAND, Study
+from armident.identify.diagnosis.stretch import MotionStretch
+from armident.identify.diagnosis.study import Study
 from armident.identify.signals.periodogram import hann_window, periodogram
 
 Array = NDArray[np.float64]
@@ -22,24 +22,16 @@ PADDING = 2
 HIGHEST = 0.35
 """Highest frequency of the search over the working rate: the first filter begins there."""
 
-PROMINENT = 100.0
-"""Power of a line of the references over that around it."""
-
-MODULATED = 0.1
-"""Width to either side of a line that the motion modulates, over the motion's bandwidth."""
-
 EQUIVALENT = BLOCK / 1.5 * np.log(2) ** 2
 """Shape of the gamma distribution with the spread of such a median; a Hann window makes 1.5 frequencies one."""
 
 
 @dataclass(frozen=True)
-class Line:
+class SpectralLine:
     """Spectral line of one joint.
 
     Parameters
     ----------
-    frequency
-        Frequency, Hz.
     p_train, p_held
         Probability of such a line in the training residual at any frequency, and in the held-out one at this frequency,
         without a line.
@@ -67,17 +59,10 @@ class Line:
         return float(stats.combine_pvalues([max(p, 1e-300) for p in (self.p_train, self.p_held)]).pvalue)
 
 
-def residuals(study: Study, stretches: Sequence[Stretch], theta: Array) -> list[Array]:
+def working_rate_residuals(study: Study, stretches: Sequence[MotionStretch], theta: Array) -> list[Array]:
     """Torques less those of the model at the working rate, (N, n) each, N m or N.
 
-    Parameters
-    ----------
-    study
-        Data with the model.
-    stretches
-        Stretches of the study.
-    theta
-        Parameters of the model, (b,).
+    ``stretches``: stretches of the study; ``theta``: parameters of the model, (b,).
     """
     return [s.torque - study.torques(s, "measured", theta) for s in stretches]
 
@@ -85,46 +70,31 @@ def residuals(study: Study, stretches: Sequence[Stretch], theta: Array) -> list[
 def bandwidth_of_motion(study: Study) -> float:
     """Bandwidth of the motion, Hz; below it the repeatable part of the residual has lines, too.
 
-    Parameters
-    ----------
-    study
-        Data with the filter of the comparison.
+    ``study``: data with the filter of the comparison.
     """
-    return 0.5 / (study.dt * study.decimation.factor * BAND)
+    return 0.5 / (study.dt * study.decimation.factor * study.criteria.band)
 
 
-def lines_of_joints(study: Study, theta: Array) -> Iterator[tuple[int, Line]]:
+def lines_of_joints(study: Study, theta: Array) -> Iterator[tuple[int, SpectralLine]]:
     """Strongest line of each joint above the frequencies of the motion that the references do not contain.
 
-    Parameters
-    ----------
-    study
-        Data with the model.
-    theta
-        Parameters of the model, (b,).
+    ``theta``: parameters of the model, (b,).
     """
-    train, held = (residuals(study, part, theta) for part in (study.train, study.held))
+    train, held = (working_rate_residuals(study, part, theta) for part in (study.train, study.held))
     lowest = bandwidth_of_motion(study)
     for j in range(study.robot.n):
         line = strongest_line([e[:, j] for e in train], [e[:, j] for e in held], study.dt, lowest)
-        if line is not None and not (line.p_value < 0.01 and of_references(study, line.frequency)):
+        if line is not None and not (line.p_value < study.criteria.line_level and of_references(study, line.frequency)):
             yield j, line
 
 
-def strongest_line(train: Sequence[Array], held: Sequence[Array], dt: float, lowest: float) -> Line | None:
+def strongest_line(train: Sequence[Array], held: Sequence[Array], dt: float, lowest: float) -> SpectralLine | None:
     """Strongest line of one joint's residuals from a frequency on; ``None`` where the recording is too short.
 
     Without a line, the power at a frequency over that of its surroundings has an F-distribution. Its phase may differ
     from one stretch to the next.
 
-    Parameters
-    ----------
-    train, held
-        Residuals, (N,) each.
-    dt
-        Sampling period, s.
-    lowest
-        Lowest frequency of the search, Hz.
+    ``train``, ``held``: residuals, (N,) each; ``lowest``: lowest frequency of the search, Hz.
     """
     spectra = [_Spectrum.of(e, dt) for e in train]
     size = max(s.power.size for s in spectra)
@@ -141,7 +111,7 @@ def strongest_line(train: Sequence[Array], held: Sequence[Array], dt: float, low
     total = sum(float(e @ e) for e in held) / sum(e.size for e in held)
     longest = max(spectra, key=lambda s: s.power.size)
     around = np.flatnonzero(np.abs(longest.f - frequency) <= 40 * longest.f[1])
-    return Line(
+    return SpectralLine(
         frequency,
         min(1.0, chosen.size * _chance(float(ratio[peak]), len(spectra))),
         _chance(float(np.mean([p / b for p, b in there])), len(there)),
@@ -159,19 +129,14 @@ def of_references(study: Study, frequency: float) -> bool:
     Set points have a rate of their own, and the arm follows them. The motion modulates the line, so its width is a
     share of the bandwidth of the motion.
 
-    Parameters
-    ----------
-    study
-        Data with the references.
-    frequency
-        Frequency of the line, Hz.
+    ``study``: data with the references.
     """
-    wide = MODULATED * bandwidth_of_motion(study)
+    wide = study.criteria.modulated_line * bandwidth_of_motion(study)
     for reference in study.auxiliary.references:
         for joint in np.diff(reference, 2, axis=0).T:
             spectrum = _Spectrum.of(joint, study.sample)
             near = np.abs(spectrum.f - frequency) <= max(wide, 2 * PADDING * spectrum.f[1])
-            if np.any(spectrum.power[near] > PROMINENT * spectrum.background[near]):
+            if np.any(spectrum.power[near] > study.criteria.reference_line * spectrum.background[near]):
                 return True
     return False
 
@@ -194,15 +159,7 @@ class _Spectrum:
 
     @classmethod
     def of(cls, e: Array, dt: float) -> "_Spectrum":
-        """Return the spectrum of a series with a Hann window.
-
-        Parameters
-        ----------
-        e
-            Series, (N,).
-        dt
-            Sampling period, s.
-        """
+        """Return the spectrum of a series with a Hann window. ``e``: series, (N,)."""
         window = hann_window(e.size)
         windowed = window * (e - e.mean())
         power = periodogram(windowed, PADDING)
@@ -213,12 +170,6 @@ class _Spectrum:
         return cls(f, power, background, 2.0 / float(window.sum()) ** 2, windowed, dt)
 
     def at(self, frequency: float) -> tuple[float, float]:
-        """Return power and background at any frequency.
-
-        Parameters
-        ----------
-        frequency
-            Frequency, Hz.
-        """
+        """Return power and background at any frequency."""
         turning = np.exp(-2j * np.pi * frequency * self.dt * np.arange(self.windowed.size))
         return float(np.abs(self.windowed @ turning) ** 2), float(np.interp(frequency, self.f, self.background))

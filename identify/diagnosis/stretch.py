@@ -15,8 +15,8 @@ KINDS = ("measured", "simulated")
 """Kinds of motion of a stretch."""
 
 
-@dataclass(frozen=True)
-class Stretch:
+@dataclass(frozen=True, eq=False)
+class MotionStretch:
     """One uninterrupted stretch of motion at the working rate, SI, joint side.
 
     Parameters
@@ -55,17 +55,10 @@ class Stretch:
     moving: NDArray[np.bool_]
     before: tuple[Derivatives, Derivatives] | None = None
 
-    def resimulated(self, motion: Derivatives, dt: float, factor: int) -> "Stretch":
+    def resimulated(self, motion: Derivatives, dt: float, factor: int) -> "MotionStretch":
         """Stretch with another simulation of the whole experiment.
 
-        Parameters
-        ----------
-        motion
-            Simulated motion of the experiment.
-        dt
-            Its sampling period, s.
-        factor
-            Decimation factor to the working rate.
+        ``motion``: simulated motion of the experiment; ``factor``: decimation factor to the working rate.
         """
         simulated = replace(at_rows(motion, self.rows, dt, factor), start=self.simulated.start)
         if self.before is None:
@@ -80,16 +73,8 @@ class Stretch:
 def at_rows(signals: Derivatives, rows: NDArray[np.int64], dt: float, factor: int) -> Derivatives:
     """Signals at some of their samples.
 
-    Parameters
-    ----------
-    signals
-        Positions and derivatives.
-    rows
-        Numbers of the samples, (N,).
-    dt
-        Sampling period of the signals, s.
-    factor
-        Distance of the chosen samples.
+    ``signals``: positions and derivatives; ``rows``: numbers of the samples, (N,); ``dt``: sampling period of the
+    signals, s; ``factor``: distance of the chosen samples.
     """
     return Derivatives(
         np.ascontiguousarray(signals.q[rows]),
@@ -104,18 +89,13 @@ def at_rows(signals: Derivatives, rows: NDArray[np.int64], dt: float, factor: in
 def rows_before(kept: NDArray[np.int64], rows: NDArray[np.int64]) -> NDArray[np.int64]:
     """Samples before a stretch, as many as it has itself if there are enough.
 
-    Parameters
-    ----------
-    kept
-        Samples of the experiment at the working rate.
-    rows
-        Samples of the stretch, (N,).
+    ``kept``: samples of the experiment at the working rate; ``rows``: samples of the stretch, (N,).
     """
     first = int(np.searchsorted(kept, rows[0]))
     return kept[max(first - rows.size, 0) : first]
 
 
-def distances(stretches: Sequence[Stretch]) -> Array:
+def distances(stretches: Sequence[MotionStretch]) -> Array:
     """Squared errors of the simulated velocities of each joint over its own measured ones, (n,)."""
     apart = sum(np.sum((s.simulated.qd - s.measured.qd) ** 2, axis=0) for s in stretches)
     size = sum(np.sum(s.measured.qd**2, axis=0) for s in stretches)
@@ -128,16 +108,9 @@ def moving_rows(qd: Array, slowest: Array, width: int, instants: NDArray[np.int6
     A joint stands still where it is slower than the width of its smoothed sign throughout a window. Reversals are
     shorter and stay. Filters spread standstill by their length, so that its neighbours are left out too.
 
-    Parameters
-    ----------
-    qd
-        Velocities at the working rate, (N, n), rad/s or m/s.
-    slowest
-        Width of the smoothed sign of each joint, rad/s or m/s, (n,).
-    width
-        Half the length of the window, samples: the decimation factor of the comparison.
-    instants
-        Samples of the comparison, (M,).
+    ``qd``: velocities at the working rate, (N, n), rad/s or m/s; ``slowest``: width of the smoothed sign of each joint,
+    rad/s or m/s, (n,); ``width``: half the length of the window, samples: the decimation factor of the comparison;
+    ``instants``: samples of the comparison, (M,).
     """
     still = minimum_filter1d((np.abs(qd) < slowest).astype(np.int8), 2 * width + 1, axis=0, mode="nearest")
     spread = maximum_filter1d(still, 8 * width + 1, axis=0, mode="nearest")

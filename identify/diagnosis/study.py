@@ -9,16 +9,16 @@ from scipy import signal
 
 from armident.configs import DataError, RobotConfig
 from armident.configs.schema.robot import Effect as Entry
+from armident.identify.diagnosis.criteria import Criteria
 from armident.identify.diagnosis.regressor_cache import RegressorCache
-from armident.identify.diagnosis.stretch import KINDS, Stretch, at_rows, distances, moving_rows, rows_before
+from armident.identify.diagnosis.stretch import KINDS, MotionStretch, at_rows, distances, moving_rows, rows_before
 from armident.identify.effects.drive import Correction
-from armident.identify.effects.recorded import of_recording, put_right
+from armident.identify.effects.recording_corrections import corrected_experiments, of_recording
 from armident.identify.effects.registry import known
 from armident.identify.effects.terms import arm_model, terms_of
 from armident.identify.effects.wiring import Wiring
 from armident.identify.estimators.auxiliary_model import AuxiliaryModel
 from armident.identify.estimators.idim_ls import idim_ls
-from armident.identify.experiment import Experiment, check_one_rate
 from armident.identify.identification.auxiliary_loop import closed_loop
 from armident.identify.identification.equations import Prepared, equations, least_rows
 from armident.identify.identification.options import CONTROLLERS, Options
@@ -31,19 +31,13 @@ from armident.identify.robot.simulation import Simulation
 from armident.identify.signals.bandwidth import motion_bandwidth
 from armident.identify.signals.decimate import Decimation, design
 from armident.identify.signals.differentiate import Derivatives, differentiate
+from armident.identify.signals.experiments import Experiment, check_one_rate
 
 Array = NDArray[np.float64]
 
-HELD_OUT_SHARE = 0.35
-"""Share at the end of every experiment that is held out, where no recording for validation is given."""
-
-BAND = 5.0
-"""Frequency up to which model and data are compared, as a multiple of the closed-loop bandwidth."""
-
 WORKING_RATE = 20.0
-"""Rate at which effects are evaluated, over the frequency up to which model and data are compared."""
-
-
+"""Rate at which effects are evaluated, over the frequency up to which model and data are compared: their harmonics up
+to the tenth are below half that rate."""
 ROUNDS = 4
 """Most simulations of a loop with terms: instruments have to follow the arm, not to solve its equations."""
 TOLERATED = 0.05
@@ -57,8 +51,6 @@ REACH = 16
 """Samples to either side from which torques are interpolated between samples."""
 KAISER = 6.0
 """Shape of the window of that interpolation: errors below 0.1 % up to 0.4 times the sampling rate."""
-STIFF_LOOP = 1.5
-"""Ratio of squared velocity errors, with over without terms, allowed in the loop of a stiff nominal controller."""
 
 
 @dataclass(frozen=True)
@@ -67,18 +59,12 @@ class Study:
 
     Parameters
     ----------
-    robot
-        The robot as configured.
-    model
-        Its model.
     decimation
         Filter and decimation from the working rate to the rate of the comparison.
     dt
         Sampling period of the working rate, s.
     duration
         Duration of all recordings, s.
-    train, held
-        Training and held-out stretches.
     loop
         Kind of controller of the closed loop that gives the instruments.
     auxiliary
@@ -96,9 +82,11 @@ class Study:
     volume
         Logarithm of the volume by which the corrections of a joint's torques scale its noise, per row, (n,): see
         `log_volume`.
+    criteria
+        Thresholds of the diagnosis.
     regressors
         Cache of the regressors that all models of the study share; see
-        `armident.identify.diagnosis.equations.regressors`.
+        `armident.identify.diagnosis.model_equations.regressors`.
     references
         Rigid parameters of the model to which nothing is added yet, for each joint with much measurement noise; see
         `armident.identify.diagnosis.predictive_score.references_of`. Empty before it is fitted.
@@ -109,8 +97,8 @@ class Study:
     decimation: Decimation
     dt: float
     duration: float
-    train: tuple[Stretch, ...]
-    held: tuple[Stretch, ...]
+    train: tuple[MotionStretch, ...]
+    held: tuple[MotionStretch, ...]
     loop: str
     auxiliary: AuxiliaryModel
     thinning: Decimation
@@ -119,6 +107,7 @@ class Study:
     volume: Array
     warnings: tuple[str, ...] = ()
     sign_given: bool = True
+    criteria: Criteria = field(default_factory=Criteria)
     regressors: RegressorCache = field(default_factory=RegressorCache, repr=False, compare=False)
     references: tuple[Array | None, ...] = ()
 
@@ -131,26 +120,18 @@ class Study:
         """The same recordings for another model, corrected again where its effect entries require other corrections.
 
         Other corrections of torques leave the controller and the simulated motion as they are: instruments need not be
-        exact. Other wiring is another arm.
-
-        Raises
-        ------
-        DataError
-            If no closed loop can be simulated with other wiring.
+        exact. Other wiring is another arm. Raises DataError if no closed loop can be simulated with other wiring.
         """
         changed = replace(self, robot=robot, model=self.model.with_effects_of(robot, terms_of(robot)))
         if changed.recorded == self.recorded:
             return changed
         wiring = [[s for s in study.recorded if isinstance(known(s.effect), Wiring)] for study in (self, changed)]
-        return changed._with_torques(self.sources) if wiring[0] == wiring[1] else build_study(*self.sources, robot)
+        return changed._with_torques(self.sources) if wiring[0] == wiring[1] else self._rebuilt(robot)
 
     def with_torque_shift(self, samples: float) -> "Study":
         """The study with torques that are late by another time.
 
-        Parameters
-        ----------
-        samples
-            Shift of all torques, see `armident.identify.experiment.Experiment`.
+        ``samples``: shift of all torques, see `armident.identify.signals.experiments.Experiment`.
         """
         training, validation = ([replace(e, torque_shift=samples) for e in part] for part in self.sources)
         return self._with_torques((training, validation))
@@ -158,19 +139,19 @@ class Study:
     def with_own_controller(self) -> "Study":
         """The study with the controller that its corrected torques identify, and the loop that this makes.
 
-        Raises
-        ------
-        DataError
-            If no closed loop can be simulated with it.
+        Raises DataError if no closed loop can be simulated with it.
         """
-        return build_study(*self.sources, self.robot, self.signals)
+        return self._rebuilt(self.robot, self.signals)
+
+    def _rebuilt(self, robot: RobotConfig, signals: Sequence[Derivatives] | None = None) -> "Study":
+        return build_study(*self.sources, robot, signals, self.criteria)
 
     def _with_torques(self, sources: tuple[Sequence[Experiment], Sequence[Experiment]]) -> "Study":
         """The study with torques of the same motion that were recorded or corrected otherwise."""
         experiments = [*sources[0], *sources[1]]
-        torques = [self.thinning(_aligned(e)) for e in put_right(experiments, self.robot)]
+        torques = [self.thinning(_aligned(e)) for e in corrected_experiments(experiments, self.robot)]
 
-        def of(s: Stretch) -> Stretch:
+        def of(s: MotionStretch) -> MotionStretch:
             torque = torques[s.experiment][s.span]
             return replace(s, torque=torque, y=np.where(s.moving, self.decimation(torque), 0.0))
 
@@ -189,17 +170,11 @@ class Study:
         """Names of the joints."""
         return [joint.name for joint in self.robot.joints]
 
-    def motion(self, stretch: Stretch, kind: str, theta: Array | None) -> Motion:
+    def motion(self, stretch: MotionStretch, kind: str, theta: Array | None) -> Motion:
         """Signals of a stretch on which effects depend, with the motion before it.
 
-        Parameters
-        ----------
-        stretch
-            A stretch of the study.
-        kind
-            ``measured`` or ``simulated``.
-        theta
-            Parameters (b,) that predict the torques on which terms depend; ``None`` if no term does.
+        ``kind``: ``measured`` or ``simulated``. ``theta``: parameters (b,) that predict the torques on which terms
+        depend; ``None`` if no term does.
         """
         parts: list[Derivatives] = [getattr(stretch, kind)]
         if stretch.before is not None:
@@ -208,32 +183,19 @@ class Study:
         lead = q.shape[0] - parts[-1].q.shape[0]
         return Motion(self.model, q, qd, qdd, self.dt, parts[0].start, theta, self.duration, lead=lead)
 
-    def terms(self, stretch: Stretch, kind: str, theta: Array | None) -> Array:
+    def terms(self, stretch: MotionStretch, kind: str, theta: Array | None) -> Array:
         """Columns (N, n, e) of the model's terms along a stretch.
 
-        Parameters
-        ----------
-        stretch
-            A stretch of the study.
-        kind
-            ``measured`` or ``simulated``.
-        theta
-            Parameters (b,) that predict the torques on which terms depend; ``None`` if no term does.
+        ``kind``: ``measured`` or ``simulated``. ``theta``: parameters (b,) that predict the torques on which terms
+        depend; ``None`` if no term does.
         """
         motion = self.motion(stretch, kind, theta)
         return self.model.term_regressor(motion)[motion.lead :]
 
-    def torques(self, stretch: Stretch, kind: str, theta: Array) -> Array:
+    def torques(self, stretch: MotionStretch, kind: str, theta: Array) -> Array:
         """Torques (N, n) of the model along a stretch, terms included, N m or N.
 
-        Parameters
-        ----------
-        stretch
-            A stretch of the study.
-        kind
-            ``measured`` or ``simulated``.
-        theta
-            Parameters of the model, (b,).
+        ``kind``: ``measured`` or ``simulated``; ``theta``: parameters of the model, (b,).
         """
         signals: Derivatives = getattr(stretch, kind)
         rigid = self.model.inverse_dynamics(theta, signals.q, signals.qd, signals.qdd)
@@ -244,23 +206,15 @@ class Study:
 
         Experiments that are held out altogether keep their motion, see `with_report_part`.
 
-        Parameters
-        ----------
-        theta
-            (b,).
-
-        Returns
-        -------
-        Study
-            The same where that loop diverges, or follows the arm less closely than the one there is: large additions to
-            the compiled loop may be too stiff for it (see `armident.identify.robot.relaxation`).
+        ``theta``: (b,). Returns the same where that loop diverges, or follows the arm less closely than the one there
+        is: large additions to the compiled loop may be too stiff for it (see `armident.identify.robot.relaxation`).
         """
         motions = self._simulated(theta, sorted({s.experiment for s in self.train}))
         if motions is None:
             return self
         train = self._moved(self.train, motions)
         # A stiff nominal controller follows the motion whatever the arm: its loop must only not get much worse.
-        bound = distances(self.train).sum() * (1.0 if self.loop in CONTROLLERS else STIFF_LOOP)
+        bound = distances(self.train).sum() * (1.0 if self.loop in CONTROLLERS else self.criteria.stiff_loop)
         if not distances(train).sum() < bound:
             return self
         return replace(self, train=train, held=self._moved(self.held, motions))
@@ -270,10 +224,7 @@ class Study:
 
         Loops of models with one more or one less effect then take one simulation instead of several.
 
-        Parameters
-        ----------
-        theta
-            Parameters of the loop, (b,).
+        ``theta``: parameters of the loop, (b,).
         """
         if self.auxiliary.first_motions is None or not self.model.e:
             return self
@@ -289,10 +240,7 @@ class Study:
     def with_report_part(self, theta: Array) -> "Study":
         """The study with the motion of its loop for the experiments that are held out altogether.
 
-        Parameters
-        ----------
-        theta
-            Parameters of the loop, (b,).
+        ``theta``: parameters of the loop, (b,).
         """
         trained = {s.experiment for s in self.train}
         numbers = sorted({s.experiment for s in self.held} - trained)
@@ -300,7 +248,8 @@ class Study:
         if motions is None:
             return self
         held = self._moved(self.held, motions)
-        return replace(self, held=held) if distances(held).sum() < STIFF_LOOP * distances(self.held).sum() else self
+        bound = self.criteria.stiff_loop * distances(self.held).sum()
+        return replace(self, held=held) if distances(held).sum() < bound else self
 
     def _simulated(self, theta: Array, numbers: Sequence[int]) -> dict[int, Derivatives] | None:
         """Motion of the closed loop with the model of the study by experiment; ``None`` if it diverges."""
@@ -317,7 +266,9 @@ class Study:
         )
         return auxiliary.of_experiments(numbers).simulate(theta)
 
-    def _moved(self, stretches: Sequence[Stretch], motions: Mapping[int, Derivatives]) -> tuple[Stretch, ...]:
+    def _moved(
+        self, stretches: Sequence[MotionStretch], motions: Mapping[int, Derivatives]
+    ) -> tuple[MotionStretch, ...]:
         """Stretches with other simulated motions."""
         dt, factor = self.auxiliary.dt, self.thinning.factor
         return tuple(
@@ -330,33 +281,24 @@ def build_study(
     validation: Sequence[Experiment],
     robot: RobotConfig,
     known_signals: Sequence[Derivatives] | None = None,
+    criteria: Criteria | None = None,
 ) -> Study:
     """Differentiate, simulate, split and filter the experiments.
 
-    Parameters
-    ----------
-    training
-        Experiments to fit; without ``validation`` their last part is held out.
-    validation
-        Experiments for the tests, or none.
-    robot
-        Configuration, with effect entries that correct recordings.
-    known_signals
-        Derivatives of the positions of both, if they were computed before.
-
-    Raises
-    ------
-    DataError
-        If rates differ, or the motion is too short or does not determine the parameters of the model.
+    ``training``: experiments to fit; without ``validation`` their last part is held out. ``validation``: experiments
+    for the tests, or none. ``robot``: configuration, with effect entries that correct recordings. ``known_signals``:
+    derivatives of the positions of both, if they were computed before. Raises DataError if rates differ, or the motion
+    is too short or does not determine the parameters of the model.
     """
-    experiments = put_right([*training, *validation], robot)
+    criteria = criteria or Criteria()
+    experiments = corrected_experiments([*training, *validation], robot)
     check_one_rate(experiments)
     dt = experiments[0].dt
     experiments = _continued(experiments)
     bandwidth = robot.bandwidth_hz or motion_bandwidth([e.q for e in experiments], dt)
     given, robot = robot, with_sign_smoothing(robot, experiments, bandwidth)
     model = arm_model(robot)
-    cutoff = min(BAND * bandwidth, 0.25 / dt)
+    cutoff = min(criteria.band * bandwidth, 0.25 / dt)
     factor = max(1, int(1.0 / (dt * WORKING_RATE * cutoff)))
     first = design(dt, 0.4 / (dt * factor), factor) if factor > 1 else design(dt, 0.5 / dt, 1)
     second = design(dt * factor, cutoff)
@@ -366,14 +308,14 @@ def build_study(
     simulated, loop, auxiliary, warnings = _simulated(model, experiments, signals, bandwidth)
     warnings += unsaturated_joints(given, robot, experiments, bandwidth)
     slowest = 1.0 / np.asarray(robot.sign_smoothing)
-    train: list[Stretch] = []
-    held: list[Stretch] = []
+    train: list[MotionStretch] = []
+    held: list[MotionStretch] = []
     for k, (e, s, z) in enumerate(zip(experiments, signals, simulated, strict=True)):
         torque = first(_aligned(e))
         kept = first.instants(e.tau.shape[0])
         pieces = [(train if k < len(training) else held, slice(0, None))]
         if not validation:
-            cut = int((1 - HELD_OUT_SHARE) * torque.shape[0])
+            cut = int((1 - criteria.held_out_share) * torque.shape[0])
             pieces = [(train, slice(0, cut)), (held, slice(cut, None))]
         for into, span in pieces:
             rows = kept[span]
@@ -385,13 +327,13 @@ def build_study(
             at = second.instants(rows.size)
             moving = moving_rows(measured.qd, slowest, second.factor, at)
             y = np.where(moving, y, 0.0)
-            into.append(Stretch(measured, noiseless, y, torque[span], t, k, rows, span, moving, before))
+            into.append(MotionStretch(measured, noiseless, y, torque[span], t, k, rows, span, moving, before))
     duration = max(e.start + dt * e.q.shape[0] for e in experiments)
     return Study(
         robot, model, second, dt * factor, duration, tuple(train), tuple(held), loop, auxiliary, first,
         (training, validation), tuple(signals),
         log_volume([*training, *validation], robot, lambda tau: second(first(tau))),
-        tuple(warnings), given.friction.sign_smoothing is not None,
+        tuple(warnings), given.friction.sign_smoothing is not None, criteria,
     )  # fmt: skip
 
 
@@ -402,21 +344,15 @@ def log_volume(experiments: Sequence[Experiment], robot: RobotConfig, band: Call
     low-pass filter makes noise smaller, and no model better. By the theorem of Szegoe it is the logarithm of the ratio
     of the innovations of white noise with and without the correction.
 
-    Parameters
-    ----------
-    experiments
-        Recordings without corrections.
-    robot
-        Configuration, with effect entries that correct recordings.
-    band
-        Filter and decimation to the rows of the comparison.
+    ``experiments``: recordings without corrections; ``robot``: configuration, with effect entries that correct
+    recordings; ``band``: filter and decimation to the rows of the comparison.
     """
     if not any(of_recording(e) and isinstance(known(e.effect), Correction) for e in robot.effects):
         return np.zeros(robot.n)
     rng = np.random.default_rng(0)
     noise = [PERTURBATION * e.tau.std(axis=0) * rng.standard_normal(e.tau.shape) for e in experiments]
     disturbed = [replace(e, tau=e.tau + x) for e, x in zip(experiments, noise, strict=True)]
-    pairs = zip(put_right(disturbed, robot), put_right(experiments, robot), strict=True)
+    pairs = zip(corrected_experiments(disturbed, robot), corrected_experiments(experiments, robot), strict=True)
     after = [band(one.tau - other.tau) for one, other in pairs]
     before = [band(x) for x in noise]
     innovations = [[ar.variance for ar in ar_models(part, NOISE_ORDER)] for part in (after, before)]

@@ -14,13 +14,6 @@ STEPS = tuple(0.5**k for k in range(1, 6))
 """Steps of the pattern search: logarithm of the velocity, and lead in samples. The last one is 3 %."""
 ROUNDS = 4
 """Most rounds with one step."""
-CLEAR = 3.0
-"""Gain of log-likelihood from which a joint has a transition: odds of 20 to 1."""
-
-LARGEST = 2.0
-"""Largest transition over the dry friction of the joint. One needs no more; dry friction breaks away at up to twice the
-level of slow motion (Armstrong-Helouvry, Dupont, Canudas de Wit 1994, Automatica 30(7)), and a joint that sticks looks
-like that."""
 
 
 def with_transitions(state: ModelState, model: Fitter) -> ModelState:
@@ -32,12 +25,7 @@ def with_transitions(state: ModelState, model: Fitter) -> ModelState:
     1961, J. ACM 8(2)): the likelihood of a smooth reversal is narrow in its velocity, that of a joint that sticks in
     its lead.
 
-    Parameters
-    ----------
-    state
-        Model to start from.
-    model
-        Fits a model.
+    ``state``: model to start from; ``model``: fits a model.
     """
     search = _Search(state)
     for number in range(search.count):
@@ -57,13 +45,7 @@ def with_transitions(state: ModelState, model: Fitter) -> ModelState:
 
 
 class _Search:
-    """Best transition of each joint so far, in the loop of the model without them.
-
-    Parameters
-    ----------
-    state
-        Model without them.
-    """
+    """Best transition of each joint so far, in the loop of the model without them. ``state``: model without them."""
 
     def __init__(self, state: ModelState) -> None:
         self.state, self.effect = state, known(TRANSITION)
@@ -81,24 +63,13 @@ class _Search:
         return {place: shapes for place, (_, shapes) in self.best.items()}
 
     def entries(self, shapes: dict[Place, Shapes]) -> dict[Place, Entry]:
-        """Entries of transitions.
-
-        Parameters
-        ----------
-        shapes
-            Nonlinear parameters of the transition at each place.
-        """
+        """Entries of transitions. ``shapes``: nonlinear parameters of the transition at each place."""
         return {place: entry_of(self.effect, place, self.state.robot, dict(one)) for place, one in shapes.items()}
 
     def tried(self, shapes: dict[Place, Shapes], before: ModelState) -> ModelState | None:
         """Model with transitions; each that predicts the torque of its joint better becomes the best one.
 
-        Parameters
-        ----------
-        shapes
-            Nonlinear parameters of the transition at each place.
-        before
-            Model that gives the noise models.
+        ``shapes``: nonlinear parameters of the transition at each place; ``before``: model that gives the noise models.
         """
         entries = self.entries(shapes)
         made = fitted_in_loop_of(before, with_entries(self.state.robot, list(entries.values())))
@@ -114,10 +85,7 @@ class _Search:
     def converged(self, state: ModelState) -> ModelState | None:
         """Model with the transitions that a pattern search finds from the best ones so far.
 
-        Parameters
-        ----------
-        state
-            Model that gives the noise models.
+        ``state``: model that gives the noise models.
         """
         made = self.tried(self.chosen, state)
         for step in STEPS if made else ():
@@ -153,11 +121,11 @@ def _clear(state: ModelState, less: ModelState | None, entry: Entry, joint: int)
         return False
     own = (state.score.own_log_likelihoods - less.score.own_log_likelihoods)[joint]
     alike = [one.score.log_likelihoods_under(less.weights)[joint] for one in (state, less)]
-    return bool(max(own, alike[0] - alike[1]) > CLEAR)
+    return bool(max(own, alike[0] - alike[1]) > state.study.criteria.close)
 
 
 def _possible(state: ModelState, entry: Entry, joint: int) -> bool:
-    """True if a transition is positive, and at most `LARGEST` within two standard deviations.
+    """True if a transition is positive, and at most `Criteria.largest_transition` within two standard deviations.
 
     Together with the smoothed sign, a larger one is friction that falls with the velocity: an effect (Stribeck).
     """
@@ -166,6 +134,6 @@ def _possible(state: ModelState, entry: Entry, joint: int) -> bool:
     if state.fit.theta[own] <= 0.0 or dry not in names:
         return bool(state.fit.theta[own] > 0.0)
     direction = np.zeros(state.fit.theta.size)
-    direction[own], direction[names.index(dry)] = 1.0, -LARGEST
+    direction[own], direction[names.index(dry)] = 1.0, -state.study.criteria.largest_transition
     std = float(np.sqrt(direction @ state.fit.covariance @ direction))
     return bool(direction @ state.fit.theta <= SIGN_TOLERANCE * std)

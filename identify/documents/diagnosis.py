@@ -1,17 +1,20 @@
 """The document ``diagnosis.json``."""
 
-from collections.abc import Mapping
 from typing import Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from armident.identify.documents.base import Document, RecordingReference
-from armident.identify.documents.diagnosis_version_1 import DIAGNOSIS_1, diagnosis_from_version_1
-
-DERIVATIVE_NOISE = 0.98
-"""Ratio of the gap without derivative noise to the gap; below it both are shown."""
 
 Verdict = Literal["no_gap", "explained", "partly_explained", "unexplained"]
+
+VERDICTS: dict[Verdict, str] = {
+    "no_gap": "The model explains the data; these recordings show no missing effect.",
+    "explained": "The model lacks effects. The findings explain the gap; the residual left is compatible with noise.",
+    "partly_explained": "The model lacks effects. The findings explain a part of the gap.",
+    "unexplained": "The model lacks something that no effect of the catalogue explains.",
+}
+"""Meaning of each verdict."""
 
 
 class Alternative(Document):
@@ -24,7 +27,7 @@ class Alternative(Document):
     joint
         Name of its joint.
     score
-        Its gain in log-likelihood, training and held-out data.
+        Its log-likelihood, of a ``structure`` less that of the finding; a difference of 3 is a factor of twenty.
     """
 
     effect: str
@@ -38,7 +41,8 @@ class Finding(Document):
     Parameters
     ----------
     effect
-        Name of the effect; ``unnamed``: a regular torque without a known cause.
+        Name of the effect; ``unnamed``: a regular torque without a known cause; ``changed_parameters``: parameters
+        that differ from the baseline without a known effect.
     law
         Formula of the effect: empty for the first one of the catalogue, ``table`` for a free shape. For ``unnamed`` the
         variable that the torque depends on.
@@ -51,9 +55,10 @@ class Finding(Document):
     parameters
         Estimated parameters, SI.
     confidence
-        Probability that this effect is there, 0 to 1.
+        Posterior probability of the finding among all alternatives in its place, 0 to 1. Where a part of the joint's
+        error is unexplained, it is multiplied by the share that the finding explains of both.
     alternatives
-        Rivals of the finding, the best first.
+        Other effects in place of the finding, the best first.
     gap_before
         Torque error of the joint without the finding, percent.
     gap_after
@@ -74,19 +79,6 @@ class Finding(Document):
     gap_after: float
     evidence: dict[str, Any]
 
-    @property
-    def gap_without_derivative_noise(self) -> float | None:
-        """Gap after the finding without derivative noise, percent; ``None`` if this noise makes no difference."""
-        without = self.evidence.get("gap_without_derivative_noise")
-        return None if without is None or without >= DERIVATIVE_NOISE * self.gap_after else float(without)
-
-    @property
-    def rejection(self) -> str:
-        """Effect, joint and the reason for the rejection, for the list of rejected effects."""
-        better = self.evidence.get("better_unnamed_dependences", [])
-        reason = f" (the {' and the '.join(better)} explains more)" if better else ""
-        return f"{self.effect.replace('_', ' ')} of {self.joint}{reason}"
-
 
 class Unexplained(Document):
     """Part of a joint's residual that no effect of the catalogue explains.
@@ -96,7 +88,7 @@ class Unexplained(Document):
     joint
         Name of the joint.
     share_of_residual
-        Share of the power of the residual, 0 to 1.
+        Share of the power of the joint's residual that the dependence predicts on held-out data, 0 to 1.
     varies_with
         Variable that it depends on.
     hint
@@ -239,13 +231,13 @@ class DiagnosisDocument(Document):
     findings
         Effects that the model lacks, those with a name first.
     unexplained
-        Parts of the residual that depend on the motion and have no cause.
+        Parts of a joint's residual that depend on a variable, without a known effect.
     gap
-        Torque errors before and after the findings.
+        Relative torque errors before and after the findings, percent.
     noise_floor
-        Torque error that noise alone causes.
+        Torque error that noise alone leaves: the remaining error less its unexplained part.
     recommended_experiment
-        Motion or recording that would decide between alternatives.
+        Recording that separates a finding from its alternatives, with the command that designs its trajectory.
     model
         Robot configuration with the findings; null if there are none or it was not written.
     timing_s
@@ -255,15 +247,16 @@ class DiagnosisDocument(Document):
     warnings
         Messages of conversion and diagnosis.
     not_visible
-        Effects that these recordings cannot show.
+        Effects that these recordings cannot show at a joint, with the reason and the required motion.
     detection_limits
-        Sizes from which effects would be detected.
+        Sizes from which nine diagnoses of ten would find an effect in such recordings. A smaller effect may be present
+        without a finding.
     simulated
-        Errors of the simulated closed loop with both models, percent.
-    considered
-        Effects that documents of former versions list beside the findings.
+        Errors of the simulated closed loop, arm and controller along the reference trajectory, with both models,
+        percent of the measured motion and torques.
     negligible
-        Effects below the least change that counts (``--material``).
+        Effects that are significant and change the torque by less than ``--material``, or the error by less than 2 %.
+        They are no cause, and not in the model.
     sign_smoothing
         ``g`` of each joint's ``sign(qd) -> (2/pi) atan(g qd)``, s/rad or s/m.
     transitions
@@ -290,16 +283,8 @@ class DiagnosisDocument(Document):
     not_visible: list[NotVisible] = Field(default_factory=list)
     detection_limits: list[DetectionLimit] = Field(default_factory=list)
     simulated: dict[str, dict[str, float]] | None = None
-    considered: list[Finding] = Field(default_factory=list)
     negligible: list[Negligible] = Field(default_factory=list)
     sign_smoothing: dict[str, float] | None = None
     transitions: dict[str, float] | None = None
     criteria: dict[str, float] | None = None
     alpha: dict[str, float] | None = None
-
-    @model_validator(mode="before")
-    @classmethod
-    def _from_version_1(cls, data: Any) -> Any:
-        if isinstance(data, Mapping) and data.get("schema") == DIAGNOSIS_1:
-            return diagnosis_from_version_1(data)
-        return data

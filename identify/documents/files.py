@@ -9,12 +9,11 @@ from typing import Any, TypeVar
 from pydantic import BaseModel, ValidationError
 
 from armident.configs import ConfigError, DataError
-from armident.identify.documents.base import Document
 
 T = TypeVar("T", bound=BaseModel)
 
 
-def to_json(document: Document) -> str:
+def to_json(document: BaseModel) -> str:
     """Return the JSON text of a document, keys in the order of the schema."""
     return document.model_dump_json(by_alias=True, indent=1) + "\n"
 

@@ -10,6 +10,7 @@ from armident.identify.documents.diagnosis import DiagnosisDocument
 from armident.identify.documents.files import write_atomically
 from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.documents.prediction import PredictionDocument, PredictionsDocument
+from armident.identify.documents.setup import SetupDocument
 from armident.identify.documents.simulation import SimulationDocument
 
 SCHEMA_FILES: dict[str, type[Document]] = {
@@ -19,6 +20,7 @@ SCHEMA_FILES: dict[str, type[Document]] = {
     "predictions.schema.json": PredictionsDocument,
     "comparison.schema.json": ComparisonDocument,
     "simulation.schema.json": SimulationDocument,
+    "check.schema.json": SetupDocument,
 }
 """Documents that have a JSON Schema in ``configs/json_schemas``, by the name of its file."""
 

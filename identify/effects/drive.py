@@ -11,9 +11,9 @@ from scipy import signal
 
 from armident.configs import RobotConfig
 from armident.configs.schema.robot import Effect as Entry
-from armident.identify.effects.effect import Linear, Periodic, Place, Shape, TorqueDependent, Trials
-from armident.identify.experiment import Experiment
+from armident.identify.effects.effect import UNITLESS, Linear, Periodic, Place, Shape, TorqueDependent, Trials
 from armident.identify.robot.motion import Motion
+from armident.identify.signals.experiments import Experiment
 
 Array = NDArray[np.float64]
 
@@ -28,12 +28,7 @@ NOMINAL_TORQUE = 100.0
 def motor_limit(robot: RobotConfig, motor: int) -> float:
     """Return the largest torque of a motor at its shaft, N m or N; that of `NOMINAL_TORQUE` if no limit is known.
 
-    Parameters
-    ----------
-    robot
-        Configuration with the limits of the joints and the transmission.
-    motor
-        Index of the motor, from 0.
+    ``robot``: configuration with the limits of the joints and the transmission; ``motor``: index of the motor, from 0.
     """
     limit = robot.joints[motor].limits.torque
     torque = limit if math.isfinite(limit) else NOMINAL_TORQUE
@@ -53,55 +48,28 @@ class Correction(TorqueDependent):
     def shaft_column(self, torque: Array, motion: Motion, motor: int) -> Array:
         """Return the torque (N,) at the shaft of a motor per unit of the parameter.
 
-        Parameters
-        ----------
-        torque
-            Predicted torque at the shaft, N m or N, (N,).
-        motion
-            The motion, N samples.
-        motor
-            Index of the motor, from 0.
+        ``torque``: predicted torque at the shaft, N m or N, (N,); ``motion``: the motion, N samples; ``motor``: index
+        of the motor, from 0.
         """
 
     @abstractmethod
     def true_torque(self, recorded: Array, value: float, dt: float, limit: float) -> Array:
         """Return the true torque (N,) of a motor.
 
-        Parameters
-        ----------
-        recorded
-            Recorded torque, N m or N, (N,).
-        value
-            Value of the parameter.
-        dt
-            Sampling period, s.
-        limit
-            Largest torque of the motor, N m or N.
+        ``recorded``: recorded torque, N m or N, (N,); ``limit``: largest torque of the motor, N m or N.
         """
 
     @abstractmethod
     def values_to_test(self, recorded: Array, dt: float, limit: float) -> Array:
         """Return the values at which a diagnosis tests the correction, increasing in size for each sign.
 
-        Parameters
-        ----------
-        recorded
-            Recorded torque, N m or N, (N,).
-        dt
-            Sampling period, s.
-        limit
-            Largest torque of the motor, N m or N.
+        ``recorded``: recorded torque, N m or N, (N,); ``limit``: largest torque of the motor, N m or N.
         """
 
     def relative_slope(self, value: float) -> float:
         """Return the change of the true torque by a change of the value, over that by a further small correction.
 
         One for corrections that add up, such as delays.
-
-        Parameters
-        ----------
-        value
-            Value of the parameter.
         """
         return 1.0
 
@@ -113,18 +81,8 @@ class Correction(TorqueDependent):
         """Return True if the entry gives the value; otherwise it is estimated with the other parameters."""
         return bool(entry.parameters.get(self.linear[0].name))
 
-    def put_right(self, experiment: Experiment, robot: RobotConfig, entry: Entry) -> Experiment:
-        """Return an experiment with corrected torques.
-
-        Parameters
-        ----------
-        experiment
-            As recorded.
-        robot
-            Configuration.
-        entry
-            Entry of this effect with the value.
-        """
+    def corrected(self, experiment: Experiment, robot: RobotConfig, entry: Entry) -> Experiment:
+        """Return an experiment with corrected torques. ``entry``: entry of this effect with the value."""
         motor = [joint.name for joint in robot.joints].index(entry.joint)
         at_motors = experiment.tau @ np.linalg.inv(robot.transmission_matrix)
         value, limit = entry.parameters[self.linear[0].name], motor_limit(robot, motor)
@@ -137,11 +95,15 @@ class DriveGainError(Correction):
 
     name = "drive_gain_error"
     title = "a wrong torque constant"
-    says = "the torque per ampere of a drive differs from its configuration: wrong data, weak magnets, a new drive"
+    description = (
+        "the torque per ampere of a drive differs from its configuration: wrong data, weak magnets, a new drive"
+    )
     reference = "Gautier, Briot 2014, IEEE Trans. Automatic Control 59(10), Global identification of drive gains"
-    needs = "several joints that carry the same link; for a single axis a baseline"
+    required_motion = "several joints that carry the same link; for a single axis a baseline"
     excitation = ("load", "accelerations")
-    linear = (Linear("gain_error", ("", ""), bounds=(-0.6, 1.5)),)
+    linear = (
+        Linear("gain_error", UNITLESS, "Relative error of the reported torque: 0.1: 10 % more.", bounds=(-0.6, 1.5)),
+    )
     scales_torque = True
     change_title = "torque constant changed since the baseline"
 
@@ -175,15 +137,15 @@ class DriveGainSaturation(Correction):
 
     name = "drive_gain_saturation"
     title = "a torque that is not proportional to the current"
-    says = (
+    description = (
         "the motor gives less torque per ampere at high current because its iron saturates (gain_loss positive), or "
         "the reported current saturates (negative); gain_loss is the share at the torque limit of the joint, and grows "
         "with the square of the torque"
     )
     reference = "Leonhard 2001, Control of Electrical Drives, chapter 5"
-    needs = "small and large torques"
+    required_motion = "small and large torques"
     excitation = ("load", "accelerations")
-    linear = (Linear("gain_loss", ("", "")),)
+    linear = (Linear("gain_loss", UNITLESS, "Share of the torque lost at the torque limit of the joint."),)
 
     def shaft_column(self, torque: Array, motion: Motion, motor: int) -> Array:
         """Return the cubic term of the curve."""
@@ -210,11 +172,13 @@ class TimeDelay(Correction):
 
     name = "time_delay"
     title = "a delay of the recorded torque"
-    says = "the reported torque belongs to a position that was reported earlier: a filter or a queue in the drive"
+    description = (
+        "the reported torque belongs to a position that was reported earlier: a filter or a queue in the drive"
+    )
     reference = "Brunot 2017, section 2.3.1"
-    needs = "quick changes of the torque"
+    required_motion = "quick changes of the torque"
     excitation = ("accelerations",)
-    linear: tuple[Linear, ...] = (Linear("delay", ("s", "s"), sign=1),)
+    linear: tuple[Linear, ...] = (Linear("delay", ("s", "s"), "Time by which the reported torque is late.", sign=1),)
 
     def shaft_column(self, torque: Array, motion: Motion, motor: int) -> Array:
         """Return minus the rate of the torque."""
@@ -240,12 +204,12 @@ class ActuatorBandwidth(TimeDelay):
 
     name = "actuator_bandwidth"
     title = "a slow current loop"
-    says = (
+    description = (
         "the reported torque is a command that the motor follows with a first-order lag: a slow current loop; a "
         "delay of the reported position has the same effect"
     )
     reference = "Leonhard 2001, Control of Electrical Drives, chapter 7"
-    linear = (Linear("lag", ("s", "s"), sign=1),)
+    linear = (Linear("lag", ("s", "s"), "Time constant of the lag of the torque behind the report.", sign=1),)
 
     def shaft_column(self, torque: Array, motion: Motion, motor: int) -> Array:
         """Return the rate of the torque."""
@@ -266,12 +230,22 @@ class EncoderEccentricity(Periodic, TorqueDependent):
 
     name = "encoder_eccentricity"
     title = "an eccentric encoder"
-    says = "the measured position has an error that is periodic in the angle: an encoder disc mounted off centre"
+    description = "the measured position has an error that is periodic in the angle: an encoder disc mounted off centre"
     reference = "Armstrong 1998, Mechanism and Machine Theory; de Silva 2007, Sensors and Actuators, chapter 5"
-    needs = "fast motion over a wide range"
+    required_motion = "fast motion over a wide range"
     excitation = ("speeds", "range")
-    linear = (Linear("ecc", ("rad", "m")), Linear("ecs", ("rad", "m")))
-    shapes = (Shape("harmonic", ("per rad of the joint", "rad/m"), continuous=(False, True)),)
+    linear = (
+        Linear("ecc", ("rad", "m"), "Amplitude of the cosine component of the position error."),
+        Linear("ecs", ("rad", "m"), "Amplitude of the sine component of the position error."),
+    )
+    shapes = (
+        Shape(
+            "harmonic",
+            ("per rad of the joint", "rad/m"),
+            "Periods of the error per turn of the joint; for a prismatic axis a wave number.",
+            continuous=(False, True),
+        ),
+    )
 
     def columns(self, motion: Motion, place: Place, shapes: Mapping[str, float]) -> Array:
         """Return columns for measured positions ``q + c cos(h q) + s sin(h q)``, linearised in ``c`` and ``s``."""

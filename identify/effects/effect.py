@@ -37,6 +37,7 @@ POSITION = ("rad", "m")
 VELOCITY = ("rad/s", "m/s")
 TORQUE = ("N m", "N")
 VISCOUS = ("N m s/rad", "N s/m")
+UNITLESS = ("", "")
 
 
 @dataclass(frozen=True)
@@ -49,6 +50,8 @@ class Linear:
         Name in the robot configuration; results append the number of the joint.
     unit
         Units at a revolute and at a prismatic joint.
+    meaning
+        Meaning, a sentence; empty: the description of the effect explains it.
     sign
         +1 or -1 where physics determines the sign, 0 otherwise.
     bounds
@@ -61,6 +64,7 @@ class Linear:
 
     name: str
     unit: tuple[str, str]
+    meaning: str = ""
     sign: int = 0
     bounds: tuple[float, float] = (-math.inf, math.inf)
     requires: str | None = None
@@ -73,8 +77,8 @@ class Shape:
 
     Parameters
     ----------
-    name, unit
-        Name in the robot configuration; units at a revolute and at a prismatic joint.
+    name, unit, meaning
+        As of `Linear`.
     continuous
         For a revolute and for a prismatic joint: True if values between those of the grid are meaningful. A harmonic of
         a turn is an integer; the pitch of a prismatic axis is unknown.
@@ -86,6 +90,7 @@ class Shape:
 
     name: str
     unit: tuple[str, str]
+    meaning: str = ""
     continuous: tuple[bool, bool] = (True, True)
     default: float | None = None
     movable: bool = False
@@ -126,20 +131,22 @@ class Effect(ABC):
     law
         Formula of the same dependence that differs from the first one in the catalogue; empty for the first one.
         ``table`` is a free shape.
-    title, says
+    title, description
         Short name and description for a plant engineer.
     reference
         Source of the functional form.
-    needs
+    required_motion
         Motion or data that make the effect visible, in words.
     excitation
-        Keywords of the motion that excites the effect, see `armident.identify.diagnosis.experiment`.
+        Keywords of the motion that excites the effect, see `armident.identify.diagnosis.next_experiment`.
     scope
         See `Scope`.
     linear
         Linear parameters, one per column.
     shapes
         Nonlinear parameters.
+    settings
+        Further parameters of an entry of an effect that adds no torque.
     depends_on_torque
         True if the columns depend on the torque that the model predicts, and so on its parameters.
     scales_torque
@@ -153,13 +160,14 @@ class Effect(ABC):
     name: str
     law: str = ""
     title: str
-    says: str
+    description: str
     reference: str
-    needs: str
+    required_motion: str
     excitation: tuple[str, ...] = ("reversals", "speeds")
     scope: Scope = "joint"
     linear: tuple[Linear, ...]
     shapes: tuple[Shape, ...] = ()
+    settings: tuple[Shape, ...] = ()
     depends_on_torque: bool = False
     scales_torque: bool = False
     regressor_signals: Signals = "measured"
@@ -267,9 +275,9 @@ class Effect(ABC):
         values, std
             Estimable linear parameters by name, and their standard deviations.
         """
-        told = ", ".join(f"{name} {value:+.3g} (standard deviation {std[name]:.2g})" for name, value in values.items())
+        each = ", ".join(f"{name} {value:+.3g} (standard deviation {std[name]:.2g})" for name, value in values.items())
         words = f"{self.change_title or self.title} at {joint}"
-        return f"{words}: {told}" if told else words
+        return f"{words}: {each}" if each else words
 
     @property
     def minimal(self) -> "Effect":
@@ -292,8 +300,13 @@ class Effect(ABC):
         return self.scope in ("pair", "other")
 
     @property
+    def parameters_of_entry(self) -> "tuple[Linear | Shape, ...]":
+        """All parameters of an entry of the configuration, the linear ones first."""
+        return (*self.linear, *self.shapes, *self.settings)
+
+    @property
     def units(self) -> dict[str, tuple[str, str]]:
-        """Units at a revolute and at a prismatic joint of all parameters by name, the linear ones first."""
+        """Units at a revolute and at a prismatic joint of linear and nonlinear parameters, by name."""
         return {p.name: p.unit for p in self.linear} | {s.name: s.unit for s in self.shapes}
 
     @property

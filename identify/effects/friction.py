@@ -5,9 +5,11 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from armident.compiled import ARITHMETIC, compiled
 from armident.identify.effects.effect import (
     POSITION,
     TORQUE,
+    UNITLESS,
     VELOCITY,
     VISCOUS,
     Effect,
@@ -19,9 +21,8 @@ from armident.identify.effects.effect import (
     TorqueDependent,
     Trials,
 )
+from armident.identify.effects.free_shapes import TOP_SPEED, FreeShape, OverPosition, hats, table, values
 from armident.identify.effects.rotor import ROTOR, rotors
-from armident.identify.effects.tables import FreeShape, OverPosition, hats, table, values
-from armident.identify.robot.compiled import compiled
 from armident.identify.robot.motion import Motion
 
 Array = NDArray[np.float64]
@@ -33,12 +34,7 @@ SLOWEST = 0.03
 def speeds(motion: Motion, place: Place) -> Sequence[float]:
     """Return characteristic speeds from those of the reversal to a third of the joint's top speed, rad/s or m/s.
 
-    Parameters
-    ----------
-    motion
-        Motion of the arm.
-    place
-        Location with the joint.
+    ``motion``: motion of the arm; ``place``: location with the joint.
     """
     return [float(v) for v in float(motion.top_speed[place.joint]) * np.geomspace(SLOWEST, 0.35, 7)]
 
@@ -52,12 +48,19 @@ class CoulombTransition(Effect):
 
     name = TRANSITION
     title = "gradual reversal of dry friction"
-    says = "dry friction changes its sign over a range of velocities about standstill; a part of the friction model"
+    description = (
+        "dry friction changes its sign over a range of velocities about standstill; a part of the friction model"
+    )
     reference = "Armstrong-Helouvry, Dupont, Canudas de Wit 1994, Automatica 30(7)"
-    needs = "reversals"
+    required_motion = "reversals"
     excitation = ("reversals",)
-    linear = (Linear("fct", TORQUE, sign=1),)
-    shapes = (Shape("velocity", VELOCITY), Shape("lead", ("s", "s"), default=0.0))
+    linear = (
+        Linear("fct", TORQUE, "Coulomb friction that reverses as `fct tanh((qd + lead qdd) / velocity)`.", sign=1),
+    )
+    shapes = (
+        Shape("velocity", VELOCITY, "Velocity over which the dry friction reverses."),
+        Shape("lead", ("s", "s"), "Time by which it reverses before the differentiated velocity.", default=0.0),
+    )
 
     def columns(self, motion: Motion, place: Place, shapes: Mapping[str, float]) -> Array:
         """Return ``tanh((qd + lead qdd) / velocity) - sign(qd)``.
@@ -84,10 +87,10 @@ class AsymmetricViscousFriction(Effect):
 
     name = "asymmetric_viscous_friction"
     title = "direction-dependent viscous friction"
-    says = "viscous friction is higher in one direction than in the other: a worn or one-sidedly loaded gear"
+    description = "viscous friction is higher in one direction than in the other: a worn or one-sidedly loaded gear"
     reference = "Janot, Gautier, Brunot 2019, Data set and reference models of EMPS"
-    needs = "both directions of motion at several speeds"
-    linear = (Linear("fva", VISCOUS),)
+    required_motion = "both directions of motion at several speeds"
+    linear = (Linear("fva", VISCOUS, "Half the difference of the viscous friction between both directions."),)
 
     def columns(self, motion: Motion, place: Place, shapes: Mapping[str, float]) -> Array:
         """Return ``qd sign(qd)``."""
@@ -99,15 +102,15 @@ class AsymmetricCoulombFriction(Effect):
 
     name = "asymmetric_coulomb_friction"
     title = "direction-dependent Coulomb friction"
-    says = (
+    description = (
         "Coulomb friction differs between the two directions of motion; the difference vanishes at standstill, "
         "unlike a constant offset"
     )
     reference = "Armstrong-Helouvry, Dupont, Canudas de Wit 1994, Automatica 30(7)"
-    needs = "both directions of motion, and standstill: while moving it looks like a constant offset"
+    required_motion = "both directions of motion, and standstill: while moving it looks like a constant offset"
     excitation = ("reversals", "standstill")
-    linear = (Linear("fca", TORQUE),)
-    shapes = (Shape("velocity", VELOCITY, default=0.0),)
+    linear = (Linear("fca", TORQUE, "Half the difference of the Coulomb friction between both directions."),)
+    shapes = (Shape("velocity", VELOCITY, "Velocity over which the difference builds up; 0: at once.", default=0.0),)
 
     def columns(self, motion: Motion, place: Place, shapes: Mapping[str, float]) -> Array:
         """Return ``sign(qd)^2``, with the smoothing of the model if the velocity is zero."""
@@ -129,12 +132,17 @@ class StribeckBell(Effect):
 
     name = "stribeck_friction"
     title = "Stribeck friction"
-    says = "additional friction at low speed that decreases with the speed: poor or squeezed-out lubricant"
+    description = "additional friction at low speed that decreases with the speed: poor or squeezed-out lubricant"
     reference = "Bittencourt, Gunnarsson 2012, J. Dyn. Sys. Meas. Control 134(5)"
-    needs = "slow motion in both directions"
+    required_motion = "slow motion in both directions"
     excitation = ("slow", "reversals")
-    linear: tuple[Linear, ...] = (Linear("fst", TORQUE, sign=1),)
-    shapes: tuple[Shape, ...] = (Shape("velocity", VELOCITY), Shape("displacement", POSITION, default=0.0))
+    linear: tuple[Linear, ...] = (
+        Linear("fst", TORQUE, "Additional friction at low speed: `fst exp(-(qd / velocity)^2) sign(qd)`.", sign=1),
+    )
+    shapes: tuple[Shape, ...] = (
+        Shape("velocity", VELOCITY, "Stribeck velocity, at which the additional friction has decreased to 37 %."),
+        Shape("displacement", POSITION, "Displacement of the bristle (Dahl); 0: no bristle.", default=0.0),
+    )
 
     def columns(self, motion: Motion, place: Place, shapes: Mapping[str, float]) -> Array:
         """Return ``exp(-(qd / velocity)^2)`` in the direction of the bristle."""
@@ -155,7 +163,10 @@ class StribeckBell(Effect):
 class StribeckFriction(StribeckBell):
     """Stribeck friction with the model's Coulomb friction on the same bristle."""
 
-    linear = (*StribeckBell.linear, Linear("fsb", TORQUE, requires="displacement", absorbs="fc"))
+    linear = (
+        *StribeckBell.linear,
+        Linear("fsb", TORQUE, "Coulomb friction on the bristle.", requires="displacement", absorbs="fc"),
+    )
 
     def columns(self, motion: Motion, place: Place, shapes: Mapping[str, float]) -> Array:
         """Return the bell, and the way of the model's Coulomb friction from the smoothed sign to the bristle."""
@@ -173,7 +184,8 @@ class StribeckFrictionExponential(StribeckBell):
 
     law = "exponential"
     reference = "Bo, Pavelescu 1982, Wear 82(3), with exponent 1"
-    shapes = StribeckBell.shapes[:1]
+    linear = (Linear("fst", TORQUE, "Additional friction: `fst exp(-|qd| / velocity) sign(qd)`.", sign=1),)
+    shapes = (Shape("velocity", VELOCITY, "Velocity at which the additional friction has decreased to 37 %."),)
 
     def columns(self, motion: Motion, place: Place, shapes: Mapping[str, float]) -> Array:
         """Return ``exp(-|qd| / velocity) sign(qd)``."""
@@ -192,8 +204,11 @@ class StribeckFrictionTable(FreeShape, StribeckBell):
     """Knots over the highest speed: close to standstill, where friction is curved."""
 
     reference = "Bittencourt, Gunnarsson 2012, J. Dyn. Sys. Meas. Control 134(5), measured curves"
-    linear = tuple(Linear(f"fst{k}", TORQUE) for k in range(len(KNOTS) - 2))
-    shapes = (Shape("top", VELOCITY, continuous=(False, False)),)
+    linear = tuple(
+        Linear(f"fst{k}", TORQUE, f"Additional friction at {share:.0%} of the speed `top`; linear in between.")
+        for k, share in enumerate(KNOTS[:-2])
+    )
+    shapes = TOP_SPEED
 
     def columns(self, motion: Motion, place: Place, shapes: Mapping[str, float]) -> Array:
         """Return functions of the speed; those at the last two knots are Coulomb and viscous friction."""
@@ -219,12 +234,12 @@ class NonlinearViscousFriction(Effect):
 
     name = "nonlinear_viscous_friction"
     title = "nonlinear viscous friction"
-    says = "friction is not proportional to speed: shear thinning or churning of the lubricant"
+    description = "friction is not proportional to speed: shear thinning or churning of the lubricant"
     reference = "Ree, Ree, Eyring 1958, Ind. Eng. Chem. 50(7)"
-    needs = "slow and fast motion"
+    required_motion = "slow and fast motion"
     excitation = ("speeds",)
-    linear = (Linear("fvn", TORQUE),)
-    shapes = (Shape("velocity", VELOCITY),)
+    linear = (Linear("fvn", TORQUE, "Nonlinear part of the viscous friction: `fvn asinh(qd / velocity)` (Eyring)."),)
+    shapes = (Shape("velocity", VELOCITY, "Velocity at which the curve bends: linear below, logarithmic above."),)
 
     def columns(self, motion: Motion, place: Place, shapes: Mapping[str, float]) -> Array:
         """Return ``asinh(qd / velocity)``."""
@@ -245,11 +260,11 @@ class LoadDependentFriction(TorqueDependent):
 
     name = "load_dependent_friction"
     title = "load-dependent friction"
-    says = "Coulomb friction grows with the torque that the gear transmits"
+    description = "Coulomb friction grows with the torque that the gear transmits"
     reference = "Hamon, Gautier, Garrec 2010, IROS, Dynamic identification with load-dependent dry friction"
-    needs = "motion in both directions under small and under large load"
+    required_motion = "motion in both directions under small and under large load"
     excitation = ("reversals", "load")
-    linear = (Linear("fcl", ("", ""), sign=1),)
+    linear = (Linear("fcl", UNITLESS, "Coulomb friction per transmitted torque.", sign=1),)
     shapes = (ROTOR,)
 
     def columns(self, motion: Motion, place: Place, shapes: Mapping[str, float]) -> Array:
@@ -267,12 +282,12 @@ class PreslidingFriction(Effect):
 
     name = "presliding_friction"
     title = "presliding friction"
-    says = "after a reversal Coulomb friction builds up over a small displacement: elastic contacts or seals"
+    description = "after a reversal Coulomb friction builds up over a small displacement: elastic contacts or seals"
     reference = "Dahl 1968, A solid friction model; Canudas de Wit et al. 1995, IEEE TAC 40(3)"
-    needs = "many reversals"
+    required_motion = "many reversals"
     excitation = ("reversals", "slow")
-    linear = (Linear("fcd", TORQUE, sign=-1),)
-    shapes = (Shape("displacement", POSITION),)
+    linear = (Linear("fcd", TORQUE, "Coulomb friction that builds up after a reversal, times -1.", sign=-1),)
+    shapes = (Shape("displacement", POSITION, "Characteristic displacement of Dahl's model."),)
 
     def columns(self, motion: Motion, place: Place, shapes: Mapping[str, float]) -> Array:
         """Return what `dahl` lacks of ``sign(qd)``."""
@@ -284,18 +299,13 @@ class PreslidingFriction(Effect):
         return (float(motion.span[place.joint]) * np.geomspace(0.0002, 0.1, 12),)
 
 
-@compiled
+@compiled("f8[:], f8", "f8[::1], f8", **ARITHMETIC)
 def dahl(q: Array, displacement: float) -> Array:
     """Return Dahl's friction over its level, shape (N,), integrated exactly between samples.
 
     ``dz/dq = (1 - z sign(qd)) / displacement``: after a reversal it approaches its level exponentially in the distance.
 
-    Parameters
-    ----------
-    q
-        Positions, rad or m, shape (N,).
-    displacement
-        Constant of the exponential, in the unit of ``q``.
+    ``q``: positions, rad or m, shape (N,); ``displacement``: constant of the exponential, in the unit of ``q``.
     """
     z = np.empty(q.size)
     state = 0.0
@@ -313,17 +323,20 @@ class PositionDependent(Effect):
 
     name = "position_dependent_friction"
     title = "position-dependent friction"
-    says = "Coulomb friction varies with the position of the joint: a bent shaft, a tight spot, uneven wear"
+    description = "Coulomb friction varies with the position of the joint: a bent shaft, a tight spot, uneven wear"
     reference = "Simoni et al. 2015, IROS, Modelling the temperature in joint friction of industrial manipulators"
-    needs = "a wide range of joint positions, passed in both directions"
+    required_motion = "a wide range of joint positions, passed in both directions"
     excitation = ("range", "reversals")
 
 
 class PositionDependentFriction(Periodic, PositionDependent):
     """Coulomb friction that is periodic in the position."""
 
-    linear = (Linear("fpc", TORQUE), Linear("fps", TORQUE))
-    shapes = (Shape("period", POSITION, continuous=(False, True)),)
+    linear = (
+        Linear("fpc", TORQUE, "Amplitude of the cosine component of the Coulomb friction over the position."),
+        Linear("fps", TORQUE, "Amplitude of the sine component of the Coulomb friction over the position."),
+    )
+    shapes = (Shape("period", POSITION, "Period of the friction in the joint position.", continuous=(False, True)),)
 
     def columns(self, motion: Motion, place: Place, shapes: Mapping[str, float]) -> Array:
         """Return cosine and sine of ``2 pi q / period`` times ``sign(qd)``."""
@@ -341,7 +354,7 @@ class PositionDependentFriction(Periodic, PositionDependent):
 class PositionDependentFrictionTable(OverPosition, PositionDependent):
     """Coulomb friction of any dependence on the position."""
 
-    linear = values("fpt", TORQUE)
+    linear = values("fpt", TORQUE, "Coulomb friction over the position")
 
     def columns(self, motion: Motion, place: Place, shapes: Mapping[str, float]) -> Array:
         """Return the functions of the table times ``sign(qd)``."""
@@ -354,12 +367,15 @@ class FrictionDrift(Effect):
 
     name = "friction_drift"
     title = "friction drift"
-    says = "friction changes between the beginning and the end of the recording: the gear warms up"
+    description = "friction changes between the beginning and the end of the recording: the gear warms up"
     reference = "Simoni et al. 2015, IROS, Modelling the temperature in joint friction of industrial manipulators"
-    needs = "the same motion early and late in the recordings"
+    required_motion = "the same motion early and late in the recordings"
     excitation = ("repeats",)
-    linear = (Linear("fcdr", TORQUE), Linear("fvdr", VISCOUS))
-    shapes = (Shape("time_constant", ("s", "s")),)
+    linear: tuple[Linear, ...] = (
+        Linear("fcdr", TORQUE, "Change of the Coulomb friction from the beginning to the end of the recordings."),
+        Linear("fvdr", VISCOUS, "Change of the viscous friction from the beginning to the end of the recordings."),
+    )
+    shapes: tuple[Shape, ...] = (Shape("time_constant", ("s", "s"), "Time constant of the change."),)
 
     def columns(self, motion: Motion, place: Place, shapes: Mapping[str, float]) -> Array:
         """Return Coulomb and viscous friction times the progress of the change."""
@@ -381,8 +397,12 @@ class FrictionDriftWithWork(FrictionDrift):
     """Change of friction with the work that viscous friction has dissipated."""
 
     law = "work"
-    says = "friction changes with the work that it has dissipated: the gear warms up"
-    shapes = (Shape("decay", ("s/rad^2", "s/m^2")),)
+    description = "friction changes with the work that it has dissipated: the gear warms up"
+    linear = (
+        Linear("fcdr", TORQUE, "Change of the Coulomb friction after much work."),
+        Linear("fvdr", VISCOUS, "Change of the viscous friction after much work."),
+    )
+    shapes = (Shape("decay", ("s/rad^2", "s/m^2"), "Rate of the change per integral of the squared velocity (work)."),)
 
     def _progress(self, motion: Motion, place: Place, shapes: Mapping[str, float]) -> Array:
         """Return the progress (N,): ``1 - exp(-decay work)``, the work that of a unit of viscous friction."""
@@ -400,12 +420,16 @@ class CouplingFriction(Effect):
 
     name = "coupling_friction"
     title = "coupling of two joints"
-    says = "two joints share a shaft or gear, whose friction and inertia act on both"
+    description = "two joints share a shaft or gear, whose friction and inertia act on both"
     reference = "Brunot 2017, equation B.1"
-    needs = "motion of both joints, together and against each other"
+    required_motion = "motion of both joints, together and against each other"
     excitation = ("independent",)
     scope = "pair"
-    linear = (Linear("iac", ("kg m^2", "kg"), sign=1), Linear("fvc", VISCOUS, sign=1), Linear("fcc", TORQUE, sign=1))
+    linear = (
+        Linear("iac", ("kg m^2", "kg"), "Inertia shared by the two joints.", sign=1),
+        Linear("fvc", VISCOUS, "Viscous friction shared by the two joints.", sign=1),
+        Linear("fcc", TORQUE, "Coulomb friction of the sum of the two velocities.", sign=1),
+    )
 
     def columns(self, motion: Motion, place: Place, shapes: Mapping[str, float]) -> Array:
         """Return acceleration and velocity of the other joint, and the sign of the common velocity."""

@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armident.identify.effects.effect import TORQUE, Effect, Linear, Place, TorqueDependent
-from armident.identify.effects.numbers import ParameterChange
-from armident.identify.effects.tables import OverPosition, table, values
+from armident.identify.effects.free_shapes import OverPosition, table, values
+from armident.identify.effects.parameter_change import ParameterChange
 from armident.identify.robot.chain import INERTIAL
 from armident.identify.robot.motion import Motion
 
@@ -19,11 +19,13 @@ class JointSpring(Effect):
 
     name = "joint_spring"
     title = "a spring at the joint"
-    says = "a torque proportional to the joint's position: a spring, a gravity compensator, a stiff cable harness"
+    description = (
+        "a torque proportional to the joint's position: a spring, a gravity compensator, a stiff cable harness"
+    )
     reference = "Khalil, Dombre 2002, Modeling, Identification and Control of Robots, chapter 9"
-    needs = "a wide range of joint positions"
+    required_motion = "a wide range of joint positions"
     excitation = ("range",)
-    linear: tuple[Linear, ...] = (Linear("ks", ("N m/rad", "N/m")),)
+    linear: tuple[Linear, ...] = (Linear("ks", ("N m/rad", "N/m"), "Stiffness: torque per joint position."),)
 
     def columns(self, motion: Motion, place: Place, shapes: Mapping[str, float]) -> Array:
         """Return the position."""
@@ -34,11 +36,11 @@ class JointSpringCubic(JointSpring):
     """Spring that stiffens with its deflection."""
 
     law = "cubic"
-    says = "a torque that grows faster than the joint's position: a stiffening spring, a bumper, a cable harness"
+    description = "a torque that grows faster than the joint's position: a stiffening spring, a bumper, a cable harness"
     linear = (
         *JointSpring.linear,
-        Linear("ks2", ("N m/rad^2", "N/m^2")),
-        Linear("ks3", ("N m/rad^3", "N/m^3")),
+        Linear("ks2", ("N m/rad^2", "N/m^2"), "Change of the stiffness: torque per square of the position."),
+        Linear("ks3", ("N m/rad^3", "N/m^3"), "Stiffening: torque per cube of the position."),
     )
 
     def columns(self, motion: Motion, place: Place, shapes: Mapping[str, float]) -> Array:
@@ -50,8 +52,10 @@ class JointSpringCubic(JointSpring):
 class JointSpringTable(OverPosition, JointSpring):
     """Spring of any shape."""
 
-    says = "a torque that depends on the joint's position: a spring, a gravity compensator, a stiff cable harness"
-    linear = values("kst", TORQUE)
+    description = (
+        "a torque that depends on the joint's position: a spring, a gravity compensator, a stiff cable harness"
+    )
+    linear = values("kst", TORQUE, "torque of the spring over the position")
 
     def columns(self, motion: Motion, place: Place, shapes: Mapping[str, float]) -> Array:
         """Return the functions of the table."""
@@ -63,13 +67,17 @@ class Payload(ParameterChange):
 
     name = "payload"
     title = "a payload on the flange"
-    says = "the last link is heavier than in the baseline: a gripper or a workpiece is mounted"
+    description = "the last link is heavier than in the baseline: a gripper or a workpiece is mounted"
     reference = "Gaz, De Luca 2017, IROS, Payload estimation based on identified coefficients of robot dynamics"
-    needs = "a baseline identified without it"
+    required_motion = "a baseline identified without it"
     excitation = ("load", "range")
     scope = "arm"
     linear = tuple(
-        Linear(f"{kind}p", ("kg" if kind == "m" else "kg m" if len(kind) == 2 and kind[0] == "m" else "kg m^2",) * 2)
+        Linear(
+            f"{kind}p",
+            ("kg" if kind == "m" else "kg m" if len(kind) == 2 and kind[0] == "m" else "kg m^2",) * 2,
+            f"Additional `{kind}` of the last link, in its frame, compared with the baseline.",
+        )
         for kind in INERTIAL
     )
 
@@ -96,12 +104,14 @@ class RotorInertia(Effect):
 
     name = "rotor_inertia"
     title = "an unmodelled rotor inertia"
-    says = "a motor has more inertia than the links explain: a rotor, a brake or a coupling is missing in the model"
+    description = (
+        "a motor has more inertia than the links explain: a rotor, a brake or a coupling is missing in the model"
+    )
     reference = "Brunot 2017, equation 2.13"
-    needs = "strong accelerations"
+    required_motion = "strong accelerations"
     excitation = ("accelerations",)
     scope = "motor"
-    linear = (Linear("iax", ("kg m^2", "kg"), sign=1),)
+    linear = (Linear("iax", ("kg m^2", "kg"), "Motor inertia on the joint side beyond that of the model.", sign=1),)
     change_title = "motor inertia changed since the baseline"
 
     def columns(self, motion: Motion, place: Place, shapes: Mapping[str, float]) -> Array:
@@ -117,12 +127,19 @@ class GravityDirection(TorqueDependent):
 
     name = "gravity_direction"
     title = "a tilted base"
-    says = "the direction of gravity differs from the configuration: the base is tilted or hangs"
+    description = "the direction of gravity differs from the configuration: the base is tilted or hangs"
     reference = "Khalil, Dombre 2002, Modeling, Identification and Control of Robots, chapter 12"
-    needs = "postures all over the workspace"
+    required_motion = "postures all over the workspace"
     excitation = ("range", "load")
     scope = "arm"
-    linear = (Linear("tilt_x", ("rad", "rad")), Linear("tilt_y", ("rad", "rad")))
+    linear = (
+        Linear(
+            "tilt_x",
+            ("rad", "rad"),
+            "Tilt of gravity along the first axis across it, a small angle (x axis of an upright arm).",
+        ),
+        Linear("tilt_y", ("rad", "rad"), "Tilt of gravity along the second axis across it (y axis of an upright arm)."),
+    )
     change_title = "gravity direction changed since the baseline"
 
     def columns(self, motion: Motion, place: Place, shapes: Mapping[str, float]) -> Array:
@@ -158,10 +175,10 @@ class TorqueOffset(ParameterChange):
 
     name = "torque_offset"
     title = "a torque offset"
-    says = "a constant torque that the baseline does not have: a drifting current sensor, a dragging brake"
+    description = "a constant torque that the baseline does not have: a drifting current sensor, a dragging brake"
     reference = "Brunot 2017, equation 2.12"
-    needs = "a baseline identified without it"
-    linear = (Linear("offx", TORQUE),)
+    required_motion = "a baseline identified without it"
+    linear = (Linear("offx", TORQUE, "Constant torque compared with the baseline."),)
 
     def parameters(self, place: Place, n: int) -> list[str]:
         """Return that of the joint."""

@@ -4,7 +4,7 @@ import json
 import sys
 from typing import Any
 
-from armident.identify.effects.effect import Effect
+from armident.identify.effects.effect import Effect, Linear, Shape
 from armident.identify.effects.registry import catalogue, known
 
 ALWAYS: tuple[tuple[str, str, str], ...] = (
@@ -16,71 +16,57 @@ ALWAYS: tuple[tuple[str, str, str], ...] = (
 )
 """Terms with a key of their own in the robot configuration: name, parameters, condition."""
 
-FORMER_KEYS = {"says": "description", "shapes": "nonlinear_parameters", "needs": "required_motion"}
-"""Keys of ``armident effects --json`` up to version 0.1 and their new names; both are printed for one release."""
 
-
-def described(effect: Effect) -> dict[str, Any]:
+def effect_json(effect: Effect) -> dict[str, Any]:
     """Return the entry of ``armident effects --json`` of an effect."""
-    entry = {
+    return {
         "name": effect.name,
         "law": effect.law,
         "title": effect.title,
-        "description": effect.says,
+        "description": effect.description,
         "scope": effect.scope,
         "parameters": [
             {
                 "name": p.name,
                 "unit": list(p.unit),
+                "meaning": p.meaning,
                 "sign": p.sign,
                 "requires": p.requires,
                 "absorbs": p.absorbs or None,
-                # Former names, printed for one release.
-                "through": p.requires,
-                "replaces": p.absorbs or None,
             }
             for p in effect.linear
         ],
         "nonlinear_parameters": [
-            {"name": s.name, "unit": list(s.unit), "continuous": list(s.continuous)} for s in effect.shapes
+            {"name": s.name, "unit": list(s.unit), "meaning": s.meaning, "continuous": list(s.continuous)}
+            for s in effect.shapes
         ],
-        "required_motion": effect.needs,
+        "required_motion": effect.required_motion,
         "reference": effect.reference,
     }
-    return entry | {old: entry[new] for old, new in FORMER_KEYS.items()}
 
 
 def effects_command(name: str | None, *, as_json: bool) -> None:
     """Print the effects of the catalogue.
 
-    Parameters
-    ----------
-    name
-        Name of one effect; ``None``: all.
-    as_json
-        Print JSON instead of a table.
-
-    Raises
-    ------
-    ConfigError
-        If there is no such effect.
+    ``name``: name of one effect; ``None``: all. ``as_json``: print JSON instead of a table. Raises ConfigError if there
+    is no such effect.
     """
     chosen = list(catalogue().values()) if name is None else [known(name)]
     if as_json:
-        sys.stdout.write(json.dumps([described(effect) for effect in chosen], indent=1) + "\n")
+        sys.stdout.write(json.dumps([effect_json(effect) for effect in chosen], indent=1) + "\n")
         return
     if name is not None:
         _one(chosen[0])
         return
     from rich.table import Table
 
-    from armident.identify.print_table import print_table
+    from armident.identify.cli.print_table import print_table
 
     table = Table(title="effects", title_justify="left")
     for heading in ("effect", "title", "parameters", "scope"):
         table.add_column(heading)
     for effect in chosen:
-        table.add_row(effect.key, effect.title, ", ".join(_parameters(effect)), effect.scope)
+        table.add_row(effect.key, effect.title, ", ".join(map(_with_unit, effect.parameters_of_entry)), effect.scope)
     print_table(table)
     print("terms with a key of their own in the robot configuration:")
     for title, parameters, when in ALWAYS:
@@ -88,24 +74,21 @@ def effects_command(name: str | None, *, as_json: bool) -> None:
 
 
 def _one(effect: Effect) -> None:
-    print(f"{effect.key}: {effect.title}\n{effect.says}")
-    for parameter in _parameters(effect):
-        print(f"  {parameter}")
+    print(f"{effect.key}: {effect.title}\n{effect.description}")
+    for parameter in effect.parameters_of_entry:
+        print(f"  {_with_unit(parameter)}: {parameter.meaning}" if parameter.meaning else f"  {_with_unit(parameter)}")
     for linear in effect.linear:
         if linear.requires is not None:
             print(f"{linear.name} requires {linear.requires} and absorbs {linear.absorbs} of the joint;")
             print(f"  `without: [{linear.name}]` in the configuration keeps {linear.absorbs}")
-    print(f"required motion: {effect.needs}\nsource: {effect.reference}")
-    names = [shape.name for shape in effect.shapes] + [parameter.name for parameter in effect.linear]
-    values = [f"{parameter}: ..." for parameter in names]
+    print(f"required motion: {effect.required_motion}\nsource: {effect.reference}")
+    values = [f"{p.name}: ..." for p in effect.parameters_of_entry]
     law = f", law: {effect.law}" if effect.law else ""
     other = ", other: joint_2" if effect.two_joints else ""
     place = f"effect: {effect.name}{law}, joint: joint_1{other}"
     print(f"configuration: {{{place}, parameters: {{{', '.join(values)}}}}}")
 
 
-def _parameters(effect: Effect) -> list[str]:
-    return [
-        f"{name} ({' | '.join(dict.fromkeys(u for u in unit if u))})" if any(unit) else name
-        for name, unit in effect.units.items()
-    ]
+def _with_unit(parameter: Linear | Shape) -> str:
+    unit = " | ".join(dict.fromkeys(u for u in parameter.unit if u))
+    return f"{parameter.name} ({unit})" if unit else parameter.name

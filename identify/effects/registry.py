@@ -5,27 +5,29 @@ from importlib.metadata import entry_points
 
 from armident.configs import ConfigError
 from armident.configs.schema.robot import Effect as Entry
-from armident.identify.effects import drive, friction, link, numbers, transmission, unnamed, wiring
+from armident.identify.effects import drive, friction, link, parameter_change, transmission, unnamed, wiring
 from armident.identify.effects.effect import Effect
 
 ENTRY_POINTS = "armident.effects"
 """Entry-point group of plug-ins: each entry names a subclass of `Effect`, an instance, or a sequence of them."""
 
-REQUIRED = ("name", "title", "says", "reference", "needs", "linear")
+REQUIRED = ("name", "title", "description", "reference", "required_motion", "linear")
 """Attributes without a usual value."""
+
+
+def own_effects() -> list[Effect]:
+    """Return the effects of this package."""
+    modules = (friction, link, transmission, drive, parameter_change, wiring, unnamed)
+    return [effect() for module in modules for effect in module.EFFECTS]
 
 
 @cache
 def catalogue() -> dict[str, Effect]:
     """Return all effects by name, those of this package first.
 
-    Raises
-    ------
-    ConfigError
-        If an entry point cannot be loaded, is not an effect, or repeats a name.
+    Raises ConfigError if an entry point cannot be loaded, is not an effect, or repeats a name.
     """
-    modules = (friction, link, transmission, drive, numbers, wiring, unnamed)
-    found = {e.key: e for e in (effect() for module in modules for effect in module.EFFECTS)}
+    found = {effect.key: effect for effect in own_effects()}
     for point in sorted(entry_points(group=ENTRY_POINTS), key=lambda p: p.name):
         where = f"effect {point.name} ({point.value})"
         try:
@@ -57,15 +59,7 @@ def _instance(one: object, where: str) -> Effect:
 def known(name: str) -> Effect:
     """Return the effect of a name.
 
-    Parameters
-    ----------
-    name
-        Name in the catalogue.
-
-    Raises
-    ------
-    ConfigError
-        If there is no such effect; the message lists all.
+    ``name``: name in the catalogue. Raises ConfigError if there is no such effect; the message lists all.
     """
     effects = catalogue()
     if name not in effects:
@@ -76,14 +70,7 @@ def known(name: str) -> Effect:
 def of_entry(entry: Entry) -> Effect:
     """Return the effect of an entry of a robot configuration, with the law that the entry names.
 
-    Parameters
-    ----------
-    entry
-        Entry of the ``effects`` of the configuration.
-
-    Raises
-    ------
-    ConfigError
-        If there is no such effect, or no such law of it; the message lists all.
+    ``entry``: entry of the ``effects`` of the configuration. Raises ConfigError if there is no such effect, or no such
+    law of it; the message lists all.
     """
     return known(f"{entry.effect}/{entry.law}" if entry.law else entry.effect)

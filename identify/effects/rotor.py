@@ -7,7 +7,14 @@ import numpy as np
 from armident.identify.effects.effect import Shape
 from armident.identify.robot.motion import Motion
 
-ROTOR = Shape("rotor", ("kg m^2", "kg"), continuous=(False, False), default=0.0, movable=True)
+ROTOR = Shape(
+    "rotor",
+    ("kg m^2", "kg"),
+    "Rotor inertia that the gear does not transmit, on the joint side; 0 where the model has it as `ia`.",
+    continuous=(False, False),
+    default=0.0,
+    movable=True,
+)
 """Nonlinear parameter of effects that depend on the torque that the gear transmits."""
 
 SHARES = (0.0, 0.25, 0.5, 0.75)
@@ -23,12 +30,7 @@ def rotors(motion: Motion, joint: int) -> Sequence[float]:
     The base parameters of joints with a constant axis, and of models without rotors, contain the rotor in the link. It
     matters for load-dependent friction, elasticity and backlash, unless all load is proportional to the acceleration.
 
-    Parameters
-    ----------
-    motion
-        Motion of the arm.
-    joint
-        Index of the joint, from 0.
+    ``motion``: motion of the arm; ``joint``: index of the joint, from 0.
     """
     if f"ia{joint + 1}" in motion.model.base.names:
         return (0.0,)

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from armident.configs import ConfigError, RobotConfig
 from armident.configs.schema.robot import Effect as Entry
 from armident.identify.effects.effect import Effect, Linear, Place
-from armident.identify.effects.recorded import of_recording
+from armident.identify.effects.recording_corrections import of_recording
 from armident.identify.effects.registry import of_entry
 from armident.identify.robot.arm import ArmModel
 from armident.identify.robot.motion import Motion
@@ -20,16 +20,9 @@ Array = NDArray[np.float64]
 class Term:
     """One entry of a robot's ``effects`` as a model term.
 
-    Parameters
-    ----------
-    effect, place, shapes
-        Effect of the catalogue, its location, and its nonlinear parameters.
-    kept
-        Indices of the effect's linear parameters that the term has, (k,).
-    names, units
-        Names and units of these in results.
-    values
-        Their values in the configuration, zero where it gives none, (k,).
+    ``effect``, ``place``, ``shapes``: effect of the catalogue, its location, and its nonlinear parameters; ``kept``:
+    indices of the effect's linear parameters that the term has, (k,); ``names``, ``units``: names and units of these in
+    results; ``values``: their values in the configuration, zero where it gives none, (k,).
     """
 
     effect: Effect
@@ -48,14 +41,8 @@ class Term:
     def add_torque(self, motion: Motion, values: Array, torque: Array) -> None:
         """Add the torque of the term.
 
-        Parameters
-        ----------
-        motion
-            The motion, N samples.
-        values
-            Values of the linear parameters, (k,).
-        torque
-            Torques of all joints, (N, n), N m or N; changed in place.
+        ``motion``: the motion, N samples. ``values``: values of the linear parameters, (k,). ``torque``: torques of all
+        joints, (N, n), N m or N; changed in place.
         """
         columns = self.effect.columns(motion, self.place, {**self.effect.defaults, **self.shapes})
         if columns.ndim == 3:
@@ -86,18 +73,7 @@ class Term:
 
 
 def arm_model(robot: RobotConfig) -> ArmModel:
-    """Build the model of a robot with the effects that its configuration names.
-
-    Parameters
-    ----------
-    robot
-        The configuration.
-
-    Raises
-    ------
-    ConfigError
-        As `terms_of`.
-    """
+    """Build the model of a robot with the effects that its configuration names. Raises ConfigError as `terms_of`."""
     return ArmModel.from_config(robot, terms_of(robot))
 
 
@@ -109,15 +85,7 @@ def effect_terms(model: ArmModel) -> tuple[Term, ...]:
 def terms_of(robot: RobotConfig) -> tuple[Term, ...]:
     """Return the terms of a robot's effects in their order, without those that correct the recordings.
 
-    Parameters
-    ----------
-    robot
-        The configuration.
-
-    Raises
-    ------
-    ConfigError
-        If an effect is unknown, lacks a parameter, has an unknown one, or cannot be at the joint.
+    Raises ConfigError if an effect is unknown, lacks a parameter, has an unknown one, or cannot be at the joint.
     """
     terms: list[Term] = []
     taken: dict[str, int] = {}
@@ -126,7 +94,7 @@ def terms_of(robot: RobotConfig) -> tuple[Term, ...]:
         if of_recording(entry):
             continue
         where = f"effects[{k}]: {entry.effect} of {entry.joint}"
-        place = place_of(entry, effect, robot, where)
+        place = place_of_entry(entry, effect, robot, where)
         shapes = _shapes(entry, effect, where)
         kind = int(robot.joints[place.joint].type == "prismatic")
         number = f"{place.joint + 1}" if place.other is None else f"{place.joint + 1}{place.other + 1}"
@@ -150,24 +118,11 @@ def terms_of(robot: RobotConfig) -> tuple[Term, ...]:
     return tuple(terms)
 
 
-def place_of(entry: Entry, effect: Effect, robot: RobotConfig, where: str) -> Place:
+def place_of_entry(entry: Entry, effect: Effect, robot: RobotConfig, where: str) -> Place:
     """Return the location of an effect entry.
 
-    Parameters
-    ----------
-    entry
-        Entry of the ``effects`` of the configuration.
-    effect
-        Its effect.
-    robot
-        The configuration.
-    where
-        Key of the entry, for messages.
-
-    Raises
-    ------
-    ConfigError
-        If a pair lacks its second joint, or another effect has one.
+    ``entry``: entry of the ``effects`` of the configuration; ``where``: key of the entry, for messages. Raises
+    ConfigError if a pair lacks its second joint, or another effect has one.
     """
     names = [joint.name for joint in robot.joints]
     joint = names.index(entry.joint)
@@ -185,16 +140,8 @@ def entry_of(
 ) -> Entry:
     """Return the configuration entry of an effect.
 
-    Parameters
-    ----------
-    effect, place
-        Effect and location.
-    robot
-        Configuration, for the names of the joints.
-    parameters
-        Values of its parameters.
-    without
-        Linear parameters that it leaves out.
+    ``effect``, ``place``: effect and location; ``robot``: configuration, for the names of the joints; ``without``:
+    linear parameters that it leaves out.
     """
     other = None if place.other is None else robot.joints[place.other].name
     return Entry(

@@ -5,9 +5,19 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from armident.identify.effects.effect import POSITION, TORQUE, Linear, Periodic, Place, Shape, TorqueDependent, Trials
+from armident.compiled import ARITHMETIC, compiled
+from armident.identify.effects.effect import (
+    POSITION,
+    TORQUE,
+    UNITLESS,
+    Linear,
+    Periodic,
+    Place,
+    Shape,
+    TorqueDependent,
+    Trials,
+)
 from armident.identify.effects.rotor import ROTOR, rotors
-from armident.identify.robot.compiled import compiled
 from armident.identify.robot.motion import Motion
 
 Array = NDArray[np.float64]
@@ -31,13 +41,23 @@ class CoggingTorque(MotorOrder):
 
     name = "cogging_torque"
     title = "a torque ripple of the motor"
-    says = "a torque ripple that is periodic in the motor angle: magnets of the motor, or an eccentric gear"
+    description = "a torque ripple that is periodic in the motor angle: magnets of the motor, or an eccentric gear"
     reference = "Petrovic et al. 2000, IEEE Trans. Power Electronics 15(6); Gandhi et al. 2002, ICRA"
-    needs = "slow motion over several motor turns"
+    required_motion = "slow motion over several motor turns"
     excitation = ("slow", "range")
     scope = "motor"
-    linear = (Linear("cgc", TORQUE), Linear("cgs", TORQUE))
-    shapes = (Shape("harmonic", ("per rad of the motor", "rad/m"), continuous=(False, False)),)
+    linear = (
+        Linear("cgc", TORQUE, "Amplitude of the cosine component of the ripple, on the joint side."),
+        Linear("cgs", TORQUE, "Amplitude of the sine component of the ripple, on the joint side."),
+    )
+    shapes = (
+        Shape(
+            "harmonic",
+            ("per rad of the motor", "rad/m"),
+            "Periods of the ripple per turn of the motor; for a prismatic axis a wave number.",
+            continuous=(False, False),
+        ),
+    )
 
     def columns(self, motion: Motion, place: Place, shapes: Mapping[str, float]) -> Array:
         """Return cosine and sine of ``harmonic`` times the motor angle."""
@@ -65,12 +85,16 @@ class JointElasticity(TorqueDependent):
 
     name = "joint_elasticity"
     title = "an elastic joint"
-    says = "the link oscillates relative to its motor: an elastic gear, belt or coupling, or a bending link"
+    description = "the link oscillates relative to its motor: an elastic gear, belt or coupling, or a bending link"
     reference = "Spong 1987, J. Dyn. Sys. Meas. Control 109(4)"
-    needs = "quick accelerations near the resonance, under load"
+    required_motion = "quick accelerations near the resonance, under load"
     excitation = ("accelerations",)
-    linear = (Linear("compliance", ("rad/(N m)", "m/N"), sign=1),)
-    shapes = (Shape("frequency", ("Hz", "Hz")), Shape("damping", ("", ""), default=DAMPINGS[-1]), ROTOR)
+    linear = (Linear("compliance", ("rad/(N m)", "m/N"), "Compliance: deflection per transmitted torque.", sign=1),)
+    shapes = (
+        Shape("frequency", ("Hz", "Hz"), "Natural frequency of the link at its mean inertia along the motion."),
+        Shape("damping", UNITLESS, "Damping ratio of that oscillation.", default=DAMPINGS[-1]),
+        ROTOR,
+    )
 
     def columns(self, motion: Motion, place: Place, shapes: Mapping[str, float]) -> Array:
         """Return the torques by `swinging` of the link.
@@ -92,25 +116,15 @@ class JointElasticity(TorqueDependent):
         return np.geomspace(4.0, min(80.0, 0.2 / motion.dt), 7), DAMPINGS, rotors(motion, place.joint)
 
 
-@compiled
+@compiled("f8[::1], f8[::1], f8, f8, f8", **ARITHMETIC)
 def swinging(pull: Array, share: Array, w: float, damping: float, dt: float) -> tuple[Array, Array, Array]:
     """Return position, velocity and acceleration (N,) of ``share x'' + 2 damping w x' + w^2 x = w^2 pull``, from rest.
 
     Trapezoidal rule (Newmark 1959), which is stable at any frequency.
 
-    Parameters
-    ----------
-    pull
-        Position at equilibrium, shape (N,). The results have its unit (per s, per s^2); for a gear it is minus the
-        transmitted torque, N m or N: the position per unit of compliance.
-    share
-        Inertia over its mean, shape (N,).
-    w
-        Angular frequency of the resonance at mean inertia, rad/s.
-    damping
-        Damping ratio.
-    dt
-        Sampling period, s.
+    ``pull``: position at equilibrium, shape (N,). The results have its unit (per s, per s^2); for a gear it is minus
+    the transmitted torque, N m or N: the position per unit of compliance. ``share``: inertia over its mean, shape (N,).
+    ``w``: angular frequency of the resonance at mean inertia, rad/s. ``damping``: damping ratio.
     """
     way, rate, acceleration = np.empty(pull.size), np.zeros(pull.size), np.zeros(pull.size)
     way[0] = pull[0]
@@ -132,12 +146,14 @@ class Backlash(TorqueDependent):
 
     name = "backlash"
     title = "backlash of the gear"
-    says = "after a sign change of the load the motor crosses a gap before the link follows: worn teeth, a loose key"
+    description = (
+        "after a sign change of the load the motor crosses a gap before the link follows: worn teeth, a loose key"
+    )
     reference = "Nordin, Gutman 2002, Automatica 38(10)"
-    needs = "many changes of the load's direction"
+    required_motion = "many changes of the load's direction"
     excitation = ("reversals", "accelerations")
-    linear = (Linear("behind", ("", ""), sign=1, bounds=(0.1, 1.5)),)
-    shapes = (Shape("gap", POSITION), ROTOR)
+    linear = (Linear("behind", UNITLESS, "Torque pulses over those of plastic impacts.", sign=1, bounds=(0.1, 1.5)),)
+    shapes = (Shape("gap", POSITION, "Width of the gap at the joint, from side to side."), ROTOR)
     regressor_signals = "measured"
     instrument_signals = "measured"
 
@@ -160,14 +176,8 @@ class Backlash(TorqueDependent):
 def falls(motion: Motion, joint: int, rotor: float = 0.0) -> Array:
     """Return the acceleration (N,) of a link relative to its motor without contact of the teeth, rad/s^2 or m/s^2.
 
-    Parameters
-    ----------
-    motion
-        Motion of the arm, N samples.
-    joint
-        Index of the joint, from 0.
-    rotor
-        Rotor inertia that the model contains in the link, kg m^2 or kg.
+    ``motion``: motion of the arm, N samples; ``joint``: index of the joint, from 0; ``rotor``: rotor inertia that the
+    model contains in the link, kg m^2 or kg.
     """
     inertia = inertias(motion, joint, rotor)
     if inertia.max() <= 0.0:
@@ -176,21 +186,14 @@ def falls(motion: Motion, joint: int, rotor: float = 0.0) -> Array:
     return away
 
 
-@compiled
+@compiled("f8[::1], f8, f8", **ARITHMETIC)
 def crossing(pull: Array, gap: float, dt: float) -> tuple[Array, Array, Array]:
     """Return position, velocity and acceleration (N,) of a link relative to its motor, in the gap of the gear.
 
     Leapfrog integration with plastic impacts at half a gap to either side. Velocity and acceleration are central
     differences of the position, so that they have no delay.
 
-    Parameters
-    ----------
-    pull
-        Free acceleration of the link, rad/s^2 or m/s^2, shape (N,).
-    gap
-        Width of the gap, rad or m.
-    dt
-        Sampling period, s.
+    ``pull``: free acceleration of the link, rad/s^2 or m/s^2, shape (N,); ``gap``: width of the gap, rad or m.
     """
     way, rate, acceleration = np.zeros(pull.size), np.zeros(pull.size), np.zeros(pull.size)
     way[0] = 0.5 * gap if pull[0] > 0.0 else -0.5 * gap
@@ -213,14 +216,8 @@ def inertias(motion: Motion, joint: int, rotor: float) -> Array:
 
     It has a lower bound, `LEAST_INERTIA`, and is zero where the fit has no inertia.
 
-    Parameters
-    ----------
-    motion
-        Motion of the arm, N samples.
-    joint
-        Index of the joint, from 0.
-    rotor
-        Rotor inertia that the model contains in the link, kg m^2 or kg.
+    ``motion``: motion of the arm, N samples; ``joint``: index of the joint, from 0; ``rotor``: rotor inertia that the
+    model contains in the link, kg m^2 or kg.
     """
     inertia = motion.slopes(joint, links=True)[2][:, joint] - rotor
     believed: Array = np.maximum(inertia, LEAST_INERTIA * inertia.max())

@@ -1,12 +1,13 @@
 """Free shapes of regular torques that have no name: what they depend on is known, their cause is not."""
 
 from collections.abc import Mapping
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
 
 from armident.identify.effects.effect import POSITION, TORQUE, VELOCITY, Linear, Place, Shape, TorqueDependent, Trials
-from armident.identify.effects.tables import FreeShape, ends, hats, table, values
+from armident.identify.effects.free_shapes import TOP_SPEED, FreeShape, ends, hats, table, values
 from armident.identify.robot.motion import Motion
 
 Array = NDArray[np.float64]
@@ -20,11 +21,10 @@ class Unnamed(FreeShape):
 
     name = NAME
     reference = "Brunot 2017, section 7.3.2"
-    needs = "a wide range of the variable"
-    linear = values("u", TORQUE)
+    required_motion = "a wide range of the variable"
 
     def __init__(self) -> None:
-        self.says = f"{self.title}; its cause is unknown"
+        self.description = f"{self.title}; its cause is unknown"
 
 
 class OfVelocity(Unnamed):
@@ -35,8 +35,11 @@ class OfVelocity(Unnamed):
 
     law = "velocity"
     title = "a torque that depends on the velocity"
-    linear = tuple(Linear(f"u{k}", TORQUE) for k in range(2 * (len(KNOTS) - 2)))
-    shapes = (Shape("top", VELOCITY, continuous=(False, False)),)
+    linear = tuple(
+        Linear(f"u{k}", TORQUE, f"Torque at {share:.0%} of the speed `top`, {way} velocity; linear in between.")
+        for k, (way, share) in enumerate(product(("positive", "negative"), KNOTS[:-2]))
+    )
+    shapes = TOP_SPEED
 
     def columns(self, motion: Motion, place: Place, shapes: Mapping[str, float]) -> Array:
         """Return the functions of the speed of either direction."""
@@ -54,7 +57,8 @@ class OfTime(Unnamed):
 
     law = "time"
     title = "a torque that changes with time"
-    shapes = (Shape("duration", ("s", "s"), continuous=(False, False)),)
+    linear = values("u", TORQUE, "torque over the time")
+    shapes = (Shape("duration", ("s", "s"), "Last knot.", continuous=(False, False)),)
 
     def columns(self, motion: Motion, place: Place, shapes: Mapping[str, float]) -> Array:
         """Return the functions of the time."""
@@ -70,6 +74,7 @@ class OfTimeAndDirection(OfTime):
 
     law = "time_and_direction"
     title = "friction that changes with time"
+    linear = values("u", TORQUE, "friction over the time")
 
     def columns(self, motion: Motion, place: Place, shapes: Mapping[str, float]) -> Array:
         """Return the functions of the time, times ``sign(qd)``."""
@@ -106,6 +111,7 @@ class OfTorque(TorqueDependent, OverSignal):
 
     law = "torque"
     title = "a torque that depends on the torque of the joint"
+    linear = values("u", TORQUE, "torque over the torque of the joint")
     shapes = ends(TORQUE)
     signal = "torque"
 
@@ -115,6 +121,7 @@ class OfAcceleration(OverSignal):
 
     law = "acceleration"
     title = "a torque that depends on the acceleration"
+    linear = values("u", TORQUE, "torque over the acceleration")
     shapes = ends(("rad/s^2", "m/s^2"))
     signal = "qdd"
 
@@ -124,6 +131,7 @@ class OfOtherVelocity(OverSignal):
 
     law = "velocity_of_other"
     title = "a torque that depends on the velocity of another joint"
+    linear = values("u", TORQUE, "torque over the velocity of the other joint")
     scope = "other"
     shapes = ends(VELOCITY)
     signal = "qd"
@@ -134,6 +142,7 @@ class OfOtherTorque(TorqueDependent, OverSignal):
 
     law = "torque_of_other"
     title = "a torque that depends on the torque of another joint"
+    linear = values("u", TORQUE, "torque over the torque of the other joint")
     scope = "other"
     shapes = ends(TORQUE)
     signal = "torque"
@@ -144,6 +153,7 @@ class OfOtherPosition(OverSignal):
 
     law = "position_of_other"
     title = "a torque that depends on the position of another joint"
+    linear = values("u", TORQUE, "torque over the position of the other joint")
     scope = "other"
     shapes = ends(POSITION)
     signal = "q"

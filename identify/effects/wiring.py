@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from armident.configs import ConfigError, RobotConfig
 from armident.configs.schema.robot import Effect as Entry
-from armident.identify.effects.effect import Effect, Place, Scope, Shapes
-from armident.identify.experiment import Experiment
+from armident.identify.effects.effect import UNITLESS, Effect, Place, Scope, Shape, Shapes
 from armident.identify.robot.motion import Motion
+from armident.identify.signals.experiments import Experiment
 
 Array = NDArray[np.float64]
 
@@ -54,9 +54,14 @@ class SignError(Wiring):
 
     name = "sign_error"
     title = "a signal with the wrong sign"
-    says = "position or torque of a drive is read with the wrong sign: a swapped polarity, a wrong gear sign"
+    description = "position or torque of a drive is read with the wrong sign: a swapped polarity, a wrong gear sign"
     reference = "CiA 402-2, object 607Eh (polarity)"
-    needs = "motion against gravity or friction"
+    required_motion = "motion against gravity or friction"
+    settings = (
+        Shape("position", UNITLESS, "1: the position signal has the wrong sign."),
+        Shape("torque", UNITLESS, "1: the torque signal has the wrong sign."),
+        Shape(JOINT_SIDE, UNITLESS, "1: the signals of the joint, in SI units, not those of the drive."),
+    )
 
     def _exchange(self, n: int, first: int, second: int, value: float) -> Array:
         """Return a change of sign."""
@@ -70,10 +75,15 @@ class JointOrder(Wiring):
 
     name = "joint_order"
     title = "two drives exchanged"
-    says = "the signals of two drives are exchanged: swapped node numbers or plugs"
+    description = "the signals of two drives are exchanged: swapped node numbers or plugs"
     reference = "CiA 301, node-ID; CiA 305"
-    needs = "different motion of the joints"
+    required_motion = "different motion of the joints"
     scope = "pair"
+    settings = (
+        Shape("position", UNITLESS, "1: the position signals are exchanged."),
+        Shape("torque", UNITLESS, "1: the torque signals are exchanged."),
+        Shape(JOINT_SIDE, UNITLESS, "1: columns of the joints, in SI units, not raw numbers of the drives."),
+    )
 
     def _exchange(self, n: int, first: int, second: int, value: float) -> Array:
         """Return a permutation."""
@@ -87,12 +97,16 @@ class SignalScale(Wiring):
 
     name = "signal_scale"
     title = "a signal with the wrong scale"
-    says = (
+    description = (
         "position or torque of a joint is recorded in another unit, on the other side of the gear, or with "
         "another gear ratio; the value is true over recorded"
     )
     reference = "Brunot 2017, equation 2.14"
-    needs = "motion of the neighbouring joints"
+    required_motion = "motion of the neighbouring joints"
+    settings = (
+        Shape("position", UNITLESS, "True over recorded position; with another joint, the share of it to add."),
+        Shape("torque", UNITLESS, "True over recorded torque; with another joint, the share of it to add."),
+    )
 
     def _exchange(self, n: int, first: int, second: int, value: float) -> Array:
         """Return the factor of the joint, or of the other joint's signal that is added."""
@@ -112,17 +126,8 @@ BY_NAME = {effect.name: effect() for effect in EFFECTS}
 def rewired(experiments: Sequence[Experiment], robot: RobotConfig) -> Sequence[Experiment]:
     """Return the experiments corrected for the wiring errors of a robot's configuration.
 
-    Parameters
-    ----------
-    experiments
-        As recorded.
-    robot
-        Configuration with the effect entries.
-
-    Raises
-    ------
-    ConfigError
-        If an entry does not name the signal or the other joint.
+    ``robot``: configuration with the effect entries. Raises ConfigError if an entry does not name the signal or the
+    other joint.
     """
     position, torque = exchanges(robot)
     if np.array_equal(position, np.eye(robot.n)) and np.array_equal(torque, np.eye(robot.n)):
@@ -147,14 +152,9 @@ def exchanges(robot: RobotConfig) -> tuple[Array, Array]:
 
     Raw values (counts, shares of the rated signal) are exchanged, while the scaling belongs to the drive. So these are
     signed permutations, scaled where two drives differ in resolution, gain or rating. With ``joint_side: 1`` columns in
-    SI units on the joint side are concerned, as they are after an import; `signal_scale` always acts on these, and
-    with an ``other`` joint adds a multiple of its signal. Several entries act one after the other: exchanges express
-    any permutation.
-
-    Raises
-    ------
-    ConfigError
-        If an entry does not name the signal or the other joint.
+    SI units on the joint side are concerned, as they are after an import; `signal_scale` always acts on these, and with
+    an ``other`` joint adds a multiple of its signal. Several entries act one after the other: exchanges express any
+    permutation. Raises ConfigError if an entry does not name the signal or the other joint.
     """
     names = [joint.name for joint in robot.joints]
     worth = {"position": _per_count(robot), "torque": _per_share(robot)}

@@ -19,7 +19,7 @@ from armident.identify.robot.simulation import Simulation
 from armident.identify.signals.bandpass import butterworth
 from armident.identify.signals.decimate import Decimation
 from armident.identify.signals.differentiate import Derivatives
-from armident.identify.streamed import chosen, kept, mapped
+from armident.identify.signals.streamed import chosen, kept, mapped
 
 HALVINGS = 8
 """Step halvings towards the last estimate that could be simulated."""
@@ -31,7 +31,7 @@ FELT = 0.6
 """Share of the band of the instruments up to which the torques of terms act on a simulated arm: hardly any torque moves
 it beyond three bandwidths of the closed loop."""
 
-POSTURES = 100
+REFERENCE_POSTURES = 100
 """Postures of the references at which the mass matrix of an iterate that diverged is examined."""
 
 
@@ -333,7 +333,7 @@ class AuxiliaryModel:
 
     def _postures(self) -> NDArray[np.float64]:
         total = sum(q_ref.shape[0] for q_ref in self.references)
-        return np.concatenate([q_ref[:: max(1, total // POSTURES)].copy() for q_ref in self.references])
+        return np.concatenate([q_ref[:: max(1, total // REFERENCE_POSTURES)].copy() for q_ref in self.references])
 
 
 def _at_samples(held: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from armident.identify.estimators.auxiliary_model import AuxiliaryModel
 from armident.identify.estimators.output_error import output_error
+from armident.identify.estimators.problem import Estimator, Solved
 from armident.identify.regression.equations import Estimate, ExperimentEquations
 from armident.identify.regression.iterations import ITERATIONS
 
@@ -41,3 +42,6 @@ def clie(
         If the closed loop cannot be simulated with ``start``.
     """
     return output_error(lambda r: r.torque, [b.y for b in blocks], blocks, auxiliary.fresh(), start, iterations)
+
+
+ESTIMATOR = Estimator("clie", lambda problem: Solved(clie(problem.blocks, problem.auxiliary, problem.start)))

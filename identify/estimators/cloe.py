@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from armident.configs import DataError
 from armident.identify.estimators.auxiliary_model import AuxiliaryModel
 from armident.identify.estimators.output_error import output_error
+from armident.identify.estimators.problem import Estimator, Problem, Solved
 from armident.identify.regression.equations import Estimate, ExperimentEquations
 from armident.identify.regression.iterations import ITERATIONS
 
@@ -49,3 +50,11 @@ def cloe(
     if shapes != expected:
         raise DataError(f"positions of shapes {shapes} do not belong to equations of shapes {expected}")
     return output_error(lambda r: r.position, positions, blocks, auxiliary.fresh(), start, iterations)
+
+
+def _solve(problem: Problem) -> Solved:
+    estimate = cloe(problem.blocks, problem.positions, problem.auxiliary, problem.start)
+    return Solved(estimate, noise_of="joint position")
+
+
+ESTIMATOR = Estimator("cloe", _solve)

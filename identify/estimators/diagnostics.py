@@ -23,8 +23,9 @@ from armident.identify.estimators.instrument_tests import (
 )
 from armident.identify.estimators.residual_tests import JointResiduals, residual_tests
 from armident.identify.regression.ar_noise import ArModel
-from armident.identify.regression.equations import MAX_AR_ORDER, Estimate, ExperimentEquations, noise_models
+from armident.identify.regression.equations import Estimate, ExperimentEquations, noise_models
 from armident.identify.regression.iv import serial_covariance
+from armident.identify.regression.orders import MAX_AR_ORDER
 from armident.identify.regression.whitening import whitened
 
 Array = NDArray[np.float64]

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armident.identify.estimators.auxiliary_model import AuxiliaryModel
+from armident.identify.estimators.problem import Estimator, Solved
 from armident.identify.estimators.sensitivity import torque_sensitivities
 from armident.identify.regression.equations import (
     Estimate,
@@ -106,3 +107,8 @@ def solve_didim(
 
     end = iterate(step, start, iterations)
     return end, auxiliary.equations(blocks, end.theta)
+
+
+ESTIMATOR = Estimator(
+    "didim", lambda problem: Solved(didim(problem.blocks, problem.auxiliary, problem.start)), white_covariance=True
+)

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armident.identify.estimators.auxiliary_model import AuxiliaryModel
+from armident.identify.estimators.problem import Estimator, Problem, Solved
 from armident.identify.regression.equations import (
     COVARIANCE_PASSES,
     Estimate,
@@ -18,7 +19,7 @@ from armident.identify.regression.equations import (
 )
 from armident.identify.regression.iterations import ITERATIONS, iterate
 from armident.identify.regression.iv import IvProducts, factored_parts, instrumented_parts, serial_covariance
-from armident.identify.streamed import mapped
+from armident.identify.signals.streamed import mapped
 
 
 def idim_iv(
@@ -75,3 +76,10 @@ def idim_iv(
             covariance = serial_covariance(zeta, x, keep, weights, noise)
     residuals = whitened_residuals(blocks, theta, noise)
     return Estimate(theta, covariance, tuple(noise), residuals, done, converged, reason, auxiliary.warnings)
+
+
+def _solve(problem: Problem) -> Solved:
+    return Solved(idim_iv(problem.blocks, problem.auxiliary, problem.start, serial_order=problem.max_ar_order))
+
+
+ESTIMATOR = Estimator("idim-iv", _solve, measured=True, white_covariance=True)

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 
+from armident.identify.estimators.problem import Estimator
 from armident.identify.regression.ar_noise import WHITE
 from armident.identify.regression.equations import (
     COVARIANCE_PASSES,
@@ -14,7 +15,7 @@ from armident.identify.regression.equations import (
 )
 from armident.identify.regression.iv import serial_covariance
 from armident.identify.regression.least_squares import Triangle, require_excitation
-from armident.identify.streamed import mapped
+from armident.identify.signals.streamed import mapped
 
 
 def idim_ls(
@@ -59,3 +60,6 @@ def idim_ls(
             noise = noise_models(blocks, theta, covariance, serial_order)
             covariance = serial_covariance(regressors, regressors, [b.keep for b in blocks], weights, noise)
     return Estimate(theta, covariance, tuple(noise), whitened_residuals(blocks, theta, noise))
+
+
+ESTIMATOR = Estimator("idim-ls", None, measured=True, white_covariance=True)

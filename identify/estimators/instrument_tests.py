@@ -168,13 +168,13 @@ def durbin_wu_hausman(
     difference = coloured[:, :b] - coloured[:, b:]
     scale = np.linalg.norm(coloured[:, :b], axis=0)
     _, singular, directions = np.linalg.svd(difference / scale, full_matrices=False)
-    told = singular**2 > SAME
-    degrees = int(told.sum())
+    distinct = singular**2 > SAME
+    degrees = int(distinct.sum())
     if degrees == 0:
         return Endogeneity(
             0.0, 0, 1.0, 0.0, "", False, "instruments and regressors are the same: nothing can be said of endogeneity"
         )
-    statistic = float(np.sum((directions[told] @ (shift / scale) / singular[told]) ** 2))
+    statistic = float(np.sum((directions[distinct] @ (shift / scale) / singular[distinct]) ** 2))
     p = float(stats.chi2.sf(statistic, degrees))
     shifts = np.abs(shift) / scale
     worst = int(np.argmax(shifts))

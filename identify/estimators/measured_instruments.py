@@ -13,7 +13,7 @@ from armident.identify.robot.controller import DiscreteController
 from armident.identify.robot.simulation import Simulation
 from armident.identify.signals.bandpass import central_difference
 from armident.identify.signals.decimate import Decimation
-from armident.identify.streamed import kept
+from armident.identify.signals.streamed import kept
 
 
 @dataclass

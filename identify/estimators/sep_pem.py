@@ -7,9 +7,9 @@ from numpy.typing import NDArray
 
 from armident.identify.estimators.auxiliary_model import AuxiliaryModel
 from armident.identify.estimators.didim import solve_didim
+from armident.identify.estimators.problem import Estimator, Problem, Solved
 from armident.identify.regression.equations import (
     COVARIANCE_PASSES,
-    MAX_AR_ORDER,
     Estimate,
     ExperimentEquations,
     joint_variances,
@@ -19,6 +19,7 @@ from armident.identify.regression.equations import (
 )
 from armident.identify.regression.iterations import ITERATIONS
 from armident.identify.regression.least_squares import Triangle
+from armident.identify.regression.orders import MAX_AR_ORDER
 
 
 def sep_pem(
@@ -62,3 +63,10 @@ def sep_pem(
         covariance = Triangle.of(stacked_parts(simulated, noise)).inverse_gram  # step 3, 6.29
     residuals = whitened_residuals(simulated, theta, noise)
     return Estimate(theta, covariance, tuple(noise), residuals, done, converged, reason, auxiliary.warnings)
+
+
+def _solve(problem: Problem) -> Solved:
+    return Solved(sep_pem(problem.blocks, problem.auxiliary, problem.start, max_order=problem.max_ar_order))
+
+
+ESTIMATOR = Estimator("sep-pem", _solve, prefiltered=True)

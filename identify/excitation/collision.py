@@ -27,7 +27,7 @@ Beyond it they touch when the angle between them is below ``2 asin(1 / (2 * 1.5)
 ALWAYS = 0.95
 """Share of random postures in which two bodies overlap by construction: that of the set-up assistant of MoveIt."""
 
-POSTURES = 300
+CONTACT_POSTURES = 300
 """Number of these postures."""
 
 STRIDE = 10
@@ -38,14 +38,7 @@ STRIDE = 10
 class ClosestApproach:
     """Smallest distance along a motion.
 
-    Parameters
-    ----------
-    distance
-        Metres; negative where bodies overlap.
-    first, second
-        Names of the two bodies.
-    sample
-        Sample of the motion.
+    ``distance``: metres; negative where bodies overlap. ``first``, ``second``: names of the two bodies.
     """
 
     distance: float
@@ -91,17 +84,8 @@ class _Body:
 class CollisionModel:
     """Pairs of bodies of an arm and its cell, and their distances.
 
-    Parameters
-    ----------
-    robot
-        Geometry, limits and ``collision``.
-    geometry
-        Capsules of links, in frames j, for links without given ones: those of a URDF.
-
-    Raises
-    ------
-    ConfigError
-        If a box contains the arm in nearly every posture.
+    ``robot``: geometry, limits and ``collision``; ``geometry``: capsules of links, in frames j, for links without given
+    ones: those of a URDF. Raises ConfigError if a box contains the arm in nearly every posture.
     """
 
     def __init__(self, robot: RobotConfig, geometry: Sequence[LinkCapsule] = ()) -> None:
@@ -128,10 +112,7 @@ class CollisionModel:
     def closest(self, q: Array) -> ClosestApproach | None:
         """Return the smallest distance along a motion; ``None`` if there is nothing to compare.
 
-        Parameters
-        ----------
-        q
-            Postures (N, n), rad or m.
+        ``q``: postures (N, n), rad or m.
         """
         if not self._pairs:
             return None
@@ -147,23 +128,14 @@ class CollisionModel:
         return ClosestApproach(float(best), one, two, sample)
 
     def profile(self, q: Array) -> Array:
-        """Return the smallest distance of all pairs at each posture, m, (N,).
-
-        Parameters
-        ----------
-        q
-            Postures (N, n), rad or m.
-        """
+        """Return the smallest distance of all pairs at each posture, m, (N,). ``q``: postures (N, n), rad or m."""
         frames, _ = self._motion(q)
         return np.array([self._distance(frame)[0] for frame in frames])
 
     def shortfall(self, q: Array) -> float:
         """Return the mean distance by which a motion misses the clearance, m; 0 where it keeps it.
 
-        Parameters
-        ----------
-        q
-            Postures (N, n), rad or m.
+        ``q``: postures (N, n), rad or m.
         """
         if not self._pairs:
             return 0.0
@@ -266,7 +238,7 @@ class CollisionModel:
         if not self._pairs:
             return
         bounds = np.clip(np.array([joint.limits.position for joint in robot.joints]), -2 * np.pi, 2 * np.pi)
-        q = np.random.default_rng(0).uniform(bounds[:, 0], bounds[:, 1], (POSTURES, robot.n))
+        q = np.random.default_rng(0).uniform(bounds[:, 0], bounds[:, 1], (CONTACT_POSTURES, robot.n))
         frames, every = self._motion(q)[0], self._pairs
         touching: list[tuple[int, int]] = []
         for pair in every:

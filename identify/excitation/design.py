@@ -14,7 +14,7 @@ the base parameters have a small weight.
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal, Protocol, TypeVar
+from typing import Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -36,11 +36,11 @@ from armident.identify.excitation.point_to_point import (
     sample_trajectory,
     slow_share,
 )
+from armident.identify.excitation.trajectory_options import Shape
 from armident.identify.robot.arm import ArmModel
 from armident.identify.robot.chain import Floats
 from armident.identify.signals.decimate import design
 
-Shape = Literal["moves", "fourier"]
 C = TypeVar("C")
 
 PERIOD = 1e-3
@@ -99,10 +99,11 @@ def design_trajectory(
 ) -> Design:
     """Design an exciting trajectory by random search.
 
+    Returns the best trajectory found, with its predicted precision. Raises ConfigError if the robot cannot make a
+    single move in that time, an argument is wrong, or no candidate keeps the limits of torque and the clearance.
+
     Parameters
     ----------
-    robot
-        Configuration with the limits.
     duration
         Length, s, met within a millisecond.
     seed
@@ -124,17 +125,6 @@ def design_trajectory(
         Bodies that the trajectory keeps apart by their clearance.
     progress
         Called with the share done, 0 to 1.
-
-    Returns
-    -------
-    Design
-        Best trajectory found, with its predicted precision.
-
-    Raises
-    ------
-    ConfigError
-        If the robot cannot make a single move in that time, an argument is wrong, or no candidate keeps the limits of
-        torque and the clearance.
     """
     robot.check_movable()
     model = arm_model(robot)
@@ -169,16 +159,7 @@ def design_trajectory(
 def excesses(robot: RobotConfig, design: Design, collision: CollisionModel | None, share: float = 1.0) -> list[str]:
     """Return the violated limits of torque and distance of a trajectory, in words.
 
-    Parameters
-    ----------
-    robot
-        Configuration with the limits.
-    design
-        The trajectory.
-    collision
-        Bodies to keep apart.
-    share
-        Share of the torque limits that may be used.
+    ``collision``: bodies to keep apart; ``share``: share of the torque limits that may be used.
     """
     found = []
     if design.torque is not None:
@@ -201,15 +182,7 @@ class _Candidates(Protocol[C]):
     def neighbour(self, candidate: C) -> C: ...
 
     def rank(self, candidate: C, best: Rank) -> Rank:
-        """Return the rank of a candidate.
-
-        Parameters
-        ----------
-        candidate
-            The candidate.
-        best
-            Rank that it must beat.
-        """
+        """Return the rank of a candidate. ``best``: rank that it must beat."""
 
     def trajectory(self, candidate: C) -> Trajectory: ...
 
@@ -238,21 +211,9 @@ def with_objective(
 
     Speeds and loads at which the effect is to be visible are those of a typical trajectory of the robot.
 
-    Parameters
-    ----------
-    robot
-        Configuration of the robot.
-    wanted, against
-        Names of the effect and of the effect to separate it from.
-    joint
-        Name of the joint; ``None``: all.
-    theta
-        Standard or base parameters, if known.
-
-    Raises
-    ------
-    ConfigError
-        See `armident.identify.excitation.objective.effect_objective`; or if ``joint`` or ``against`` are given alone.
+    ``wanted``, ``against``: names of the effect and of the effect to separate it from. ``joint``: name of the joint;
+    ``None``: all. ``theta``: standard or base parameters, if known. Raises ConfigError: see
+    `armident.identify.excitation.objective.effect_objective`; or if ``joint`` or ``against`` are given alone.
     """
     if wanted is None:
         for option, value in (("--joint", joint), ("--against", against)):
@@ -281,10 +242,6 @@ def predict_precision(
 
     Parameters
     ----------
-    model
-        Model of the robot.
-    trajectory
-        The reference.
     noise
         Standard deviation of the filtered torque noise of each joint, (n,), N m or N.
     cutoff_hz
@@ -294,11 +251,6 @@ def predict_precision(
         False if ``noise`` is only a weight: there are no standard deviations then.
     theta, aim, collision
         As in `design_trajectory`.
-
-    Returns
-    -------
-    Design
-        The trajectory with its predicted precision.
     """
     period = PERIOD
     q, qd, qdd = sample_trajectory(trajectory, period)

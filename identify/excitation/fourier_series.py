@@ -29,14 +29,8 @@ DIGITS = 7
 class FourierSeries:
     """Candidate of the search.
 
-    Parameters
-    ----------
-    coefficients
-        Sine and cosine coefficients (2, H, n) before scaling to the limits.
-    share
-        Used share (n,) of the amplitude that the limits allow.
-    middle
-        Position (n,) of the motion in the free range, 0 to 1.
+    ``coefficients``: sine and cosine coefficients (2, H, n) before scaling to the limits; ``share``: used share (n,) of
+    the amplitude that the limits allow; ``middle``: position (n,) of the motion in the free range, 0 to 1.
     """
 
     coefficients: Floats
@@ -47,12 +41,7 @@ class FourierSeries:
 class FourierSearch:
     """Search space of Fourier series; limits and cost are those of the point-to-point search.
 
-    Parameters
-    ----------
-    search
-        Limits, noise, model and cost.
-    harmonics
-        Number of harmonics; ``None``: up to `HIGHEST_HZ`.
+    ``search``: limits, noise, model and cost. ``harmonics``: number of harmonics; ``None``: up to `HIGHEST_HZ`.
     """
 
     def __init__(self, search: PointToPointSearch, harmonics: int | None = None) -> None:
@@ -112,13 +101,5 @@ class FourierSearch:
         )
 
     def rank(self, candidate: FourierSeries, best: Rank) -> Rank:
-        """Return the rank of a candidate, as in `PointToPointSearch`.
-
-        Parameters
-        ----------
-        candidate
-            The candidate.
-        best
-            Rank that it must beat.
-        """
+        """Return the rank of a candidate, as in `PointToPointSearch`. ``best``: rank that it must beat."""
         return self._search.trajectory_rank(self.trajectory(candidate), best)

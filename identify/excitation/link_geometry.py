@@ -16,13 +16,7 @@ SMALLEST = 1e-3
 
 
 def capsules_of(shapes: Iterable[UrdfShape]) -> tuple[list[LinkCapsule], list[str]]:
-    """Return a capsule around each shape, in the frame of its link, and the names of meshes that cannot be read.
-
-    Parameters
-    ----------
-    shapes
-        Shapes of the links.
-    """
+    """Return a capsule around each shape, in the frame of its link, and the names of meshes that cannot be read."""
     capsules: list[LinkCapsule] = []
     unread: list[str] = []
     for shape in shapes:
@@ -43,10 +37,7 @@ def capsules_of(shapes: Iterable[UrdfShape]) -> tuple[list[LinkCapsule], list[st
 def bounding_capsule(points: Array) -> tuple[Array, float]:
     """Return segment (2, 3) and radius of a capsule that contains points and lies along their largest extent.
 
-    Parameters
-    ----------
-    points
-        Points (K, 3), m.
+    ``points`` (K, 3), m.
     """
     middle = (points.min(axis=0) + points.max(axis=0)) / 2.0
     axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2]

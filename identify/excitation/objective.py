@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from armident.configs import ConfigError, RobotConfig
 from armident.identify.diagnosis.candidates import Shapes
 from armident.identify.effects.effect import Effect, Place
-from armident.identify.effects.numbers import ParameterChange
+from armident.identify.effects.parameter_change import ParameterChange
 from armident.identify.effects.registry import known
 from armident.identify.effects.wiring import Wiring
 from armident.identify.robot.motion import Motion
@@ -36,16 +36,9 @@ class EffectLocation:
     def columns(self, motion: Motion, shapes: Shapes, decimation: Decimation, sigma: Array) -> Array:
         """Return the filtered columns over the noise of each joint, (M n, k), per unit of the linear parameters.
 
-        Parameters
-        ----------
-        motion
-            Motion at the input rate of the decimation.
-        shapes
-            Nonlinear parameters by name.
-        decimation
-            Filter of the regression.
-        sigma
-            Standard deviation of the torque noise of each joint, N m or N, (n,).
+        ``motion``: motion at the input rate of the decimation; ``shapes``: nonlinear parameters by name;
+        ``decimation``: filter of the regression; ``sigma``: standard deviation of the torque noise of each joint,
+        N m or N, (n,).
         """
         columns = decimation(self.effect.torque(motion, self.place, dict(shapes))) / sigma[:, None]
         return columns.reshape(-1, columns.shape[2])
@@ -55,10 +48,7 @@ class EffectLocation:
 class EffectObjective:
     """Objective of a design for effects.
 
-    Parameters
-    ----------
-    pairs
-        Effects to estimate, each with the effect to separate it from, or ``None``.
+    ``pairs``: effects to estimate, each with the effect to separate it from, or ``None``.
     """
 
     pairs: tuple[tuple[EffectLocation, EffectLocation | None], ...]
@@ -73,16 +63,9 @@ class EffectObjective:
     def cost(self, motion: Motion, x: Array, decimation: Decimation, sigma: Array) -> float:
         """Return the mean log standard deviation of all linear parameters (D-optimality); lower is better.
 
-        Parameters
-        ----------
-        motion
-            Motion at the input rate of the decimation.
-        x
-            Weighted base regressor at the instants that the decimation keeps, (M n, b).
-        decimation
-            Filter of the regression.
-        sigma
-            Standard deviation of the torque noise of each joint, N m or N, (n,).
+        ``motion``: motion at the input rate of the decimation; ``x``: weighted base regressor at the instants that the
+        decimation keeps, (M n, b); ``decimation``: filter of the regression; ``sigma``: standard deviation of the
+        torque noise of each joint, N m or N, (n,).
         """
         values = []
         for location, rival in self.pairs:
@@ -97,16 +80,9 @@ class EffectObjective:
 
         Nonlinear parameters are in the middle of their grids. Parameters that are not identifiable are infinite.
 
-        Parameters
-        ----------
-        motion
-            Motion at the input rate of the decimation.
-        x
-            Weighted base regressor at the instants that the decimation keeps, (M n, b).
-        decimation
-            Filter of the regression.
-        sigma
-            Standard deviation of the torque noise of each joint, N m or N, (n,).
+        ``motion``: motion at the input rate of the decimation; ``x``: weighted base regressor at the instants that the
+        decimation keeps, (M n, b); ``decimation``: filter of the regression; ``sigma``: standard deviation of the
+        torque noise of each joint, N m or N, (n,).
         """
         found: dict[str, float] = {}
         for location, rival in self.pairs:
@@ -125,21 +101,10 @@ def effect_objective(
 ) -> EffectObjective:
     """Return the objective for an effect at one joint or at all joints.
 
-    Parameters
-    ----------
-    robot
-        Configuration of the robot.
-    wanted, against
-        Names of the effect and of the effect to separate it from.
-    joint
-        Name of the joint; ``None``: all.
-    motion
-        Typical motion of the robot; its speeds and loads give the values of nonlinear parameters.
-
-    Raises
-    ------
-    ConfigError
-        If there is no such effect or joint, the robot has no location for it, or any motion shows it.
+    ``wanted``, ``against``: names of the effect and of the effect to separate it from. ``joint``: name of the joint;
+    ``None``: all. ``motion``: typical motion of the robot; its speeds and loads give the values of nonlinear
+    parameters. Raises ConfigError if there is no such effect or joint, the robot has no location for it, or any motion
+    shows it.
     """
     effect, rival = _designable(wanted, "--for"), None if against is None else _designable(against, "--against")
     if rival is not None and rival.name == effect.name:
@@ -167,12 +132,7 @@ def effect_objective(
 def weighted_rows(x: Array, sigma: ArrayLike) -> Array:
     """Return a regressor over the noise of each joint as rows (M n, b).
 
-    Parameters
-    ----------
-    x
-        Regressor, shape (M, n, b).
-    sigma
-        Standard deviation of the torque noise of each joint, N m or N, (n,).
+    ``x``: regressor, shape (M, n, b); ``sigma``: standard deviation of the torque noise of each joint, N m or N, (n,).
     """
     rows: Array = (x / np.asarray(sigma, dtype=np.float64)[:, None]).reshape(-1, x.shape[2])
     return rows

@@ -18,21 +18,9 @@ LINE, LIMIT, OUTSIDE = "#2a5d8f", "#b5403a", "#f6dfdd"
 def draw(robot: RobotConfig, design: Design, path: Path, title: str) -> None:
     """Write a plot with one row per joint.
 
-    Parameters
-    ----------
-    robot
-        Names, units and limits.
-    design
-        Trajectory; torques are drawn if they are known.
-    path
-        File to write; its suffix gives the format, see `SUFFIXES`.
-    title
-        Title of the plot.
-
-    Raises
-    ------
-    ConfigError
-        If the file cannot be written, or its suffix is not in `SUFFIXES`.
+    ``robot``: names, units and limits. ``design``: trajectory; torques are drawn if they are known. ``path``: file to
+    write; its suffix gives the format, see `SUFFIXES`. Raises ConfigError if the file cannot be written, or its suffix
+    is not in `SUFFIXES`.
     """
     check_name(path)
     q, qd, qdd = sample_trajectory(design.trajectory, PERIOD)
@@ -85,18 +73,7 @@ def draw(robot: RobotConfig, design: Design, path: Path, title: str) -> None:
 
 
 def check_name(path: Path) -> None:
-    """Check the suffix of the file of a plot.
-
-    Parameters
-    ----------
-    path
-        File to write.
-
-    Raises
-    ------
-    ConfigError
-        If its suffix is not in `SUFFIXES`.
-    """
+    """Check the suffix of the file of a plot. Raises ConfigError if its suffix is not in `SUFFIXES`."""
     if path.suffix not in SUFFIXES:
         raise ConfigError(f"--picture {path}: expected a name that ends in {', '.join(SUFFIXES)}")
 
@@ -104,12 +81,7 @@ def check_name(path: Path) -> None:
 def limits_of(joint: Joint, name: str) -> tuple[float, float]:
     """Return the lower and upper limit of a quantity of a joint, rad or m, s, N m or N.
 
-    Parameters
-    ----------
-    joint
-        The joint.
-    name
-        ``position``, ``velocity``, ``acceleration`` or ``torque``.
+    ``name``: ``position``, ``velocity``, ``acceleration`` or ``torque``.
     """
     if name == "position":
         return joint.limits.position

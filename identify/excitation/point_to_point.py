@@ -77,12 +77,8 @@ MISS_UNIT = 0.01
 class Rank(NamedTuple):
     """Rank of a candidate; the smaller one is better, and nothing is better than a violated limit.
 
-    Parameters
-    ----------
-    violation
-        Excess of torque over its limit, relative, plus missing distance in `MISS_UNIT`; 0 if all limits are kept.
-    cost
-        Mean log standard deviation with penalties.
+    ``violation``: excess of torque over its limit, relative, plus missing distance in `MISS_UNIT`; 0 if all limits are
+    kept. ``cost``: mean log standard deviation with penalties.
     """
 
     violation: float
@@ -95,12 +91,7 @@ WORST = Rank(np.inf, np.inf)
 def slow_share(robot: RobotConfig, qd: Floats) -> Floats:
     """Return the share of slow samples of each joint, (n,).
 
-    Parameters
-    ----------
-    robot
-        Velocity limits.
-    qd
-        Velocities (N, n), rad/s or m/s; slow means below `SLOW` of the limit.
+    ``robot``: velocity limits. ``qd``: velocities (N, n), rad/s or m/s; slow means below `SLOW` of the limit.
     """
     limit = SLOW * np.array([joint.limits.velocity for joint in robot.joints])
     result: Floats = (np.abs(qd) < limit).mean(axis=0)
@@ -118,31 +109,9 @@ class PointToPoint:
 class PointToPointSearch:
     """Search space of point-to-point trajectories, and the cost of a trajectory.
 
-    Parameters
-    ----------
-    robot
-        Limits.
-    model
-        Its model.
-    duration
-        Length, s.
-    sigma
-        Standard deviation (n,) of the torque noise, N m or N.
-    margin
-        Share of each limit that may be used.
-    theta
-        Standard or base parameters, or ``None``.
-    aim
-        Effects to make visible; ``None``: base parameters only.
-    rng
-        Source of random numbers.
-    collision
-        Bodies to keep apart, or ``None``.
-
-    Raises
-    ------
-    ConfigError
-        If no posture is free of collisions.
+    ``sigma``: standard deviation (n,) of the torque noise, N m or N. ``margin``: share of each limit that may be used.
+    ``theta``: standard or base parameters, or ``None``. ``aim``: effects to make visible; ``None``: base parameters
+    only. ``collision``: bodies to keep apart, or ``None``. Raises ConfigError if no posture is free of collisions.
     """
 
     def __init__(
@@ -247,12 +216,8 @@ class PointToPointSearch:
     def rank(self, candidate: PointToPoint, best: Rank) -> Rank:
         """Return the rank of a candidate.
 
-        Parameters
-        ----------
-        candidate
-            Candidate; one that exceeds a limit of velocity or acceleration is the worst.
-        best
-            Rank that it must beat: the distances of a candidate that does not are not computed.
+        ``candidate``: candidate; one that exceeds a limit of velocity or acceleration is the worst. ``best``: rank that
+        it must beat: the distances of a candidate that does not are not computed.
         """
         durations = self._durations(candidate)
         lengths = np.diff(np.vstack([self.home, candidate.points]), axis=0)
@@ -263,12 +228,7 @@ class PointToPointSearch:
     def trajectory_rank(self, trajectory: Trajectory, best: Rank) -> Rank:
         """Return the rank of a trajectory within the limits of motion.
 
-        Parameters
-        ----------
-        trajectory
-            The reference.
-        best
-            Rank that it must beat, as for `rank`.
+        ``best``: rank that it must beat, as for `rank`.
         """
         factor = 1 if self.aim is None else AIM_FACTOR
         period = 1.0 / (factor * SEARCH_RATE)
@@ -328,16 +288,8 @@ def equations_of(
 ) -> tuple[Floats, Decimation, Floats]:
     """Return the arguments of `EffectObjective.cost`: weighted base regressor (R, b), decimation and noise.
 
-    Parameters
-    ----------
-    model
-        Model of the robot.
-    motion
-        Motion along the trajectory.
-    decimation
-        Filter of the regression.
-    sigma
-        Standard deviation (n,) of the torque noise, N m or N.
+    ``motion``: motion along the trajectory; ``decimation``: filter of the regression; ``sigma``: standard deviation
+    (n,) of the torque noise, N m or N.
     """
     kept = decimation.instants(motion.samples)
     x = model.rigid_regressor(motion.q[kept], motion.qd[kept], motion.qdd[kept])
@@ -349,16 +301,8 @@ def equations_of(
 def predicted_torque(model: ArmModel, theta: ArrayLike, q: Floats, qd: Floats, qdd: Floats, period: float) -> Floats:
     """Return the joint torques along a motion with those of the model's terms, (N, n), N m or N.
 
-    Parameters
-    ----------
-    model
-        Model of the robot.
-    theta
-        Standard (p,) or base parameters (b,), SI.
-    q, qd, qdd
-        Positions, velocities and accelerations (N, n), rad or m, s.
-    period
-        Sampling period, s.
+    ``theta``: standard (p,) or base parameters (b,), SI; ``q``, ``qd``, ``qdd``: positions, velocities and
+    accelerations (N, n), rad or m, s.
     """
     torque = model.inverse_dynamics(theta, q, qd, qdd)
     if model.terms:
@@ -367,15 +311,7 @@ def predicted_torque(model: ArmModel, theta: ArrayLike, q: Floats, qd: Floats, q
 
 
 def sample_trajectory(trajectory: Trajectory, period: float) -> tuple[Floats, Floats, Floats]:
-    """Return positions, velocities and accelerations (N, n) along a trajectory by finite differences.
-
-    Parameters
-    ----------
-    trajectory
-        The reference.
-    period
-        Sampling period, s.
-    """
+    """Return positions, velocities and accelerations (N, n) along a trajectory by finite differences."""
     q = trajectory.sample(period)
     qd = np.gradient(q, period, axis=0)
     return q, qd, np.gradient(qd, period, axis=0)

@@ -9,10 +9,10 @@ from scipy import signal
 from armident.configs import DataError, RobotConfig
 from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.effects.terms import arm_model
-from armident.identify.identification.criteria import IdentificationCriteria
+from armident.identify.identification.checks.excitation import workspace_postures
+from armident.identify.identification.checks.physics import impossible_values
 from armident.identify.identification.equations import LS_CUTOFF
-from armident.identify.identification.excitation_check import workspace_postures
-from armident.identify.identification.physics_check import impossible_values
+from armident.identify.identification.identification_criteria import IdentificationCriteria
 
 FREQUENCIES = 4096
 """Number of frequencies of a noise spectrum."""
@@ -22,12 +22,8 @@ FREQUENCIES = 4096
 class PreviousEstimate:
     """An earlier estimate and its noise.
 
-    Parameters
-    ----------
-    theta
-        Base parameters (b,).
-    noise
-        Standard deviation (n,) of the torque noise below the cut-off of the regression, N m or N.
+    ``theta``: base parameters (b,); ``noise``: standard deviation (n,) of the torque noise below the cut-off of the
+    regression, N m or N.
     """
 
     theta: NDArray[np.float64]
@@ -40,19 +36,8 @@ def previous_estimate(document: IdentificationDocument, robot: RobotConfig, wher
     The noise is that of its noise models (thesis equation 6.19) below `LS_CUTOFF` times the closed-loop bandwidth,
     where the regression is made (thesis section 2.3.1); without a configured bandwidth, all of it.
 
-    Parameters
-    ----------
-    document
-        The identification.
-    robot
-        Configuration of the robot.
-    where
-        Source of the document, for messages.
-
-    Raises
-    ------
-    DataError
-        If it is of another robot or model, or its noise models are not of joint torques.
+    ``where``: source of the document, for messages. Raises DataError if it is of another robot or model, or its noise
+    models are not of joint torques.
     """
     model = arm_model(robot)
     if document.robot != robot.name:
@@ -75,20 +60,8 @@ def physical_estimate(document: IdentificationDocument, robot: RobotConfig, wher
 
     Where the document has the nearest physically consistent parameters, they are taken.
 
-    Parameters
-    ----------
-    document
-        The identification.
-    robot
-        Configuration of the robot.
-    where
-        Source of the document, for messages.
-
-    Raises
-    ------
-    DataError
-        As `previous_estimate`; or if the identification calls itself unusable, or friction, rotor inertias or mass
-        matrix are impossible by more than their uncertainty.
+    ``where``: source of the document, for messages. Raises DataError as `previous_estimate`; or if the identification
+    calls itself unusable, or friction, rotor inertias or mass matrix are impossible by more than their uncertainty.
     """
     found = previous_estimate(document, robot, where)
     without = "Next: identify the arm from a better recording, or design without --known"

@@ -26,16 +26,9 @@ NO_BOXES = "list what stands around it in collision.boxes of the robot configura
 class SafetyModel:
     """Masses and bodies of an arm.
 
-    Parameters
-    ----------
-    collision
-        Bodies of arm and cell.
-    theta
-        Base (b,) or standard (p,) parameters that predict torques; ``None`` if no masses are known.
-    torque_source
-        Origin of the parameters, for messages.
-    remarks
-        Properties that cannot be checked.
+    ``collision``: bodies of arm and cell. ``theta``: base (b,) or standard (p,) parameters that predict torques;
+    ``None`` if no masses are known. ``torque_source``: origin of the parameters, for messages. ``remarks``: properties
+    that cannot be checked.
     """
 
     collision: CollisionModel
@@ -48,10 +41,7 @@ class SafetyModel:
 class SafetyChecks:
     """Results of the checks of a trajectory, one sentence each.
 
-    Parameters
-    ----------
-    checked, unchecked
-        Properties that were checked, with the result, and those that were not, with the reason.
+    ``checked``, ``unchecked``: properties that were checked, with the result, and those that were not, with the reason.
     """
 
     checked: tuple[str, ...]
@@ -67,21 +57,10 @@ def safety_model(
 ) -> SafetyModel:
     """Collect masses and bodies of an arm: of an earlier estimate, of a file, of its configuration, of its URDF.
 
-    Parameters
-    ----------
-    robot
-        Configuration.
-    source
-        Path or shipped name from which it was loaded: its URDF is read; ``None``: there is none.
-    prior, prior_name
-        Earlier estimate, and its name in messages.
-    masses
-        JSON file of standard parameters, as ``armident robot --truth`` writes it; replaces the masses of the URDF.
-
-    Raises
-    ------
-    ConfigError
-        If masses, shapes or boxes are wrong.
+    ``source``: path or shipped name from which it was loaded: its URDF is read; ``None``: there is none. ``prior``,
+    ``prior_name``: earlier estimate, and its name in messages. ``masses``: JSON file of standard parameters, as
+    ``armident robot --truth`` writes it; replaces the masses of the URDF. Raises ConfigError if masses, shapes or boxes
+    are wrong.
     """
     shapes = None if source is None else load_shapes(source)
     capsules, unread = ([], []) if shapes is None else capsules_of(shapes.shapes)
@@ -145,14 +124,7 @@ def _not_negative(names: Sequence[str], *kinds: str) -> list[str]:
 def check_safety(robot: RobotConfig, design: Design, safety: SafetyModel) -> SafetyChecks:
     """Return what was checked of a trajectory, with the results, and what was not.
 
-    Parameters
-    ----------
-    robot
-        Configuration with the limits.
-    design
-        The trajectory.
-    safety
-        Masses and bodies by which it was designed or checked.
+    ``safety``: masses and bodies by which it was designed or checked.
     """
     done = ["position, velocity and acceleration keep their limits"]
     left = list(safety.remarks)
@@ -186,8 +158,6 @@ class CheckedTrajectory:
 
     Parameters
     ----------
-    robot
-        Configuration of the robot.
     path
         File of the trajectory; ``None``: it is not in a file.
     design
@@ -216,10 +186,7 @@ class CheckedTrajectory:
     def refuse_excess(self) -> None:
         """Refuse a trajectory that exceeds limits of torque or distance.
 
-        Raises
-        ------
-        ConfigError
-            Names each excess and the next step.
+        Raises ConfigError: names each excess and the next step.
         """
         if self.excess:
             next_step = "Next: design another one with --out FILE, or correct limits.torque and collision of the robot"
@@ -231,18 +198,7 @@ def checked_trajectory(
 ) -> CheckedTrajectory:
     """Return a trajectory with all checks.
 
-    Parameters
-    ----------
-    robot
-        Configuration with the limits.
-    design
-        The trajectory.
-    safety
-        Masses and bodies by which it was designed or checked.
-    prior
-        Earlier estimate, if there is one.
-    path
-        File of the trajectory, if there is one.
+    ``safety``: masses and bodies by which it was designed or checked; ``prior``: earlier estimate, if there is one.
     """
     std, checks = expected_std(robot, design, prior), check_safety(robot, design, safety)
     return CheckedTrajectory(
@@ -253,14 +209,7 @@ def checked_trajectory(
 def expected_std(robot: RobotConfig, design: Design, prior: PreviousEstimate | None) -> Floats:
     """Return the predicted standard deviations of the base parameters (b,), SI; of an assumed noise without estimate.
 
-    Parameters
-    ----------
-    robot
-        Configuration of the robot.
-    design
-        The trajectory.
-    prior
-        Earlier estimate, if there is one.
+    ``prior``: earlier estimate, if there is one.
     """
     std = design.std
     if prior is None or std is None:

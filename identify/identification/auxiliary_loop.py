@@ -14,23 +14,22 @@ from armident.identify.controller.nominal import known_controller, nominal_contr
 from armident.identify.controller.parametric import ControlLaw, identify_parametric
 from armident.identify.estimators.auxiliary_model import AuxiliaryModel
 from armident.identify.estimators.measured_instruments import MotionInstruments
-from armident.identify.experiment import Experiment
+from armident.identify.estimators.methods import estimator
 from armident.identify.identification.equations import PIV_CUTOFF, Prepared
+from armident.identify.identification.identification_criteria import IdentificationCriteria
 from armident.identify.identification.options import CONTROLLERS, Options
-from armident.identify.identification.solvers import MEASURED
 from armident.identify.robot.arm import ArmModel
 from armident.identify.robot.controller import DiscreteController
 from armident.identify.robot.simulation import Simulation
 from armident.identify.signals.bandpass import butterworth
 from armident.identify.signals.decimate import Decimation
 from armident.identify.signals.differentiate import Derivatives, differentiate
-from armident.identify.streamed import kept, mapped
+from armident.identify.signals.experiments import Experiment
+from armident.identify.signals.streamed import kept, mapped
 
 RUNAWAY = 3.0
-"""Speed of a simulated joint, over the highest measured speed, beyond which the simulation has diverged."""
-
-RELEVANT = 0.3
-"""Relative velocity error of the auxiliary model below which its instruments are relevant enough."""
+"""Speed of a simulated joint, over the highest measured speed, beyond which the simulation has diverged: a stable loop
+oversteps its set points by less than their own speed, so that it stays below two."""
 
 NO_REFERENCE = (
     "There is no reference trajectory in the recording. Instruments: simulation of a stiff PD controller that "
@@ -46,17 +45,9 @@ Array = NDArray[np.float64]
 class ClosedLoop(NamedTuple):
     """The closed loop that an estimator simulates.
 
-    Parameters
-    ----------
-    auxiliary
-        The auxiliary model.
-    start
-        Parameters with which it runs, shape (b,): the first iterate.
-    controller
-        Description of the controller, as in the result document: its kind, parameters, and the relative error of the
-        simulated velocities in percent.
-    warnings
-        Reasons why a preferred controller was not used.
+    ``start``: parameters with which it runs, shape (b,): the first iterate; ``controller``: description of the
+    controller, as in the result document: its kind, parameters, and the relative error of the simulated velocities in
+    percent; ``warnings``: reasons why a preferred controller was not used.
     """
 
     auxiliary: AuxiliaryModel
@@ -78,25 +69,10 @@ def closed_loop(
     Controllers are tried in order of preference: the identified or known one, then a stiff PD controller. Each is
     simulated with the IDIM-LS estimate, then with the initial parameters of the configuration.
 
-    Parameters
-    ----------
-    prepared
-        The arm, the experiments and the derivatives of their positions.
-    options
-        Method and controller.
-    ls
-        IDIM-LS estimate, shape (b,).
-    decimation
-        Parallel filter of the method.
-    bandwidth
-        Closed-loop bandwidth, Hz.
-    excluded
-        Kind of controller that is not tried.
-
-    Raises
-    ------
-    DataError
-        If every simulation diverges and the method has no measured regressor.
+    ``prepared``: the arm, the experiments and the derivatives of their positions; ``options``: method and controller;
+    ``ls``: IDIM-LS estimate, shape (b,); ``decimation``: parallel filter of the method; ``excluded``: kind of
+    controller that is not tried. Raises DataError if every simulation diverges and the method has no measured
+    regressor.
     """
     model, experiments, signals = prepared.model, prepared.experiments, prepared.signals
     dt = experiments[0].dt
@@ -122,7 +98,7 @@ def closed_loop(
                 fastest,
                 anchor=start,
                 # Methods without a measured regressor have the torque's band in both their sides.
-                band_hz=PIV_CUTOFF * bandwidth if options.method in MEASURED else np.inf,
+                band_hz=PIV_CUTOFF * bandwidth if estimator(options.method).measured else np.inf,
                 starts=[e.start for e in experiments],
                 measured=_bandpassed(options, bandwidth, dt),
                 feedback=description["kind"] in CONTROLLERS,
@@ -135,10 +111,10 @@ def closed_loop(
                 found = description | {"start": origin, "velocity_error_pct": 100 * error}
                 closest = error, ClosedLoop(auxiliary, start, found)
             break
-        if closest is not None and closest[0] < RELEVANT:
+        if closest is not None and closest[0] < IdentificationCriteria.max_velocity_error:
             break
     if closest is None:
-        if options.method not in MEASURED or options.noise_model == "grey-box":
+        if not estimator(options.method).measured or options.noise_model == "grey-box":
             raise DataError(
                 f"{options.method} needs a simulated closed loop, which diverges with every controller and start "
                 "tried. Next: judge the recording by --method idim-ls, or armident check RECORDING"
@@ -156,7 +132,7 @@ def _bandpassed(options: Options, bandwidth: float, dt: float) -> Callable[[Arra
     Without it the instruments of IDIM-PIV hold frequencies that the measured regressor lacks, and the prefilter takes
     them for information.
     """
-    if options.derivatives != "bandpass" or options.method not in MEASURED:
+    if options.derivatives != "bandpass" or not estimator(options.method).measured:
         return None
     return lambda q, _: differentiate(q, dt, "bandpass", bandwidth_hz=bandwidth)
 
@@ -164,10 +140,7 @@ def _bandpassed(options: Options, bandwidth: float, dt: float) -> Callable[[Arra
 def velocity_error(runs: Sequence[Simulation], signals: Sequence[Derivatives]) -> float:
     """Norm of the difference of simulated and smoothed velocities over that of the smoothed ones.
 
-    Parameters
-    ----------
-    runs, signals
-        Simulated and smoothed motion of every experiment.
+    ``runs``, ``signals``: simulated and smoothed motion of every experiment.
     """
     differences = [float(np.linalg.norm(run.qd - s.qd)) for run, s in zip(runs, signals, strict=True)]
     return float(np.linalg.norm(differences) / np.linalg.norm([np.linalg.norm(s.qd) for s in signals]))
@@ -245,15 +218,7 @@ def _description(response: JointResponse) -> dict[str, Any]:
 def initial_parameters(model: ArmModel) -> Array:
     """Base parameters (b,) of the configuration's ``initial_parameters`` (standard names), the rest zero.
 
-    Parameters
-    ----------
-    model
-        The arm.
-
-    Raises
-    ------
-    ConfigError
-        If a name is not a standard parameter of the robot.
+    Raises ConfigError if a name is not a standard parameter of the robot.
     """
     standard = np.zeros(len(model.names))
     for name, value in model.robot.initial_parameters.items():

@@ -15,24 +15,17 @@ from armident.identify.documents.identification import (
     Whiteness,
     parameter,
 )
-from armident.identify.identification.result import Identification
+from armident.identify.identification.identification_result import IdentificationResult
 
 
 def identification_document(
-    result: Identification, recordings: Sequence[Recording], robot: RobotConfig, notes: Sequence[str] = ()
+    result: IdentificationResult, recordings: Sequence[Recording], robot: RobotConfig, notes: Sequence[str] = ()
 ) -> IdentificationDocument:
     """Return the document of an identification.
 
-    Parameters
-    ----------
-    result
-        Estimates of the base parameters with covariance, residual statistics and timing.
-    recordings
-        Recordings that they come from.
-    robot
-        Configuration of the robot, which the document keeps.
-    notes
-        Messages of the conversion; they precede the estimator's warnings.
+    ``result``: estimates of the base parameters with covariance, residual statistics and timing. ``recordings``:
+    recordings that they come from. ``robot``: configuration of the robot, which the document keeps. ``notes``: messages
+    of the conversion; they precede the estimator's warnings.
     """
     joints = [joint.name for joint in robot.joints]
     essential = np.asarray(result.essential, dtype=bool)

@@ -8,14 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armident.configs.schema.robot import Preprocessing
-from armident.identify.experiment import Experiment
 from armident.identify.regression.equations import ExperimentEquations, filtered_regressor
 from armident.identify.robot.arm import ArmModel
 from armident.identify.signals.bandpass import butterworth, central_difference
 from armident.identify.signals.decimate import Decimation, design
 from armident.identify.signals.differentiate import Derivatives
+from armident.identify.signals.experiments import Experiment
 from armident.identify.signals.published_filters import chebyshev_decimate, kept_samples
-from armident.identify.streamed import Streamed, chosen, kept
+from armident.identify.signals.streamed import Streamed, chosen, kept
 
 LS_CUTOFF = 2.0
 """Cut-off of the least-squares decimation in closed-loop bandwidths (thesis 2.3.1: ``w_Fp >= 2 w_dyn``)."""
@@ -41,12 +41,7 @@ def least_rows(model: ArmModel) -> int:
 def decimated_rows(decimation: Decimation, samples: Sequence[int]) -> int:
     """Number of instants that a decimation leaves, of all experiments together.
 
-    Parameters
-    ----------
-    decimation
-        Parallel filter.
-    samples
-        Length of every experiment.
+    ``decimation``: parallel filter; ``samples``: length of every experiment.
     """
     return sum(decimation.count(count) for count in samples)
 
@@ -57,17 +52,8 @@ def sufficient(decimation: Decimation, dt: float, samples: Sequence[int], rows: 
     Motion slower than the cut-off passes any wider filter. A higher cut-off only admits noise, which the estimator
     averages, while too few equations determine neither parameters nor noise.
 
-    Parameters
-    ----------
-    decimation
-        Decimation by the bandwidth.
-    dt
-        Sampling period, s.
-    samples
-        Length of every experiment.
-    rows
-        Least number of instants of all experiments together, see :func:`least_rows`. Without decimation there may be
-        fewer.
+    ``decimation``: decimation by the bandwidth. ``samples``: length of every experiment. ``rows``: least number of
+    instants of all experiments together, see :func:`least_rows`. Without decimation there may be fewer.
     """
     if decimated_rows(decimation, samples) >= rows:
         return decimation
@@ -89,12 +75,8 @@ def aligned_torque(tau: NDArray[np.float64], late: float = 0.0) -> NDArray[np.fl
     Sample k is held over ``[k, k + 1)``, so the torque as recorded belongs half a period after the position. A torque
     that is late by some more is interpolated between its samples.
 
-    Parameters
-    ----------
-    tau
-        Torques as recorded, (N, n).
-    late
-        Samples by which they are late, see :class:`~armident.identify.experiment.Experiment`.
+    ``tau``: torques as recorded, (N, n); ``late``: samples by which they are late, see
+    :class:`~armident.identify.signals.experiments.Experiment`.
     """
     if late:
         k = np.arange(tau.shape[0], dtype=np.float64)
@@ -112,14 +94,8 @@ def equations(
     The sign of the velocity is the smoothed one of the robot's configuration, so all samples can stay, as a linear
     filter requires. Where the configuration gives ``velocity_threshold``, slower rows are left out.
 
-    Parameters
-    ----------
-    model
-        The arm.
-    experiments, signals
-        Recordings of one sampling rate, and the derivatives of their positions.
-    decimation
-        Parallel filter.
+    ``experiments``, ``signals``: recordings of one sampling rate, and the derivatives of their positions;
+    ``decimation``: parallel filter.
     """
     threshold = model.robot.friction.velocity_threshold
 
@@ -139,12 +115,7 @@ def equations(
 class Prepared:
     """Recordings with the derivatives of their positions, and their equations, computed once for every decimation.
 
-    Parameters
-    ----------
-    model
-        The arm.
-    experiments, signals
-        Recordings of one sampling rate, and the derivatives of their positions.
+    ``experiments``, ``signals``: recordings of one sampling rate, and the derivatives of their positions.
     """
 
     model: ArmModel
@@ -159,13 +130,7 @@ class Prepared:
         return self._made[decimation]
 
     def part(self, numbers: Sequence[int]) -> "Prepared":
-        """Some of the experiments.
-
-        Parameters
-        ----------
-        numbers
-            Their numbers, from 0.
-        """
+        """Some of the experiments. ``numbers``: their numbers, from 0."""
         return Prepared(self.model, chosen(self.experiments, numbers), chosen(self.signals, numbers))
 
 
@@ -173,11 +138,6 @@ def tested(blocks: Sequence[ExperimentEquations]) -> list[int]:
     """Numbers of the experiments that tests of an estimate use: all, or evenly spaced stretches of a long recording.
 
     The tests take several times the memory of their equations, and need no hour to reject what is wrong.
-
-    Parameters
-    ----------
-    blocks
-        Equations of every experiment.
     """
     if not isinstance(blocks, Streamed):
         return list(range(len(blocks)))
@@ -191,14 +151,7 @@ def published_equations(
 ) -> Sequence[ExperimentEquations]:
     """Equations by the filters of a published fit: sharp ``sign``, torque as recorded, all rows.
 
-    Parameters
-    ----------
-    model
-        The arm.
-    experiments
-        Recordings.
-    preprocessing
-        Filters, decimation and dropped samples of the published fit.
+    ``preprocessing``: filters, decimation and dropped samples of the published fit.
     """
     p = preprocessing
 

@@ -10,15 +10,15 @@ from numpy.typing import NDArray
 from armident.configs import DataError, Joint, RobotConfig
 from armident.configs.schema.limits import ENDLESS
 from armident.daq.recording import Recording, Stream
-from armident.identify.experiment import Experiment
-from armident.identify.streamed import OnDisk
+from armident.identify.identification.identification_criteria import IdentificationCriteria
+from armident.identify.identification.set_points import between_set_points
+from armident.identify.signals.experiments import Experiment
+from armident.identify.signals.streamed import OnDisk
 
 MAX_MISSING_SHARE = 0.05
 """Largest share of missing samples of an experiment; with more, the rest is no longer the designed motion."""
 MIN_PIECE_S = 0.5
 """Shortest piece between two gaps, s: edge effects of the filters cover shorter ones."""
-STILL_SHARE = 1e-3
-"""Share of its position range below which a joint counts as not moving."""
 RATE_TOLERANCE = 0.01
 """Relative difference between the nominal rate and the receive times above which a note is added."""
 NO_REFERENCE = "no reference trajectory was recorded: identified without one"
@@ -34,13 +34,8 @@ Array = NDArray[np.float64]
 class StretchRule:
     """Size from which a recording is identified in stretches, of which one is in memory at a time.
 
-    Parameters
-    ----------
-    beyond
-        Number of values (samples times joints) up to which a recording is one piece. An identification takes up to
-        260 bytes per value.
-    length
-        Largest number of values of a stretch.
+    ``beyond``: number of values (samples times joints) up to which a recording is one piece. An identification takes up
+    to 260 bytes per value. ``length``: largest number of values of a stretch.
     """
 
     beyond: int = 12_000_000
@@ -59,29 +54,11 @@ def experiments_from_recording(
     Joint positions are ``R^-1 q_motor`` and joint torques ``R' tau_motor`` (thesis equation 2.14 and section B.1).
     The reference between two set points is the straight line that a CiA 402 drive interpolates (60C2h).
 
-    Parameters
-    ----------
-    recording
-        The recording; of a torn one the readable part is used.
-    robot
-        The robot to identify: the recorded one, possibly with other numbers.
-    stretches
-        Size from which pieces are cut into stretches, which are kept on disk.
-
-    Returns
-    -------
-    experiments
-        One per uninterrupted piece or stretch, in time order.
-    notes
-        Remarks for the user, one line each.
-
-    Raises
-    ------
-    ConfigError
-        If the robot lacks a value that identification needs.
-    DataError
-        If the recording is of another robot, lacks a quantity or too many samples, contains NaN, or disagrees with
-        its own counters; names the file, where there is one.
+    ``recording``: of a torn one the readable part is used. ``robot``: may have other numbers than the recorded one.
+    ``stretches``: size from which pieces are cut into stretches, which are kept on disk. Returns one experiment per
+    piece or stretch, in time order, and remarks for the user. Raises ConfigError if the robot lacks a value; DataError
+    if the recording is of another robot, lacks a quantity or too many samples, contains NaN, or disagrees with its own
+    counters.
     """
     try:
         robot.check_filled("identify")
@@ -192,19 +169,8 @@ def _part(recording: Recording, rows: NDArray[np.int64]) -> Recording:
 def joint_positions(stream: Stream, quantity: Literal["position", "demand"], robot: RobotConfig) -> Array:
     """Position or demand of a stream on the joint side, shape (N, n), rad or m.
 
-    Parameters
-    ----------
-    stream
-        Samples of one stream.
-    quantity
-        ``position`` or ``demand``.
-    robot
-        Configuration with the transmission.
-
-    Raises
-    ------
-    DataError
-        If the stream has no such quantity, or a value that is not finite.
+    ``stream``: samples of one stream; ``quantity``: ``position`` or ``demand``; ``robot``: configuration with the
+    transmission. Raises DataError if the stream has no such quantity, or a value that is not finite.
     """
     name = stream.named(quantity)
     if name is None:
@@ -220,17 +186,8 @@ def joint_torques(stream: Stream, robot: RobotConfig) -> Array:
 
     Current and voltage belong to the motor, independently of the side of the positions; a torque names its side.
 
-    Parameters
-    ----------
-    stream
-        Samples of one stream.
-    robot
-        Configuration with the drive gains and the transmission.
-
-    Raises
-    ------
-    DataError
-        If the stream has neither current, voltage nor torque, or a value that is not finite.
+    ``stream``: samples of one stream; ``robot``: configuration with the drive gains and the transmission. Raises
+    DataError if the stream has neither current, voltage nor torque, or a value that is not finite.
     """
     wanted = robot.joints[0].drive.signal
     for quantity in sorted(EFFORTS, key=lambda effort: effort != wanted):
@@ -273,7 +230,7 @@ def _check_counters(recording: Recording) -> None:
     for name, stream in recording.streams.items():
         counted = recording.counters.get(f"{name}.rows")
         if counted is not None and counted != stream.sync.size:
-            raise DataError(f"the recording's counter says {counted} samples of {name!r}, it holds {stream.sync.size}")
+            raise DataError(f"the recording holds {stream.sync.size} samples of {name!r}, its counter is {counted}")
 
 
 def _finite(stream: Stream, name: str, robot: RobotConfig) -> Array:
@@ -308,8 +265,8 @@ def _reference(stream: Stream, samples: Stream, robot: RobotConfig) -> Array:
     knots = joint_positions(stream, "demand", robot)
     if stream is samples:
         return knots
-    _, low, share = _between_knots(stream, samples.sync)
-    q_ref: Array = knots[low] + share[:, None] * (knots[low + 1] - knots[low])
+    _, low, high, share = between_set_points(stream.sync, stream.every, samples.sync)
+    q_ref: Array = knots[low] + share * (knots[high] - knots[low])
     return q_ref
 
 
@@ -317,28 +274,8 @@ def _has_reference(stream: Stream, sync: NDArray[np.int64]) -> NDArray[np.bool_]
     """Mask (N,) of samples with a reference, found piece by piece: the numbers of all knots would fill the memory."""
     if stream.sync is sync:
         return np.ones(sync.size, dtype=bool)
-    return np.concatenate([_between_knots(stream, part)[0] for part in np.array_split(sync, 1 + sync.size // PIECE)])
-
-
-def _between_knots(stream: Stream, sync: NDArray[np.int64]) -> tuple[NDArray[np.bool_], NDArray[np.int64], Array]:
-    """Mask (N,) of samples with a reference, number of the knot before each, and its place between that and the next.
-
-    Parameters
-    ----------
-    stream
-        Stream with the reference.
-    sync
-        SYNC numbers of the samples, (N,).
-    """
-    if stream.sync is sync:
-        return np.ones(sync.size, dtype=bool), np.arange(sync.size), np.zeros(sync.size)
-    before = np.searchsorted(stream.sync, sync, side="right") - 1
-    on_knot = (before >= 0) & (stream.sync[np.maximum(before, 0)] == sync)
-    between = (before >= 0) & (before < stream.sync.size - 1)
-    low = np.clip(before, 0, stream.sync.size - 2)
-    width = stream.sync[low + 1] - stream.sync[low]
-    share = np.clip((sync - stream.sync[low]) / width, 0.0, 1.0)
-    return on_knot | (between & (width == stream.every)), low, share
+    pieces = np.array_split(sync, 1 + sync.size // PIECE)
+    return np.concatenate([between_set_points(stream.sync, stream.every, part)[0] for part in pieces])
 
 
 def _signal_notes(experiments: Sequence[Experiment], robot: RobotConfig) -> list[str]:
@@ -382,18 +319,13 @@ def _usual_range(joint: Joint) -> float:
 def rest_notes(experiments: Sequence[Experiment], robot: RobotConfig) -> list[str]:
     """Remarks on joints that do not move; an identification has them in its verdict.
 
-    Parameters
-    ----------
-    experiments
-        Experiments of one robot.
-    robot
-        Its configuration.
+    ``experiments``: experiments of one robot.
     """
     q = np.concatenate([e.q for e in experiments])
     return [
         f"{joint.name} does not move: its own parameters cannot be determined from this recording"
         for joint, width in zip(robot.joints, np.ptp(q, axis=0), strict=True)
-        if width < STILL_SHARE * _usual_range(joint)
+        if width < IdentificationCriteria.rest_limit_share * _usual_range(joint)
     ]
 
 

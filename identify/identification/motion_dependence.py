@@ -30,19 +30,12 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Dependence:
+class MotionDependence:
     """Dependence of the residuals of one joint on its motion.
 
-    Parameters
-    ----------
-    joint
-        Index of the joint.
-    variable
-        ``position`` (and direction) or ``velocity``.
-    share
-        Share of the power of the residuals that the averages explain beyond chance, 0 to 1.
-    deviation
-        Difference of that share from its mean under shifts, in standard deviations of the shifts.
+    ``joint``: index of the joint; ``variable``: ``position`` (and direction) or ``velocity``; ``share``: share of the
+    power of the residuals that the averages explain beyond chance, 0 to 1; ``deviation``: difference of that share from
+    its mean under shifts, in standard deviations of the shifts.
     """
 
     joint: int
@@ -51,17 +44,12 @@ class Dependence:
     deviation: float
 
 
-def motion_dependence(prepared: Prepared, blocks: Sequence[ExperimentEquations], theta: Array) -> list[Dependence]:
+def motion_dependence(
+    prepared: Prepared, blocks: Sequence[ExperimentEquations], theta: Array
+) -> list[MotionDependence]:
     """Return the dependence of the residuals of every joint on its own position and velocity.
 
-    Parameters
-    ----------
-    prepared
-        Experiments with the derivatives of their positions.
-    blocks
-        Equations of the residuals.
-    theta
-        Base parameters (b,), SI.
+    ``prepared``: experiments with the derivatives of their positions; ``theta``: base parameters (b,), SI.
     """
     dt = prepared.experiments[0].dt
     errors = residuals(blocks, theta)
@@ -73,7 +61,7 @@ def motion_dependence(prepared: Prepared, blocks: Sequence[ExperimentEquations],
         kept = [np.where(used[:, j], e[:, j], 0.0) for e, used in zip(errors, keep, strict=True)]
         q, qd = (signal[:, j] for signal in motion)
         for variable, bins in (("position", _position_bins(q, qd)), ("velocity", _velocity_bins(qd))):
-            found.append(Dependence(j, variable, *_explained(kept, bins)))
+            found.append(MotionDependence(j, variable, *_explained(kept, bins)))
     return found
 
 

@@ -6,10 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armident.configs import DataError, RobotConfig
-from armident.identify.experiment import Experiment
-from armident.identify.identification.criteria import IdentificationCriteria
+from armident.identify.identification.identification_criteria import IdentificationCriteria
 from armident.identify.signals.differentiate import encoder_resolution
-from armident.identify.streamed import mapped
+from armident.identify.signals.experiments import Experiment
+from armident.identify.signals.streamed import mapped
 
 NOISE_SAMPLES = 100_000
 """Samples from which the position noise is estimated."""
@@ -24,13 +24,7 @@ Mask = NDArray[np.bool_]
 
 
 def joint_ranges(experiments: Sequence[Experiment]) -> Array:
-    """Range of the measured position of each joint, shape (n,), rad or m.
-
-    Parameters
-    ----------
-    experiments
-        Recordings of one robot.
-    """
+    """Range of the measured position of each joint, shape (n,), rad or m. ``experiments``: recordings of one robot."""
     return _ranges(mapped(lambda e: e.q, experiments))
 
 
@@ -39,14 +33,8 @@ def moving_joints(experiments: Sequence[Experiment], robot: RobotConfig, criteri
 
     A joint whose recorded reference rests is at rest, whatever disturbances deflect it.
 
-    Parameters
-    ----------
-    experiments
-        Recordings of the robot.
-    robot
-        Its configuration.
-    criteria
-        Limits in encoder counts, position noise, and ranges of limits and other joints.
+    ``experiments``: recordings of the robot; ``criteria``: limits in encoder counts, position noise, and ranges of
+    limits and other joints.
     """
     ranges = joint_ranges(experiments)
     limits = np.array([joint.limits.position for joint in robot.joints], dtype=np.float64)
@@ -69,19 +57,8 @@ def moving_joints(experiments: Sequence[Experiment], robot: RobotConfig, criteri
 def require_motion(experiments: Sequence[Experiment], robot: RobotConfig, moving: Mask) -> None:
     """Raise if no joint moves.
 
-    Parameters
-    ----------
-    experiments
-        Recordings of the robot.
-    robot
-        Its configuration.
-    moving
-        Mask (n,) of the joints that move.
-
-    Raises
-    ------
-    DataError
-        If no joint moves; the message gives the largest range.
+    ``experiments``: recordings of the robot; ``moving``: mask (n,) of the joints that move. Raises DataError if no
+    joint moves; the message gives the largest range.
     """
     if moving.any():
         return

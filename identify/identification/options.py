@@ -3,73 +3,83 @@
 from dataclasses import dataclass
 from typing import Literal, cast, get_args
 
-from armident.configs import ConfigError
-from armident.identify.regression.equations import MAX_AR_ORDER
-from armident.identify.signals.differentiate import NVR_RULES, NvrRule
+from armident.identify.command_options import documented, option
+from armident.identify.estimators.methods import METHODS, Method
+from armident.identify.regression.orders import MAX_AR_ORDER
+from armident.identify.signals.choices import NVR_RULES, DerivativesName, NvrRule
 
-Method = Literal["idim-piv", "idim-iv", "idim-ls", "didim", "clie", "cloe", "sep-pem"]
-METHODS: tuple[Method, ...] = get_args(Method)
-DerivativesName = Literal["irwsm", "irwsm2", "bandpass"]
-DERIVATIVES: tuple[DerivativesName, ...] = get_args(DerivativesName)
 ControllerName = Literal["crc", "parametric", "known"]
 CONTROLLERS: tuple[ControllerName, ...] = get_args(ControllerName)
 NoiseModelName = Literal["black-box", "grey-box"]
-NOISE_MODELS: tuple[NoiseModelName, ...] = get_args(NoiseModelName)
 
 
+def parse_nvr(text: str) -> float | NvrRule:
+    """Noise-variance ratio from text: a number, or the name of a rule (which `Options` checks)."""
+    try:
+        return float(text)
+    except ValueError:
+        return cast(NvrRule, text)
+
+
+def parse_decimation(text: str) -> int | Literal["noise"]:
+    """Decimation from text: a number, or ``noise`` (which `Options` checks)."""
+    try:
+        return int(text)
+    except ValueError:
+        return cast(Literal["noise"], text)
+
+
+@documented
 @dataclass(frozen=True)
 class Options:
-    """Options of an identification; every default works without knowledge of the robot.
+    """Options of an identification; every default works without knowledge of the robot."""
 
-    Parameters
-    ----------
-    method
-        ``idim-piv``, ``idim-iv``, ``idim-ls``, ``didim``, ``clie``, ``cloe`` or ``sep-pem``.
-    derivatives
-        ``irwsm``, ``irwsm2`` or ``bandpass`` (5.1.2, 2.3.1); ``None``: IRWSM 1, except that IDIM-LS uses the filters of
-        a published fit where the robot's configuration has them.
-    controller
-        ``crc`` identifies it by correlation analysis, ``parametric`` as a cascade or PID by refined instrumental
-        variables, ``known`` takes the gains of the configuration.
-    decimation
-        Keep one sample of so many; ``noise``: from the correlation time of the noise (6.2.3); ``None``: from the
-        bandwidth.
-    nvr
-        Noise-variance ratio of the smoother, or the rule to find it: ``automatic``, ``cross-validation``,
-        ``likelihood``, ``tracking-error``; ``None``: ``automatic``.
-    bandwidth_hz
-        Closed-loop bandwidth, Hz; ``None``: from the configuration, else from the data.
-    noise_model
-        Of IDIM-PIV: ``black-box`` (6.27), or ``grey-box``, position noise through the controller (6.28).
-    max_ar_order
-        Highest order of the noise models of IDIM-PIV and SEP-PEM.
-    weighted
-        Weight each joint of IDIM-LS by its noise (2.23) or not (2.22).
-    physical
-        True to compute the nearest physically consistent arm as well.
-    """
+    __pydantic_config__ = {"extra": "forbid"}  # noqa: RUF012 - pydantic's name, for the keys of a session
 
-    method: Method = "idim-piv"
-    derivatives: DerivativesName | None = None
-    controller: ControllerName = "crc"
-    decimation: int | Literal["noise"] | None = None
-    nvr: float | NvrRule | None = None
-    bandwidth_hz: float | None = None
-    noise_model: NoiseModelName = "black-box"
-    max_ar_order: int = MAX_AR_ORDER
-    weighted: bool = True
-    physical: bool = False
+    method: Method = option("Estimator.", "idim-piv")
+    derivatives: DerivativesName | None = option(
+        "Derivatives of the positions (thesis 5.1.2, 2.3.1). [default: irwsm; of idim-ls the published filters]", None
+    )
+    nvr: float | NvrRule | None = option(
+        f"Noise-variance ratio of the smoother: a number, {', '.join(NVR_RULES[:-1])} or {NVR_RULES[-1]}. "
+        f"[default: {NVR_RULES[0]}]",
+        None,
+        parser=parse_nvr,
+        metavar="<str>",
+    )
+    controller: ControllerName = option(
+        "Controller of the simulated loop: crc (impulse response), parametric (cascade or PID) or known (configured).",
+        "crc",
+    )
+    noise_model: NoiseModelName = option(
+        "Noise model of idim-piv: black-box (thesis 6.27), or grey-box, position noise through the controller (6.28).",
+        "black-box",
+    )
+    max_ar_order: int = option("Highest order of the noise models.", MAX_AR_ORDER, min=0)
+    bandwidth_hz: float | None = option("Closed-loop bandwidth, Hz. [default: as configured, or estimated]", None)
+    decimation: int | Literal["noise"] | None = option(
+        "Decimation factor, or noise: from its correlation time (thesis 6.2.3). [default: from the bandwidth]",
+        None,
+        parser=parse_decimation,
+        metavar="<str>",
+    )
+    weighted: bool = option("Weight each joint of idim-ls by its noise (thesis 2.23).", True)
+    physical: bool = option("Also compute the nearest physically consistent parameters.", False, flag="--physical")
 
     def __post_init__(self) -> None:
         """Refuse values that are not offered; the message names those that are."""
-        for name, value, offered in (
-            ("method", self.method, METHODS),
-            ("derivatives", self.derivatives, (None, *DERIVATIVES)),
-            ("controller", self.controller, CONTROLLERS),
-            ("noise_model", self.noise_model, NOISE_MODELS),
+        from armident.configs.errors import ConfigError
+
+        for name, offered in (
+            ("method", METHODS),
+            ("derivatives", (None, *get_args(DerivativesName))),
+            ("controller", CONTROLLERS),
+            ("noise_model", get_args(NoiseModelName)),
         ):
-            if value not in offered:
-                raise ConfigError(f"{name}: {value!r} is not one of {', '.join(str(o) for o in offered if o)}")
+            if getattr(self, name) not in offered:
+                raise ConfigError(
+                    f"{name}: {getattr(self, name)!r} is not one of {', '.join(str(o) for o in offered if o)}"
+                )
         if self.decimation not in (None, "noise") and not (isinstance(self.decimation, int) and self.decimation >= 1):
             raise ConfigError(f"decimation: expected a number of samples or noise, got {self.decimation}")
         if self.max_ar_order < 0:
@@ -81,23 +91,3 @@ class Options:
                 raise ConfigError(f"nvr: {self.nvr!r} is neither a number nor one of {', '.join(NVR_RULES)}")
         elif self.nvr is not None and not self.nvr > 0:
             raise ConfigError(f"nvr: expected a ratio above 0, got {self.nvr}")
-
-
-def parse_nvr(text: str | None) -> float | NvrRule | None:
-    """Noise-variance ratio from text: a number, or the name of a rule (which `Options` checks)."""
-    if text is None:
-        return None
-    try:
-        return float(text)
-    except ValueError:
-        return cast(NvrRule, text)
-
-
-def parse_decimation(text: str | None) -> int | Literal["noise"] | None:
-    """Decimation from text: a number, or ``noise`` (which `Options` checks)."""
-    if text is None:
-        return None
-    try:
-        return int(text)
-    except ValueError:
-        return cast(Literal["noise"], text)

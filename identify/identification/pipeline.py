@@ -9,14 +9,16 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from armident.configs import DataError, RobotConfig
-from armident.identify.effects.recorded import put_right
+from armident.identify.effects.recording_corrections import corrected_experiments
 from armident.identify.effects.terms import arm_model
 from armident.identify.estimators.diagnostics import diagnose_estimate
 from armident.identify.estimators.essential import essential_parameters
 from armident.identify.estimators.idim_ls import idim_ls
-from armident.identify.experiment import Experiment, check_one_rate
-from armident.identify.identification.auxiliary_loop import RELEVANT, ClosedLoop, closed_loop, velocity_error
-from armident.identify.identification.criteria import IdentificationCriteria
+from armident.identify.estimators.methods import estimator
+from armident.identify.estimators.reason import Reason
+from armident.identify.identification.auxiliary_loop import ClosedLoop, closed_loop, velocity_error
+from armident.identify.identification.checks.interval import doubts_of_least_squares, interval_reason
+from armident.identify.identification.checks.judged import Judged
 from armident.identify.identification.equations import (
     Prepared,
     aligned_torque,
@@ -25,32 +27,33 @@ from armident.identify.identification.equations import (
     published_equations,
     tested,
 )
-from armident.identify.identification.excitation_check import examine_support
-from armident.identify.identification.interval_doubts import doubts_of_least_squares
-from armident.identify.identification.judgement import Judged, Notes, judgement, refusing_singular, require_finite
-from armident.identify.identification.moving_joints import MOVE, moving_joints, require_motion
-from armident.identify.identification.noise_decimation import decimation_from_noise
-from armident.identify.identification.options import CONTROLLERS, Options
-from armident.identify.identification.residual_statistics import residual_statistics
-from armident.identify.identification.result import (
+from armident.identify.identification.identification_criteria import IdentificationCriteria
+from armident.identify.identification.identification_result import (
     Array,
-    Identification,
+    IdentificationResult,
     LeastSquares,
     MethodResult,
     Statistics,
     make_result,
 )
+from armident.identify.identification.judgement import Notes, judgement, refusing_singular, require_finite
+from armident.identify.identification.moving_joints import MOVE, moving_joints, require_motion
+from armident.identify.identification.noise_decimation import decimation_from_noise
+from armident.identify.identification.options import CONTROLLERS, Options
+from armident.identify.identification.residual_statistics import residual_statistics
 from armident.identify.identification.sign_smoothing import unsaturated_joints, with_sign_smoothing
-from armident.identify.identification.solvers import MEASURED, PREFILTERED, Problem, Solution, decimation_of, solve
-from armident.identify.identification.verdict import Reason, SetupCheck, judge
+from armident.identify.identification.solvers import IdentificationProblem, Solution, decimation_of, solve
+from armident.identify.identification.support import examine_support
+from armident.identify.identification.verdict import judge
 from armident.identify.regression.equations import Estimate, ExperimentEquations, residuals_of
 from armident.identify.robot.arm import ArmModel
 from armident.identify.robot.consistent import nearest_consistent
-from armident.identify.setup.result import with_torque_shift
+from armident.identify.setup.result import SetupCheck, with_torque_shift
 from armident.identify.signals.bandwidth import motion_bandwidth
 from armident.identify.signals.decimate import Decimation
 from armident.identify.signals.differentiate import Derivatives, differentiate, encoder_resolution
-from armident.identify.streamed import kept, mapped
+from armident.identify.signals.experiments import Experiment, check_one_rate
+from armident.identify.signals.streamed import kept, mapped
 
 TORQUE_PREDICTIONS = 2
 """Largest number of predictions of the torques on which terms depend."""
@@ -70,32 +73,18 @@ def identify_experiment(
     options: Options | None = None,
     progress: Progress | None = None,
     setup: SetupCheck | None = None,
-) -> Identification:
+) -> IdentificationResult:
     """Identify the base parameters of a robot, and judge the result.
 
     The steps are those of the thesis: derivatives (5.1), IDIM-LS (2.3.2), controller (5.2), auxiliary closed loop,
     IDIM-IV (2.3.3) or IDIM-PIV (6.2.2). IDIM-LS is always computed: it starts the iterations and is reported beside
     their result.
 
-    Parameters
-    ----------
-    experiments
-        One or more recordings of the same robot at one sampling rate.
-    robot
-        Its configuration.
-    options
-        Options; ``None``: the defaults.
-    progress
-        Called with a stage and the share done, 0 to 1.
-    setup
-        Check of the set-up of these recordings, which enters the verdict; ``None``: not made.
-
-    Raises
-    ------
-    ConfigError
-        If ``controller='known'`` and the configuration has none.
-    DataError
-        If the data cannot support the request: too short, not finite, motion that leaves parameters undetermined.
+    ``experiments``: one or more recordings of the same robot at one sampling rate. ``options``: options; ``None``: the
+    defaults. ``progress``: called with a stage and the share done, 0 to 1. ``setup``: check of the set-up of these
+    recordings, which enters the verdict; ``None``: not made. Raises ConfigError if ``controller='known'`` and the
+    configuration has none; DataError if the data cannot support the request: too short, not finite, motion that leaves
+    parameters undetermined.
     """
     if isinstance(experiments, Experiment):
         experiments = [experiments]
@@ -119,7 +108,7 @@ def _identify(
     options: Options,
     clock: "_Clock",
     setup: SetupCheck | None,
-) -> Identification:
+) -> IdentificationResult:
     """Carry out the steps of the thesis in their order."""
     notes = Notes()
     criteria = IdentificationCriteria()
@@ -127,14 +116,14 @@ def _identify(
     clock.enter("model", 0.0)
     moving = moving_joints(experiments, robot, criteria)
     require_motion(experiments, robot, moving)
-    experiments = shifted_experiments(put_right(experiments, robot), robot, options, setup, notes)
+    experiments = shifted_experiments(corrected_experiments(experiments, robot), robot, options, setup, notes)
     bandwidth = (
         options.bandwidth_hz
         or robot.bandwidth_hz
         or motion_bandwidth(mapped(lambda e: e.q, experiments), experiments[0].dt)
     )
     given, robot = robot, with_sign_smoothing(robot, experiments, bandwidth)
-    notes.reasons += [_interval_reason(line) for line in unsaturated_joints(given, robot, experiments, bandwidth)]
+    notes.reasons += [interval_reason(line) for line in unsaturated_joints(given, robot, experiments, bandwidth)]
     model = arm_model(robot)
 
     clock.enter("derivatives", 0.05)
@@ -149,7 +138,7 @@ def _identify(
 
     with refusing_singular(options.method, model, support, criteria):
         doubts: tuple[str, ...] = ()
-        if options.method == "idim-ls":
+        if estimator(options.method).solve is None:
             solution, found = None, MethodResult(ls.estimate, ls.blocks, {"kind": "none"})
             doubts = doubts_of_least_squares(prepared, options, ls, bandwidth)
         else:
@@ -172,8 +161,7 @@ def _identify(
 
     clock.enter("verdict", 0.97)
     reasons = judgement(Judged(prepared, options, ls, found, solution, statistics, support), criteria)
-    doubtful = [_interval_reason(line) for line in statistics.interval_warnings]
-    verdict = judge([*notes.reasons, *reasons, *doubtful], setup)
+    verdict = judge([*notes.reasons, *reasons], setup)
     if verdict.of_kind("excitation"):
         statistics = replace(statistics, essential=statistics.essential & support.supported)
     clock.done()
@@ -214,7 +202,7 @@ def _least_squares(
 
     # A factor chosen by the user is that of the method; a method with a noise model keeps its own for the comparison.
     factor = options.decimation if isinstance(options.decimation, int) else None
-    plain = decimation(None if options.method in PREFILTERED else factor)
+    plain = decimation(None if estimator(options.method).prefiltered else factor)
     published = model.robot.preprocessing
     as_published = has_published_filters(model.robot, options)
     if as_published and published is not None:
@@ -224,7 +212,7 @@ def _least_squares(
     ls = estimate(blocks)
     if options.decimation == "noise":
         factor = _memory_of_noise(prepared, ls.theta, notes.reasons)
-        if options.method not in PREFILTERED:
+        if not estimator(options.method).prefiltered:
             plain = decimation(factor)
             blocks = prepared.equations(plain)
             ls = estimate(blocks)
@@ -234,10 +222,7 @@ def _least_squares(
 def has_published_filters(robot: RobotConfig, options: Options) -> bool:
     """Return True if IDIM-LS uses the filters of a published fit, which takes the torque as recorded.
 
-    Parameters
-    ----------
-    robot, options
-        Configuration, which may have such filters, and options of the identification.
+    ``robot``, ``options``: configuration, which may have such filters, and options of the identification.
     """
     return options.derivatives is None and options.decimation is None and robot.preprocessing is not None
 
@@ -247,16 +232,8 @@ def shifted_experiments(
 ) -> Sequence[Experiment]:
     """Return the experiments with the common shift of the torques that the check of the set-up found.
 
-    Parameters
-    ----------
-    experiments
-        Experiments of one robot.
-    robot, options
-        Its configuration, and options of the identification.
-    setup
-        Check of the set-up; ``None``: not made.
-    notes
-        Receives a remark on the shift.
+    ``experiments``: experiments of one robot. ``robot``, ``options``: its configuration, and options of the
+    identification. ``setup``: check of the set-up; ``None``: not made. ``notes``: receives a remark on the shift.
     """
     shift = None if setup is None else setup.torque_shift
     if shift is None or not shift.applied or (options.method == "idim-ls" and has_published_filters(robot, options)):
@@ -287,13 +264,13 @@ def _solve_in_closed_loop(
     )
 
     def in_loop(loop: ClosedLoop) -> Solution:
-        return solve(Problem(prepared, loop.auxiliary, loop.start, ls.decimation, options))
+        return solve(IdentificationProblem(prepared, loop.auxiliary, loop.start, ls.decimation, options))
 
     loop = closed_loop(prepared, options, ls.estimate.theta, decimation, bandwidth)
     clock.enter(options.method, 0.5)
     solution = in_loop(loop)
     kind = loop.controller["kind"]
-    if options.method in MEASURED and kind in CONTROLLERS:
+    if estimator(options.method).measured and kind in CONTROLLERS:
         defect = _defect_of_loop(solution, prepared.signals)
         if defect:
             other = closed_loop(prepared, options, ls.estimate.theta, decimation, bandwidth, excluded=kind)
@@ -330,13 +307,6 @@ def _statistics(prepared: Prepared, found: MethodResult, solution: Solution | No
     return Statistics(essential, diagnostics, delay, interval_warnings=solution.interval_warnings, bias=solution.bias)
 
 
-def _interval_reason(line: str) -> Reason:
-    """Reason for the verdict from a line about intervals, which ends with the next step."""
-    message, _, step = line.partition(" Next: ")
-    message = message.rstrip(".")
-    return Reason("doubtful", message[0].lower() + message[1:], step.rstrip("."), kind="uncertainty")
-
-
 def _defect_of_loop(solution: Solution, signals: Sequence[Derivatives]) -> str:
     """Reason why the instruments of an estimate are unsuitable; empty if they are suitable.
 
@@ -346,7 +316,7 @@ def _defect_of_loop(solution: Solution, signals: Sequence[Derivatives]) -> str:
     runs = solution.runs
     if runs is None:
         defect = "diverges with"
-    elif (error := velocity_error(runs, signals)) >= RELEVANT:
+    elif (error := velocity_error(runs, signals)) >= IdentificationCriteria.max_velocity_error:
         defect = f"misses the measured velocities by {100 * error:.0f} % with"
     elif solution.estimate.converged:
         return ""
@@ -399,14 +369,8 @@ def smoothed_derivatives(
 ) -> Sequence[Derivatives]:
     """Smoothed positions of every experiment and their derivatives (5.1).
 
-    Parameters
-    ----------
-    experiments
-        Experiments of one robot.
-    robot, options
-        Its configuration, and options of the identification.
-    bandwidth
-        Closed-loop bandwidth, Hz.
+    ``experiments``: experiments of one robot; ``robot``, ``options``: its configuration, and options of the
+    identification; ``bandwidth``: closed-loop bandwidth, Hz.
     """
     resolution = encoder_resolution(robot) if options.nvr == "tracking-error" else None
 
@@ -429,15 +393,7 @@ class _Clock:
     _begin: float = field(default_factory=time.perf_counter)
 
     def enter(self, stage: str, share: float) -> None:
-        """End the current stage and begin the next one.
-
-        Parameters
-        ----------
-        stage
-            Name of the next stage.
-        share
-            Share of the identification that is done, 0 to 1.
-        """
+        """End the current stage and begin the next one. ``share``: share of the identification that is done, 0 to 1."""
         self._close()
         self._stage, self._since = stage, time.perf_counter()
         self.report(stage, share)

@@ -12,16 +12,17 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from armident.identify.effects.free_shapes import hats
 from armident.identify.identification.equations import Prepared
 from armident.identify.regression.ar_noise import ArModel
 from armident.identify.regression.equations import (
-    MAX_AR_ORDER,
     Estimate,
     ExperimentEquations,
     instants,
     noise_models,
     residuals,
 )
+from armident.identify.regression.orders import MAX_AR_ORDER
 from armident.identify.regression.whitening import whitened
 
 Array = NDArray[np.float64]
@@ -52,8 +53,6 @@ class JointResidualStatistics:
 
     Parameters
     ----------
-    joint
-        Name of the joint.
     position_range
         Smallest and largest position, rad or m: first and last knot.
     velocity_limit
@@ -85,14 +84,8 @@ def residual_statistics(
 ) -> tuple[JointResidualStatistics, ...]:
     """Return the statistics of the residuals of every joint.
 
-    Parameters
-    ----------
-    prepared
-        Experiments with the derivatives of their positions.
-    blocks
-        Equations of the estimate.
-    estimate
-        Estimate, whose noise models weigh the residuals; a model is fitted where it has none.
+    ``prepared``: experiments with the derivatives of their positions. ``blocks``: equations of the estimate.
+    ``estimate``: whose noise models weigh the residuals; a model is fitted where it has none.
     """
     noise: Sequence[ArModel] = estimate.noise
     if not any(ar.order for ar in noise):
@@ -130,14 +123,8 @@ def residual_statistics(
 def motion_functions(q: Array, qd: Array, limits: tuple[float, float], fastest: float) -> Array:
     """Return the free functions of the motion of a joint at every instant, shape (M, k).
 
-    Parameters
-    ----------
-    q, qd
-        Position and velocity (M,), rad and rad/s, or m and m/s.
-    limits
-        First and last knot of position.
-    fastest
-        Last knot of velocity; the first is its negative.
+    ``q``, ``qd``: position and velocity (M,), rad and rad/s, or m and m/s. ``limits``: first and last knot of position.
+    ``fastest``: last knot of velocity; the first is its negative.
     """
     place = _hats(q, np.linspace(*limits, POSITION_KNOTS))
     direction = qd / np.hypot(qd, max(DIRECTION * fastest, 1e-300))
@@ -145,10 +132,8 @@ def motion_functions(q: Array, qd: Array, limits: tuple[float, float], fastest: 
 
 
 def _hats(x: Array, knots: Array) -> Array:
-    """Piecewise linear functions, each one at its knot and zero at the others, shape (M, knots)."""
-    width = max(float(knots[1] - knots[0]), 1e-300)
-    inside = np.clip(x, knots[0], knots[-1])
-    return np.maximum(1.0 - np.abs(inside[:, None] - knots) / width, 0.0)
+    """Piecewise linear functions (M, k), each one at its knot; all one for a signal that never changes."""
+    return hats(x, knots) if knots[-1] > knots[0] else np.ones((x.size, knots.size))
 
 
 def band_powers(series: Sequence[Array], noise: ArModel) -> tuple[Array, Array]:
@@ -157,12 +142,7 @@ def band_powers(series: Sequence[Array], noise: ArModel) -> tuple[Array, Array]:
     Ordinates of a periodogram are independent chi-square variables with two degrees of freedom each, scaled by the
     spectrum. Satterthwaite's approximation with the spectrum of the noise model gives those of their sum.
 
-    Parameters
-    ----------
-    series
-        Residuals of one joint, one array (M,) per experiment.
-    noise
-        Noise model of the joint.
+    ``series``: residuals of one joint, one array (M,) per experiment; ``noise``: noise model of the joint.
     """
     bands = len(BANDS) - 1
     power, sums, squares = np.zeros(bands), np.zeros(bands), np.zeros(bands)

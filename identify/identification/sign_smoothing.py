@@ -11,10 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armident.configs import RobotConfig
-from armident.identify.experiment import Experiment
+from armident.identify.identification.identification_criteria import IdentificationCriteria
 from armident.identify.signals.bandpass import butterworth, central_difference
 from armident.identify.signals.bandwidth import position_noise
-from armident.identify.streamed import Streamed
+from armident.identify.signals.experiments import Experiment
+from armident.identify.signals.streamed import Streamed
 
 SATURATION = 450.0
 """``g`` times the top speed of the joint.
@@ -27,13 +28,6 @@ sign reaches 0.99 at 14 % of the top speed.
 
 TOP_QUANTILE = 0.99
 """Quantile of the absolute velocity that counts as the top speed."""
-
-SATURATED = 0.98
-"""Least smoothed sign at the root mean square velocity of a joint; below it a warning names the joint.
-
-The missing part of Coulomb friction, ``2 / (pi g qd)``, varies with the velocity, and viscous friction absorbs it: a
-lift at 150 s/m and 0.1 m/s rms misses 4 %, and its viscous friction comes out at 45 instead of 60 N s/m.
-"""
 
 SPEEDS_PER_PERIOD = 8
 """Velocities per period of the low-pass from which the top speed of a long recording is taken: all of them would take
@@ -49,14 +43,8 @@ Array = NDArray[np.float64]
 class Speeds:
     """Velocities of each joint in the recordings, rad/s or m/s, shape (n,) each.
 
-    Parameters
-    ----------
-    top
-        99 % quantile of the absolute velocity.
-    rms
-        Root mean square velocity.
-    noise
-        Standard deviation of the velocity that the noise of the encoder causes after the same filter.
+    ``top``: 99 % quantile of the absolute velocity; ``rms``: root mean square velocity; ``noise``: standard deviation
+    of the velocity that the noise of the encoder causes after the same filter.
     """
 
     top: Array
@@ -65,15 +53,7 @@ class Speeds:
 
 
 def recorded_speeds(experiments: Sequence[Experiment], bandwidth_hz: float) -> Speeds:
-    """Velocities of each joint, after a zero-phase low-pass at the closed-loop bandwidth.
-
-    Parameters
-    ----------
-    experiments
-        Recordings.
-    bandwidth_hz
-        Closed-loop bandwidth, Hz.
-    """
+    """Velocities of each joint, after a zero-phase low-pass at the closed-loop bandwidth."""
     speeds, noise, power, samples = [], [], np.zeros(experiments[0].q.shape[1]), 0
     for e in experiments:
         cutoff = min(bandwidth_hz, LARGEST_CUTOFF / e.dt)
@@ -94,14 +74,8 @@ def with_sign_smoothing(robot: RobotConfig, experiments: Sequence[Experiment], b
     The width ``1/g`` is ``1 / SATURATION`` of the joint's top speed. It is not below the noise of the measured
     velocity: the sign of a narrower one would be that of the noise. A joint without any motion keeps the nominal value.
 
-    Parameters
-    ----------
-    robot
-        Configuration; it is returned as it is where it gives the smoothing.
-    experiments
-        Recordings, corrected for wiring errors.
-    bandwidth_hz
-        Closed-loop bandwidth, Hz.
+    ``robot``: configuration; it is returned as it is where it gives the smoothing. ``experiments``: recordings,
+    corrected for wiring errors. ``bandwidth_hz``: closed-loop bandwidth, Hz.
     """
     if robot.friction.sign_smoothing is not None:
         return robot
@@ -118,12 +92,7 @@ def with_sign_smoothing(robot: RobotConfig, experiments: Sequence[Experiment], b
 def with_numbers(robot: RobotConfig, smoothing: Sequence[float] | Array) -> RobotConfig:
     """Return the configuration with numbers for ``friction.sign_smoothing`` where it gives none.
 
-    Parameters
-    ----------
-    robot
-        Configuration; it is returned as it is where it gives the smoothing.
-    smoothing
-        ``g`` of each joint, s/rad or s/m, (n,).
+    ``smoothing``: ``g`` of each joint, s/rad or s/m, (n,).
     """
     if robot.friction.sign_smoothing is not None:
         return robot
@@ -136,22 +105,14 @@ def unsaturated_joints(
 ) -> list[str]:
     """Warnings for joints that move so slowly that the smoothing of the sign biases their friction.
 
-    Parameters
-    ----------
-    given
-        Configuration of the user.
-    robot
-        Configuration with numbers, from `with_sign_smoothing`.
-    experiments
-        Recordings.
-    bandwidth_hz
-        Closed-loop bandwidth, Hz.
+    ``given``: configuration of the user; ``robot``: configuration with numbers, from `with_sign_smoothing`;
+    ``bandwidth_hz``: closed-loop bandwidth, Hz.
     """
     speeds = recorded_speeds(experiments, bandwidth_hz)
     reached = 2 / np.pi * np.arctan(robot.sign_smoothing * speeds.rms)
     warnings = []
     for j, joint in enumerate(robot.joints):
-        if reached[j] >= SATURATED or speeds.rms[j] == 0.0:
+        if reached[j] >= IdentificationCriteria.min_smoothed_sign or speeds.rms[j] == 0.0:
             continue
         unit = "s/rad" if joint.type == "revolute" else "s/m"
         wanted = SATURATION / max(float(speeds.top[j]), 1e-300)

@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 from scipy import signal, stats
 
 from armident.identify.estimators.auxiliary_model import AuxiliaryModel
-from armident.identify.experiment import Experiment
 from armident.identify.identification.equations import Prepared, aligned_torque
-from armident.identify.identification.options import DerivativesName
+from armident.identify.identification.identification_criteria import IdentificationCriteria
 from armident.identify.regression.ar_noise import ArModel
 from armident.identify.regression.equations import (
     Estimate,
@@ -33,13 +32,11 @@ from armident.identify.robot.controller import DiscreteController
 from armident.identify.robot.simulation import Simulation
 from armident.identify.signals.bandpass import central_difference
 from armident.identify.signals.bandwidth import position_noise
+from armident.identify.signals.choices import DerivativesName
 from armident.identify.signals.decimate import Decimation
 from armident.identify.signals.differentiate import Derivatives, differentiate
-from armident.identify.streamed import kept, mapped
-
-RELEVANT_BIAS = 0.5
-"""Bias in standard deviations above which an estimate is corrected: a 2-sigma interval with this bias holds the truth
-in 92.7 % of the cases instead of 95.4 %."""
+from armident.identify.signals.experiments import Experiment
+from armident.identify.signals.streamed import kept, mapped
 
 SIMULATION_ERROR = 0.15
 """Standard deviation of the part of the bias that the simulation misses, over the bias.
@@ -64,16 +61,9 @@ Array = NDArray[np.float64]
 class SimulatedBias:
     """Bias of an estimator and scatter by encoder noise, from simulated recordings.
 
-    Parameters
-    ----------
-    bias
-        Mean estimate of the simulated recordings less the parameters that made them, SI, (b,).
-    scatter
-        Standard deviations of these estimates, SI, (b,).
-    runs
-        Number of simulated recordings.
-    share
-        Share of the experiments that were simulated, 0 to 1: estimates from all scatter by its square root of that.
+    ``bias``: mean estimate of the simulated recordings less the parameters that made them, SI, (b,); ``scatter``:
+    standard deviations of these estimates, SI, (b,); ``share``: share of the experiments that were simulated, 0 to 1:
+    estimates from all scatter by its square root of that.
     """
 
     bias: Array
@@ -84,10 +74,7 @@ class SimulatedBias:
     def largest(self, estimate: Estimate) -> tuple[int, float]:
         """Parameter with the largest bias, and the bias in its standard deviations.
 
-        Parameters
-        ----------
-        estimate
-            Estimate whose standard deviations count.
+        ``estimate``: estimate whose standard deviations count.
         """
         share = np.abs(self.bias) / estimate.std
         k = int(np.argmax(share))
@@ -107,6 +94,9 @@ def simulated_bias(
 ) -> SimulatedBias | None:
     """Return the bias of an instrumental-variable estimate.
 
+    Returns ``None`` if the loop with this estimate cannot be simulated, or its recordings do not determine the
+    parameters.
+
     Parameters
     ----------
     prepared
@@ -125,11 +115,6 @@ def simulated_bias(
         Number of simulated recordings; ``None``: few where the bias is irrelevant, else many.
     share
         Share of the experiments of the estimate that are simulated, 0 to 1.
-
-    Returns
-    -------
-    SimulatedBias or None
-        ``None`` if the loop with this estimate cannot be simulated, or its recordings do not determine the parameters.
     """
     auxiliary, theta = auxiliary.fresh(), estimate.theta
     clean = auxiliary.simulate(theta)
@@ -164,14 +149,7 @@ def corrected(estimate: Estimate, found: SimulatedBias, blocks: Sequence[Experim
     more than its standard deviation, which assumes noise that is independent of the motion, it is widened to that
     scatter.
 
-    Parameters
-    ----------
-    estimate
-        Estimate with its noise models.
-    found
-        Its bias.
-    blocks
-        Equations of the estimate.
+    ``estimate``: estimate with its noise models.
     """
     theta = estimate.theta - found.bias
     ratio = np.sqrt(found.share) * found.scatter / estimate.std
@@ -185,7 +163,7 @@ def corrected(estimate: Estimate, found: SimulatedBias, blocks: Sequence[Experim
 
 
 def _relevant(errors: Sequence[Array], estimate: Estimate) -> bool:
-    return bool(np.any(np.abs(np.mean(errors, axis=0)) > RELEVANT_BIAS * estimate.std))
+    return bool(np.any(np.abs(np.mean(errors, axis=0)) > IdentificationCriteria.max_bias_std * estimate.std))
 
 
 def _recorded(
@@ -232,14 +210,8 @@ def auxiliary_smoother(
 ) -> Callable[[Array], Derivatives]:
     """Smoother of the measured positions, for simulated ones.
 
-    Parameters
-    ----------
-    auxiliary
-        Closed loop; it has the bandpass where one was chosen.
-    derivatives
-        Name of the smoother.
-    nvr
-        Noise-variance ratios (n,) of the measured positions; ``None``: bandpass.
+    ``auxiliary``: closed loop; it has the bandpass where one was chosen. ``nvr``: noise-variance ratios (n,) of the
+    measured positions; ``None``: bandpass.
     """
     if nvr is None:
         measured = auxiliary.measured

@@ -1,6 +1,6 @@
-"""Equations and estimator of every identification method, by name."""
+"""The problem that an estimator solves, its solution, and what the covariance of the solution neglects."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -8,13 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armident.identify.estimators.auxiliary_model import AuxiliaryModel
-from armident.identify.estimators.clie import clie
-from armident.identify.estimators.cloe import cloe
 from armident.identify.estimators.diagnostics import Diagnostics, diagnose_estimate
-from armident.identify.estimators.didim import didim
-from armident.identify.estimators.idim_iv import idim_iv
-from armident.identify.estimators.idim_piv import idim_piv
-from armident.identify.estimators.sep_pem import sep_pem
+from armident.identify.estimators.methods import Method, estimator
+from armident.identify.estimators.problem import JOINT_TORQUE
+from armident.identify.estimators.reason import Reason
+from armident.identify.estimators.residual_tests import ljung_box
 from armident.identify.identification.equations import (
     LS_CUTOFF,
     PIV_CUTOFF,
@@ -23,18 +21,16 @@ from armident.identify.identification.equations import (
     sufficient,
     tested,
 )
-from armident.identify.identification.interval_doubts import doubts_of_serial_correlation
-from armident.identify.identification.options import Method, Options
+from armident.identify.identification.identification_criteria import IdentificationCriteria
+from armident.identify.identification.options import Options
 from armident.identify.identification.simulated_bias import (
     DOMINANT,
     FEW,
-    RELEVANT_BIAS,
     SimulatedBias,
     corrected,
     simulated_bias,
 )
 from armident.identify.identification.torque_delay import TorqueDelay, torque_delay
-from armident.identify.identification.verdict import Reason
 from armident.identify.regression.equations import (
     Estimate,
     ExperimentEquations,
@@ -46,23 +42,13 @@ from armident.identify.regression.iv import serial_covariance
 from armident.identify.robot.simulation import Simulation
 from armident.identify.signals.decimate import Decimation, design
 from armident.identify.signals.differentiate import Derivatives
-from armident.identify.streamed import chosen
-
-CONTRADICTION = 5.0
-"""Standard deviations by which IDIM-PIV may differ from IDIM-IV in any parameter before IDIM-IV replaces it."""
-
-CONTRADICTION_CAUSE = "they contain errors of the model or its derivatives"
-NO_REFERENCE_CAUSE = f"{CONTRADICTION_CAUSE}, or the instruments, which follow the measured motion, share their noise"
-"""Causes of a contradiction between IDIM-PIV and IDIM-IV, with instruments from a recorded reference and without."""
+from armident.identify.signals.streamed import chosen
 
 NOT_FINITE = "infs or NaNs"
 """Text of scipy's ``ValueError`` for arrays that are not finite."""
 
-PREFILTERED: tuple[Method, ...] = ("idim-piv", "sep-pem")
-"""Methods with a noise model: their equations are decimated only roughly (thesis section 7.2)."""
-
-MEASURED: tuple[Method, ...] = ("idim-ls", "idim-iv", "idim-piv")
-"""Methods whose regressor is the measured one."""
+FEW_LAGS = 5
+"""Lags of the test for serial correlation: the correlation that widens intervals is that of near neighbours."""
 
 Array = NDArray[np.float64]
 
@@ -84,8 +70,6 @@ def decimation_of(
     ----------
     method
         Name of the method; those with a noise model decimate only roughly.
-    dt
-        Sampling period, s.
     bandwidth_hz
         Closed-loop bandwidth, Hz.
     factor
@@ -99,7 +83,7 @@ def decimation_of(
     reasons
         List to which a reason of the verdict is added if too few equations are left.
     """
-    share = PIV_CUTOFF if method in PREFILTERED else LS_CUTOFF
+    share = PIV_CUTOFF if estimator(method).prefiltered else LS_CUTOFF
     cutoff = share * bandwidth_hz if factor is None else 0.5 / (dt * factor)
     wanted = design(dt, cutoff, factor)
     chosen = wanted if factor is not None else sufficient(wanted, dt, samples, rows)
@@ -120,21 +104,11 @@ def decimation_of(
 
 
 @dataclass(frozen=True)
-class Problem:
+class IdentificationProblem:
     """Input of every method: experiments with derivatives, the closed loop, and the first iterate.
 
-    Parameters
-    ----------
-    prepared
-        Arm, experiments and derivatives.
-    auxiliary
-        The simulated closed loop with the decimation of the method.
-    start
-        First theta, shape (b,).
-    plain
-        Decimation of the methods without a noise model.
-    options
-        Options of the identification.
+    ``prepared``: arm, experiments and derivatives; ``auxiliary``: the simulated closed loop with the decimation of the
+    method; ``start``: first theta, shape (b,); ``plain``: decimation of the methods without a noise model.
     """
 
     prepared: Prepared
@@ -148,13 +122,50 @@ class Problem:
         """Equations at measured signals with the decimation of the method."""
         return self.prepared.equations(self.auxiliary.decimation)
 
+    @property
+    def positions(self) -> Sequence[Array]:
+        """Measured joint positions with the decimation of the method, one (M, n) array per experiment, rad or m."""
+        return [self.auxiliary.decimation(e.q) for e in self.prepared.experiments]
+
+    @property
+    def max_ar_order(self) -> int:
+        """Highest order of the noise models."""
+        return self.options.max_ar_order
+
+    @property
+    def grey_box(self) -> bool:
+        """True if the noise is that of the positions, through the controller (6.28)."""
+        return self.options.noise_model == "grey-box"
+
+    def bias(self, estimate: Estimate, *, prefiltered: bool) -> Array | None:
+        """Bias (b,) of IDIM-IV or IDIM-PIV by derivatives and sampling alone; ``None``: no loop can be simulated."""
+        found = self.simulated_bias(estimate, prefiltered=prefiltered, runs=FEW)
+        return None if found is None else found.bias
+
+    def simulated_bias(self, estimate: Estimate, *, prefiltered: bool, runs: int | None = None) -> SimulatedBias | None:
+        """Bias of IDIM-IV or IDIM-PIV on recordings simulated with the estimate; ``None`` if that is impossible.
+
+        Of a long recording the `tested` stretches are simulated: more of them take as much time as all iterations.
+        """
+        numbers = tested(self.blocks)
+        return simulated_bias(
+            self.prepared.part(numbers),
+            self.auxiliary.of_experiments(numbers),
+            chosen(self.blocks, numbers),
+            estimate,
+            estimate.noise if prefiltered else joint_variances(self.blocks, estimate.theta),
+            self.options.derivatives or "irwsm",
+            runs=runs,
+            share=len(numbers) / len(self.blocks),
+        )
+
     @cached_property
-    def plain_problem(self) -> "Problem":
+    def plain_problem(self) -> "IdentificationProblem":
         """Problem with the decimation of the methods without a noise model."""
         return replace(self, auxiliary=replace(self.auxiliary.fresh(), decimation=self.plain))
 
     @cached_property
-    def in_band(self) -> "Problem":
+    def in_band(self) -> "IdentificationProblem":
         """Problem decimated to the band of the instruments where the equations have a wider one.
 
         At the recorded rate nearly all rows lie beyond the band of the instruments and carry no information.
@@ -186,9 +197,9 @@ class Solution:
     """
 
     estimate: Estimate
-    problem: Problem
+    problem: IdentificationProblem
     prefiltered: bool = False
-    noise_of: str = "joint torque"
+    noise_of: str = JOINT_TORQUE
     reasons: tuple[Reason, ...] = ()
     interval_warnings: tuple[str, ...] = ()
     bias: Array | None = None
@@ -202,10 +213,7 @@ class Solution:
     def motions(self) -> Sequence[Derivatives]:
         """Simulated motion of the estimate along the recorded references, without the disturbances of the recordings.
 
-        Raises
-        ------
-        DataError
-            If neither the estimate nor any point between it and the last good one can be simulated.
+        Raises DataError if neither the estimate nor any point between it and the last good one can be simulated.
         """
         auxiliary = self.problem.auxiliary.fresh()
         return auxiliary.motions(self.estimate.theta) if self.runs is None else auxiliary.motions_of(self.runs)
@@ -222,8 +230,8 @@ class Solution:
         problem = self.problem.in_band
         numbers = tested(problem.blocks)
         estimate, instruments = residuals_of(self.estimate, numbers), self.instruments
-        blocks, method = [problem.blocks[k] for k in numbers], problem.options.method
-        if method not in MEASURED:
+        blocks, measured = [problem.blocks[k] for k in numbers], estimator(problem.options.method).measured
+        if not measured:
             blocks = [replace(b, x=z) for b, z in zip(blocks, instruments, strict=True)]
         as_weighed = self.prefiltered and problem is self.problem
         weights = None if as_weighed else joint_variances(blocks, estimate.theta)
@@ -232,7 +240,7 @@ class Solution:
             [joint.name for joint in problem.auxiliary.model.robot.joints],
             blocks,
             estimate,
-            instruments=instruments if method in MEASURED else None,
+            instruments=instruments if measured else None,
             weights=weights,
             essential=essential,
         )
@@ -263,120 +271,33 @@ class Solution:
 def is_singular(error: Exception) -> bool:
     """Return true for a singular matrix, and for scipy's ``ValueError`` about numbers that are not finite.
 
-    Parameters
-    ----------
-    error
-        Exception of numpy or scipy.
+    ``error``: exception of numpy or scipy.
     """
     return isinstance(error, np.linalg.LinAlgError) or NOT_FINITE in str(error)
 
 
-def solve(problem: Problem) -> Solution:
-    """Solution of a problem by the method of its options.
-
-    Raises
-    ------
-    DataError
-        If no auxiliary closed loop runs.
-    """
-    return _SOLVERS[problem.options.method](problem)
-
-
-def _idim_piv(problem: Problem) -> Solution:
-    """IDIM-PIV (6.2.2), or IDIM-IV where the prefilter contradicts it or does not converge.
-
-    A noise model may move the estimate within its uncertainty only. Where it moves it further, the residual is model
-    error and not noise, and the inverse filter amplifies it (thesis section 6.2.3). Then, as in SEP-PEM, the dynamic
-    model is estimated without the noise model, which only enters the covariance (6.2.1). The same holds where the
-    iterations with the prefilter, which weights frequencies beyond those of the motion, do not converge.
-    """
-    options, plain = problem.options, problem.plain_problem
-    without = idim_iv(plain.blocks, plain.auxiliary, problem.start, serial_order=options.max_ar_order)
-    estimate = idim_piv(
-        problem.blocks,
-        problem.auxiliary,
-        without.theta,
-        max_order=options.max_ar_order,
-        grey_box=options.noise_model == "grey-box",
-    )
-    difference, black_box = estimate.theta - without.theta, options.noise_model == "black-box"
-    with np.errstate(invalid="ignore", divide="ignore"):
-        if black_box and np.any(np.abs(difference) > CONTRADICTION * without.std):
-            difference = difference - _difference_without_model_error(problem, estimate, without)
-        shift = np.nan_to_num(np.abs(difference) / without.std, nan=np.inf)
-    worst = int(np.argmax(shift))
-    if shift[worst] > CONTRADICTION:
-        name = problem.auxiliary.model.base.names[worst]
-        reason = Reason(
-            "doubtful",
-            f"a noise model would move {name} by {shift[worst]:.0f} standard deviations (result: idim-iv), so "
-            + (CONTRADICTION_CAUSE if problem.auxiliary.feedback else NO_REFERENCE_CAUSE),
-            "armident diagnose RECORDING",
-            kind="residual",
-        )
-    elif without.converged and not estimate.converged:
-        reason = Reason(
-            "doubtful",
-            f"idim-piv did not converge ({estimate.stop_reason}); the result is that of idim-iv",
-            "armident diagnose RECORDING",
-            kind="convergence",
-        )
-    else:
-        if not black_box:
-            return Solution(estimate, problem, noise_of="motor position")
-        return _without_bias(Solution(estimate, problem, prefiltered=True))
-    return _without_bias(Solution(without, plain, reasons=(reason,)))
-
-
-def _idim_iv(problem: Problem) -> Solution:
-    order = problem.options.max_ar_order
-    return _without_bias(
-        Solution(idim_iv(problem.blocks, problem.auxiliary, problem.start, serial_order=order), problem)
-    )
-
-
-def _bias(problem: Problem, estimate: Estimate, *, prefiltered: bool, runs: int | None = None) -> SimulatedBias | None:
-    """Bias of IDIM-IV or IDIM-PIV on recordings simulated with the estimate; ``None`` if that is impossible.
-
-    Of a long recording the `tested` stretches are simulated: more of them take as much time as all iterations.
-    """
-    weights = estimate.noise if prefiltered else joint_variances(problem.blocks, estimate.theta)
-    numbers = tested(problem.blocks)
-    return simulated_bias(
-        problem.prepared.part(numbers),
-        problem.auxiliary.of_experiments(numbers),
-        chosen(problem.blocks, numbers),
-        estimate,
-        weights,
-        problem.options.derivatives or "irwsm",
-        runs=runs,
-        share=len(numbers) / len(problem.blocks),
-    )
-
-
-def _difference_without_model_error(problem: Problem, estimate: Estimate, without: Estimate) -> Array:
-    """Difference (b,) of IDIM-PIV and IDIM-IV on data of exactly the model, by derivatives and sampling alone.
-
-    The prefilter weights high frequencies, at which the smoothed derivatives of few noisy or undecimated samples are
-    wrong. The two estimates then differ although the model misses nothing. Zero where no loop can be simulated.
-    """
-    biases = [
-        _bias(problem, estimate, prefiltered=True, runs=FEW),
-        _bias(problem.plain_problem, without, prefiltered=False, runs=FEW),
-    ]
-    if biases[0] is None or biases[1] is None:
-        return np.zeros_like(without.theta)
-    return biases[0].bias - biases[1].bias
+def solve(problem: IdentificationProblem) -> Solution:
+    """Solution of a problem by the method of its options, without the bias that instrumental variables have."""
+    used = estimator(problem.options.method)
+    assert used.solve is not None, f"{used.name} solves no problem with a closed loop"
+    found = used.solve(problem)
+    own = problem.plain_problem if found.plain else problem
+    solution = Solution(found.estimate, own, found.prefiltered, found.noise_of, found.reasons)
+    if found.noise_of != JOINT_TORQUE:
+        return solution
+    if used.measured:
+        return _without_bias(solution)
+    return solution if used.prefiltered else _doubted(solution)
 
 
 def _without_bias(solution: Solution) -> Solution:
     """The solution without the bias by derivatives, encoder noise and sampling, where that is relevant."""
     problem, estimate = solution.problem, solution.estimate
-    found = _bias(problem, estimate, prefiltered=solution.prefiltered)
+    found = problem.simulated_bias(estimate, prefiltered=solution.prefiltered)
     if found is None:
         return solution
     worst, share = found.largest(estimate)
-    if share <= RELEVANT_BIAS:
+    if share <= IdentificationCriteria.max_bias_std:
         return solution
     name = problem.auxiliary.model.base.names[worst]
     line = (
@@ -393,7 +314,7 @@ def _without_bias(solution: Solution) -> Solution:
     )
 
 
-def _doubted(method: str, solution: Solution) -> Solution:
+def _doubted(solution: Solution) -> Solution:
     """The solution with a warning where serial correlation, which 2.37 neglects, makes its intervals too narrow."""
     problem, estimate = solution.problem, solution.estimate
     simulated = problem.auxiliary.fresh().equations(problem.blocks, estimate.theta)
@@ -401,37 +322,22 @@ def _doubted(method: str, solution: Solution) -> Solution:
     zeta, keep = [b.x for b in simulated], [b.keep for b in simulated]
     covariance = serial_covariance(zeta, zeta, keep, joint_variances(simulated, estimate.theta), noise)
     names = problem.auxiliary.model.base.names
+    method = problem.options.method.upper()
     doubts = doubts_of_serial_correlation(method, names, estimate, np.sqrt(np.diag(covariance)))
-    return replace(
-        solution,
-        interval_warnings=(*solution.interval_warnings, *doubts),
+    return replace(solution, interval_warnings=(*solution.interval_warnings, *doubts))
+
+
+def doubts_of_serial_correlation(method: str, names: Sequence[str], estimate: Estimate, std: Array) -> tuple[str, ...]:
+    """Warning if the residuals of a joint are not white (Ljung and Box 1978) and intervals are too narrow for it.
+
+    ``std`` (b,) are the standard deviations that allow for serial correlation, SI.
+    """
+    ratio = std / estimate.std
+    worst = int(np.argmax(ratio))
+    white = all(ljung_box(series, FEW_LAGS)[2] >= IdentificationCriteria.serial_level for series in estimate.residuals)
+    if white or ratio[worst] <= IdentificationCriteria.max_serial_std_ratio:
+        return ()
+    return (
+        f"The residuals of {method} are serially correlated, which its covariance neglects (the std of {names[worst]} "
+        f"would be {ratio[worst]:.1f} times as large): its intervals are doubtful. Next: IDIM-IV or IDIM-PIV.",
     )
-
-
-def _didim(problem: Problem) -> Solution:
-    return _doubted("DIDIM", Solution(didim(problem.blocks, problem.auxiliary, problem.start), problem))
-
-
-def _clie(problem: Problem) -> Solution:
-    return _doubted("CLIE", Solution(clie(problem.blocks, problem.auxiliary, problem.start), problem))
-
-
-def _cloe(problem: Problem) -> Solution:
-    positions = [problem.auxiliary.decimation(e.q) for e in problem.prepared.experiments]
-    estimate = cloe(problem.blocks, positions, problem.auxiliary, problem.start)
-    return Solution(estimate, problem, noise_of="joint position")
-
-
-def _sep_pem(problem: Problem) -> Solution:
-    order = problem.options.max_ar_order
-    return Solution(sep_pem(problem.blocks, problem.auxiliary, problem.start, max_order=order), problem)
-
-
-_SOLVERS: dict[Method, Callable[[Problem], Solution]] = {
-    "idim-piv": _idim_piv,
-    "idim-iv": _idim_iv,
-    "didim": _didim,
-    "clie": _clie,
-    "cloe": _cloe,
-    "sep-pem": _sep_pem,
-}

@@ -15,7 +15,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from armident.identify.experiment import Experiment
 from armident.identify.regression.ar_noise import WHITE, ArModel
 from armident.identify.regression.equations import (
     ExperimentEquations,
@@ -28,15 +27,17 @@ from armident.identify.regression.whitening import whitened
 from armident.identify.robot.arm import ArmModel
 from armident.identify.signals.decimate import Decimation
 from armident.identify.signals.differentiate import Derivatives, differentiate
+from armident.identify.signals.experiments import Experiment
 
 HELD = 0.5
 """Delay in samples of a drive that reports the torque it holds until the next sample."""
 
-MAX_AR_ORDER = 10
-"""Highest order of the noise models after decimation, for the standard deviations."""
+DELAY_AR_ORDER = 10
+"""Highest order of the noise models, for the standard deviations. The equations have a rate of four closed-loop
+bandwidths (`LS_CUTOFF`): ten coefficients reach over two and a half periods, and the residuals keep little beyond."""
 
 REWEIGHTINGS = 2
-"""Weighted fits after the first, unweighted one."""
+"""Weighted fits after the first, unweighted one: the delay is linear in the last theta, which hardly changes."""
 
 _CHUNK_SAMPLES = 32768
 
@@ -53,8 +54,6 @@ class TorqueDelay:
         Estimates, shape (n,): recorded torque k belongs to the instant ``k + samples`` of the positions.
     std
         Standard deviations, shape (n,), samples.
-    dt
-        Sampling period, s.
     instrumented
         True if there were instruments independent of the disturbances. Otherwise the delay is that of least squares.
         In a closed loop with disturbances its bias is far larger than its standard deviation.
@@ -73,12 +72,7 @@ class TorqueDelay:
     def contradicts(self, expected: float = HELD, deviations: float = 3.0) -> NDArray[np.bool_]:
         """Mask (n,) of the joints whose delay differs significantly from an expected one.
 
-        Parameters
-        ----------
-        expected
-            Expected delay, samples.
-        deviations
-            Standard deviations by which the delay must differ.
+        ``expected``: expected delay, samples; ``deviations``: standard deviations by which the delay must differ.
         """
         contradiction: NDArray[np.bool_] = np.abs(self.samples - expected) > deviations * self.std
         return contradiction
@@ -95,13 +89,12 @@ def torque_delay(
     """Delay between torque and position of every joint, in fractions of samples.
 
     The torque is taken as recorded. All base parameters are estimated along with the delays, so a delay explains only
-    the part that they cannot. Each joint has its own delay; coupled motors of a wrist give the mixture that acts on
-    the joint.
+    the part that they cannot. Each joint has its own delay; coupled motors of a wrist give the mixture that acts on the
+    joint. Result: with standard deviations that allow for serially correlated residuals. Raises DataError if a
+    recording is shorter than the parallel filter.
 
     Parameters
     ----------
-    model
-        The arm.
     experiments, signals
         Recordings of one sampling rate, and the derivatives of their positions.
     decimation
@@ -112,16 +105,6 @@ def torque_delay(
     regressors
         Filtered regressors, (M, n, b) each, at the measured motions and at the instruments, if they were computed
         before.
-
-    Returns
-    -------
-    TorqueDelay
-        With standard deviations that allow for serially correlated residuals.
-
-    Raises
-    ------
-    DataError
-        If a recording is shorter than the parallel filter.
     """
     references = [e.q_ref for e in experiments if e.q_ref is not None]
     instrumented = instruments is not None or len(references) == len(experiments)
@@ -157,7 +140,7 @@ def torque_delay(
         theta, blocks = solve(z, x, noise)
         noise = joint_variances(blocks, theta)
     covariance = serial_covariance(z, x, keep, noise, noise)
-    coloured = noise_models(blocks, theta, covariance, MAX_AR_ORDER)
+    coloured = noise_models(blocks, theta, covariance, DELAY_AR_ORDER)
     covariance = serial_covariance(z, x, keep, noise, coloured)
     return TorqueDelay(theta[b:], np.sqrt(np.diag(covariance)[b:]), experiments[0].dt, instrumented)
 

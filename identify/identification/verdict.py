@@ -2,78 +2,28 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal, Protocol
+from typing import Any
 
-from armident.identify.setup.result import TorqueShift
-
-Level = Literal["trustworthy", "doubtful", "unusable"]
-LEVELS: tuple[Level, ...] = ("trustworthy", "doubtful", "unusable")
+from armident.identify.estimators.reason import LEVELS, Kind, Level, Reason
+from armident.identify.setup.result import SetupCheck, SetupFinding
 
 AT_REST = ("standstill", "joint_at_rest")
 """Findings of the set-up that are a matter of the excitation."""
-
-Kind = Literal[
-    "setup", "error", "physics", "excitation", "convergence", "loop", "residual", "uncertainty", "instruments", "delay"
-]
-
-
-@dataclass(frozen=True)
-class Reason:
-    """One defect of a result.
-
-    Parameters
-    ----------
-    level
-        Level of the verdict that the defect causes.
-    message
-        The defect in one sentence, with figures.
-    next_step
-        Action that removes it.
-    joint
-        Joint concerned; ``None``: several, or none in particular.
-    kind
-        Property that was judged.
-    """
-
-    level: Level
-    message: str
-    next_step: str
-    joint: str | None = None
-    kind: Kind = "error"
 
 
 @dataclass(frozen=True)
 class Verdict:
     """Judgement of a result.
 
-    Parameters
-    ----------
-    level
-        ``trustworthy``: no defect was found. ``doubtful``: usable within the limits that the reasons state.
-        ``unusable``: the parameters must not be used.
-    reasons
-        Defects, the most severe first; empty if trustworthy.
+    ``level``: ``trustworthy``: no defect was found. ``doubtful``: usable within the limits that the reasons state.
+    ``unusable``: the parameters must not be used. ``reasons``: defects, the most severe first; empty if trustworthy.
     """
 
     level: Level
     reasons: tuple[Reason, ...] = ()
 
-    @property
-    def sentence(self) -> str:
-        """The level and, if not trustworthy, the first reason."""
-        if not self.reasons:
-            return self.level
-        more = len(self.reasons) - 1
-        return f"{self.level}: {self.reasons[0].message}" + (f" (and {more} more)" if more else "")
-
     def of_kind(self, kind: Kind) -> tuple[Reason, ...]:
-        """Return the reasons of one kind.
-
-        Parameters
-        ----------
-        kind
-            Property that was judged.
-        """
+        """Return the reasons of one kind. ``kind``: property that was judged."""
         return tuple(reason for reason in self.reasons if reason.kind == kind)
 
     def document(self) -> dict[str, Any]:
@@ -87,66 +37,13 @@ class Verdict:
         }
 
 
-class SetupFinding(Protocol):
-    """Finding of the check of the set-up, as far as the verdict uses it."""
-
-    @property
-    def kind(self) -> str:
-        """Kind of the mistake, for example ``time_shift`` or ``joint_at_rest``."""
-
-    @property
-    def joints(self) -> tuple[str, ...]:
-        """Joints concerned."""
-
-    @property
-    def probability(self) -> float:
-        """Posterior probability among the hypotheses tried, 0 to 1."""
-
-    @property
-    def message(self) -> str:
-        """Finding in one sentence."""
-
-    @property
-    def remedy(self) -> str:
-        """Line of configuration, or option, that corrects it."""
-
-    @property
-    def decisive(self) -> bool:
-        """True if results without the correction are unusable."""
-
-
-class SetupCheck(Protocol):
-    """Result of the check of the set-up, as far as the verdict uses it."""
-
-    @property
-    def findings(self) -> Sequence[SetupFinding]:
-        """Findings, the most probable first."""
-
-    @property
-    def joints_not_understood(self) -> tuple[str, ...]:
-        """Joints of whose torque more than a third stays, with every hypothesis."""
-
-    @property
-    def tried(self) -> tuple[str, ...]:
-        """Hypotheses that were tried, in words."""
-
-    @property
-    def torque_shift(self) -> TorqueShift | None:
-        """Common shift of the torques by less than a sample; ``None``: not estimated."""
-
-
 def judge(reasons: Sequence[Reason], setup: SetupCheck | None = None) -> Verdict:
     """Return the verdict that reasons and the check of the set-up lead to.
 
     The level is that of the most severe reason. Reasons are sorted by severity, those of the set-up first; each message
     occurs once.
 
-    Parameters
-    ----------
-    reasons
-        Defects found in data and result.
-    setup
-        Check of the set-up; ``None``: not made.
+    ``reasons``: defects found in data and result. ``setup``: check of the set-up; ``None``: not made.
     """
     every = _merged(reasons, setup)
     once = {reason.message: reason for reason in reversed(every)}
@@ -206,12 +103,7 @@ def _tried(setup: SetupCheck) -> str:
 def listed(names: Sequence[str], most: int = 12) -> str:
     """Return names as a list in words, cut after ``most``.
 
-    Parameters
-    ----------
-    names
-        Names, at least one.
-    most
-        Largest number of names.
+    ``names``: at least one; ``most``: largest number of names.
     """
     shown = list(names[:most])
     if len(names) > most:

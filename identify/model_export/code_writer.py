@@ -14,7 +14,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from armident.identify.documents.base import versions
 from armident.identify.documents.files import write_atomically
 from armident.identify.effects.link import GravityDirection
-from armident.identify.effects.numbers import ParameterChange
+from armident.identify.effects.parameter_change import ParameterChange
 from armident.identify.effects.registry import of_entry
 from armident.identify.model_export.exported_model import ExportedModel
 from armident.identify.model_export.formulas import FUNCTIONS, InstantModel, instant_model
@@ -41,14 +41,7 @@ _TEMPLATES.filters["quoted"] = lambda text: json.dumps(text, ensure_ascii=False)
 class Code:
     """Content of the files of a model.
 
-    Parameters
-    ----------
-    name
-        Identifier of the robot.
-    content
-        Variables of the templates.
-    sheet
-        What the code does not hold.
+    ``name``: identifier of the robot; ``content``: variables of the templates; ``sheet``: what the code does not hold.
     """
 
     name: str
@@ -56,28 +49,12 @@ class Code:
     sheet: LimitationSheet
 
     def render(self, template: str, **more: Any) -> str:
-        """Return the text of a file.
-
-        Parameters
-        ----------
-        template
-            Name in ``templates``.
-        **more
-            Further variables.
-        """
+        """Return the text of a file. ``template``: name in ``templates``; ``**more``: further variables."""
         return _TEMPLATES.get_template(template).render(**self.content, **more)
 
 
 def write_python(model: ExportedModel, path: Path) -> tuple[list[Path], LimitationSheet]:
-    """Write a Python module that needs only ``math``; see `armident.identify.model_export.formats.Format.write`.
-
-    Parameters
-    ----------
-    model
-        The model.
-    path
-        File to write.
-    """
+    """Write a Python module that needs only ``math``; see `armident.identify.model_export.formats.Format.write`."""
     code = code_of(model, "python")
     write_atomically(path, code.render("model.py.jinja"))
     return [path], code.sheet
@@ -86,12 +63,7 @@ def write_python(model: ExportedModel, path: Path) -> tuple[list[Path], Limitati
 def write_c(model: ExportedModel, path: Path) -> tuple[list[Path], LimitationSheet]:
     """Write a C99 source file and its header, with inverse and forward dynamics.
 
-    Parameters
-    ----------
-    model
-        The model.
-    path
-        Source file to write; the header is beside it and has the name of the robot.
+    ``path``: source file to write; the header is beside it and has the name of the robot.
     """
     code = code_of(model, "c")
     header = path.with_name(f"{code.name}.h")
@@ -101,15 +73,7 @@ def write_c(model: ExportedModel, path: Path) -> tuple[list[Path], LimitationShe
 
 
 def code_of(model: ExportedModel, format_name: str) -> Code:
-    """Return names, tables and formulas of a model.
-
-    Parameters
-    ----------
-    model
-        The model.
-    format_name
-        Format for the sheet.
-    """
+    """Return names, tables and formulas of a model. ``format_name``: format for the sheet."""
     instant = instant_model(model.arm, model.theta)
     values, chain = model.arm.values(instant.theta), model.arm.chain
     friction = zip(values.ia, values.fv, values.fc, values.off, values.smoothing, strict=True)
@@ -153,13 +117,7 @@ def code_of(model: ExportedModel, format_name: str) -> Code:
 
 
 def identifier(name: str) -> str:
-    """Return a name as an identifier of Python and C.
-
-    Parameters
-    ----------
-    name
-        Name of a robot or joint.
-    """
+    """Return a name as an identifier of Python and C. ``name``: name of a robot or joint."""
     found = re.sub(r"[^A-Za-z0-9_]", "_", name)
     return f"_{found}" if not found or found[0].isdigit() or keyword.iskeyword(found) else found
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from armident.identify.documents.files import write_atomically
-from armident.identify.identification.result import unit
+from armident.identify.identification.identification_result import unit
 from armident.identify.model_export.code_writer import EVERY_PART
 from armident.identify.model_export.exported_model import ExportedModel
 from armident.identify.model_export.sheet import LimitationSheet, limitation_sheet
@@ -21,13 +21,6 @@ def write_csv(model: ExportedModel, path: Path) -> tuple[list[Path], LimitationS
 
     ``identifiable`` is ``alone``, ``group`` or ``no``; ``std`` is empty where the recordings do not determine the
     parameter alone.
-
-    Parameters
-    ----------
-    model
-        The model.
-    path
-        File to write.
     """
     found = model.consistent
     rigid = len(found.names) - model.arm.e

@@ -8,18 +8,18 @@ import numpy as np
 
 from armident.configs import DataError, RobotConfig, load_robot
 from armident.identify.documents.identification import IdentificationDocument
-from armident.identify.effects.recorded import of_recording
+from armident.identify.effects.recording_corrections import of_recording
 from armident.identify.effects.registry import of_entry
 from armident.identify.effects.terms import effect_terms
-from armident.identify.identification.excitation_check import workspace_postures
+from armident.identify.identification.checks.excitation import workspace_postures
+from armident.identify.identification.robot_model import RobotModel
+from armident.identify.identification.saved_model import load_model
 from armident.identify.model_export.link_frames import LinkFrames, mdh_link_frames
 from armident.identify.model_export.source_urdf import SourceUrdf, known_bodies, source_for, source_frames, source_of
 from armident.identify.robot.arm import ArmModel
 from armident.identify.robot.chain import Floats
 from armident.identify.robot.consistent import ConsistentParameters, nearest_consistent, pseudo_inertias
 from armident.identify.robot.known_bodies import nearest_to_known
-from armident.identify.robot_model import RobotModel
-from armident.identify.saved_model import SavedModel, load_model
 
 IMPOSSIBLE = (
     "look for the effect with armident diagnose RECORDING and identify with the model it writes, "
@@ -72,7 +72,7 @@ class LinkBody:
 
 
 @dataclass(frozen=True)
-class JointFriction:
+class ExportedFriction:
     """Rotor inertia and friction of a joint, joint side.
 
     Parameters
@@ -183,7 +183,7 @@ class ExportedModel:
     consistent: ConsistentParameters
     frames: LinkFrames
     links: tuple[LinkBody, ...]
-    joints: tuple[JointFriction, ...]
+    joints: tuple[ExportedFriction, ...]
     couplings: tuple[JointCoupling, ...]
     effects: tuple[ExportedEffect, ...]
     source_urdf: SourceUrdf | None = None
@@ -197,8 +197,8 @@ class ExportedModel:
 
     @property
     def model(self) -> RobotModel:
-        """The model as ``import armident`` offers it; ``model.inverse_dynamics(exported.theta, q, qd, qdd)``."""
-        return RobotModel(self.robot)
+        """The model as ``import armident`` offers it, with the exported parameters."""
+        return RobotModel(self.robot, self.theta)
 
     @property
     def undetermined(self) -> dict[str, str]:
@@ -266,7 +266,7 @@ def load_exported_model(
     ----------
     path
         ``identification.json``, ``diagnosis.json``, or the folder of one of them. The structure that a diagnosis found
-        is identified from its recordings (`armident.identify.saved_model.load_model`).
+        is identified from its recordings (`armident.identify.identification.saved_model.load_model`).
     robot
         Configuration, or its path or shipped name; ``None``: that of the document.
     urdf
@@ -295,7 +295,7 @@ def load_exported_model(
     return model if source is None else model.in_frames_of(source)
 
 
-def exported_model(saved: SavedModel, *, nearest: bool = False) -> ExportedModel:
+def exported_model(saved: RobotModel, *, nearest: bool = False) -> ExportedModel:
     """Compute the physically consistent arm of an identification.
 
     Parameters
@@ -345,12 +345,12 @@ def _refuse_negative_inertia(arm: ArmModel, theta: Floats, source: Path) -> None
         )
 
 
-def _joints(arm: ArmModel, theta: Floats, frames: LinkFrames) -> tuple[JointFriction, ...]:
+def _joints(arm: ArmModel, theta: Floats, frames: LinkFrames) -> tuple[ExportedFriction, ...]:
     """Return rotor inertias and friction of the joints, with their names in the file."""
     values = arm.values(theta)
     rows = np.stack([values.ia, values.fv, values.fc, values.off], axis=1).tolist()
     types = [joint.type for joint in arm.robot.joints]
-    return tuple(JointFriction(name, kind, *row) for name, kind, row in zip(frames.joints, types, rows, strict=True))
+    return tuple(ExportedFriction(name, kind, *row) for name, kind, row in zip(frames.joints, types, rows, strict=True))
 
 
 def _couplings(arm: ArmModel, theta: Floats) -> tuple[JointCoupling, ...]:

@@ -31,12 +31,8 @@ EPOCH = (1980, 1, 1, 0, 0, 0)
 class Variable:
     """Variable of an FMU.
 
-    Parameters
-    ----------
-    name, causality, initial, unit, description
-        As in ``modelDescription.xml``; ``initial`` is empty where there is none.
-    start
-        Value at the start; ``None``: computed.
+    ``name``, ``causality``, ``initial``, ``unit``, ``description``: as in ``modelDescription.xml``; ``initial`` is
+    empty where there is none. ``start``: value at the start; ``None``: computed.
     """
 
     name: str
@@ -50,17 +46,7 @@ class Variable:
 def write_fmu(model: ExportedModel, path: Path) -> tuple[list[Path], LimitationSheet]:
     """Write an FMU for 64-bit Linux, compiled on this machine; its sources are inside.
 
-    Parameters
-    ----------
-    model
-        The model.
-    path
-        File to write.
-
-    Raises
-    ------
-    ConfigError
-        If there is no C compiler, or the machine is another one.
+    Raises ConfigError if there is no C compiler, or the machine is another one.
     """
     code, variables = code_of(model, "fmu"), variables_of(model)
     source = code.render("model.c.jinja")
@@ -94,10 +80,7 @@ def write_fmu(model: ExportedModel, path: Path) -> tuple[list[Path], LimitationS
 def variables_of(model: ExportedModel) -> list[Variable]:
     """Return the variables of an FMU: torques, positions, velocities and accelerations of the joints.
 
-    Parameters
-    ----------
-    model
-        The model. Joints start at zero, or in the middle of limits that exclude zero.
+    ``model``: the model. Joints start at zero, or in the middle of limits that exclude zero.
     """
     kinds = (
         ("tau", "input", "", ("N.m", "N"), "torque or force of {}, held during a communication step"),
@@ -126,17 +109,8 @@ def variables_of(model: ExportedModel) -> list[Variable]:
 def compiled(sources: dict[str, str], name: str) -> bytes:
     """Compile C sources to a shared library with the compiler of this machine.
 
-    Parameters
-    ----------
-    sources
-        Texts by file name.
-    name
-        Name of the library.
-
-    Raises
-    ------
-    ConfigError
-        If there is no compiler, or the machine is not one of 64-bit Linux.
+    ``sources``: texts by file name. Raises ConfigError if there is no compiler, or the machine is not one of 64-bit
+    Linux.
     """
     if (platform.system(), platform.machine()) != MACHINE:
         raise ConfigError(f"--format fmu: needs {' '.join(MACHINE)}; on other machines use --format c")

@@ -21,14 +21,8 @@ from armident.identify.model_export.urdf_writer import write_urdf
 class Format:
     """A format of exported models.
 
-    Parameters
-    ----------
-    suffix
-        Suffix of its main file, with the dot.
-    title
-        Name in words.
-    write
-        Writes the model to the path of the main file; returns all files written, the main one first, and the sheet.
+    ``suffix``: suffix of its main file, with the dot. ``title``: name in words. ``write``: writes the model to the path
+    of the main file; returns all files written, the main one first, and the sheet.
     """
 
     suffix: str
@@ -52,15 +46,7 @@ FORMATS: dict[str, Format] = {
 def check_format(format_name: str) -> None:
     """Refuse a format that does not exist.
 
-    Parameters
-    ----------
-    format_name
-        Name of the format.
-
-    Raises
-    ------
-    ConfigError
-        If there is no such format; names those that there are.
+    Raises ConfigError if there is no such format; names those that there are.
     """
     if format_name not in FORMATS:
         raise ConfigError(f"--format: {format_name!r} is not one of {', '.join(FORMATS)}")
@@ -69,26 +55,9 @@ def check_format(format_name: str) -> None:
 def export_model(model: ExportedModel, format_name: str, out: Path) -> tuple[list[Path], LimitationSheet]:
     """Write a model in a format, and the sheet of its limits beside it.
 
-    Parameters
-    ----------
-    model
-        The model.
-    format_name
-        Name in `FORMATS`.
-    out
-        Main file, or a folder in which it is named after the robot.
-
-    Returns
-    -------
-    files : list of Path
-        Files written: the main one first, the sheet last.
-    sheet : LimitationSheet
-        Parts that the format cannot hold, and parameters that were not determined.
-
-    Raises
-    ------
-    ConfigError
-        If there is no such format.
+    ``format_name``: name in `FORMATS`; ``out``: main file, or a folder in which it is named after the robot. Returns
+    ``files``: files written: the main one first, the sheet last; ``sheet``: parts that the format cannot hold, and
+    parameters that were not determined. Raises ConfigError if there is no such format.
     """
     check_format(format_name)
     chosen = FORMATS[format_name]

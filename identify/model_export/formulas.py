@@ -15,8 +15,8 @@ import numpy as np
 from numba.core.errors import NumbaError
 
 from armident.identify.effects.link import GravityDirection, across
-from armident.identify.effects.numbers import ParameterChange
-from armident.identify.effects.recorded import of_recording
+from armident.identify.effects.parameter_change import ParameterChange
+from armident.identify.effects.recording_corrections import of_recording
 from armident.identify.effects.terms import Term, effect_terms
 from armident.identify.robot.arm import ArmModel
 from armident.identify.robot.chain import Floats
@@ -35,15 +35,7 @@ class NotAFormula(Exception):
 
 @dataclass(frozen=True, eq=False)
 class Formula:
-    """Formula in the common notation of Python and C.
-
-    Parameters
-    ----------
-    text
-        The formula.
-    rank
-        Binding strength: 0 sum, 1 product, 2 atom.
-    """
+    """Formula in the common notation of Python and C. ``rank``: binding strength: 0 sum, 1 product, 2 atom."""
 
     text: str
     rank: int = 2
@@ -165,15 +157,7 @@ def _of(value: "Formula | float") -> Formula:
 
 
 def hat(x: float, left: float, top: float, right: float) -> float:
-    """Return the function of `Formula.hats`, as the generated code has it.
-
-    Parameters
-    ----------
-    x
-        Variable.
-    left, top, right
-        Knots.
-    """
+    """Return the function of `Formula.hats`, as the generated code has it. ``x``: variable."""
     if x < top:
         return 1.0 if left == top else max(0.0, (x - left) / (top - left))
     return 1.0 if right == top else max(0.0, (right - x) / (right - top))
@@ -245,12 +229,8 @@ class InstantModel:
 def instant_model(arm: ArmModel, theta: Floats) -> InstantModel:
     """Return the dynamics of an arm at one instant, with those of its effects that have no memory.
 
-    Parameters
-    ----------
-    arm
-        Dynamic model with the effects as terms.
-    theta
-        Standard parameters (p,), those of the effects last, SI.
+    ``arm``: dynamic model with the effects as terms; ``theta``: standard parameters (p,), those of the effects last,
+    SI.
     """
     theta, gravity = theta.copy(), arm.chain.gravity.copy()
     torques: dict[int, dict[int, str]] = {}

@@ -15,8 +15,6 @@ class LinkFrames:
 
     Parameters
     ----------
-    base
-        Name of the base link.
     links, joints
         Names of the moving links and of their joints, (n,).
     placements
@@ -55,10 +53,7 @@ class LinkFrames:
 def mdh_link_frames(robot: RobotConfig) -> LinkFrames:
     """Return the modified Denavit-Hartenberg frames of a robot configuration as link frames.
 
-    Parameters
-    ----------
-    robot
-        Configuration, n joints. A link is named after its joint.
+    ``robot``: configuration, n joints. A link is named after its joint.
     """
     n = robot.n
     links = tuple(f"{joint.name}_link" for joint in robot.joints)
@@ -78,10 +73,7 @@ def mdh_link_frames(robot: RobotConfig) -> LinkFrames:
 def mdh_transform(mdh: Mdh) -> Floats:
     """Return frame j in frame j-1 at position zero, ``Rot(x, alpha) Trans(x, d) Rot(z, theta) Trans(z, r)``, (4, 4).
 
-    Parameters
-    ----------
-    mdh
-        Modified Denavit-Hartenberg parameters (thesis section 2.1.1).
+    ``mdh``: modified Denavit-Hartenberg parameters (thesis section 2.1.1).
     """
     (ca, sa), (ct, st) = cos_sin(mdh.alpha), cos_sin(mdh.theta)
     return np.array(

@@ -29,22 +29,7 @@ REMARKS = (
 
 
 def write_mjcf(model: ExportedModel, out: Path) -> tuple[list[Path], LimitationSheet]:
-    """Write an MJCF file.
-
-    Parameters
-    ----------
-    model
-        The model.
-    out
-        The file.
-
-    Returns
-    -------
-    files : list of Path
-        The file.
-    sheet : LimitationSheet
-        Limits of the format.
-    """
+    """Write an MJCF file. Returns ``files``: the file; ``sheet``: limits of the format."""
     model, parts = with_rigid_effects(model)
     root = ET.Element("mujoco", model=model.robot.name)
     ET.SubElement(root, "compiler", angle="radian", autolimits="true", inertiafromgeom="false")

@@ -21,24 +21,7 @@ TAG = "model"
 def write_pinocchio(model: ExportedModel, out: Path) -> tuple[list[Path], LimitationSheet]:
     """Write an XML archive that ``pinocchio.Model.loadFromXML(file, "model")`` reads.
 
-    Parameters
-    ----------
-    model
-        The model.
-    out
-        The file.
-
-    Returns
-    -------
-    files : list of Path
-        The file.
-    sheet : LimitationSheet
-        Limits of the format.
-
-    Raises
-    ------
-    ConfigError
-        If Pinocchio is not installed.
+    Returns ``files``: the file; ``sheet``: limits of the format. Raises ConfigError if Pinocchio is not installed.
     """
     try:
         import pinocchio

@@ -14,18 +14,9 @@ SPRINGS = "springs"
 def with_rigid_effects(model: ExportedModel) -> tuple[ExportedModel, dict[int, str]]:
     """Return the model with such effects added to its joints, couplings and gravity.
 
-    Parameters
-    ----------
-    model
-        The model.
-
-    Returns
-    -------
-    model : ExportedModel
-        The model with the sums; its effects are still listed.
-    parts : dict
-        Part of the model that holds an effect, by index of the effect: ``rotor inertia``, ``couplings``, ``gravity``
-        or `SPRINGS`. Springs are not added to anything: see `springs`.
+    Returns ``model``: the model with the sums; its effects are still listed. ``parts``: part of the model that holds an
+    effect, by index of the effect: ``rotor inertia``, ``couplings``, ``gravity`` or `SPRINGS`. Springs are not added to
+    anything: see `springs`.
     """
     parts = {k: part for k, effect in enumerate(model.effects) if (part := _part(model, effect)) is not None}
     joints, couplings, gravity = list(model.joints), list(model.couplings), model.frames.gravity
@@ -47,13 +38,7 @@ def with_rigid_effects(model: ExportedModel) -> tuple[ExportedModel, dict[int, s
 
 
 def springs(model: ExportedModel) -> dict[int, float]:
-    """Return the stiffness of the linear spring at each joint that has one, N m/rad or N/m, by index of the joint.
-
-    Parameters
-    ----------
-    model
-        The model.
-    """
+    """Return the stiffness of the linear spring at each joint that has one, N m/rad or N/m, by index of the joint."""
     found: dict[int, float] = {}
     for effect in model.effects:
         if _part(model, effect) == SPRINGS:

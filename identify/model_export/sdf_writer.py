@@ -20,19 +20,7 @@ VERSION = "1.7"
 def write_sdf(model: ExportedModel, out: Path) -> tuple[list[Path], LimitationSheet]:
     """Write an SDF file with one model, fixed to the world.
 
-    Parameters
-    ----------
-    model
-        The model.
-    out
-        The file.
-
-    Returns
-    -------
-    files : list of Path
-        The file.
-    sheet : LimitationSheet
-        Limits of the format.
+    Returns ``files``: the file; ``sheet``: limits of the format.
     """
     model, parts = with_rigid_effects(model)
     root = ET.Element("sdf", version=VERSION)

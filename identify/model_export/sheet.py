@@ -25,12 +25,8 @@ ATTRIBUTES = ("rotor_inertia", "viscous", "coulomb", "offset")
 class Omission:
     """Part of the model that a format cannot hold.
 
-    Parameters
-    ----------
-    part
-        Part of the model with its joint and values, for example ``offset of joint_2: 0.31 N m``.
-    reason
-        Consequence or the next step, one sentence; empty: none.
+    ``part``: part of the model with its joint and values, for example ``offset of joint_2: 0.31 N m``. ``reason``:
+    consequence or the next step, one sentence; empty: none.
     """
 
     part: str
@@ -41,18 +37,9 @@ class Omission:
 class LimitationSheet:
     """Limits of an exported file.
 
-    Parameters
-    ----------
-    format_name
-        Name of the format.
-    held
-        Parts of the model that the file holds, one phrase each.
-    omitted
-        Parts of the model that the file does not hold.
-    undetermined
-        Names of the parameters that the recordings did not determine, with the reason.
-    remarks
-        Further sentences for the user.
+    ``held``: parts of the model that the file holds, one phrase each; ``omitted``: parts of the model that the file
+    does not hold; ``undetermined``: names of the parameters that the recordings did not determine, with the reason;
+    ``remarks``: further sentences for the user.
     """
 
     format_name: str
@@ -62,13 +49,7 @@ class LimitationSheet:
     remarks: tuple[str, ...] = ()
 
     def markdown(self, title: str) -> str:
-        """Return the sheet as a Markdown page.
-
-        Parameters
-        ----------
-        title
-            First heading.
-        """
+        """Return the sheet as a Markdown page. ``title``: first heading."""
         lines = [f"# {title}"]
         for heading, entries in self._sections():
             lines += ["", f"## {heading}", "", *(f"- {entry}" for entry in entries)]
@@ -112,21 +93,9 @@ def limitation_sheet(
 ) -> LimitationSheet:
     """Return the sheet of a file.
 
-    Parameters
-    ----------
-    model
-        The exported model.
-    format_name
-        Name of the format.
-    holds
-        Parts that the file holds: those of `PARTS`, ``couplings``, ``gravity`` and ``springs``; every file holds the
-        links.
-    effects
-        Effects that the file holds as such.
-    parts
-        Part of the arm that another effect was added to, by index of the effect; ``holds`` says if the file holds it.
-    remarks
-        Further sentences for the user.
+    ``holds``: parts that the file holds: those of `PARTS`, ``couplings``, ``gravity`` and ``springs``; every file holds
+    the links. ``effects``: effects that the file holds as such. ``parts``: part of the arm that another effect was
+    added to, by index of the effect; ``holds`` says if the file holds it. ``remarks``: further sentences for the user.
     """
     held = ["masses, centres of mass and inertias of the links", *(part for part in PARTS if part in holds)]
     omitted = [
@@ -165,15 +134,7 @@ def limitation_sheet(
 
 
 def effect_in_words(model: ExportedModel, effect: ExportedEffect) -> str:
-    """Return title, joints and parameters of an effect.
-
-    Parameters
-    ----------
-    model
-        The exported model, for the names of the joints.
-    effect
-        One of its effects.
-    """
+    """Return title, joints and parameters of an effect. ``model``: the exported model, for the names of the joints."""
     names = [model.joints[k].name for k in (effect.joint, effect.other) if k is not None]
     values = ", ".join(
         f"{name} = {_number(value)} {effect.units.get(name, '')}".rstrip() for name, value in effect.parameters.items()

@@ -27,12 +27,7 @@ SAME_GEOMETRY = 1e-5
 class SourceUrdf:
     """URDF of an arm, and the chain in it that was identified.
 
-    Parameters
-    ----------
-    file
-        The URDF.
-    base, tip
-        First and last link of the chain; ``None``: the root, and the last link that moves.
+    ``base``, ``tip``: first and last link of the chain; ``None``: the root, and the last link that moves.
     """
 
     file: Path
@@ -47,10 +42,7 @@ class SourceUrdf:
 def source_of(robot: str | Path) -> SourceUrdf | None:
     """Return the URDF that a robot configuration names, ``None`` if it names none.
 
-    Parameters
-    ----------
-    robot
-        Path or shipped name of the configuration; it has been loaded before.
+    ``robot``: path or shipped name of the configuration; it has been loaded before.
     """
     path = config_path(robot)
     data = read_yaml(path.read_text(encoding="utf-8"), str(path))
@@ -63,17 +55,7 @@ def source_of(robot: str | Path) -> SourceUrdf | None:
 def source_for(robot: RobotConfig, file: Path) -> SourceUrdf:
     """Return the chain of a URDF that ends with the last joint of a robot.
 
-    Parameters
-    ----------
-    robot
-        Configuration of the robot.
-    file
-        The URDF.
-
-    Raises
-    ------
-    ConfigError
-        If there is no such file, or the URDF has no such joint.
+    Raises ConfigError if there is no such file, or the URDF has no such joint.
     """
     if not file.is_file():
         raise ConfigError(f"--urdf: {file}: no such file")
@@ -93,17 +75,8 @@ def source_for(robot: RobotConfig, file: Path) -> SourceUrdf:
 def source_frames(source: SourceUrdf, robot: RobotConfig) -> LinkFrames:
     """Return the frames of the URDF's links.
 
-    Parameters
-    ----------
-    source
-        URDF and chain.
-    robot
-        Configuration of the same arm, n joints; its frame 0 may be anywhere.
-
-    Raises
-    ------
-    ConfigError
-        If the URDF cannot be read, or its arm is another one than that of the configuration.
+    ``source``: URDF and chain. ``robot``: configuration of the same arm, n joints; its frame 0 may be anywhere. Raises
+    ConfigError if the URDF cannot be read, or its arm is another one than that of the configuration.
     """
     joints = read_chain(source.file, source.base, source.tip)
     ours = np.stack(list(accumulate((mdh_transform(joint.mdh) for joint in robot.joints), np.matmul)))
@@ -129,19 +102,7 @@ def source_frames(source: SourceUrdf, robot: RobotConfig) -> LinkFrames:
 def known_bodies(source: SourceUrdf, arm: ArmModel, frames: LinkFrames) -> Floats | None:
     """Return the masses of the URDF as standard parameters (p,) of the arm, the others zero.
 
-    Parameters
-    ----------
-    source
-        URDF and chain.
-    arm
-        Model of the arm.
-    frames
-        Frames of this URDF.
-
-    Returns
-    -------
-    ndarray or None
-        ``None`` if a link has no mass, or one that no body has.
+    ``source``: URDF and chain. Returns ``None`` if a link has no mass, or one that no body has.
     """
     try:
         given = read_inertials(source.file, source.base, source.tip)
@@ -169,10 +130,7 @@ def known_bodies(source: SourceUrdf, arm: ArmModel, frames: LinkFrames) -> Float
 def _frame_0(source: SourceUrdf, joints: tuple[UrdfJoint, ...], robot: RobotConfig, ours: Floats) -> Floats:
     """Frame 0 of the configuration in the base link, so that all axes coincide at position zero, (4, 4).
 
-    Raises
-    ------
-    ConfigError
-        If there is no such frame: the arms differ.
+    Raises ConfigError if there is no such frame: the arms differ.
     """
     names = ", ".join(joint.name for joint in joints)
     hint = "give the URDF of this arm, or the configuration that names it with --config"
@@ -201,14 +159,8 @@ def _aligned(axes: Floats, points: Floats, onto: Floats, onto_points: Floats, re
 
     A prismatic joint has a direction, and no place.
 
-    Parameters
-    ----------
-    axes, points
-        Unit vectors of the axes, and a point on each, (n, 3).
-    onto, onto_points
-        The same of the axes to coincide with, (n, 3).
-    revolute
-        True for revolute joints, (n,).
+    ``axes``, ``points``: unit vectors of the axes, and a point on each, (n, 3); ``onto``, ``onto_points``: the same of
+    the axes to coincide with, (n, 3); ``revolute``: True for revolute joints, (n,).
     """
     vectors, images = axes, onto
     if np.linalg.norm(np.cross(axes, axes[0]), axis=1).max() < PARALLEL and revolute.any():

@@ -10,7 +10,7 @@ import numpy as np
 
 from armident.configs.schema.limits import WRITTEN_NO_LIMIT
 from armident.configs.urdf_origin import rotation, rotation_of_quaternion, rounded_angle
-from armident.identify.model_export.exported_model import ExportedModel, JointFriction, LinkBody
+from armident.identify.model_export.exported_model import ExportedFriction, ExportedModel, LinkBody
 from armident.identify.model_export.rigid_effects import with_rigid_effects
 from armident.identify.model_export.sheet import LimitationSheet, limitation_sheet
 from armident.identify.model_export.source_urdf import SourceUrdf
@@ -21,22 +21,7 @@ HOLDS = ("viscous friction", "Coulomb friction")
 
 
 def write_urdf(model: ExportedModel, out: Path) -> tuple[list[Path], LimitationSheet]:
-    """Write a URDF.
-
-    Parameters
-    ----------
-    model
-        The model.
-    out
-        The file.
-
-    Returns
-    -------
-    files : list of Path
-        The file.
-    sheet : LimitationSheet
-        Limits of the format.
-    """
+    """Write a URDF. Returns ``files``: the file; ``sheet``: limits of the format."""
     model, parts = with_rigid_effects(model)
     if model.source_urdf is None:
         root, remarks = _new(model), ["there are no meshes"]
@@ -126,7 +111,7 @@ def _inertial(body: LinkBody) -> ET.Element:
     return element
 
 
-def _set_dynamics(element: ET.Element, joint: JointFriction) -> None:
+def _set_dynamics(element: ET.Element, joint: ExportedFriction) -> None:
     """Write viscous and Coulomb friction of a joint."""
     found = element.find("dynamics")
     dynamics = ET.SubElement(element, "dynamics") if found is None else found

@@ -14,23 +14,14 @@ VERTICAL = 1e-12
 
 
 def numbers(values: float | Iterable[float] | Floats) -> str:
-    """Return numbers as text that reads back exactly.
-
-    Parameters
-    ----------
-    values
-        One number or a sequence.
-    """
+    """Return numbers as text that reads back exactly. ``values``: one number or a sequence."""
     return " ".join(repr(float(value) + 0.0) for value in np.atleast_1d(np.asarray(values, dtype=np.float64)))
 
 
 def roll_pitch_yaw(rotation: Floats) -> Floats:
     """Return the fixed-axis angles of a rotation, ``Rot(z, yaw) Rot(y, pitch) Rot(x, roll)``, rad, (3,).
 
-    Parameters
-    ----------
-    rotation
-        Rotation matrix (3, 3).
+    ``rotation``: rotation matrix (3, 3).
     """
     r = rotation
     level = float(np.hypot(r[0, 0], r[1, 0]))
@@ -41,14 +32,6 @@ def roll_pitch_yaw(rotation: Floats) -> Floats:
 
 
 def write_xml(root: ET.Element, path: Path) -> None:
-    """Write an indented XML file.
-
-    Parameters
-    ----------
-    root
-        Root element.
-    path
-        The file.
-    """
+    """Write an indented XML file."""
     ET.indent(root)
     write_atomically(path, '<?xml version="1.0" encoding="utf-8"?>\n' + ET.tostring(root, encoding="unicode") + "\n")

@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from armident.compiled import ARITHMETIC, compiled
 from armident.identify.regression.fir import filter_columns
-from armident.identify.robot.compiled import compiled
 
 LEAST_VARIANCE = 1e-300
 """Variance of a residual that is zero, in squared units of the series: its inverse is finite."""
@@ -16,18 +16,12 @@ PIECE = 4096
 """Numbers multiplied at a time: they stay in the cache."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ArModel:
     """Noise model ``C(z^-1) xi = e`` with ``C = 1 + c_1 z^-1 + ...`` (6.19), ``e`` white.
 
-    Parameters
-    ----------
-    coefficients
-        ``c_1 .. c_l``, shape (l,); order 0 is white noise.
-    variance
-        Variance of ``e``, ``lambda^2``, in squared units of the series.
-    aic
-        Akaike criterion (6.24) by which the order was chosen.
+    ``coefficients``: ``c_1 .. c_l``, shape (l,); order 0 is white noise. ``variance``: variance of ``e``, ``lambda^2``,
+    in squared units of the series. ``aic``: Akaike criterion (6.24) by which the order was chosen.
     """
 
     coefficients: NDArray[np.float64]
@@ -65,10 +59,7 @@ class ArModel:
         the relative variance of an AR spectrum, less the part to which the parameters are insensitive. The former is
         ``2 l / N`` on the average of the frequencies (Berk, Consistent autoregressive spectral estimates, 1974).
 
-        Parameters
-        ----------
-        samples
-            N, length of the residuals from which the model comes, of all experiments together; more than the order.
+        ``samples``: N, length of the residuals behind the model, of all experiments together; more than the order.
         """
         factor = ((samples + self.order) / (samples - self.order)) ** 2
         return replace(self, variance=factor * self.variance)
@@ -79,15 +70,10 @@ WHITE = ArModel(np.empty(0), 1.0, 0.0)
 
 
 @dataclass(frozen=True)
-class Whiteness:
+class WhitenessTest:
     """Autocorrelation of residuals against the 2-sigma band of white noise.
 
-    Parameters
-    ----------
-    autocorrelation
-        Autocorrelation at lags 1..L, shape (L,).
-    bound
-        Half width of the band.
+    ``autocorrelation``: autocorrelation at lags 1..L, shape (L,); ``bound``: half width of the band.
     """
 
     autocorrelation: NDArray[np.float64]
@@ -116,7 +102,8 @@ def ar_models(
 
     Two corrections make up for the noise that estimated parameters have taken out of the errors. The number of
     parameters widens all variances by the same factor, which suffices for weights and comparisons. The autocovariances
-    of that noise (``absorbed``) are right for every frequency, but need the covariance of the parameters.
+    of that noise (``absorbed``) are right for every frequency, but need the covariance of the parameters. Raises
+    ValueError if ``keep`` is given for coloured noise.
 
     Parameters
     ----------
@@ -130,11 +117,6 @@ def ar_models(
         Number of estimated parameters. Joints share their degrees of freedom in proportion to their equations.
     absorbed
         Sums of the autocovariances that the parameters took from each joint, see `fit_ar`; ``None``: nothing.
-
-    Raises
-    ------
-    ValueError
-        If ``keep`` is given for coloured noise.
     """
     if keep is not None and max_order:
         raise ValueError("coloured noise needs a record without gaps")
@@ -177,12 +159,8 @@ def fit_ar(
 def lowest_aic(r: NDArray[np.float64], samples: int) -> ArModel:
     """AR model of the order with the lowest Akaike criterion (6.24, 6.25).
 
-    Parameters
-    ----------
-    r
-        Autocovariances at lags 0..highest order, ``r[0] > 0``.
-    samples
-        Length of the residuals from which they come, of all experiments together.
+    ``r``: autocovariances at lags 0..highest order, ``r[0] > 0``; ``samples``: length of the residuals from which they
+    come, of all experiments together.
     """
     return ArModel(*_lowest_aic(r, samples))
 
@@ -190,12 +168,8 @@ def lowest_aic(r: NDArray[np.float64], samples: int) -> ArModel:
 def fit_spectrum(power: NDArray[np.float64], order: int) -> ArModel:
     """AR model of a given order whose spectrum ``variance / |C|^2`` follows a given one; its inverse is stable.
 
-    Parameters
-    ----------
-    power
-        Positive spectral density at equally spaced frequencies from zero to the Nyquist frequency.
-    order
-        Order; less where a shorter model is exact.
+    ``power``: positive spectral density at equally spaced frequencies from zero to the Nyquist frequency. ``order``:
+    order; less where a shorter model is exact.
     """
     r = np.fft.irfft(power)[: order + 1]
     coefficients, variances = levinson_durbin(r)
@@ -203,21 +177,13 @@ def fit_spectrum(power: NDArray[np.float64], order: int) -> ArModel:
     return ArModel(coefficients[last, :last].copy(), float(variances[last]), -np.inf)
 
 
-@compiled
+@compiled("f8[::1]", **ARITHMETIC)
 def levinson_durbin(r: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Solutions of the Yule-Walker equations of every order by the Levinson-Durbin recursion (6.21 to 6.23).
 
-    Parameters
-    ----------
-    r
-        Autocovariances at lags 0..L, ``r[0] > 0``.
-
-    Returns
-    -------
-    coefficients
-        Row l holds ``c_1 .. c_l`` of the model of order l, then zeros; shape (P + 1, L).
-    variances
-        Variances of the innovations, shape (P + 1,). P is L, or less where a model of order P + 1 would be exact.
+    ``r``: autocovariances at lags 0..L, ``r[0] > 0``. Returns ``coefficients``: row l holds ``c_1 .. c_l`` of the model
+    of order l, then zeros; shape (P + 1, L). ``variances``: variances of the innovations, shape (P + 1,). P is L, or
+    less where a model of order P + 1 would be exact.
     """
     highest = r.size - 1
     coefficients, variances = np.zeros((highest + 1, highest)), np.zeros(highest + 1)
@@ -240,27 +206,15 @@ def levinson_durbin(r: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArra
 def lagged_sums(x: NDArray[np.float64], max_lag: int, first: int = 0) -> NDArray[np.float64]:
     """``sum_t x(t) . x(t - k)`` for lags 0..max_lag, shape (max_lag + 1,).
 
-    Parameters
-    ----------
-    x
-        Vector series, shape (M, m).
-    max_lag
-        Highest lag k.
-    first
-        First t of the sums.
+    ``x``: vector series, shape (M, m); ``max_lag``: highest lag k.
     """
     return _lagged_sums(np.ascontiguousarray(x, dtype=np.float64), max_lag, first)
 
 
-def whiteness(series: Sequence[NDArray[np.float64]], lags: int = 20) -> Whiteness:
+def whiteness(series: Sequence[NDArray[np.float64]], lags: int = 20) -> WhitenessTest:
     """Autocorrelation of residuals pooled over experiments, with the bound ``2 / sqrt(M)``.
 
-    Parameters
-    ----------
-    series
-        Residuals of one joint, one array (M,) per experiment.
-    lags
-        Number of lags.
+    ``series``: residuals of one joint, one array (M,) per experiment.
     """
     total = sum(s.size for s in series)
     mean = sum(float(s.sum()) for s in series) / total
@@ -269,10 +223,10 @@ def whiteness(series: Sequence[NDArray[np.float64]], lags: int = 20) -> Whitenes
         centred = s - mean
         for lag in range(min(lags, centred.size - 1) + 1):
             r[lag] += centred[lag:] @ centred[: centred.size - lag]
-    return Whiteness(r[1:] / r[0] if r[0] > 0 else np.zeros(lags), 2 / float(np.sqrt(total)))
+    return WhitenessTest(r[1:] / r[0] if r[0] > 0 else np.zeros(lags), 2 / float(np.sqrt(total)))
 
 
-@compiled
+@compiled("f8[::1], i8", **ARITHMETIC)
 def _lowest_aic(r: NDArray[np.float64], samples: int) -> tuple[NDArray[np.float64], float, float]:
     """Coefficients, variance and criterion of the model with the lowest AIC."""
     coefficients, variances = levinson_durbin(r)
@@ -284,7 +238,7 @@ def _lowest_aic(r: NDArray[np.float64], samples: int) -> tuple[NDArray[np.float6
     return coefficients[best, :best].copy(), variances[best], lowest
 
 
-@compiled
+@compiled("f8[:, ::1], i8, i8", **ARITHMETIC)
 def _lagged_sums(x: NDArray[np.float64], max_lag: int, first: int) -> NDArray[np.float64]:
     samples, width = x.shape
     # The previous sample is the previous row of the array: one long sum per lag, in pieces that stay in the cache.

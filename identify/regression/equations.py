@@ -15,10 +15,7 @@ from armident.identify.robot.arm import ArmModel
 from armident.identify.robot.kernels import fill_regressor
 from armident.identify.signals.decimate import Decimation
 from armident.identify.signals.differentiate import Derivatives
-from armident.identify.streamed import mapped
-
-MAX_AR_ORDER = 60
-"""Highest order tried for the noise models."""
+from armident.identify.signals.streamed import mapped
 
 COVARIANCE_PASSES = 3
 """Noise model and covariance need each other; the third pass changes standard deviations by less than 1 %."""
@@ -37,16 +34,8 @@ ROWS_PER_TASK, SAMPLES_PER_TASK = 256, 4096
 class ExperimentEquations:
     """Equations of one experiment after the parallel filter (thesis 2.3.1).
 
-    Parameters
-    ----------
-    y
-        Torques, shape (M, n), N m or N.
-    x
-        Regressor at measured signals, shape (M, n, b).
-    keep
-        Equations to use, shape (M, n).
-    t
-        Instants, s, shape (M,).
+    ``y``: torques, shape (M, n), N m or N; ``x``: regressor at measured signals, shape (M, n, b); ``keep``: equations
+    to use, shape (M, n); ``t``: instants, s, shape (M,).
     """
 
     y: NDArray[np.float64]
@@ -57,13 +46,7 @@ class ExperimentEquations:
 
 @dataclass(frozen=True)
 class InstrumentedEquations(ExperimentEquations):
-    """Equations of one experiment with instruments.
-
-    Parameters
-    ----------
-    z
-        Regressor at simulated signals, shape (M, n, b).
-    """
+    """Equations of one experiment with instruments. ``z``: regressor at simulated signals, shape (M, n, b)."""
 
     z: NDArray[np.float64]
 
@@ -113,21 +96,9 @@ def filtered_regressor(
     It is computed piece by piece, so that unfiltered rows stay in the cache, and on all processors: neither kernel nor
     product holds the interpreter lock. Terms of the model may depend on the past, so they get the whole motion at once.
 
-    Parameters
-    ----------
-    model
-        The arm.
-    signals
-        Positions and derivatives, (N, n) each.
-    decimation
-        Parallel filter.
-    sharp_sign
-        True for ``sign`` of the velocity in the friction; false for the smoothed sign of the configuration.
-
-    Raises
-    ------
-    ValueError
-        If the model has terms and the signals no sampling period.
+    ``signals``: positions and derivatives, (N, n) each. ``decimation``: parallel filter. ``sharp_sign``: True for
+    ``sign`` of the velocity in the friction; false for the smoothed sign of the configuration. Raises ValueError if the
+    model has terms and the signals no sampling period.
     """
     count = decimation.count(signals.q.shape[0])
     rows = max(ROWS_PER_TASK, SAMPLES_PER_TASK // decimation.factor)
@@ -179,12 +150,7 @@ def stacked(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Regressor (rows, b) and torques (rows,) of 2.20 and 2.21, whitened, without the equations left out.
 
-    Parameters
-    ----------
-    blocks
-        Equations of every experiment.
-    noise
-        Noise model of each joint.
+    ``noise``: noise model of each joint.
     """
     keep = [b.keep for b in blocks]
     return whitened(mapped(lambda b: b.x, blocks), noise, keep), whitened([b.y for b in blocks], noise, keep)
@@ -195,12 +161,7 @@ def stacked_parts(
 ) -> Iterator[tuple[NDArray[np.float64], NDArray[np.float64]]]:
     """Yield `stacked` of one experiment after the other: rows of a long recording are in memory one at a time.
 
-    Parameters
-    ----------
-    blocks
-        Equations of every experiment.
-    noise
-        Noise model of each joint.
+    ``noise``: noise model of each joint.
     """
     for block in blocks:
         yield stacked([block], noise)
@@ -211,78 +172,36 @@ def instrumented(
 ) -> Sequence[InstrumentedEquations]:
     """Equations with instruments.
 
-    Parameters
-    ----------
-    blocks
-        Equations of every experiment.
-    instruments
-        Regressor at simulated signals, one (M, n, b) array per experiment.
+    ``instruments``: regressor at simulated signals, one (M, n, b) array per experiment.
     """
     return mapped(lambda b, z: InstrumentedEquations(b.y, b.x, b.keep, b.t, z), blocks, instruments)
 
 
 def applied(columns: NDArray[np.float64], values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """``columns @ values``, shape (M, n), as one product.
-
-    Parameters
-    ----------
-    columns
-        Shape (M, n, k).
-    values
-        Shape (k,).
-    """
+    """``columns @ values``, shape (M, n), as one product. ``columns``: shape (M, n, k); ``values``: shape (k,)."""
     product: NDArray[np.float64] = (columns.reshape(-1, columns.shape[2]) @ values).reshape(columns.shape[:2])
     return product
 
 
 def instants(blocks: Sequence[ExperimentEquations], dt: float) -> list[NDArray[np.int64]]:
-    """Numbers of the samples of the equations, (M,) per experiment.
-
-    Parameters
-    ----------
-    blocks
-        Equations of every experiment.
-    dt
-        Sampling period, s.
-    """
+    """Numbers of the samples of the equations, (M,) per experiment."""
     return [np.rint(block.t / dt).astype(np.int64) for block in blocks]
 
 
 def residuals(blocks: Sequence[ExperimentEquations], theta: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-    """``tau - phi theta`` of each experiment, shape (M, n).
-
-    Parameters
-    ----------
-    blocks
-        Equations of every experiment.
-    theta
-        Base parameters, shape (b,).
-    """
+    """``tau - phi theta`` of each experiment, shape (M, n). ``theta``: base parameters, shape (b,)."""
     return [block.y - applied(block.x, theta) for block in blocks]
 
 
 def residuals_of(estimate: Estimate, numbers: Sequence[int]) -> Estimate:
-    """Estimate with the residuals of some of its experiments.
-
-    Parameters
-    ----------
-    estimate
-        The estimate.
-    numbers
-        Numbers of the experiments, from 0.
-    """
+    """Estimate with the residuals of some of its experiments. ``numbers``: numbers of the experiments, from 0."""
     return replace(estimate, residuals=tuple(tuple(series[k] for k in numbers) for series in estimate.residuals))
 
 
 def joint_variances(blocks: Sequence[ExperimentEquations], theta: NDArray[np.float64]) -> list[ArModel]:
     """Serially uncorrelated noise with the residual variance of each joint (2.25, 2.26).
 
-    Parameters
-    ----------
-    blocks
-        Equations of every experiment.
-    theta
-        Base parameters, shape (b,).
+    ``theta``: base parameters, shape (b,).
     """
     return ar_models(residuals(blocks, theta), 0, keep=[b.keep for b in blocks], parameters=theta.size)
 
@@ -290,14 +209,7 @@ def joint_variances(blocks: Sequence[ExperimentEquations], theta: NDArray[np.flo
 def residual_norm(blocks: Sequence[ExperimentEquations], theta: NDArray[np.float64], scale: Sequence[ArModel]) -> float:
     """Norm of the residuals, each joint in the units of ``scale``.
 
-    Parameters
-    ----------
-    blocks
-        Equations of every experiment.
-    theta
-        Base parameters, shape (b,).
-    scale
-        Noise model of each joint that scales its residuals.
+    ``theta``: base parameters, shape (b,); ``scale``: noise model of each joint that scales its residuals.
     """
     keep = [b.keep for b in blocks]
     return float(np.linalg.norm(whitened(residuals(blocks, theta), scale, keep)))
@@ -314,14 +226,7 @@ def noise_models(
     small (median, 20 seeds). The variances are widened because the coefficients are estimates themselves
     (:meth:`ArModel.widened`).
 
-    Parameters
-    ----------
-    blocks
-        Equations of every experiment.
-    theta, covariance
-        Base parameters (b,) and their covariance (b, b).
-    max_order
-        Highest order tried.
+    ``theta``, ``covariance``: base parameters (b,) and their covariance (b, b); ``max_order``: highest order tried.
     """
     errors = residuals(blocks, theta)
     factor = _square_root(covariance)
@@ -343,14 +248,8 @@ def absorbed_sums(x: NDArray[np.float64], factor: NDArray[np.float64], max_lag: 
     They correct the autocovariances of the residuals by the share b / M. One stretch in ``EVERY`` of a long series is
     accurate enough for that: ``SAMPLED`` rows, after those that its lags need.
 
-    Parameters
-    ----------
-    x
-        Regressor of one joint, shape (M, b).
-    factor
-        Factor of the covariance, shape (b, b).
-    max_lag
-        Highest lag k.
+    ``x``: regressor of one joint, shape (M, b); ``factor``: factor of the covariance, shape (b, b); ``max_lag``:
+    highest lag k.
     """
     rows = x.shape[0]
     stretch = max_lag + SAMPLED
@@ -377,13 +276,6 @@ def whitened_residuals(
 ) -> tuple[tuple[NDArray[np.float64], ...], ...]:
     """Residuals of each joint in standard deviations of its noise model, one array per experiment.
 
-    Parameters
-    ----------
-    blocks
-        Equations of every experiment.
-    theta
-        Base parameters, shape (b,).
-    noise
-        Noise model of each joint.
+    ``theta``: base parameters, shape (b,).
     """
     return whitened_series(residuals(blocks, theta), noise, [b.keep for b in blocks])

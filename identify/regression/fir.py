@@ -11,7 +11,7 @@ import numpy as np
 from numpy.lib.stride_tricks import as_strided
 from numpy.typing import NDArray
 
-from armident.identify.robot.compiled import compiled
+from armident.compiled import ARITHMETIC, compiled
 
 _ROWS = 8
 """Fewest rows per product. Half as many rows as taps are fastest: fewer cost calls, more cost zeros off the band."""
@@ -26,22 +26,8 @@ _PIECE = 2048
 def filter_columns(taps: NDArray[np.float64], x: NDArray[np.float64]) -> NDArray[np.float64]:
     """``sum_i taps[i] x(t - i)`` for every t whose samples are all there.
 
-    Parameters
-    ----------
-    taps
-        Impulse response, shape (l + 1,).
-    x
-        Columns, shape (M, b), at least l + 1 rows.
-
-    Returns
-    -------
-    ndarray
-        Shape (M - l, b).
-
-    Raises
-    ------
-    ValueError
-        If there are fewer rows than taps.
+    ``taps``: impulse response, shape (l + 1,); ``x``: columns, shape (M, b), at least l + 1 rows. Result: shape
+    (M - l, b). Raises ValueError if there are fewer rows than taps.
     """
     span, count = taps.size - 1, x.shape[0] - taps.size + 1
     if count < 1:
@@ -68,7 +54,7 @@ def filter_columns(taps: NDArray[np.float64], x: NDArray[np.float64]) -> NDArray
     return out
 
 
-@compiled
+@compiled("f8[::1], f8[:, ::1], f8[:, ::1]", **ARITHMETIC)
 def _add_delayed(taps: NDArray[np.float64], x: NDArray[np.float64], out: NDArray[np.float64]) -> None:
     span, width = taps.size - 1, x.shape[1]
     # The previous sample is the previous row of the array: one long sum per tap.

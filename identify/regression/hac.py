@@ -11,17 +11,9 @@ Array = NDArray[np.float64]
 def newey_west(series: Sequence[Array], lags: int) -> Array:
     """Heteroskedasticity and autocorrelation consistent variance of the sum of all terms, with Bartlett weights.
 
-    Parameters
-    ----------
-    series
-        Terms of mean zero, one array (M,) or (M, b) per experiment. Different experiments are independent.
-    lags
-        Number L of autocovariances; lag k has the weight ``1 - k / (L + 1)``. Lags longer than a series are skipped.
-
-    Returns
-    -------
-    ndarray
-        Variance of the sum, shape () or (b,), not negative.
+    ``series``: terms of mean zero, one array (M,) or (M, b) per experiment. Different experiments are independent.
+    ``lags``: number L of autocovariances; lag k has the weight ``1 - k / (L + 1)``. Lags longer than a series are
+    skipped. Returns the variance of the sum, shape () or (b,), not negative.
 
     Notes
     -----
@@ -38,12 +30,7 @@ def newey_west(series: Sequence[Array], lags: int) -> Array:
 def newey_west_matrix(series: Sequence[Array], lags: int) -> Array:
     """Covariance matrix of the sums of all terms, (b, b): `newey_west` with the covariances between the sums.
 
-    Parameters
-    ----------
-    series
-        Terms of mean zero, one array (M, b) per experiment.
-    lags
-        Number of autocovariances.
+    ``series``: terms of mean zero, one array (M, b) per experiment; ``lags``: number of autocovariances.
     """
     total = np.asarray(sum(s.T @ s for s in series))
     for lag in range(1, min(lags, max(s.shape[0] for s in series) - 1) + 1):

@@ -19,16 +19,8 @@ EXACT = 1e-10
 class Iterations(NamedTuple):
     """End of an iteration.
 
-    Parameters
-    ----------
-    theta
-        Last or best iterate, shape (b,).
-    done
-        Iterations done.
-    converged
-        True if the iterates settled.
-    reason
-        Rule that ended the iteration, as a sentence.
+    ``theta``: last or best iterate, shape (b,); ``converged``: True if the iterates settled; ``reason``: rule that
+    ended the iteration, as a sentence.
     """
 
     theta: NDArray[np.float64]
@@ -48,16 +40,8 @@ def iterate(
     Where that does not happen, the iterate of the smallest residual norm is kept. Equations without a finite
     solution end the iterations.
 
-    Parameters
-    ----------
-    step
-        ``step(theta, k) -> (theta, residual norm)`` of iteration k, from 1 on.
-    start
-        First theta, shape (b,).
-    iterations
-        Most iterations.
-    tolerance
-        Relative change that ends the iterations.
+    ``step``: ``step(theta, k) -> (theta, residual norm)`` of iteration k, from 1 on; ``start``: first theta, shape
+    (b,); ``iterations``: most iterations; ``tolerance``: relative change that ends the iterations.
     """
     theta, norm = start, np.inf
     best, least = start, np.inf

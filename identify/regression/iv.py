@@ -16,13 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg, signal
 
+from armident.compiled import ARITHMETIC, compiled
 from armident.identify.regression.ar_noise import ArModel
 from armident.identify.regression.equations import InstrumentedEquations
 from armident.identify.regression.fir import filter_columns
 from armident.identify.regression.least_squares import column_norms
 from armident.identify.regression.qr import triangularize, triangularize_parts
 from armident.identify.regression.whitening import columns_of, whitened
-from armident.identify.robot.compiled import compiled
 from armident.identify.signals.decimate import Decimation
 
 Array = NDArray[np.float64]
@@ -44,16 +44,8 @@ NEGLIGIBLE = 1e-14
 class IvProducts:
     """Products of whitened rows: combinations ``Q = Z T`` of the instruments, of norm one, and columns ``X D``.
 
-    Parameters
-    ----------
-    gram
-        ``Q' Q``, shape (b, b).
-    cross
-        ``Q' X D``, shape (b, b).
-    projected
-        ``Q' y``, shape (b,).
-    scale
-        Inverse diagonal of D, shape (b,).
+    ``gram``: ``Q' Q``, shape (b, b); ``cross``: ``Q' X D``, shape (b, b); ``projected``: ``Q' y``, shape (b,);
+    ``scale``: inverse diagonal of D, shape (b,).
     """
 
     gram: Array
@@ -71,23 +63,16 @@ class IvProducts:
     def parameters(self, through: Array) -> Array:
         """Parameters (b,) or (b, k) of torques with the products ``Q' torques`` = ``through``.
 
-        Raises
-        ------
-        numpy.linalg.LinAlgError
-            If the equations are singular.
+        Raises numpy.linalg.LinAlgError if the equations are singular.
         """
         solved: Array = linalg.lu_solve(self._factors, through, check_finite=False)
         return (solved.T / self.scale).T
 
-    def beside(self, through: Array) -> Array:
+    def projection_weights(self, through: Array) -> Array:
         """Weights W (b, k) of the combinations with ``X' Q W`` = ``through``.
 
-        Instruments less ``Q W`` are orthogonal to the regressor, where ``through`` are their products with it.
-
-        Raises
-        ------
-        numpy.linalg.LinAlgError
-            If the equations are singular.
+        Instruments less ``Q W`` are orthogonal to the regressor, where ``through`` are their products with it. Raises
+        numpy.linalg.LinAlgError if the equations are singular.
         """
         weights: Array = linalg.lu_solve(self._factors, through / self.scale[:, None], trans=1, check_finite=False)
         return weights
@@ -96,10 +81,7 @@ class IvProducts:
     def theta(self) -> Array:
         """The solution of ``Z' W (y - X theta) = 0`` (2.33, 6.30), shape (b,).
 
-        Raises
-        ------
-        numpy.linalg.LinAlgError
-            If the equations are singular.
+        Raises numpy.linalg.LinAlgError if the equations are singular.
         """
         return self.parameters(self.projected)
 
@@ -108,12 +90,8 @@ class IvProducts:
         """``(Z' W X)^-1 Z' W Z (X' W Z)^-1`` (4.34), shape (b, b).
 
         It equals ``(Z' W Z)^-1`` (2.34, 6.31) where the simulator is exact. It stays valid where the controller is only
-        approximate, as an identified impulse response is.
-
-        Raises
-        ------
-        numpy.linalg.LinAlgError
-            If the equations are singular.
+        approximate, as an identified impulse response is. Raises numpy.linalg.LinAlgError if the equations are
+        singular.
         """
         covariance = self.parameters(self.parameters(self.gram).T)
         return (covariance + covariance.T) / 2
@@ -122,12 +100,7 @@ class IvProducts:
 def factored(z: Array, x: Array, y: Array) -> IvProducts:
     """Products of whitened rows with orthonormal instruments, by the QR factors of ``z``: none of ``z' x`` is formed.
 
-    Parameters
-    ----------
-    z, x
-        Instruments and regressor, shape (rows, b).
-    y
-        Torques, shape (rows,).
+    ``z``, ``x``: instruments and regressor, shape (rows, b); ``y``: torques, shape (rows,).
     """
     return factored_parts([(z, x, y)], x.shape[1])
 
@@ -135,12 +108,8 @@ def factored(z: Array, x: Array, y: Array) -> IvProducts:
 def factored_parts(parts: Iterable[tuple[Array, Array, Array]], b: int) -> IvProducts:
     """`factored` of rows that come in parts, of which one is in memory.
 
-    Parameters
-    ----------
-    parts
-        Whitened instruments and regressor (rows, b) and torques (rows,) of each part.
-    b
-        Number of parameters.
+    ``parts``: whitened instruments and regressor (rows, b) and torques (rows,) of each part; ``b``: number of
+    parameters.
     """
     top, norms = triangularize_parts(parts, columns=b)
     scale = norms[b : 2 * b]
@@ -152,12 +121,7 @@ def instrumented_parts(
 ) -> Iterator[tuple[Array, Array, Array]]:
     """Yield whitened instruments, regressor (rows, b) and torques (rows,) of one experiment after the other.
 
-    Parameters
-    ----------
-    blocks
-        Equations of every experiment.
-    noise
-        Noise model of each joint.
+    ``noise``: noise model of each joint.
     """
     for block in blocks:
         z, x, y = (whitened([values], noise, [block.keep]) for values in (block.z, block.x, block.y))
@@ -176,16 +140,9 @@ def serial_covariance(
     ``A = (Z' W X)^-1 Z' W`` maps the noise to the estimate and ``A Omega A'`` is its covariance, with ``Omega`` given
     by the AR model of each joint: ``Z' W Omega W Z`` is the Gram matrix of ``H' W Z``.
 
-    Parameters
-    ----------
-    zeta, x
-        Instruments and regressor, one (M, n, b) array per experiment.
-    keep
-        Equations to use, (M, n) per experiment.
-    weights
-        White noise models by which the estimate weights its rows, one per joint.
-    noise
-        Noise model of the residuals of each joint.
+    ``zeta``, ``x``: instruments and regressor, one (M, n, b) array per experiment; ``keep``: equations to use, (M, n)
+    per experiment; ``weights``: white noise models by which the estimate weights its rows, one per joint; ``noise``:
+    noise model of the residuals of each joint.
     """
     b = zeta[0].shape[2]
     squares, cross, meat = np.zeros(b), np.zeros((b, b)), np.zeros((b, b))
@@ -206,14 +163,8 @@ def serial_covariance(
 class Columns:
     """Rows ``[X, Z, y]`` of one joint in one experiment, collected when they are used.
 
-    Parameters
-    ----------
-    x, z
-        Regressor and instruments, shape (M, b), in which the numbers of the columns are those of a `JointEquations`.
-    y
-        Torques, shape (M,).
-    chosen
-        Numbers of the columns of regressor and instruments.
+    ``x``, ``z``: regressor and instruments, shape (M, b), in which the numbers of the columns are those of a
+    `JointEquations`; ``y``: torques, shape (M,); ``chosen``: numbers of the columns of regressor and instruments.
     """
 
     x: Array
@@ -232,14 +183,9 @@ class Columns:
 class JointEquations:
     """Equations of one joint without the columns that are zero there: a link acts on the joints before it only.
 
-    Parameters
-    ----------
-    x, z
-        Numbers of the columns of regressor and instruments that are not zero.
-    parts
-        Rows ``[X, Z, y]`` of these columns, one array (M, x + z + 1) per experiment.
-    keep
-        Rows to use, (M,) per experiment; ``None``: all.
+    ``x``, ``z``: numbers of the columns of regressor and instruments that are not zero. ``parts``: rows ``[X, Z, y]``
+    of these columns, one array (M, x + z + 1) per experiment. ``keep``: rows to use, (M,) per experiment; ``None``:
+    all.
     """
 
     x: NDArray[np.int64]
@@ -251,14 +197,8 @@ class JointEquations:
     def of(cls, blocks: Sequence[InstrumentedEquations], joint: int, *, copied: bool) -> "JointEquations":
         """Equations of a joint.
 
-        Parameters
-        ----------
-        blocks
-            Equations of every experiment.
-        joint
-            Number of the joint.
-        copied
-            True to copy the columns side by side: faster where the same equations are whitened many times.
+        ``blocks``: equations of every experiment; ``copied``: True to copy the columns side by side: faster where the
+        same equations are whitened many times.
         """
         x = np.unique(np.concatenate([columns_of(b.x[:, joint]) for b in blocks]))
         z = np.unique(np.concatenate([columns_of(b.z[:, joint]) for b in blocks]))
@@ -267,13 +207,7 @@ class JointEquations:
         return cls(x, z, tuple(part[:] if copied else part for part in parts), tuple(keep))
 
     def whitened(self, ar: ArModel) -> Iterator[Array]:
-        """Rows whitened by a noise model, (m, x + z + 1), a few at a time, which stay in the cache.
-
-        Parameters
-        ----------
-        ar
-            Noise model of the joint.
-        """
+        """Rows whitened by a noise model, (m, x + z + 1), a few at a time, which stay in the cache."""
         for part, kept in zip(self.parts, self.keep, strict=True):
             for first in range(0, len(part) - ar.order, CHUNK_ROWS):
                 span = slice(first, first + CHUNK_ROWS + ar.order)
@@ -283,12 +217,8 @@ class JointEquations:
     def products(self, rows: Iterable[Array], combine: Array | None = None) -> Array:
         """``Q' [X, Q, y]`` of whitened rows, shape (q, x + q + 1).
 
-        Parameters
-        ----------
-        rows
-            Whitened rows ``[X, Z, y]``.
-        combine
-            Combinations T of the instruments, ``Q = Z T``, shape (b, b); ``None``: the instruments of the joint.
+        ``rows``: whitened rows ``[X, Z, y]``. ``combine``: combinations T of the instruments, ``Q = Z T``, shape
+        (b, b); ``None``: the instruments of the joint.
         """
         width = self.x.size
         count = self.z.size if combine is None else combine.shape[1]
@@ -310,16 +240,8 @@ def together(
 ) -> IvProducts:
     """Products of the rows of all joints, with combinations of the instruments of norm one.
 
-    Parameters
-    ----------
-    products
-        Equations of each joint, or of parts of it, and their products; added in this order.
-    b
-        Number of parameters.
-    combined
-        True if the instruments are combined.
-    scale
-        Scale of the parameters' columns, shape (b,); ``None``: norms of the instruments.
+    ``products``: equations of each joint, or of parts of it, and their products; added in this order. ``b``: number of
+    parameters. ``scale``: scale of the parameters' columns, shape (b,); ``None``: norms of the instruments.
     """
     gram, cross, projected = np.zeros((b, b)), np.zeros((b, b)), np.zeros(b)
     for joint, sums in products:
@@ -336,12 +258,7 @@ def together(
 def iv_products(blocks: Sequence[InstrumentedEquations], noise: Sequence[ArModel]) -> IvProducts:
     """Whiten every joint by its noise model and sum the products that the IV equations need.
 
-    Parameters
-    ----------
-    blocks
-        Equations of every experiment.
-    noise
-        Noise model of each joint.
+    ``blocks``: equations of every experiment.
     """
     combine, scale = _combinations(blocks, noise)
 
@@ -380,7 +297,12 @@ def _combinations(blocks: Sequence[InstrumentedEquations], noise: Sequence[ArMod
     return combined, scale
 
 
-@compiled
+@compiled(
+    "f8[:, :], f8[:, :], f8[:], i8[::1], i8[::1]",
+    "f8[:, ::1], f8[:, ::1], f8[:], i8[::1], i8[::1]",
+    "f8[:, ::1], f8[:, ::1], f8[::1], i8[::1], i8[::1]",
+    **ARITHMETIC,
+)
 def _side_by_side(x: Array, z: Array, y: Array, of_x: NDArray[np.int64], of_z: NDArray[np.int64]) -> Array:
     out = np.empty((y.size, of_x.size + of_z.size + 1))
     for m in range(y.size):

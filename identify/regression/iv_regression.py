@@ -38,16 +38,8 @@ class Jointwise(Protocol):
 class IvRegression:
     """Solution of whitened equations with instruments, and their rows.
 
-    Parameters
-    ----------
-    equations
-        Equations of each joint.
-    noise
-        Noise models that whiten the rows.
-    products
-        Products ``Z' [X, Z, y]`` of the rows of each joint.
-    solution
-        Products of all rows, with the instruments in units of their norms.
+    ``equations``: equations of each joint; ``products``: products ``Z' [X, Z, y]`` of the rows of each joint;
+    ``solution``: products of all rows, with the instruments in units of their norms.
     """
 
     equations: Jointwise
@@ -59,14 +51,8 @@ class IvRegression:
     def of(cls, equations: Jointwise, noise: Sequence[ArModel], known: "IvRegression | None" = None) -> "IvRegression":
         """Regression under given noise models.
 
-        Parameters
-        ----------
-        equations
-            Equations of each joint.
-        noise
-            Noise model of each joint.
-        known
-            Regression of the same equations; rows and products of joints with the same noise model are reused.
+        ``equations``: equations of each joint. ``noise``: noise model of each joint. ``known``: regression of the same
+        equations; rows and products of joints with the same noise model are reused.
         """
         joints, rows, products = equations.joints, [], []
         for j, (joint, ar) in enumerate(zip(joints, noise, strict=True)):
@@ -108,10 +94,7 @@ class IvRegression:
     def absorbed(self, columns: Array) -> Array:
         """Parameters (b, k) that the model would give to torques (R, k): ``(Z'X)^-1 Z' columns``.
 
-        Parameters
-        ----------
-        columns
-            Whitened torques of all joints, (R, k).
+        ``columns``: whitened torques of all joints, (R, k).
         """
         _, q = self._through([(j, columns[own]) for j, own in enumerate(self.rows_of)], columns.shape[1])
         return self.solution.parameters(q)
@@ -119,40 +102,30 @@ class IvRegression:
     def without_model(self, torques: Array) -> Array:
         """Torques (R, k) less those that the model gives to them: ``T - X (Z'X)^-1 Z'T``.
 
-        Parameters
-        ----------
-        torques
-            Whitened torques T of all joints, (R, k).
+        ``torques``: whitened torques T of all joints, (R, k).
         """
         theta, rest = self.absorbed(torques), torques.copy()
         for joint, rows, own in zip(self.equations.joints, self.rows, self.rows_of, strict=True):
             rest[own] -= rows[:, : joint.x.size] @ theta[joint.x]
         return rest
 
-    def beside(self, instruments: Array) -> Array:
+    def orthogonalized(self, instruments: Array) -> Array:
         """Instruments (R, k) orthogonal to the regressor: ``D - Z (X'Z)^-1 X'D``.
 
-        Parameters
-        ----------
-        instruments
-            Whitened instruments D of all joints, (R, k).
+        ``instruments``: whitened instruments D of all joints, (R, k).
         """
         x, _ = self._through([(j, instruments[own]) for j, own in enumerate(self.rows_of)], instruments.shape[1])
-        weights = self.solution.beside(x) / self.solution.scale[:, None]
+        weights = self.solution.projection_weights(x) / self.solution.scale[:, None]
         rest = instruments.copy()
         for joint, rows, own in zip(self.equations.joints, self.rows, self.rows_of, strict=True):
             rest[own] -= rows[:, joint.x.size : -1] @ weights[joint.z]
         return rest
 
-    def products_beside(self, columns: Sequence[tuple[int, Array]], count: int) -> tuple[Array, Array]:
-        """``B'B`` (G, k, k) and ``B' residual`` (G, k) of ``B = beside(instruments)``, without computing B.
+    def orthogonal_products(self, columns: Sequence[tuple[int, Array]], count: int) -> tuple[Array, Array]:
+        """``B'B`` (G, k, k) and ``B' residual`` (G, k) of ``B = orthogonalized(D)``, without computing B.
 
-        Parameters
-        ----------
-        columns
-            Instruments (R_j, G k) of each joint on which they act, with its number, group after group.
-        count
-            Number of groups, G.
+        ``columns``: instruments (R_j, G k) of each joint on which they act, with its number, group after group;
+        ``count``: number of groups, G.
         """
         width = columns[0][1].shape[1]
         gram, score = np.zeros((count, width // count, width // count)), np.zeros(width)
@@ -161,7 +134,7 @@ class IvRegression:
             groups = own.reshape(own.shape[0], count, -1).transpose(1, 0, 2)
             gram += groups.transpose(0, 2, 1) @ groups
         x, q = self._through(columns, width)
-        weights = self.solution.beside(x)
+        weights = self.solution.projection_weights(x)
 
         def products(right: Array) -> Array:
             left, other = (part.reshape(part.shape[0], count, -1).transpose(1, 0, 2) for part in (weights, right))

@@ -21,14 +21,8 @@ RANK_TOLERANCE = 1e-10
 class Triangle:
     """QR factors of a column-normalised regressor with torques.
 
-    Parameters
-    ----------
-    factor
-        Triangular factor of the regressor, (b, b).
-    projected
-        Projections of the torques, (b,); of no use where the rows had no torques.
-    scale
-        Norms of the regressor's columns, 1 where a column is zero, (b,).
+    ``factor``: triangular factor of the regressor, (b, b). ``projected``: projections of the torques, (b,); of no use
+    where the rows had no torques. ``scale``: norms of the regressor's columns, 1 where a column is zero, (b,).
     """
 
     factor: Array
@@ -39,10 +33,7 @@ class Triangle:
     def of(cls, parts: Iterable[tuple[Array, Array]]) -> "Triangle":
         """Factors of rows that come in parts.
 
-        Parameters
-        ----------
-        parts
-            Regressor (rows, b) and torques (rows,) of each part, of which there is at least one.
+        ``parts``: regressor (rows, b) and torques (rows,) of each part, of which there is at least one.
         """
         rows = iter(parts)
         first = next(rows)
@@ -67,12 +58,7 @@ class Triangle:
 def least_squares(x: Array, y: Array) -> Array:
     """Solution (b,) of ``min |y - x theta|`` by QR of the column-normalised regressor (2.22).
 
-    Parameters
-    ----------
-    x
-        Regressor, shape (rows, b).
-    y
-        Torques, shape (rows,).
+    ``x``: regressor, shape (rows, b); ``y``: torques, shape (rows,).
     """
     return Triangle.of([(x, y)]).theta
 
@@ -91,17 +77,8 @@ def column_norms(x: Array) -> Array:
 def require_excitation(rows: Triangle, names: Sequence[str]) -> int:
     """Rank of the stacked regressor; a motion that leaves parameters undetermined is an error.
 
-    Parameters
-    ----------
-    rows
-        Factors of the regressor.
-    names
-        Base parameters, shape (b,), for the message.
-
-    Raises
-    ------
-    DataError
-        Naming the parameters that the motion did not excite.
+    ``rows``: factors of the regressor; ``names``: base parameters, shape (b,), for the message. Raises DataError:
+    naming the parameters that the motion did not excite.
     """
     dead = [name for name, used in zip(names, np.any(rows.factor, axis=0).tolist(), strict=True) if not used]
     if not dead:

@@ -9,15 +9,7 @@ def holm(p: NDArray[np.float64]) -> NDArray[np.float64]:
 
     A test is rejected at level alpha of the whole family if its adjusted p-value is at most alpha.
 
-    Parameters
-    ----------
-    p
-        P-values of the single tests, shape (k,).
-
-    Returns
-    -------
-    ndarray
-        Adjusted p-values in the same order, shape (k,), at most 1.
+    ``p``: P-values of the single tests, shape (k,). Returns adjusted p-values in the same order, shape (k,), at most 1.
 
     Notes
     -----

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from armident.identify.robot.compiled import compiled
+from armident.compiled import ARITHMETIC, compiled
 
 _ROWS = 64
 """Rows eliminated at a time: with a hundred columns they fit the second-level cache."""
@@ -22,20 +22,9 @@ def triangularize(
 ) -> NDArray[np.float64]:
     """Reflect ``[A1 A2 ...]`` until its first columns are upper triangular (Householder, ``Q' A``).
 
-    Parameters
-    ----------
-    blocks
-        Arrays (m, p_i) or (m,), side by side.
-    columns
-        Number b of the leading columns to make triangular.
-    scales
-        Divisors (p_i,) of the columns of the first arrays.
-
-    Returns
-    -------
-    ndarray
-        The first b rows of ``Q' [A1 A2 ...]``, shape (b, sum of p_i): the triangular factor, then the projections of
-        the other columns on the space of the first.
+    ``blocks``: arrays (m, p_i) or (m,), side by side; ``columns``: number b of the leading columns to make triangular;
+    ``scales``: divisors (p_i,) of the columns of the first arrays. Returns the first b rows of ``Q' [A1 A2 ...]``,
+    shape (b, sum of p_i): the triangular factor, then the projections of the other columns on the space of the first.
     """
     matrices = [block.reshape(block.shape[0], -1) for block in blocks]
     ends = np.cumsum([0, *(matrix.shape[1] for matrix in matrices)])
@@ -52,19 +41,9 @@ def triangularize_parts(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Reflect rows that come in parts, of which one is in memory, as `triangularize` does with all together.
 
-    Parameters
-    ----------
-    parts
-        Arrays (m, p_i) or (m,), side by side, of each part; the numbers of their columns are the same in all.
-    columns
-        Number b of the leading columns to make triangular.
-
-    Returns
-    -------
-    top : ndarray
-        Triangular factor and projections, as `triangularize` returns them, (b, p).
-    norms : ndarray
-        Norm of every column over all rows, 1 where it is zero, (p,).
+    ``parts``: arrays (m, p_i) or (m,), side by side, of each part; the numbers of their columns are the same in all.
+    ``columns``: number b of the leading columns to make triangular. Returns ``top``: triangular factor and projections,
+    as `triangularize` returns them, (b, p); ``norms``: norm of every column over all rows, 1 where it is zero, (p,).
     """
     top, squares = np.empty((0, 0)), np.zeros(0)
     for part in parts:
@@ -77,7 +56,7 @@ def triangularize_parts(
     return top, np.where(norms > 0.0, norms, 1.0)
 
 
-@compiled
+@compiled("f8[:, ::1], f8[:, ::1]", "f8[::1, :], f8[:, ::1]", **ARITHMETIC)
 def _reflect(a: NDArray[np.float64], top: NDArray[np.float64]) -> None:
     """Reduce ``a`` (m, p), which is overwritten, into the triangle kept in ``top`` (b, p)."""
     rows, width = a.shape

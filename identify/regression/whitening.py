@@ -6,8 +6,8 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from armident.compiled import ARITHMETIC, compiled
 from armident.identify.regression.ar_noise import ArModel
-from armident.identify.robot.compiled import compiled
 
 Array = NDArray[np.float64]
 
@@ -17,14 +17,8 @@ def whitened(
 ) -> Array:
     """Values of all joints, one below the other as in 2.21, each whitened by its noise model, shape (R,) or (R, k).
 
-    Parameters
-    ----------
-    values
-        One (M, n) or (M, n, k) array per experiment.
-    noise
-        Noise model of each joint.
-    keep
-        Equations to use, (M, n) per experiment; ``None``: all.
+    ``values``: one (M, n) or (M, n, k) array per experiment. ``keep``: equations to use, (M, n) per experiment;
+    ``None``: all.
     """
     return np.concatenate([part for joint in whitened_series(values, noise, keep) for part in joint])
 
@@ -34,14 +28,8 @@ def whitened_series(
 ) -> tuple[tuple[Array, ...], ...]:
     """Values of each joint in standard deviations of its noise model, one array per experiment.
 
-    Parameters
-    ----------
-    values
-        One (M, n) or (M, n, k) array per experiment.
-    noise
-        Noise model of each joint.
-    keep
-        Equations to use, (M, n) per experiment; ``None``: all.
+    ``values``: one (M, n) or (M, n, k) array per experiment. ``keep``: equations to use, (M, n) per experiment;
+    ``None``: all.
     """
     acts = [range(len(noise)) if value.ndim == 2 else joints_of(value) for value in values]
     out = []
@@ -59,13 +47,7 @@ def whitened_series(
 
 
 def rows_of_joints(counts: Iterable[int]) -> list[slice]:
-    """Rows of each joint in the result of `whitened`.
-
-    Parameters
-    ----------
-    counts
-        Number of rows of each joint.
-    """
+    """Rows of each joint in the result of `whitened`."""
     ends = np.cumsum([0, *counts]).tolist()
     return [slice(begin, end) for begin, end in pairwise(ends)]
 
@@ -80,7 +62,7 @@ def columns_of(values: Array) -> NDArray[np.int64]:
     return np.flatnonzero(_acting(values[:, :, None]))
 
 
-@compiled
+@compiled("f8[:, :, :]", "f8[:, :, ::1]", "f8[::1, :, :]", **ARITHMETIC)
 def _acting(columns: Array) -> NDArray[np.bool_]:
     acting = np.zeros(columns.shape[1], np.bool_)
     for j in range(columns.shape[1]):

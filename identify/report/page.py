@@ -12,7 +12,7 @@ import matplotlib
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 from markupsafe import Markup, escape
 
-from armident.identify.report.glossary import in_words
+from armident.identify.report.glossary import CONVENTIONS, in_words, mentioned
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -49,6 +49,8 @@ _TEMPLATES = Environment(
 )
 _TEMPLATES.filters["code"] = lambda text: Markup(re.sub("`([^`]+)`", r"<code>\1</code>", str(escape(text))))
 _TEMPLATES.filters["words"] = in_words
+_TEMPLATES.filters["mentioned"] = mentioned
+_TEMPLATES.globals["conventions"] = CONVENTIONS
 _TEMPLATES.globals["plot_hint"] = Markup(
     '<p class="hint">Drag over a plot to zoom all of them, double-click to see all again. '
     "The line below a plot reads the values under the pointer; a click on a name hides its curve.</p>"
@@ -60,12 +62,7 @@ _TEMPLATES.filters["fixed"] = lambda value, digits=2: "" if value is None else f
 def render(template: str, **content: Any) -> str:
     """Return the HTML page of a template; it needs no other file.
 
-    Parameters
-    ----------
-    template
-        Name in ``templates``.
-    **content
-        Variables of the template.
+    ``template``: name in ``templates``; ``**content``: variables of the template.
     """
     return _TEMPLATES.get_template(template).render(**content)
 
@@ -74,17 +71,8 @@ def render(template: str, **content: Any) -> str:
 def figure(rows: int, columns: int, height: float) -> Iterator[tuple["Figure", Any, list[str]]]:
     """Draw on a grid of axes; at the end of the block the list receives the picture as a ``data:`` URL.
 
-    Parameters
-    ----------
-    rows, columns
-        Size of the grid.
-    height
-        Height of one row, inches.
-
-    Yields
-    ------
-    tuple of Figure, ndarray and list of str
-        Figure, its axes (rows, columns), and the list for the picture.
+    ``rows``, ``columns``: size of the grid; ``height``: height of one row, inches. Yields the figure, its axes
+    (rows, columns), and the list for the picture.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure

@@ -22,16 +22,9 @@ DIGITS = 5
 class Series:
     """Curve of a plot.
 
-    Parameters
-    ----------
-    name
-        Name in words.
-    y
-        Values (M,); NaN breaks the curve.
-    colour, width
-        CSS colour, and width of the line, pixels.
-    half
-        Half widths (M,) of the intervals around the values: points with bars are drawn instead of a curve.
+    ``name``: name in words. ``y``: values (M,); NaN breaks the curve. ``colour``, ``width``: CSS colour, and width of
+    the line, pixels. ``half``: half widths (M,) of the intervals around the values: points with bars are drawn instead
+    of a curve.
     """
 
     name: str
@@ -45,22 +38,9 @@ class Series:
 class Plot:
     """Curves over a common axis.
 
-    Parameters
-    ----------
-    title, unit
-        Title, and unit of the values.
-    x
-        Ascending values (M,) of the axis.
-    series
-        The curves.
-    limits
-        Horizontal lines: name and value.
-    x_unit
-        Unit of the axis.
-    names
-        Names of the points, M of them, at integer ``x`` from 0; empty: the axis has numbers.
-    readings
-        Text that is read at each point, M of them; empty: the values of the curves.
+    ``x``: ascending values (M,) of the axis. ``limits``: horizontal lines: name and value. ``names``: names of the
+    points, M of them, at integer ``x`` from 0; empty: the axis has numbers. ``readings``: text that is read at each
+    point, M of them; empty: the values of the curves.
     """
 
     title: str
@@ -74,13 +54,7 @@ class Plot:
 
 
 def plots_html(plots: Sequence[Plot]) -> Markup:
-    """Return a group of plots that share zoom and pointer, as HTML.
-
-    Parameters
-    ----------
-    plots
-        Plots over axes of one unit.
-    """
+    """Return a group of plots that share zoom and pointer, as HTML. ``plots``: plots over axes of one unit."""
     content = json.dumps([_data(plot) for plot in plots], separators=(",", ":"), allow_nan=False)
     safe = content.replace("<", "\\u003c")
     return Markup(f'<div class="plots"><script type="application/json">{safe}</script></div>')
@@ -89,12 +63,7 @@ def plots_html(plots: Sequence[Plot]) -> Markup:
 def kept_points(curves: Sequence[Array], most: int = MOST_POINTS) -> NDArray[np.intp]:
     """Return the indices of the points to draw: of every stretch the extremes of each curve, and all breaks.
 
-    Parameters
-    ----------
-    curves
-        Values (M,) of each curve; NaN is a break.
-    most
-        Largest number of points without breaks.
+    ``curves``: values (M,) of each curve; NaN is a break. ``most``: largest number of points without breaks.
     """
     size = curves[0].size
     if size <= most:

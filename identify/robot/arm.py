@@ -85,12 +85,8 @@ class ArmModel:
     def from_config(cls, robot: RobotConfig, terms: tuple[ModelTerm, ...] = ()) -> Self:
         """Build the model of a robot configuration.
 
-        Parameters
-        ----------
-        robot
-            The configuration; its ``effects`` are not read here (`armident.identify.effects.terms.arm_model` does).
-        terms
-            Additional torque terms.
+        ``robot``: the configuration; its ``effects`` are not read here (`armident.identify.effects.terms.arm_model`
+        does). ``terms``: additional torque terms.
         """
         chain = chain_of(robot)
         names = standard_names(robot)
@@ -127,15 +123,7 @@ class ArmModel:
         return replace(self, anchor=np.asarray(theta, dtype=np.float64))
 
     def with_effects_of(self, robot: RobotConfig, terms: tuple[ModelTerm, ...]) -> Self:
-        """Return the model of a configuration; faster than `from_config` if only the effects differ.
-
-        Parameters
-        ----------
-        robot
-            The configuration.
-        terms
-            Its terms.
-        """
+        """Return the model of a configuration; faster than `from_config` if only the effects differ."""
         if robot.model_copy(update={"effects": self.robot.effects}) != self.robot:
             return self.from_config(robot, terms)
         rigid, further = self.without_terms(), tuple(name for term in terms for name in term.names)
@@ -162,13 +150,9 @@ class ArmModel:
     def smooth_sign(self, qd: Floats, joints: tuple[int, ...] | None = None) -> Floats:
         """``(2/pi) atan(g qd)`` of velocities (thesis appendix B.2).
 
-        Parameters
-        ----------
-        qd
-            Velocities, rad/s or m/s: of all joints, (..., n), or, with ``joints``, one series of any shape.
-        joints
-            Joints, from 0, to whose friction the series belongs: one, or the two of a coupling, which has the smaller
-            ``g`` of both.
+        ``qd``: velocities, rad/s or m/s: of all joints, (..., n), or, with ``joints``, one series of any shape;
+        ``joints``: from 0, to whose friction the series belongs: one, or the two of a coupling, which has the smaller
+        ``g`` of both.
         """
         g = self.smoothing if joints is None else self.smoothing[list(joints)].min()
         smooth: Floats = 2 / np.pi * np.arctan(g * qd)
@@ -179,16 +163,9 @@ class ArmModel:
     ) -> Motion:
         """Return the motion from which the terms compute their columns.
 
-        Parameters
-        ----------
-        q, qd, qdd
-            Positions, velocities, accelerations, each (N, n); rad or m, s.
-        dt
-            Sampling period, s.
-        start
-            Time of the first sample since the beginning of the first recording, s.
-        sharp_sign
-            ``sign(qd)`` instead of its smoothed form.
+        ``q``, ``qd``, ``qdd``: positions, velocities, accelerations, each (N, n); rad or m, s. ``start``: time of the
+        first sample since the beginning of the first recording, s. ``sharp_sign``: ``sign(qd)`` instead of its smoothed
+        form.
         """
         q, qd, qdd = self._motion(q, qd, qdd)
         return Motion(self, q, qd, qdd, dt, start, self.anchor, sharp=sharp_sign)
@@ -201,12 +178,7 @@ class ArmModel:
     def term_torque(self, motion: Motion, values: Floats) -> Floats:
         """Joint torques of the terms, N m or N, shape (N, n).
 
-        Parameters
-        ----------
-        motion
-            The motion, N samples.
-        values
-            Values of the linear parameters, (e,).
+        ``motion``: the motion, N samples; ``values``: values of the linear parameters, (e,).
         """
         torque, first = np.zeros((motion.samples, self.n)), 0
         for term in self.terms:
@@ -226,19 +198,10 @@ class ArmModel:
     ) -> Floats:
         """Regressor of the standard parameters without those of the terms.
 
-        Parameters
-        ----------
-        q, qd, qdd
-            Positions, velocities, accelerations, each (N, n); rad or m, s.
-        sharp_sign
-            ``sign(qd)`` instead of its smoothed form.
-        out
-            Array to write into: zeros, or an earlier regressor of this model and length, which is then reused.
-
-        Returns
-        -------
-        ndarray
-            Shape (N, n, p - e): row j of sample k times ``theta`` is the torque of joint j.
+        ``q``, ``qd``, ``qdd``: positions, velocities, accelerations, each (N, n); rad or m, s. ``sharp_sign``:
+        ``sign(qd)`` instead of its smoothed form. ``out``: array to write into: zeros, or an earlier regressor of this
+        model and length, which is then reused. Result: shape (N, n, p - e): row j of sample k times ``theta`` is the
+        torque of joint j.
         """
         return self._regressor(self.columns, len(self.names) - self.e, q, qd, qdd, sharp_sign, out)
 
@@ -256,21 +219,9 @@ class ArmModel:
 
         A model with terms needs ``dt``, ``start`` and the whole motion: terms may depend on earlier samples.
 
-        Parameters
-        ----------
-        q, qd, qdd
-            Positions, velocities, accelerations, each (N, n); rad or m, s.
-        sharp_sign
-            ``sign(qd)`` instead of its smoothed form.
-        dt
-            Sampling period, s.
-        start
-            Time of the first sample since the beginning of the first recording, s.
-
-        Raises
-        ------
-        ValueError
-            If the model has terms and ``dt`` is missing.
+        ``q``, ``qd``, ``qdd``: positions, velocities, accelerations, each (N, n); rad or m, s. ``sharp_sign``:
+        ``sign(qd)`` instead of its smoothed form. ``start``: time of the first sample since the beginning of the first
+        recording, s. Raises ValueError if the model has terms and ``dt`` is missing.
         """
         rigid = self.rigid_regressor(q, qd, qdd, sharp_sign=sharp_sign)
         if not self.terms:
@@ -283,12 +234,8 @@ class ArmModel:
     def rigid_regressor(self, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, *, sharp_sign: bool = False) -> Floats:
         """Regressor of the base parameters without those of the terms, shape (N, n, b - e).
 
-        Parameters
-        ----------
-        q, qd, qdd
-            Positions, velocities, accelerations, each (N, n); rad or m, s.
-        sharp_sign
-            ``sign(qd)`` instead of its smoothed form.
+        ``q``, ``qd``, ``qdd``: positions, velocities, accelerations, each (N, n); rad or m, s. ``sharp_sign``:
+        ``sign(qd)`` instead of its smoothed form.
         """
         return self._regressor(self.base_columns, self.base.b - self.e, q, qd, qdd, sharp_sign)
 
@@ -297,14 +244,8 @@ class ArmModel:
     ) -> Floats:
         """Joint torques (N, n) along a motion, by the Newton-Euler recursion (A.22 to A.26), without the terms.
 
-        Parameters
-        ----------
-        theta
-            Standard parameters (p,) or base parameters (b,), SI.
-        q, qd, qdd
-            Positions, velocities, accelerations, each (N, n); rad or m, s.
-        sharp_sign
-            ``sign(qd)`` instead of its smoothed form.
+        ``theta``: standard parameters (p,) or base parameters (b,), SI. ``q``, ``qd``, ``qdd``: positions, velocities,
+        accelerations, each (N, n); rad or m, s. ``sharp_sign``: ``sign(qd)`` instead of its smoothed form.
         """
         q, qd, qdd = self._motion(q, qd, qdd)
         out = np.empty_like(q)
@@ -315,12 +256,7 @@ class ArmModel:
     def mass_matrix(self, theta: ArrayLike, q: ArrayLike) -> Floats:
         """Mass matrices (N, n, n) with rotors and couplings, kg m^2, kg m or kg.
 
-        Parameters
-        ----------
-        theta
-            Standard parameters (p,) or base parameters (b,), SI.
-        q
-            Postures (N, n), rad or m.
+        ``theta``: standard parameters (p,) or base parameters (b,), SI; ``q``: postures (N, n), rad or m.
         """
         (q,) = self._motion(q)
         out = np.empty((q.shape[0], self.n, self.n))
@@ -330,19 +266,9 @@ class ArmModel:
     def forward_dynamics(self, theta: ArrayLike, q: ArrayLike, qd: ArrayLike, tau: ArrayLike) -> Floats:
         """Joint accelerations (N, n) of the direct dynamic model with smoothed friction (2.9), without the terms.
 
-        Parameters
-        ----------
-        theta
-            Standard parameters (p,) or base parameters (b,), SI.
-        q, qd
-            Positions and velocities, each (N, n); rad or m, s.
-        tau
-            Joint torques or forces (N, n), N m or N.
-
-        Raises
-        ------
-        ArmidentError
-            If the mass matrix of a sample is not positive definite; the message names the sample.
+        ``theta``: standard parameters (p,) or base parameters (b,), SI. ``q``, ``qd``: positions and velocities, each
+        (N, n); rad or m, s. ``tau``: joint torques or forces (N, n), N m or N. Raises ArmidentError if the mass matrix
+        of a sample is not positive definite; the message names the sample.
         """
         q, qd, tau = self._motion(q, qd, tau)
         out = np.empty_like(q)
@@ -362,10 +288,7 @@ class ArmModel:
     def values(self, theta: ArrayLike) -> Values:
         """Parameter arrays for the kernels, from standard (p,) or base (b,) parameters in SI units.
 
-        Raises
-        ------
-        ValueError
-            If ``theta`` has neither shape.
+        Raises ValueError if ``theta`` has neither shape.
         """
         vector = np.asarray(theta, dtype=np.float64)
         if vector.shape == (len(self.names),):

@@ -69,17 +69,8 @@ class BaseParameters:
 def with_terms(base: BaseParameters, names: tuple[str, ...]) -> BaseParameters:
     """Append the parameters of model terms, which are never regrouped with others.
 
-    Parameters
-    ----------
-    base
-        Base parameters (b,) of the rigid model.
-    names
-        Names of the terms' linear parameters (e,).
-
-    Returns
-    -------
-    BaseParameters
-        With b + e base and p + e standard parameters.
+    ``base``: base parameters (b,) of the rigid model; ``names``: names of the terms' linear parameters (e,). Result:
+    with b + e base and p + e standard parameters.
     """
     if not names:
         return base
@@ -100,21 +91,8 @@ def with_terms(base: BaseParameters, names: tuple[str, ...]) -> BaseParameters:
 def base_parameters(robot: RobotConfig, chain: Chain, columns: Columns, names: tuple[str, ...]) -> BaseParameters:
     """Find the base parameters by Khalil's rules and the dependences of a random regressor (thesis section A.3).
 
-    Parameters
-    ----------
-    robot
-        Configuration of the robot.
-    chain
-        Its geometry.
-    columns
-        Regressor columns of the standard parameters.
-    names
-        Names of the standard parameters (p,).
-
-    Returns
-    -------
-    BaseParameters
-        Combinations by the rules, further regrouped where the regressor shows dependences that the rules miss.
+    ``columns``: regressor columns of the standard parameters; ``names``: names of the standard parameters (p,). Returns
+    combinations by the rules, further regrouped where the regressor shows dependences that the rules miss.
     """
     forms = khalil_rules(robot, chain, names)
     lengths = lengths_of(chain)
@@ -156,27 +134,10 @@ def independent_columns(
     The QR decomposition takes the columns from base to tip, within a link in the order `KEEP_FIRST`. Of several
     possible sets it therefore finds that of tables B.2 and B.3.
 
-    Parameters
-    ----------
-    robot
-        Configuration of the robot.
-    chain
-        Its geometry.
-    columns
-        Regressor columns of the standard parameters.
-    names
-        Names of the standard parameters (p,).
-    candidates
-        Indices of the standard columns to examine; ``None``: all of them.
-    seed
-        Seed of the random motion.
-
-    Returns
-    -------
-    kept : ndarray
-        Indices of the independent standard columns, shape (b,), increasing.
-    mixing : ndarray
-        Shape (b, len(candidates)), with ``theta_base = mixing @ theta[candidates]``.
+    ``columns``: regressor columns of the standard parameters. ``names``: names of the standard parameters (p,).
+    ``candidates``: indices of the standard columns to examine; ``None``: all of them. ``seed``: seed of the random
+    motion. Returns ``kept``: indices of the independent standard columns, shape (b,), increasing; ``mixing``: shape (b,
+    len(candidates)), with ``theta_base = mixing @ theta[candidates]``.
     """
     if candidates is None:
         candidates = np.arange(len(names), dtype=np.int64)

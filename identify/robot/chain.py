@@ -5,6 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from armident.compiled import structure
 from armident.configs import RobotConfig
 
 Floats = NDArray[np.float64]
@@ -14,21 +15,13 @@ INERTIAL = ("xx", "xy", "xz", "yy", "yz", "zz", "mx", "my", "mz", "m")
 """Inertial parameters of a link, in the order of the columns (thesis equation 2.6)."""
 
 
+@structure("f8[::1], f8[::1], f8[::1], f8[::1], f8[::1], b1[::1], f8[::1]")
 class Chain(NamedTuple):
     """Geometry of a serial chain in modified Denavit-Hartenberg notation (thesis section 2.1.1).
 
-    Parameters
-    ----------
-    cos_alpha, sin_alpha
-        Cosine and sine of the twist angles alpha_j, (n,).
-    d, r
-        Distances d_j along x and r_j along z, m, (n,).
-    theta
-        Joint angles at position zero, rad, (n,).
-    prismatic
-        True for prismatic joints, (n,).
-    gravity
-        Gravity in the base frame, m/s^2, (3,).
+    ``cos_alpha``, ``sin_alpha``: cosine and sine of the twist angles alpha_j, (n,); ``d``, ``r``: distances d_j along x
+    and r_j along z, m, (n,); ``theta``: joint angles at position zero, rad, (n,); ``prismatic``: True for prismatic
+    joints, (n,); ``gravity``: gravity in the base frame, m/s^2, (3,).
     """
 
     cos_alpha: Floats
@@ -40,6 +33,7 @@ class Chain(NamedTuple):
     gravity: Floats
 
 
+@structure("i8[:, ::1], i8[::1], i8[::1], i8[::1], i8[::1], i8[:, ::1], i8[:, ::1]")
 class Columns(NamedTuple):
     """Regressor column of each parameter; -1 for a parameter without one.
 
@@ -64,6 +58,7 @@ class Columns(NamedTuple):
     coupling: Ints
 
 
+@structure("f8[:, ::1], f8[::1], f8[::1], f8[::1], f8[::1], i8[:, ::1], f8[:, ::1], f8[::1]")
 class Values(NamedTuple):
     """Parameter values in SI units, one array per kind of parameter.
 
@@ -125,17 +120,7 @@ def standard_names(robot: RobotConfig) -> tuple[str, ...]:
 def columns_of(robot: RobotConfig, names: tuple[str, ...]) -> Columns:
     """Column numbers of the standard parameters listed in ``names``.
 
-    Parameters
-    ----------
-    robot
-        Configuration of the robot.
-    names
-        Standard parameter of each column.
-
-    Returns
-    -------
-    Columns
-        With -1 for parameters that ``names`` does not list.
+    ``names``: standard parameter of each column. Result: with -1 for parameters that ``names`` does not list.
     """
     where = {name: k for k, name in enumerate(names)}
     joints = range(1, robot.n + 1)
@@ -163,14 +148,8 @@ def columns_of(robot: RobotConfig, names: tuple[str, ...]) -> Columns:
 def values_of(columns: Columns, theta: Floats, smoothing: Floats) -> Values:
     """Parameter values by kind, from a parameter vector; parameters without a column are zero.
 
-    Parameters
-    ----------
-    columns
-        Elements of ``theta`` by kind of parameter.
-    theta
-        Parameters in SI units; further elements, for instance those of terms, are not used.
-    smoothing
-        ``g`` of each joint's smoothed sign, s/rad or s/m, (n,).
+    ``columns``: elements of ``theta`` by kind of parameter. ``theta``: parameters in SI units; further elements, for
+    instance those of terms, are not used. ``smoothing``: ``g`` of each joint's smoothed sign, s/rad or s/m, (n,).
     """
     padded = np.append(np.asarray(theta, dtype=np.float64), 0.0)
     return Values(
@@ -188,12 +167,7 @@ def values_of(columns: Columns, theta: Floats, smoothing: Floats) -> Values:
 def link_frames(chain: Chain, q: Floats) -> Floats:
     """Frames of the links in frame 0, homogeneous, shape (N, n + 1, 4, 4); the first one is frame 0.
 
-    Parameters
-    ----------
-    chain
-        Geometry of the chain.
-    q
-        Postures (N, n), rad or m.
+    ``chain``: geometry of the chain; ``q``: postures (N, n), rad or m.
     """
     n, frames = chain.d.size, np.tile(np.eye(4), (q.shape[0], chain.d.size + 1, 1, 1))
     for j in range(n):

@@ -140,8 +140,10 @@ def nearest_consistent(
     negative.
 
     Of several solutions the lightest arm is returned. It has the smallest sum of the traces of the pseudo-inertias,
-    with second moments divided by the square of the arm's mean length. A consistent estimate keeps its base
-    parameters. For an inconsistent estimate the squared distance may exceed its minimum by ``INDIFFERENCE``.
+    with second moments divided by the square of the arm's mean length. A consistent estimate keeps its base parameters.
+    For an inconsistent estimate the squared distance may exceed its minimum by ``INDIFFERENCE``. Raises DataError if
+    shapes are wrong, numbers are not finite, or the covariance is not positive definite; ArmidentError if the solver
+    fails.
 
     Parameters
     ----------
@@ -154,17 +156,6 @@ def nearest_consistent(
     smallest_link
         Pseudo-inertia (4, 4) that every link contains, kg and kg m^2: the difference is positive semidefinite too, so
         that no link is a point or a disc without thickness; ``None``: no such limit.
-
-    Returns
-    -------
-    ConsistentParameters
-
-    Raises
-    ------
-    DataError
-        If shapes are wrong, numbers are not finite, or the covariance is not positive definite.
-    ArmidentError
-        If the solver fails.
 
     Notes
     -----
@@ -214,14 +205,8 @@ def nearest_consistent(
 class NearestBase:
     """Base parameters of the nearest physically consistent arm, without the choice among equal ones and without test.
 
-    Parameters
-    ----------
-    theta
-        Base parameters (b,), SI.
-    shifts
-        Their changes in standard deviations of the estimate (b,).
-    distance
-        Mahalanobis distance from the estimate, standard deviations.
+    ``theta``: base parameters (b,), SI; ``shifts``: their changes in standard deviations of the estimate (b,);
+    ``distance``: Mahalanobis distance from the estimate, standard deviations.
     """
 
     theta: Floats
@@ -232,21 +217,9 @@ class NearestBase:
 def nearest_base(model: ArmModel, theta_base: ArrayLike, covariance: ArrayLike) -> NearestBase:
     """Find the base parameters of the nearest physically consistent arm: one semidefinite programme.
 
-    Parameters
-    ----------
-    model
-        Arm with b base parameters.
-    theta_base
-        Estimate of the base parameters (b,), SI.
-    covariance
-        Covariance of the estimate (b, b), positive definite.
-
-    Raises
-    ------
-    DataError
-        If shapes are wrong, numbers are not finite, or the covariance is not positive definite.
-    ArmidentError
-        If the solver fails.
+    ``model``: arm with b base parameters; ``theta_base``: estimate of the base parameters (b,), SI; ``covariance``:
+    covariance of the estimate (b, b), positive definite. Raises DataError if shapes are wrong, numbers are not finite,
+    or the covariance is not positive definite; ArmidentError if the solver fails.
     """
     theta, p = _checked(model, theta_base, covariance)
     std = np.sqrt(np.diag(p))
@@ -279,17 +252,7 @@ def identifiability(model: ArmModel) -> tuple[Identifiability, ...]:
 def pseudo_inertias(model: ArmModel, theta: ArrayLike) -> Floats:
     """Pseudo-inertia matrices of the links: second moments (kg m^2), first moments (kg m) and mass (kg).
 
-    Parameters
-    ----------
-    model
-        Arm with n joints.
-    theta
-        Standard parameters (p,), SI.
-
-    Returns
-    -------
-    ndarray
-        Shape (n, 4, 4).
+    ``model``: arm with n joints; ``theta``: standard parameters (p,), SI. Result: shape (n, 4, 4).
     """
     xx, xy, xz, yy, yz, zz, mx, my, mz, m = model.values(theta).inertial.T
     inertia = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]).transpose(2, 0, 1)
@@ -314,16 +277,9 @@ class _Projection:
     ``scale`` standard deviations. Without this scale, t values of a thousand beside masses of one make the problem
     badly conditioned.
 
-    Parameters
-    ----------
-    model
-        Arm with p standard and b base parameters.
-    factor
-        Lower Cholesky factor L (b, b) of the covariance of the base estimate.
-    scale
-        Unit of the residual, standard deviations.
-    smallest_link
-        Pseudo-inertia (4, 4) that every link contains; ``None``: zero.
+    ``model``: arm with p standard and b base parameters. ``factor``: lower Cholesky factor L (b, b) of the covariance
+    of the base estimate. ``scale``: unit of the residual, standard deviations. ``smallest_link``: pseudo-inertia (4, 4)
+    that every link contains; ``None``: zero.
     """
 
     def __init__(self, model: ArmModel, factor: Floats, scale: float, smallest_link: Floats | None = None) -> None:
@@ -355,17 +311,9 @@ class _Projection:
     def nearest(self, whitened: Floats, price: float = REGULARISATION) -> tuple[Floats, Floats]:
         """Solve the programme for one whitened base estimate.
 
-        Parameters
-        ----------
-        whitened
-            Whitened base parameters ``L^-1 theta_base``, (b,), standard deviations.
-        price
-            Weight of a kilogram in the objective.
-
-        Returns
-        -------
-        theta, residual : ndarray
-            Standard parameters (p,) of the nearest consistent arm, SI, and the whitened residual (b,).
+        ``whitened``: whitened base parameters ``L^-1 theta_base``, (b,), standard deviations; ``price``: weight of a
+        kilogram in the objective. Returns ``theta``, ``residual``: standard parameters (p,) of the nearest consistent
+        arm, SI, and the whitened residual (b,).
         """
         right = self._limits.copy()
         right[: self._b] = whitened / self._scale
@@ -377,19 +325,9 @@ class _Projection:
 
         The weight of a kilogram is increased in steps until the squared distance exceeds this limit.
 
-        Parameters
-        ----------
-        whitened
-            Whitened base parameters (b,), standard deviations.
-        nearest
-            Standard parameters (p,) of the nearest consistent arm, SI.
-        distance
-            Distance of that arm, standard deviations.
-
-        Returns
-        -------
-        ndarray
-            Standard parameters (p,), SI.
+        ``whitened``: whitened base parameters (b,), standard deviations; ``nearest``: standard parameters (p,) of the
+        nearest consistent arm, SI; ``distance``: distance of that arm, standard deviations. Returns standard parameters
+        (p,), SI.
         """
         best, price = nearest, REGULARISATION
         while price < 1.0:
@@ -414,24 +352,9 @@ class _Projection:
 def minimise_in_cones(quadratic: Floats, linear: Floats, rows: Floats, right: Floats, cones: Sequence[Any]) -> Floats:
     """Minimise ``x'Qx/2 + c'x`` subject to ``right - rows x`` in the cones.
 
-    Parameters
-    ----------
-    quadratic, linear
-        Q, (k, k), and c, (k,).
-    rows, right
-        Rows of all cones one after the other, (m, k) and (m,).
-    cones
-        Cones of the solver in the order of the rows.
-
-    Returns
-    -------
-    ndarray
-        The minimum x, (k,).
-
-    Raises
-    ------
-    ArmidentError
-        If the solver finds no solution.
+    ``quadratic``, ``linear``: Q, (k, k), and c, (k,); ``rows``, ``right``: rows of all cones one after the other,
+    (m, k) and (m,); ``cones``: cones of the solver in the order of the rows. Returns the minimum x, (k,). Raises
+    ArmidentError if the solver finds no solution.
     """
     settings = clarabel.DefaultSettings()
     settings.verbose = False
@@ -480,10 +403,7 @@ def triangles(length: float) -> Floats:
     Lengths are in units of ``length`` (m). Triangles are stored column by column with off-diagonals times sqrt(2), an
     isometry, in the format of the solver (`clarabel.PSDTriangleConeT`).
 
-    Parameters
-    ----------
-    length
-        Unit of length, m.
+    ``length``: unit of length, m.
     """
     out = np.empty((10, 10))
     for k, ten in enumerate(np.eye(10)):
@@ -500,12 +420,7 @@ def triangles(length: float) -> Floats:
 def triangle(matrix: Floats, length: float) -> Floats:
     """Upper triangle of a pseudo-inertia in the units and the order of `triangles`, shape (10,).
 
-    Parameters
-    ----------
-    matrix
-        Pseudo-inertia, (4, 4), kg and kg m^2.
-    length
-        Unit of length, m.
+    ``matrix``: pseudo-inertia, (4, 4), kg and kg m^2; ``length``: unit of length, m.
     """
     scale = np.array([1 / length, 1 / length, 1 / length, 1.0])
     scaled = matrix * np.outer(scale, scale)

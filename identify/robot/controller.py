@@ -19,21 +19,10 @@ class DiscreteController:
     Here ``eps = R (q_ref - q)`` and ``q_motor = R q``, with the transmission matrix R. The output ``nu`` is limited
     to ``saturation``; later samples use the limited value.
 
-    Parameters
-    ----------
-    error_taps, position_taps
-        Coefficients of the tracking error (n, m) and of the motor position (n, m2), N m/rad or N/m.
-    output_taps
-        Coefficients of earlier outputs, shape (n, m3), without unit.
-    saturation
-        Largest absolute motor torque, shape (n,), N m or N; ``inf``: no limit.
-    dt
-        Sampling period, s.
-
-    Raises
-    ------
-    ValueError
-        If the shapes differ in n, a coefficient is not finite, or ``saturation`` or ``dt`` is not positive.
+    ``error_taps``, ``position_taps``: coefficients of the tracking error (n, m) and of the motor position (n, m2),
+    N m/rad or N/m. ``output_taps``: coefficients of earlier outputs, shape (n, m3), without unit. ``saturation``:
+    largest absolute motor torque, shape (n,), N m or N; ``inf``: no limit. Raises ValueError if the shapes differ in n,
+    a coefficient is not finite, or ``saturation`` or ``dt`` is not positive.
     """
 
     error_taps: Floats
@@ -78,7 +67,8 @@ class DiscreteController:
     ) -> Self:
         """Position loop around a velocity loop: ``nu = gain kv (kp eps - qd_motor)`` (thesis section B.3).
 
-        The velocity is the difference of the motor position over ``velocity_samples`` periods.
+        The velocity is the difference of the motor position over ``velocity_samples`` periods. Raises ValueError if
+        ``velocity_samples`` is not positive.
 
         Parameters
         ----------
@@ -88,17 +78,10 @@ class DiscreteController:
             Velocity gains (n,), units of the drive's signal per rad/s or m/s of the motor.
         gain
             Drive gains (n,), motor torque (N m) or force (N) per unit of the drive's signal.
-        dt
-            Sampling period, s.
         saturation
             Largest absolute motor torque, scalar or (n,), N m or N; ``None``: no limit.
         velocity_samples
             Number of periods, at least 1; 2 is the mean of the last two backward differences.
-
-        Raises
-        ------
-        ValueError
-            If ``velocity_samples`` is not positive.
         """
         if velocity_samples < 1:
             raise ValueError(f"velocity_samples: expected at least 1, got {velocity_samples}")
@@ -121,14 +104,8 @@ class DiscreteController:
     def fir(cls, taps: ArrayLike, dt: float, saturation: ArrayLike | None = None) -> Self:
         """Controller of finite impulse responses from the tracking error to the motor torque (CRC, thesis section 5.2).
 
-        Parameters
-        ----------
-        taps
-            Impulse responses (n, m), N m/rad or N/m.
-        dt
-            Sampling period, s.
-        saturation
-            Largest absolute motor torque, scalar or (n,), N m or N; ``None``: no limit.
+        ``taps``: impulse responses (n, m), N m/rad or N/m. ``saturation``: largest absolute motor torque, scalar or
+        (n,), N m or N; ``None``: no limit.
         """
         taps = np.atleast_2d(np.asarray(taps, dtype=np.float64))
         empty = np.zeros((taps.shape[0], 0))

@@ -7,8 +7,8 @@ precision). The code has no branches; errors are a few units in the last place f
 
 import numpy as np
 
+from armident.compiled import inlined
 from armident.identify.robot.chain import Floats
-from armident.identify.robot.compiled import inlined
 
 LANES = 4
 """Array lengths are rounded up to a multiple of this number, so that no element needs a scalar loop."""
@@ -28,15 +28,7 @@ def padded(n: int) -> int:
 
 @inlined
 def sines_cosines(angle: Floats, sine: Floats, cosine: Floats) -> None:
-    """Compute sines and cosines of an array.
-
-    Parameters
-    ----------
-    angle
-        Angles, rad, (m,).
-    sine, cosine
-        Output arrays, (m,) each.
-    """
+    """Compute sines and cosines of an array. ``angle``: rad, (m,); ``sine``, ``cosine``: output arrays, (m,) each."""
     for i in range(angle.size):
         x = angle[i]
         k = np.rint(x * _TWO_OVER_PI)
@@ -67,12 +59,8 @@ def sines_cosines(angle: Floats, sine: Floats, cosine: Floats) -> None:
 def arctangents(x: Floats, out: Floats, slope: Floats) -> None:
     """Compute arctangents of an array and their derivatives ``1 / (1 + x^2)``.
 
-    Parameters
-    ----------
-    x
-        Arguments, (m,).
-    out, slope
-        Output arrays of the arctangents (rad) and of the derivatives, (m,) each.
+    ``x``: arguments, (m,); ``out``, ``slope``: output arrays of the arctangents (rad) and of the derivatives, (m,)
+    each.
     """
     for i in range(x.size):
         t = abs(x[i])

@@ -7,8 +7,8 @@ Sizes: N samples, n joints.
 
 import numpy as np
 
+from armident.compiled import ARITHMETIC, compiled, inlined
 from armident.identify.robot.chain import Chain, Columns, Floats, Values
-from armident.identify.robot.compiled import compiled, inlined
 from armident.identify.robot.elementary import padded, sines_cosines
 
 TWO_OVER_PI = 2.0 / np.pi
@@ -18,12 +18,7 @@ TWO_OVER_PI = 2.0 / np.pi
 def smooth_sign(x: float, smoothing: float) -> float:
     """``sign(x)``, or ``(2/pi) atan(smoothing x)`` if ``smoothing`` is positive (thesis section B.2).
 
-    Parameters
-    ----------
-    x
-        Velocity, rad/s or m/s.
-    smoothing
-        ``g`` of the smoothed sign, s/rad or s/m; 0: the sharp sign.
+    ``x``: velocity, rad/s or m/s. ``smoothing``: ``g`` of the smoothed sign, s/rad or s/m; 0: the sharp sign.
     """
     return TWO_OVER_PI * np.arctan(smoothing * x) if smoothing > 0.0 else float(np.sign(x))
 
@@ -32,19 +27,8 @@ def smooth_sign(x: float, smoothing: float) -> float:
 def into_child(ca: float, sa: float, c: float, s: float, x: float, y: float, z: float) -> tuple[float, float, float]:
     """Transform the components of a vector from frame j-1 to frame j (rotation only).
 
-    Parameters
-    ----------
-    ca, sa
-        Cosine and sine of the twist angle alpha_j.
-    c, s
-        Cosine and sine of the joint angle theta_j.
-    x, y, z
-        Components of the vector in frame j-1.
-
-    Returns
-    -------
-    tuple of float
-        Components in frame j.
+    ``ca``, ``sa``: cosine and sine of the twist angle alpha_j; ``c``, ``s``: cosine and sine of the joint angle
+    theta_j; ``x``, ``y``, ``z``: components of the vector in frame j-1.
     """
     t = ca * y + sa * z
     return c * x + s * t, c * t - s * x, ca * z - sa * y
@@ -54,19 +38,8 @@ def into_child(ca: float, sa: float, c: float, s: float, x: float, y: float, z: 
 def into_parent(ca: float, sa: float, c: float, s: float, x: float, y: float, z: float) -> tuple[float, float, float]:
     """Transform the components of a vector from frame j to frame j-1 (rotation only).
 
-    Parameters
-    ----------
-    ca, sa
-        Cosine and sine of the twist angle alpha_j.
-    c, s
-        Cosine and sine of the joint angle theta_j.
-    x, y, z
-        Components of the vector in frame j.
-
-    Returns
-    -------
-    tuple of float
-        Components in frame j-1.
+    ``ca``, ``sa``: cosine and sine of the twist angle alpha_j; ``c``, ``s``: cosine and sine of the joint angle
+    theta_j; ``x``, ``y``, ``z``: components of the vector in frame j. Returns components in frame j-1.
     """
     t = s * x + c * y
     return c * x - s * y, ca * t - sa * z, sa * t + ca * z
@@ -76,23 +49,15 @@ def into_parent(ca: float, sa: float, c: float, s: float, x: float, y: float, z:
 def turn(n: int, chain: Chain, q: Floats, angle: Floats, sine: Floats, cosine: Floats) -> None:
     """Compute the joint angles of one sample, with their sines and cosines.
 
-    Parameters
-    ----------
-    n
-        Number of joints.
-    chain
-        Geometry of the chain.
-    q
-        Joint positions (n,), rad or m.
-    angle, sine, cosine
-        Output arrays of `padded` length: angles in rad, their sines and cosines.
+    ``chain``: geometry of the chain; ``q``: joint positions (n,), rad or m; ``angle``, ``sine``, ``cosine``: output
+    arrays of `padded` length: angles in rad, their sines and cosines.
     """
     for j in range(n):
         angle[j] = chain.theta[j] + (0.0 if chain.prismatic[j] else q[j])
     sines_cosines(angle, sine, cosine)
 
 
-@compiled
+@compiled("Chain, Columns, f8[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, :, ::1]", **ARITHMETIC)
 def fill_regressor(
     chain: Chain, columns: Columns, smoothing: Floats, q: Floats, qd: Floats, qdd: Floats, out: Floats
 ) -> None:
@@ -212,16 +177,9 @@ def fill_regressor(
 def add_friction(values: Values, smoothing: Floats, qd: Floats, tau: Floats) -> None:
     """Add friction, offsets and coupled friction of one sample to its torques (thesis equations 2.7, B.1).
 
-    Parameters
-    ----------
-    values
-        Parameter values by kind, SI.
-    smoothing
-        ``g`` (n,) of each joint's smoothed sign, s/rad or s/m; 0: the sharp sign.
-    qd
-        Joint velocities (n,), rad/s or m/s.
-    tau
-        Joint torques (n,), N m or N, changed in place.
+    ``values``: parameter values by kind, SI. ``smoothing``: ``g`` (n,) of each joint's smoothed sign, s/rad or s/m; 0:
+    the sharp sign. ``qd``: joint velocities (n,), rad/s or m/s. ``tau``: joint torques (n,), N m or N, changed in
+    place.
     """
     for j in range(qd.size):
         tau[j] += values.fv[j] * qd[j] + values.off[j]
@@ -251,8 +209,6 @@ def rigid_torque(
 
     Parameters
     ----------
-    n
-        Number of joints.
     chain
         Geometry of the chain.
     values
@@ -332,20 +288,9 @@ def fill_mass_matrix(
 ) -> None:
     """Compute the mass matrix of one posture, with rotors and couplings, by the composite rigid body method.
 
-    Parameters
-    ----------
-    n
-        Number of joints.
-    chain
-        Geometry of the chain.
-    values
-        Parameter values by kind, SI.
-    q
-        Joint positions (n,), rad or m.
-    sine, cosine
-        Sines and cosines of the joint angles, of `padded` length, from `turn`.
-    mass
-        Output array (n, n), kg m^2, kg m or kg.
+    ``chain``: geometry of the chain; ``values``: parameter values by kind, SI; ``q``: joint positions (n,), rad or m;
+    ``sine``, ``cosine``: sines and cosines of the joint angles, of `padded` length, from `turn`; ``mass``: output array
+    (n, n), kg m^2, kg m or kg.
     """
     xx = xy = xz = yy = yz = zz = hx = hy = hz = m = 0.0
     for j in range(n - 1, -1, -1):
@@ -419,24 +364,15 @@ def fill_mass_matrix(
         mass[j, i] += values.coupling[k, 0]
 
 
-@compiled
+@compiled("Chain, Values, f8[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1]", **ARITHMETIC)
 def fill_inverse_dynamics(
     chain: Chain, values: Values, smoothing: Floats, q: Floats, qd: Floats, qdd: Floats, out: Floats
 ) -> None:
     """Compute the joint torques along a motion, with friction, rotors and couplings.
 
-    Parameters
-    ----------
-    chain
-        Geometry of the chain.
-    values
-        Parameter values by kind, SI.
-    smoothing
-        ``g`` (n,) of each joint's smoothed sign, s/rad or s/m; 0: the sharp sign.
-    q, qd, qdd
-        Positions, velocities, accelerations, each (N, n); rad or m, s.
-    out
-        Output array of the joint torques (N, n), N m or N.
+    ``chain``: geometry of the chain. ``values``: parameter values by kind, SI. ``smoothing``: ``g`` (n,) of each
+    joint's smoothed sign, s/rad or s/m; 0: the sharp sign. ``q``, ``qd``, ``qdd``: positions, velocities,
+    accelerations, each (N, n); rad or m, s. ``out``: output array of the joint torques (N, n), N m or N.
     """
     n = chain.d.size
     work = np.empty((n, 6))
@@ -453,20 +389,12 @@ def fill_inverse_dynamics(
             out[k, j] += values.coupling[m, 0] * qdd[k, i]
 
 
-@compiled
+@compiled("Chain, Values, f8[:, ::1], f8[:, :, ::1]", **ARITHMETIC)
 def fill_mass_matrices(chain: Chain, values: Values, q: Floats, out: Floats) -> None:
     """Compute the mass matrices of several postures; see `fill_mass_matrix`.
 
-    Parameters
-    ----------
-    chain
-        Geometry of the chain.
-    values
-        Parameter values by kind, SI.
-    q
-        Postures (N, n), rad or m.
-    out
-        Output array (N, n, n), kg m^2, kg m or kg.
+    ``chain``: geometry of the chain; ``values``: parameter values by kind, SI; ``q``: postures (N, n), rad or m;
+    ``out``: output array (N, n, n), kg m^2, kg m or kg.
     """
     n = chain.d.size
     angle, sine, cosine = np.zeros(padded(n)), np.empty(padded(n)), np.empty(padded(n))
@@ -479,19 +407,9 @@ def fill_mass_matrices(chain: Chain, values: Values, q: Floats, out: Floats) -> 
 def cholesky(matrix: Floats, factor: Floats, n: int) -> bool:
     """Factor a symmetric matrix as ``L D L'``.
 
-    Parameters
-    ----------
-    matrix
-        Symmetric matrix (n, n); only its lower triangle is read.
-    factor
-        Output array (n, n): L below the diagonal, the inverse of D on it, ``D L'`` above it.
-    n
-        Size of the matrix.
-
-    Returns
-    -------
-    bool
-        ``False`` if the matrix is not positive definite; ``factor`` is then incomplete.
+    ``matrix``: symmetric matrix (n, n); only its lower triangle is read. ``factor``: output array (n, n): L below the
+    diagonal, the inverse of D on it, ``D L'`` above it. ``n``: size of the matrix. Returns ``False`` if the matrix is
+    not positive definite; ``factor`` is then incomplete.
     """
     for j in range(n):
         pivot = matrix[j, j]
@@ -515,14 +433,8 @@ def cholesky(matrix: Floats, factor: Floats, n: int) -> bool:
 def solve_factored(factor: Floats, n: int, x: Floats) -> None:
     """Solve ``L D L' x = b`` in place with the factors of `cholesky`.
 
-    Parameters
-    ----------
-    factor
-        Factors (n, n) from `cholesky`.
-    n
-        Size of the system.
-    x
-        Right side b (n,) at entry, solution at return.
+    ``factor``: factors (n, n) from `cholesky`; ``n``: size of the system; ``x``: right side b (n,) at entry, solution
+    at return.
     """
     for i in range(n):
         value = x[i]
@@ -536,11 +448,13 @@ def solve_factored(factor: Floats, n: int, x: Floats) -> None:
         x[i] = value
 
 
-@compiled
+@compiled("Chain, Values, f8[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1]", **ARITHMETIC)
 def fill_forward_dynamics(
     chain: Chain, values: Values, smoothing: Floats, q: Floats, qd: Floats, tau: Floats, out: Floats
 ) -> int:
     """Compute the joint accelerations of the direct dynamic model (thesis equation 2.9).
+
+    Returns the first sample whose mass matrix is not positive definite, or -1.
 
     Parameters
     ----------
@@ -556,11 +470,6 @@ def fill_forward_dynamics(
         Joint torques (N, n), N m or N.
     out
         Output array of the accelerations (N, n), rad/s^2 or m/s^2.
-
-    Returns
-    -------
-    int
-        First sample whose mass matrix is not positive definite, or -1.
     """
     n = chain.d.size
     work = np.empty((n, 6))

@@ -28,20 +28,8 @@ PARALLEL = 1e-9
 def khalil_rules(robot: RobotConfig, chain: Chain, names: tuple[str, ...]) -> dict[str, Form]:
     """Derive the base parameters as linear forms in the standard ones by Khalil's rules (thesis section A.3).
 
-    Parameters
-    ----------
-    robot
-        Configuration of the robot.
-    chain
-        Its geometry.
-    names
-        Names of the standard parameters (p,).
-
-    Returns
-    -------
-    dict
-        Linear form of each remaining parameter, in the order of ``names``. A form maps standard parameters to
-        polynomials in the lengths.
+    ``names``: names of the standard parameters (p,). Returns the linear form of each remaining parameter, in the order
+    of ``names``. A form maps standard parameters to polynomials in the lengths.
     """
     forms: dict[str, Form] = {name: {name: {(): 1.0}} for name in names}
     axes, origins = _axes(chain)
@@ -88,19 +76,8 @@ def khalil_rules(robot: RobotConfig, chain: Chain, names: tuple[str, ...]) -> di
 def evaluate(form: Form, lengths: Mapping[str, float], names: tuple[str, ...]) -> Floats:
     """Evaluate the coefficients of a linear form at given lengths.
 
-    Parameters
-    ----------
-    form
-        Linear form in the standard parameters.
-    lengths
-        Values of the symbols, m, from `lengths_of`.
-    names
-        Names of the standard parameters (p,).
-
-    Returns
-    -------
-    ndarray
-        Coefficients, shape (p,).
+    ``form``: linear form in the standard parameters; ``lengths``: values of the symbols, m, from `lengths_of`;
+    ``names``: names of the standard parameters (p,). Returns coefficients, shape (p,).
     """
     row = np.zeros(len(names))
     for k, name in enumerate(names):
@@ -117,14 +94,8 @@ def lengths_of(chain: Chain) -> dict[str, float]:
 def text_of(name: str, form: Form, names: tuple[str, ...]) -> str:
     """Text of a linear form as in thesis table B.3; parameters with equal coefficients share a bracket.
 
-    Parameters
-    ----------
-    name
-        Parameter that stands first.
-    form
-        Linear form in the standard parameters, with ``name`` among them.
-    names
-        Names of the standard parameters, the order of the other terms.
+    ``name``: parameter that stands first; ``form``: linear form in the standard parameters, with ``name`` among them;
+    ``names``: names of the standard parameters, the order of the other terms.
     """
     groups: dict[str, list[str]] = {}
     polynomials: dict[str, Polynomial] = {}

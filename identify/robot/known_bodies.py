@@ -33,21 +33,10 @@ def nearest_to_known(model: ArmModel, theta: Floats, known: Floats, smallest_lin
     Base parameters determine the torques; the other combinations of standard parameters are free. Distances are in
     kilograms: first moments are divided by the arm's mean length, moments of inertia by its square.
 
-    Parameters
-    ----------
-    model
-        Arm with p standard and b base parameters.
-    theta
-        Consistent standard parameters (p,), SI; every link contains ``smallest_link``.
-    known
-        Known standard parameters (p,), SI, for example of the maker; only those of links count.
-    smallest_link
-        Pseudo-inertia (4, 4) that every link contains, kg and kg m^2.
-
-    Returns
-    -------
-    ndarray
-        Shape (p,); ``theta`` itself where the solver finds nothing nearer.
+    ``model``: arm with p standard and b base parameters. ``theta``: consistent standard parameters (p,), SI; every link
+    contains ``smallest_link``. ``known``: known standard parameters (p,), SI, for example of the maker; only those of
+    links count. ``smallest_link``: pseudo-inertia (4, 4) that every link contains, kg and kg m^2. Result: shape (p,);
+    ``theta`` itself where the solver finds nothing nearer.
     """
     free = linalg.null_space(model.base.regroup)
     if not free.shape[1]:

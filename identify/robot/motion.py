@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import qmc
 
-from armident.identify.robot.compiled import compiled
+from armident.compiled import ARITHMETIC, compiled
 
 if TYPE_CHECKING:
     from armident.identify.robot.arm import ArmModel
@@ -19,14 +19,14 @@ STEP = 1e-6
 """Step of the finite differences, rad and rad/s or m and m/s."""
 
 
-POSTURES = 64
+WORKSPACE_POSTURES = 64
 """Number P of postures for mean values over the workspace."""
 
 
 @cache
 def _spread(revolute: tuple[bool, ...]) -> Array:
     """Points (P, n) of the Halton sequence over a turn of each revolute joint, rad; prismatic joints are at zero."""
-    points = qmc.Halton(len(revolute), scramble=False).random(POSTURES)
+    points = qmc.Halton(len(revolute), scramble=False).random(WORKSPACE_POSTURES)
     return np.ascontiguousarray(np.where(revolute, np.pi * (2.0 * points - 1.0), 0.0))
 
 
@@ -258,7 +258,13 @@ class Motion:
         return self._still[links]
 
     def rate(self, values: Array) -> Array:
-        """Time derivative along the first axis by central differences, in units of ``values`` per s."""
+        """Return the time derivative along the first axis by central differences.
+
+        Parameters
+        ----------
+        values
+            Values (N, ...), in any unit; the derivative is in this unit per s.
+        """
         slope: Array = np.gradient(values, self.dt, axis=0)
         return slope
 
@@ -272,7 +278,7 @@ class Motion:
         return self.theta
 
 
-@compiled
+@compiled("f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[::1], f8[::1], f8[::1], i8, f8", **ARITHMETIC)
 def _first_order(
     position: Array,
     velocity: Array,

@@ -19,14 +19,9 @@ MOST_HALVINGS = 30
 class Damped:
     """Physical iterate and the applied fraction of its step.
 
-    Parameters
-    ----------
-    theta
-        Parameters, base (b,) or standard (p,) as given, SI.
-    step
-        Applied fraction of the step from the previous to the proposed iterate, 0 to 1.
-    reason
-        Defects of the proposed iterate and their correction; empty if there were none.
+    ``theta``: parameters, base (b,) or standard (p,) as given, SI. ``step``: applied fraction of the step from the
+    previous to the proposed iterate, 0 to 1. ``reason``: defects of the proposed iterate and their correction; empty if
+    there were none.
     """
 
     theta: Floats
@@ -40,14 +35,8 @@ def damp_to_physical(model: ArmModel, theta: ArrayLike, theta_previous: ArrayLik
     Negative friction coefficients are set to zero. Then the step from ``theta_previous`` is halved until the mass
     matrix is positive definite at all postures.
 
-    Parameters
-    ----------
-    model
-        Arm model with n joints.
-    theta, theta_previous
-        Proposed parameters and those of the previous, physical iterate, SI: both base (b,) or both standard (p,).
-    q_samples
-        Postures, shape (N, n), rad or m.
+    ``model``: arm model with n joints; ``theta``, ``theta_previous``: proposed parameters and those of the previous,
+    physical iterate, SI: both base (b,) or both standard (p,); ``q_samples``: postures, shape (N, n), rad or m.
     """
     previous = np.asarray(theta_previous, dtype=np.float64)
     wanted = np.asarray(theta, dtype=np.float64)

@@ -29,7 +29,7 @@ ROUNDS = 16
 SETTLED = 1e-3
 """Difference between the torque of the terms and the applied load, over that torque, at which the iteration ends."""
 
-POSTURES = 100
+INERTIA_POSTURES = 100
 """Approximate number of postures of a motion at which the joint inertias are evaluated."""
 
 MEMORY = 6
@@ -62,6 +62,8 @@ def simulate_with_terms(
 ) -> Simulation:
     """Simulate the closed loop with the terms of the model; see :func:`armident.identify.robot.simulation.simulate`.
 
+    Result: ``tau`` is the torque that the drives report: that of the rigid arm plus that of the terms.
+
     Parameters
     ----------
     model
@@ -72,8 +74,6 @@ def simulate_with_terms(
         Controller with the sampling period ``dt``.
     q_ref
         Reference positions (N, n), rad or m.
-    dt
-        Sampling period, s.
     start
         Time of the first sample since the beginning of the first recording, s.
     disturbance
@@ -90,11 +90,6 @@ def simulate_with_terms(
         Motion (N, n) close to that of the loop, at which the first load is computed; ``None``: begin without load.
     **initial
         Further arguments of ``simulate``: ``q0``, ``qd0``, ``max_velocity``.
-
-    Returns
-    -------
-    Simulation
-        ``tau`` is the torque that the drives report: that of the rigid arm plus that of the terms.
     """
     theta = np.asarray(theta_base, dtype=np.float64)
     values = theta[theta.size - model.e :]
@@ -169,7 +164,7 @@ def _slow(values: Floats, dt: float, band_hz: float) -> Floats:
 def _inertia(model: ArmModel, theta: Floats, q: Floats, torque: Floats, qdd: Floats) -> Floats:
     """Inertia (n,) of each joint that fits the torque (N, n) of the terms, zero where it is small; kg m^2 or kg."""
     found = np.sum(torque * qdd, axis=0) / np.maximum(np.sum(qdd * qdd, axis=0), 1e-300)
-    postures = q[:: max(1, q.shape[0] // POSTURES)]
+    postures = q[:: max(1, q.shape[0] // INERTIA_POSTURES)]
     own = np.maximum(np.einsum("kjj->kj", model.mass_matrix(theta, postures)).min(axis=0), 0.0)
     found = np.maximum(found, (LEAST_INERTIA - 1.0) * own)
     return np.where(np.abs(found) > FELT_INERTIA * own, found, 0.0)
@@ -185,12 +180,8 @@ class _Past:
     def next(self, load: Floats, missing: Floats) -> Floats:
         """Return the next load: the one of least difference in a linear model, plus ``STEP`` times that difference.
 
-        Parameters
-        ----------
-        load
-            Load of the last simulation (N, n), N m or N.
-        missing
-            Torque of the terms minus ``load`` (N, n), N m or N.
+        ``load``: load of the last simulation (N, n), N m or N; ``missing``: torque of the terms minus ``load`` (N, n),
+        N m or N.
         """
         self._loads.append(load)
         self._missing.append(missing)

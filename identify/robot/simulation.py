@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from armident.compiled import ARITHMETIC, compiled, inlined
 from armident.identify.robot.arm import ArmModel
 from armident.identify.robot.chain import Chain, Floats, Ints, Values
-from armident.identify.robot.compiled import compiled, inlined
 from armident.identify.robot.controller import DiscreteController
 from armident.identify.robot.elementary import arctangents, padded
 from armident.identify.robot.kernels import TWO_OVER_PI, cholesky, fill_mass_matrix, rigid_torque, solve_factored, turn
@@ -37,6 +37,13 @@ MOST_STEPS = 16
 
 HISTORY = 1024
 """Number of samples after which the past of the controller is copied to the front of its arrays."""
+
+UNROLLED = ((1, 0), (2, 0), (3, 0), (4, 0), (5, 0), (6, 0), (6, 1), (7, 0))
+"""Numbers of joints and of couplings for which the loop is compiled before its use; others are compiled when needed."""
+_SIGNATURE = (
+    "Chain, Values, *[f8[:, ::1]] * 5, f8[::1], i8, *[f8[:, ::1]] * 2, f8, f8[::1], *[f8[:, ::1]] * 4, "
+    "Tuple([i8] * {}), Tuple([i8] * {})"
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,6 +85,8 @@ def simulate(
 ) -> Simulation:
     """Simulate the arm under its controller along a reference (thesis equation 2.9, section B.3).
 
+    Raises ValueError if numbers of joints, shapes or sampling periods differ.
+
     Parameters
     ----------
     model
@@ -100,11 +109,6 @@ def simulate(
         Motor torques (N, n), N m or N, added to those of the controller after their saturation; ``tau`` contains them.
     inertia
         Additional inertia of the joints (n,), kg m^2 or kg.
-
-    Raises
-    ------
-    ValueError
-        If numbers of joints, shapes or sampling periods differ.
     """
     reference = np.ascontiguousarray(q_ref, dtype=np.float64)
     samples, n = reference.shape
@@ -216,16 +220,8 @@ def friction(
 def divisions(n: int, pairs: int, values: Values, v: Floats, a: Floats, dt: float) -> int:
     """Number of integration steps in one sample: more while a joint with Coulomb friction passes standstill.
 
-    Parameters
-    ----------
-    n, pairs
-        Numbers of joints and of couplings.
-    values
-        Parameter values by kind, SI.
-    v, a
-        Joint velocities and accelerations (n,), rad or m, s.
-    dt
-        Sampling period, s.
+    ``n``, ``pairs``: numbers of joints and of couplings; ``values``: parameter values by kind, SI; ``v``, ``a``: joint
+    velocities and accelerations (n,), rad or m, s.
     """
     most = 1
     for j in range(n):
@@ -271,7 +267,7 @@ def stiffen(
         stiff[max(i, j), min(i, j)] += GAMMA * step * pair_slope[m]
 
 
-@compiled
+@compiled(*(_SIGNATURE.format(n, pairs) for n, pairs in UNROLLED), **ARITHMETIC)
 def run(
     chain: Chain,
     values: Values,
@@ -296,7 +292,7 @@ def run(
     """Simulate the closed loop; fill ``q, qd, qdd, tau`` from the state in the first row of ``q`` and ``qd``.
 
     The length of a tuple is known when the kernel is compiled: with ``joints`` and ``couplings`` the compiler unrolls
-    the short loops.
+    the short loops. Returns the sample at which the simulation stopped, or -1 if it reached the end.
 
     Parameters
     ----------
@@ -314,19 +310,12 @@ def run(
         Reference positions of the motors (N, n), rad or m.
     disturbance
         Additional motor torques (N, n), N m or N; shape (0, n): none.
-    dt
-        Sampling period, s.
     max_velocity
         Joint velocities (n,), rad/s or m/s, above which the simulation stops.
     q, qd, qdd, tau
         Output arrays (N, n), joint side, SI.
     joints, couplings
         Tuples with one entry per joint and per coupling; only their lengths are used.
-
-    Returns
-    -------
-    int
-        Sample at which the simulation stopped, or -1 if it reached the end.
     """
     samples, n = reference.shape[0], len(joints)
     coupled = values.coupling_joints

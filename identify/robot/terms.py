@@ -37,12 +37,6 @@ class ModelTerm(Protocol):
     def add_torque(self, motion: Motion, values: NDArray[np.float64], torque: NDArray[np.float64]) -> None:
         """Add the torque of the term.
 
-        Parameters
-        ----------
-        motion
-            The motion, N samples.
-        values
-            Values of the linear parameters, (k,).
-        torque
-            Torques of all joints, (N, n), N m or N; changed in place.
+        ``motion``: the motion, N samples. ``values``: values of the linear parameters, (k,). ``torque``: torques of all
+        joints, (N, n), N m or N; changed in place.
         """

@@ -20,13 +20,6 @@ def by_rows(bench: Bench, h: Hypothesis) -> Hypothesis:
 
     Every row of the model is fitted alone to every recorded torque with either sign; the assignment with the least sum
     of logarithmic residuals is taken (Kuhn 1955).
-
-    Parameters
-    ----------
-    bench
-        Signals.
-    h
-        Start.
     """
     n = bench.n
     found = normal(bench, h)
@@ -60,12 +53,7 @@ def by_friction(bench: Bench, h: Hypothesis) -> Array:
     Dry friction changes the torque of its own joint where that joint turns round, and of no other joint. Needs no
     model of the arm.
 
-    Parameters
-    ----------
-    bench
-        Signals.
-    h
-        Start; its assignments are not used.
+    ``h``: start; its assignments are not used.
     """
     n = bench.n
     x = bench.rows(np.eye(n)).x
@@ -91,13 +79,7 @@ def by_friction(bench: Bench, h: Hypothesis) -> Array:
 
 
 def orders(moving: NDArray[np.bool_]) -> Iterator[Array]:
-    """Permutation matrices (n, n) of the joints that move.
-
-    Parameters
-    ----------
-    moving
-        Mask (n,) of the joints that move.
-    """
+    """Permutation matrices (n, n) of the joints that move. ``moving``: mask (n,) of the joints that move."""
     chosen = np.flatnonzero(moving)
     for order in permutations(chosen):
         rows = np.arange(moving.size)
@@ -108,10 +90,7 @@ def orders(moving: NDArray[np.bool_]) -> Iterator[Array]:
 def usual_orders(moving: NDArray[np.bool_]) -> list[Array]:
     """Orders from which a search by exchanges starts: as configured, reversed, and all rotations.
 
-    Parameters
-    ----------
-    moving
-        Mask (n,) of the joints that move.
+    ``moving``: mask (n,) of the joints that move.
     """
     own, chosen = np.eye(moving.size), np.flatnonzero(moving)
     made = []
@@ -125,12 +104,7 @@ def usual_orders(moving: NDArray[np.bool_]) -> list[Array]:
 def exchanged(order: Array, first: int, second: int) -> Array:
     """Return an order (n, n) with two joints exchanged.
 
-    Parameters
-    ----------
-    order
-        Permutation matrix.
-    first, second
-        Indices of the joints.
+    ``order``: permutation matrix; ``first``, ``second``: indices of the joints.
     """
     other = order.copy()
     other[[first, second]] = other[[second, first]]

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armident.configs import DataError, RobotConfig
-from armident.identify.experiment import Experiment
 from armident.identify.robot.arm import ArmModel
 from armident.identify.signals.bandwidth import motion_bandwidth
 from armident.identify.signals.decimate import Decimation, design
+from armident.identify.signals.experiments import Experiment
 
 Array = NDArray[np.float64]
 
@@ -71,16 +71,9 @@ GENERIC = np.array([3.1, -5.3, -7.6])
 class Segment:
     """Signals of one experiment at the working rate.
 
-    Parameters
-    ----------
-    q, qd, qdd
-        Recorded positions and their derivatives, (W, n); rad or m, s.
-    tau
-        Recorded torques, (W, n), N m or N.
-    dt
-        Working period, s.
-    q_ref
-        Reference positions, (W, n), rad or m; ``None``: not recorded.
+    ``q``, ``qd``, ``qdd``: recorded positions and their derivatives, (W, n); rad or m, s. ``tau``: recorded torques,
+    (W, n), N m or N. ``dt``: working period, s. ``q_ref``: reference positions, (W, n), rad or m; ``None``: not
+    recorded.
     """
 
     q: Array
@@ -95,15 +88,9 @@ class Segment:
 class Rows:
     """Equations of all joints for one assignment of positions.
 
-    Parameters
-    ----------
-    x
-        Regressors: base parameters without gravity, then free terms, (M, n, c).
-    gravity
-        What gravity along each base axis adds to the regressors, per m/s^2, (3, M, n, c).
-    physical
-        Rows whose product with the parameters must not be negative: mean moment of inertia, and power of friction,
-        (2 n, c).
+    ``x``: regressors: base parameters without gravity, then free terms, (M, n, c); ``gravity``: what gravity along each
+    base axis adds to the regressors, per m/s^2, (3, M, n, c); ``physical``: rows whose product with the parameters must
+    not be negative: mean moment of inertia, and power of friction, (2 n, c).
     """
 
     x: Array
@@ -119,8 +106,6 @@ class Bench:
     ----------
     model
         Rigid model, with base parameters for gravity in any direction.
-    robot
-        The configuration.
     segments
         Signals of each experiment.
     decimation
@@ -189,13 +174,7 @@ class Bench:
         return q, qd, tau
 
     def coarse(self, rows: int) -> "Bench":
-        """Return the same signals with fewer instants.
-
-        Parameters
-        ----------
-        rows
-            Largest number of instants.
-        """
+        """Return the same signals with fewer instants. ``rows``: largest number of instants."""
         return self._with(rows, self.at_rest)
 
     @cached_property
@@ -209,20 +188,14 @@ class Bench:
     def column(self, name: str) -> int:
         """Column of a standard parameter that is a base parameter, possibly with others regrouped into it.
 
-        Parameters
-        ----------
-        name
-            Standard parameter.
+        ``name``: standard parameter.
         """
         return list(self.model.base.independent).index(self.model.names.index(name))
 
     def torque(self, shift: Array) -> Array:
         """Recorded torques at the instants of the rows, moved to earlier times, (M, n), N m or N.
 
-        Parameters
-        ----------
-        shift
-            Time by which each torque is late, s, (n,).
+        ``shift``: time by which each torque is late, s, (n,).
         """
         key = np.round(shift, 9).tobytes()
         if key not in self._torques:
@@ -232,10 +205,7 @@ class Bench:
     def rows(self, position: Array) -> Rows:
         """Equations with the joint positions ``position @ q_recorded``.
 
-        Parameters
-        ----------
-        position
-            Matrix (n, n): signs, permutation and scale.
+        ``position``: matrix (n, n): signs, permutation and scale.
         """
         key = np.round(position, 9).tobytes()
         if key not in self._rows:
@@ -247,10 +217,7 @@ class Bench:
     def kept(self, signals: Sequence[Array]) -> Array:
         """Signals at the instants of the rows, filtered, (M, ...).
 
-        Parameters
-        ----------
-        signals
-            Signals of each segment at the working rate, (W, ...).
+        ``signals``: signals of each segment at the working rate, (W, ...).
         """
         pairs = zip(signals, self.instants_used, strict=True)
         return np.concatenate([self.decimation(x)[instants] for x, instants in pairs])
@@ -303,23 +270,9 @@ def make_bench(
 ) -> Bench:
     """Filter and differentiate the recordings.
 
-    Parameters
-    ----------
-    experiments
-        SI, joint side, one sampling rate.
-    robot
-        The configuration.
-    moving
-        Mask (n,) of the joints that move.
-    working_rate
-        Rate of the derivatives over the cut-off of the equations.
-    model
-        Model of another bench of the same robot; ``None``: made.
-
-    Raises
-    ------
-    DataError
-        If the recordings are too short for any comparison.
+    ``experiments``: SI, joint side, one sampling rate. ``moving``: mask (n,) of the joints that move. ``working_rate``:
+    rate of the derivatives over the cut-off of the equations. ``model``: model of another bench of the same robot;
+    ``None``: made. Raises DataError if the recordings are too short for any comparison.
     """
     dt = experiments[0].dt
     cutoff = min(CUTOFF * motion_bandwidth([e.q for e in experiments], dt), 0.45 / dt)

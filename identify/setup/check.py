@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from armident.configs import DataError, RobotConfig
-from armident.identify.effects.recorded import put_right
-from armident.identify.experiment import Experiment, check_one_rate
+from armident.identify.effects.recording_corrections import corrected_experiments
 from armident.identify.setup import signals
 from armident.identify.setup.bench import Bench, make_bench
 from armident.identify.setup.clipping import clipped_torques
@@ -19,6 +18,7 @@ from armident.identify.setup.fit import Hypothesis, joint_errors
 from armident.identify.setup.result import SetupCheck, SetupFinding, TorqueShift
 from armident.identify.setup.search import NOT_UNDERSTOOD, STRUCTURED, Search, Step
 from armident.identify.setup.torque_shift import SHIFT_RATE, long_torque_shift, torque_shift
+from armident.identify.signals.experiments import Experiment, check_one_rate
 
 Array = NDArray[np.float64]
 
@@ -49,28 +49,15 @@ TRIED = {
 def check_setup(experiments: Sequence[Experiment], robot: RobotConfig) -> SetupCheck:
     """Compare the set-up as configured with its possible mistakes, each with everything refitted.
 
-    Parameters
-    ----------
-    experiments
-        SI, joint side, of one robot at one sampling rate.
-    robot
-        The configuration; mistakes that its ``effects`` correct are corrected first.
-
-    Returns
-    -------
-    SetupCheck
-        The mistakes with their probability and remedy.
-
-    Raises
-    ------
-    DataError
-        If the recordings do not fit together or are too short.
+    ``experiments``: SI, joint side, of one robot at one sampling rate. ``robot``: the configuration; mistakes that its
+    ``effects`` correct are corrected first. Returns the mistakes with their probability and remedy. Raises DataError if
+    the recordings do not fit together or are too short.
     """
     _validate(experiments, robot)
     # The matrices are small: threads delay each other.
     with threadpool_limits(1):
         try:
-            return _check(put_right(experiments, robot), robot)
+            return _check(corrected_experiments(experiments, robot), robot)
         except np.linalg.LinAlgError as error:
             message = f"the set-up cannot be checked: the equations of the motion are singular ({error})"
             raise DataError(message) from error
@@ -98,7 +85,7 @@ def _check(experiments: Sequence[Experiment], robot: RobotConfig) -> SetupCheck:
         tried = tried | again.tried
     findings += signals.rate_findings(experiments, robot)
     findings += _clipped(bench, best, robot, {name for finding in findings for name in finding.joints})
-    lost = _not_understood(bench, best)
+    lost = _not_explained(bench, best)
     return SetupCheck(
         findings=(*setup_findings, *findings),
         relative_error_pct=before,
@@ -199,7 +186,7 @@ def _errors(bench: Bench, h: Hypothesis) -> tuple[float, ...]:
     return tuple(float(100 * e) for e in np.where(bench.moving, joint_errors(bench, h)[0], 1.0))
 
 
-def _not_understood(bench: Bench, best: Step) -> tuple[str, ...]:
+def _not_explained(bench: Bench, best: Step) -> tuple[str, ...]:
     """Names of moving joints with a large residual that is not noise."""
     # A spring or another law of friction is no doubt about the set-up.
     errors, memory = joint_errors(bench, best.h, free=True)

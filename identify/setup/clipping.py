@@ -55,16 +55,8 @@ LEVEL_QUANTILE = 0.98
 class Clip:
     """A clipped torque.
 
-    Parameters
-    ----------
-    joint
-        Index of the recorded torque.
-    level
-        Largest recorded torque, N m or N.
-    share
-        Share of rows at the level.
-    needed
-        Median over the level of the torque that the model needs there.
+    ``joint``: index of the recorded torque; ``level``: largest recorded torque, N m or N; ``share``: share of rows at
+    the level; ``needed``: median over the level of the torque that the model needs there.
     """
 
     joint: int
@@ -78,12 +70,7 @@ def clipped_torques(bench: Bench, h: Hypothesis) -> list[Clip]:
 
     A torque of dry friction is also nearly constant over long times, but there the model needs no more than recorded.
 
-    Parameters
-    ----------
-    bench
-        Signals.
-    h
-        Corrections of the signals.
+    ``h``: corrections of the signals.
     """
     x, y, physical = equations(bench.everywhere, h)
     found = []

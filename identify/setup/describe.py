@@ -33,12 +33,7 @@ CLOCK_WORDS = {1e-3: "ms", 1e-6: "us", 1e-9: "ns", 1e3: "ks"}
 class Described:
     """Findings of a search, and what a configuration can express of their corrections.
 
-    Parameters
-    ----------
-    findings
-        The findings.
-    robot
-        Configuration with the corrections; ``None`` if there are none that it can express.
+    ``robot``: configuration with the corrections; ``None`` if there are none that it can express.
     """
 
     findings: tuple[SetupFinding, ...]
@@ -46,17 +41,7 @@ class Described:
 
 
 def described(step: Step, robot: RobotConfig, bench: Bench) -> Described:
-    """Return the findings of a search.
-
-    Parameters
-    ----------
-    step
-        Its result.
-    robot
-        The configuration.
-    bench
-        Signals, for the figures of the messages.
-    """
+    """Return the findings of a search. ``bench``: signals, for the figures of the messages."""
     findings: list[SetupFinding] = []
     entries: list[Effect] = []
     step = _scales_merged(step, bench)
@@ -188,10 +173,7 @@ def _order(
 def transpositions(order: NDArray[np.int64]) -> list[tuple[int, int]]:
     """Return exchanges that, one after the other, bring recorded column ``order[j]`` to joint j.
 
-    Parameters
-    ----------
-    order
-        Recorded column of each joint, (n,).
+    ``order``: recorded column of each joint, (n,).
     """
     current = list(range(len(order)))
     pairs = []

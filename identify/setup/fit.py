@@ -33,16 +33,9 @@ BLOCKS = 24
 class Hypothesis:
     """Corrections of the recorded signals and of the configuration.
 
-    Parameters
-    ----------
-    position, torque
-        Matrices (n, n) that turn recorded joint positions and torques into the true ones.
-    gravity
-        Gravity in the base frame, m/s^2, (3,).
-    shift
-        Time by which each recorded torque is late, s, (n,).
-    clock
-        True over recorded duration.
+    ``position``, ``torque``: matrices (n, n) that turn recorded joint positions and torques into the true ones;
+    ``gravity``: gravity in the base frame, m/s^2, (3,); ``shift``: time by which each recorded torque is late, s, (n,);
+    ``clock``: True over recorded duration.
     """
 
     position: Array
@@ -56,14 +49,8 @@ class Hypothesis:
 class Fit:
     """Result of the physical fit of a hypothesis.
 
-    Parameters
-    ----------
-    shares
-        Residual share of the power of every recorded torque, in sample, (n,).
-    residual
-        Residuals of the recorded torques, (M, n), N m or N.
-    theta
-        Parameters (c,).
+    ``shares``: residual share of the power of every recorded torque, in sample, (n,); ``residual``: residuals of the
+    recorded torques, (M, n), N m or N; ``theta``: parameters (c,).
     """
 
     shares: Array
@@ -75,16 +62,9 @@ class Fit:
 class Normal:
     """Normal equations of all rows of the model, for one assignment of positions and one gravity.
 
-    Parameters
-    ----------
-    x
-        Regressors of the joint torques, (M, n, c).
-    grams
-        ``X_m' X_m`` of every row, (n, c, c).
-    physical
-        Constraints, (k, c).
-    products
-        ``X_m' y_k`` of row m and recorded torque k, (n, n, c), by the shifts of the torques.
+    ``x``: regressors of the joint torques, (M, n, c); ``grams``: ``X_m' X_m`` of every row, (n, c, c); ``physical``:
+    constraints, (k, c); ``products``: ``X_m' y_k`` of row m and recorded torque k, (n, n, c), by the shifts of the
+    torques.
     """
 
     x: Array
@@ -96,12 +76,7 @@ class Normal:
 def normal(bench: Bench, h: Hypothesis) -> Normal:
     """Return the normal equations of a hypothesis; repeated calls return the same object.
 
-    Parameters
-    ----------
-    bench
-        Signals.
-    h
-        The hypothesis; its torques are not used.
+    ``h``: the hypothesis; its torques are not used.
     """
     # Accelerations scale with the clock squared; only their proportion to gravity matters to the fit.
     gravity = h.gravity * h.clock**2
@@ -127,15 +102,7 @@ def _products(bench: Bench, found: Normal, shift: Array) -> Array:
 
 
 def fit_shares(bench: Bench, h: Hypothesis) -> Array:
-    """Residual share of the power of every recorded torque, in sample, (n,); see `fit`.
-
-    Parameters
-    ----------
-    bench
-        Signals.
-    h
-        The hypothesis.
-    """
+    """Residual share of the power of every recorded torque, in sample, (n,); see `fit`."""
     owner = np.abs(h.torque).argmax(axis=0)
     scale = h.torque[owner, np.arange(bench.n)]
     single = np.zeros_like(h.torque)
@@ -152,14 +119,7 @@ def fit_shares(bench: Bench, h: Hypothesis) -> Array:
 def equations(bench: Bench, h: Hypothesis, *, free: bool = True) -> tuple[Array, Array, Array]:
     """Regressors of the recorded torques (M, n, c), the torques (M, n), and the constraints (k, c).
 
-    Parameters
-    ----------
-    bench
-        Signals.
-    h
-        The hypothesis.
-    free
-        True to include the free friction terms and springs.
+    ``free``: True to include the free friction terms and springs.
     """
     found = normal(bench, h)
     x, physical = (found.x, found.physical) if free else (found.x[..., : bench.rigid], found.physical[:, : bench.rigid])
@@ -171,14 +131,7 @@ def equations(bench: Bench, h: Hypothesis, *, free: bool = True) -> tuple[Array,
 def fit(bench: Bench, h: Hypothesis, *, free: bool = True) -> Fit:
     """Fit all parameters with non-negative mean inertias and friction that dissipates power.
 
-    Parameters
-    ----------
-    bench
-        Signals.
-    h
-        The hypothesis.
-    free
-        True to include the free friction terms and springs.
+    ``free``: True to include the free friction terms and springs.
     """
     x, y, physical = equations(bench, h, free=free)
     grams, products, power = _normal(x, y)
@@ -189,16 +142,8 @@ def fit(bench: Bench, h: Hypothesis, *, free: bool = True) -> Fit:
 def fit_rows(x: Array, y: Array, used: NDArray[np.bool_], physical: Array, moving: NDArray[np.bool_]) -> Array:
     """Return the parameters (c,) of a fit to some of the equations.
 
-    Parameters
-    ----------
-    x, y
-        Regressors (M, n, c) and torques (M, n).
-    used
-        Mask (M, n) of the equations.
-    physical
-        Constraints, (k, c).
-    moving
-        Mask (n,) of the joints that move.
+    ``x``, ``y``: regressors (M, n, c) and torques (M, n); ``used``: mask (M, n) of the equations; ``physical``:
+    constraints, (k, c); ``moving``: mask (n,) of the joints that move.
     """
     theta, _ = _solve(*_normal(x * used[:, :, None], y * used), physical, moving)
     return theta
@@ -207,14 +152,7 @@ def fit_rows(x: Array, y: Array, used: NDArray[np.bool_], physical: Array, movin
 def joint_errors(bench: Bench, h: Hypothesis, *, free: bool = False) -> tuple[Array, Array]:
     """Relative error of the rigid model at every joint, and the correlation of neighbouring residuals, (n,) each.
 
-    Parameters
-    ----------
-    bench
-        Signals.
-    h
-        Corrections of the signals.
-    free
-        True to include the free friction terms and springs.
+    ``h``: corrections of the signals; ``free``: True to include the free friction terms and springs.
     """
     residual = fit(bench, h, free=free).residual @ h.torque.T
     torque = bench.torque(h.shift) @ h.torque.T
@@ -224,15 +162,7 @@ def joint_errors(bench: Bench, h: Hypothesis, *, free: bool = False) -> tuple[Ar
 
 
 def held_out(bench: Bench, h: Hypothesis) -> Array:
-    """Residual share of the power of every recorded torque (n,) on blocks of time that were not fitted.
-
-    Parameters
-    ----------
-    bench
-        Signals.
-    h
-        The hypothesis.
-    """
+    """Residual share of the power of every recorded torque (n,) on blocks of time that were not fitted."""
     x, y, physical = equations(bench, h)
     block = (np.arange(y.shape[0]) * BLOCKS // y.shape[0]) % PARTS
     parts = [_normal(x[block == k], y[block == k]) for k in range(PARTS)]
@@ -269,12 +199,7 @@ def physical_least_squares(gram: Array, right: Array, physical: Array) -> Array:
 
     Lawson, Hanson, Solving Least Squares Problems, 1974, chapter 23.
 
-    Parameters
-    ----------
-    gram, right
-        Normal equations, (c, c) and (c,).
-    physical
-        Constraints, (k, c).
+    ``gram``, ``right``: normal equations, (c, c) and (c,); ``physical``: constraints, (k, c).
     """
     scale = np.sqrt(np.diag(gram))
     scale[scale <= 1e-12 * scale.max(initial=0.0)] = np.inf

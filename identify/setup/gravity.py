@@ -32,12 +32,7 @@ SHIFTS_S = (1e-3, 2e-3, 4e-3, 8e-3, 16e-3, 32e-3, 64e-3)
 def best_direction(h: Hypothesis, criterion: Criterion) -> Hypothesis:
     """Return the hypothesis with the direction of gravity that fits best.
 
-    Parameters
-    ----------
-    h
-        Start; the magnitude of its gravity is kept.
-    criterion
-        Misfit to minimise.
+    ``h``: start; the magnitude of its gravity is kept. ``criterion``: misfit to minimise.
 
     Notes
     -----
@@ -83,16 +78,8 @@ def without_gravity(h: Hypothesis) -> Hypothesis:
 def best_shift(h: Hypothesis, criterion: Criterion, dt: float, mask: NDArray[np.bool_]) -> Hypothesis:
     """Return the hypothesis with the best common shift of some torques.
 
-    Parameters
-    ----------
-    h
-        Start.
-    criterion
-        Misfit to minimise.
-    dt
-        Sampling period, s: longer shifts than 1000 samples are not tried.
-    mask
-        Torques that are late by the same time, (n,).
+    ``criterion``: misfit to minimise; ``dt``: sampling period, s: longer shifts than 1000 samples are not tried;
+    ``mask``: torques that are late by the same time, (n,).
     """
 
     def late(shift: float) -> Hypothesis:

@@ -24,16 +24,9 @@ LEAST_SPREAD = 0.01
 class Move:
     """One mistake: what to do to the corrections found so far.
 
-    Parameters
-    ----------
-    family
-        Kind of the mistake, for the prior: all members of a family share its probability.
-    words
-        Description.
-    position, torque
-        Matrices (n, n) that multiply the corrections; ``None``: no change.
-    drives
-        True if raw numbers of two drives are exchanged, with the scales of both.
+    ``family``: kind of the mistake, for the prior: all members of a family share its probability. ``position``,
+    ``torque``: matrices (n, n) that multiply the corrections; ``None``: no change. ``drives``: True if raw numbers of
+    two drives are exchanged, with the scales of both.
     """
 
     family: str
@@ -50,15 +43,7 @@ class Move:
 
 
 def sign_moves(robot: RobotConfig, joints: Sequence[int]) -> Iterator[Move]:
-    """Signals with the wrong sign: of one joint, and of all.
-
-    Parameters
-    ----------
-    robot
-        The configuration.
-    joints
-        Indices of the joints that move.
-    """
+    """Signals with the wrong sign: of one joint, and of all. ``joints``: indices of the joints that move."""
     for j in joints:
         yield from _signs(robot, (j,))
     if len(joints) > 1:
@@ -79,12 +64,7 @@ def set_moves(robot: RobotConfig, joints: Sequence[int]) -> Iterator[Move]:
 
     The joints of an arm are coupled: one of such mistakes, corrected alone, may improve nothing.
 
-    Parameters
-    ----------
-    robot
-        The configuration.
-    joints
-        Indices of the joints that move.
+    ``joints``: indices of the joints that move.
     """
     for size in range(2, len(joints) + 1):
         for chosen in combinations(joints, size):
@@ -95,12 +75,7 @@ def set_moves(robot: RobotConfig, joints: Sequence[int]) -> Iterator[Move]:
 def exchange_moves(robot: RobotConfig, joints: Sequence[int]) -> Iterator[Move]:
     """Two joints exchanged: as columns in SI units, and as raw numbers of the drives where that differs.
 
-    Parameters
-    ----------
-    robot
-        The configuration.
-    joints
-        Indices of the joints that move.
+    ``joints``: indices of the joints that move.
     """
     names = [joint.name for joint in robot.joints]
     ratios = robot.transmission_matrix
@@ -122,13 +97,7 @@ def exchange_moves(robot: RobotConfig, joints: Sequence[int]) -> Iterator[Move]:
 
 
 def unit_moves(robot: RobotConfig) -> Iterator[Move]:
-    """Units and sides of a whole signal.
-
-    Parameters
-    ----------
-    robot
-        The configuration.
-    """
+    """Units and sides of a whole signal."""
     n, ratios = robot.n, robot.transmission_matrix
     inverse = np.asarray(np.linalg.inv(ratios), np.float64)
     yield from _position_unit_moves(robot)
@@ -165,15 +134,7 @@ def _where(places: tuple[bool, bool], position: Array, torque: Array) -> tuple[A
 
 
 def single_unit_moves(robot: RobotConfig, joints: Sequence[int]) -> Iterator[Move]:
-    """Unit or side of one joint's signal.
-
-    Parameters
-    ----------
-    robot
-        The configuration.
-    joints
-        Indices of the joints that move.
-    """
+    """Unit or side of one joint's signal. ``joints``: indices of the joints that move."""
     for j in joints:
         yield from _units(robot, (j,))
 
@@ -212,17 +173,7 @@ def _names(robot: RobotConfig, joints: Sequence[int]) -> str:
 
 
 def scaled(n: int, joint: int, factor: float) -> Array:
-    """Identity (n, n) with a factor at one joint.
-
-    Parameters
-    ----------
-    n
-        Number of joints.
-    joint
-        Index of the joint.
-    factor
-        The factor.
-    """
+    """Identity (n, n) with a factor at one joint. ``joint``: index of the joint."""
     matrix = np.eye(n)
     matrix[joint, joint] = factor
     return matrix

@@ -28,41 +28,17 @@ NO_LIMIT = 1e6
 
 
 def position_ratio(bench: Bench, h: Hypothesis) -> float:
-    """Geometric mean over the moving joints of the largest position over its limit.
-
-    Parameters
-    ----------
-    bench
-        Signals.
-    h
-        Corrections.
-    """
+    """Geometric mean over the moving joints of the largest position over its limit."""
     return _mean(*_positions(bench, h), bench.moving)
 
 
 def velocity_ratio(bench: Bench, h: Hypothesis) -> float:
-    """Geometric mean over the moving joints of the largest velocity over its limit.
-
-    Parameters
-    ----------
-    bench
-        Signals.
-    h
-        Corrections.
-    """
+    """Geometric mean over the moving joints of the largest velocity over its limit."""
     return _mean(*_velocities(bench, h), bench.moving)
 
 
 def torque_ratio(bench: Bench, h: Hypothesis) -> float:
-    """Geometric mean over the moving joints of the largest torque over its limit.
-
-    Parameters
-    ----------
-    bench
-        Signals.
-    h
-        Corrections.
-    """
+    """Geometric mean over the moving joints of the largest torque over its limit."""
     return _mean(*_torques(bench, h), bench.moving)
 
 
@@ -85,29 +61,13 @@ def _torques(bench: Bench, h: Hypothesis) -> tuple[Array, Array]:
 
 
 def plausible_factor(bench: Bench, h: Hypothesis) -> float:
-    """Common factor that brings the torques to the middle of their plausible range, 1 inside of it.
-
-    Parameters
-    ----------
-    bench
-        Signals.
-    h
-        Corrections.
-    """
+    """Common factor that brings the torques to the middle of their plausible range, 1 inside of it."""
     ratio = torque_ratio(bench, h)
     return 1.0 if TORQUE[0] <= ratio <= TORQUE[1] else float(np.sqrt(TORQUE[0] * TORQUE[1])) / ratio
 
 
 def log_plausibility(bench: Bench, h: Hypothesis) -> float:
-    """Logarithm of the plausibility of the corrected signals against the limits, 0 or less.
-
-    Parameters
-    ----------
-    bench
-        Signals.
-    h
-        Corrections.
-    """
+    """Logarithm of the plausibility of the corrected signals against the limits, 0 or less."""
     rate = 1.0 / (bench.period * h.clock)
     return (
         _beyond(position_ratio(bench, h), 0.0, POSITION_MOST)
@@ -123,12 +83,7 @@ def worst_change(bench: Bench, old: Hypothesis, new: Hypothesis) -> float:
     A wrong unit of one joint hardly changes the mean over all joints. A correction that makes the signals of the joint
     itself implausible gives a negative number.
 
-    Parameters
-    ----------
-    bench
-        Signals.
-    old, new
-        Corrections before and after.
+    ``old``, ``new``: corrections before and after.
     """
 
     def each(h: Hypothesis) -> Array:

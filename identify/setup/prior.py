@@ -28,14 +28,7 @@ def cost(families: tuple[str, ...], made: tuple[tuple[Array, Array, bool], ...],
 
     Permutations and signs are judged by their product, so that two ways to the same wiring cost the same.
 
-    Parameters
-    ----------
-    families
-        Kind of each mistake.
-    made
-        Changes of each mistake, see `armident.identify.setup.search.Step`.
-    n
-        Number of joints.
+    ``families``: kind of each mistake; ``made``: changes of each mistake, see `armident.identify.setup.search.Step`.
     """
     total, position, torque = 0.0, np.eye(n), np.eye(n)
     for family, (of_position, of_torque, raw) in zip(families, made, strict=True):
@@ -58,10 +51,7 @@ def _place_cost(position: Array, torque: Array) -> float:
 def wiring_cost(position: Array, torque: Array) -> float:
     """Negative logarithm of the prior of signed permutations of positions and torques, nats.
 
-    Parameters
-    ----------
-    position, torque
-        Signed permutation matrices, (n, n).
+    ``position``, ``torque``: signed permutation matrices, (n, n).
     """
     n = position.shape[0]
     own = np.arange(n)

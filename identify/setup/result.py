@@ -4,8 +4,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from armident.configs import RobotConfig
-from armident.identify.experiment import Experiment
-from armident.identify.streamed import mapped
+from armident.identify.signals.experiments import Experiment
+from armident.identify.signals.streamed import mapped
 
 SIGNIFICANT = 3.0
 """Standard deviations between a shift and a convention from which they differ: one false alarm in 370."""
@@ -67,8 +67,6 @@ class TorqueShift:
     ----------
     samples, std
         Common estimate and its standard deviation, samples; negative: early.
-    dt
-        Sampling period, s.
     by_joint
         Estimate and standard deviation of every joint that moves, samples.
     odds
@@ -120,7 +118,7 @@ class TorqueShift:
 
     @property
     def confirmed(self) -> bool:
-        """True if it is longer than shifts of sampling, and two joints show it alone while none denies it.
+        """True if it exceeds one sample; at least two joints confirm it, none contradicts it.
 
         Without instruments it never is: friction and elasticity that the model lacks look like a shift, too.
         """
@@ -188,12 +186,7 @@ class SetupCheck:
 def with_torque_shift(experiments: Sequence[Experiment], shift: TorqueShift | None) -> Sequence[Experiment]:
     """Return the experiments with a shift of their torques that the equations of motion allow for.
 
-    Parameters
-    ----------
-    experiments
-        As recorded.
-    shift
-        Common shift; ``None``, or one that is not applied: no change.
+    ``shift``: common shift; ``None``, or one that is not applied: no change.
     """
     if shift is None or not shift.applied:
         return experiments

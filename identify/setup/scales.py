@@ -41,16 +41,7 @@ def scale_moves(robot: RobotConfig, joint: int, h: Hypothesis, criterion: Criter
 
     A wrong gear ratio scales the position by ``f`` and the torque by ``1 / f``: their power stays.
 
-    Parameters
-    ----------
-    robot
-        The configuration.
-    joint
-        Index of the joint.
-    h
-        Corrections so far.
-    criterion
-        Misfit to minimise.
+    ``joint``: index of the joint; ``h``: corrections so far; ``criterion``: misfit to minimise.
     """
     n, name = robot.n, robot.joints[joint].name
 
@@ -74,14 +65,7 @@ def torque_scales(h: Hypothesis, criterion: Criterion, starts: Sequence[Array]) 
 
     The torques of joints that carry the same links determine the proportions; the common factor is free.
 
-    Parameters
-    ----------
-    h
-        Corrections so far.
-    criterion
-        Misfit to minimise.
-    starts
-        Factors (n,) from which the search starts.
+    ``h``: corrections so far; ``criterion``: misfit to minimise; ``starts``: factors (n,) from which the search starts.
     """
 
     def misfit(logs: Array) -> float:
@@ -124,11 +108,6 @@ def _best(made: Callable[[float], Move], h: Hypothesis, criterion: Criterion) ->
 def with_clock(h: Hypothesis, factor: float) -> Hypothesis:
     """Return the hypothesis with another unit of time.
 
-    Parameters
-    ----------
-    h
-        Corrections so far.
-    factor
-        True over recorded duration.
+    ``h``: corrections so far; ``factor``: True over recorded duration.
     """
     return replace(h, clock=h.clock * factor)

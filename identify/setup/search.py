@@ -52,7 +52,7 @@ WHITE = 0.05
 """Least correlation of neighbouring residuals that counts as structure: below it, estimates are noise."""
 
 NOT_UNDERSTOOD = 1.0 / 3.0
-"""Largest relative error of a joint that the rigid model explains (DIAGNOSIS.md, principle 1)."""
+"""Largest relative error of a joint that the rigid model explains (a third is more than friction or a load takes)."""
 
 WELL_UNDERSTOOD = 0.2
 """Largest relative error of a joint for which no whole orders and no mistakes of several joints are tried."""
@@ -93,8 +93,6 @@ class Step:
 
     Parameters
     ----------
-    h
-        The hypothesis.
     families, words
         Kind and description of each mistake.
     made
@@ -126,12 +124,7 @@ class Step:
 class Search:
     """Search over the hypotheses of one set of recordings.
 
-    Parameters
-    ----------
-    bench
-        Signals.
-    tried
-        Families of hypotheses that were tried, in words, filled by the search.
+    ``tried``: families of hypotheses that were tried, in words, filled by the search.
     """
 
     bench: Bench
@@ -142,23 +135,17 @@ class Search:
         return _rank(self.bench, h)
 
     def run(self, start: Hypothesis) -> Step:
-        """Return the corrected set-up.
-
-        Parameters
-        ----------
-        start
-            The set-up as configured.
-        """
+        """Return the corrected set-up. ``start``: the set-up as configured."""
         first = Step(start, rank=self.rank(start))
         best = self._greedy(first)
-        understood = self._understood(best.h)
+        explained = self._explained(best.h)
         starts: list[Step] = []
         if self.bench.moving.sum() > 2:
             # An exchange that needs a second mistake beside it may be a part of another order.
-            if not understood or (len(best.families) > 1 and {"exchange", "assignment"} & set(best.families)):
+            if not explained or (len(best.families) > 1 and {"exchange", "assignment"} & set(best.families)):
                 starts += self._orders(first)
             # Several mistakes may be one that a set of joints shares.
-            if not understood or len(best.families) > 1:
+            if not explained or len(best.families) > 1:
                 starts += self._sets(first)
         # An order or a set that explains no more than the configuration is no part of an explanation.
         starts = sorted((s for s in starts if s.rank < first.rank), key=lambda s: s.rank)
@@ -169,11 +156,11 @@ class Search:
             if better and self._material(first.h, other.h, LEAST_TOGETHER):
                 best = other
             clear = all(0.5 * RANKED_ROWS * (s.rank - step.rank) > LEAST_ODDS for s in starts[k + 1 : k + 2])
-            if clear and self._understood(best.h):
+            if clear and self._explained(best.h):
                 break
         return best
 
-    def _understood(self, h: Hypothesis) -> bool:
+    def _explained(self, h: Hypothesis) -> bool:
         """True if the model leaves little of every joint's torque, apart from noise."""
         # Torques of another order are wrong at rest, too.
         errors, memory = joint_errors(self.bench.everywhere, h, free=True)
@@ -414,10 +401,7 @@ def independent_rows(residual: Array) -> Array:
 
     ``M (1 - r) / (1 + r)`` for the correlation r of neighbouring rows (Bartlett 1946), at least 4.
 
-    Parameters
-    ----------
-    residual
-        Residuals (M, n).
+    ``residual`` (M, n).
     """
     power = np.maximum((residual**2).sum(axis=0), 1e-300)
     r = np.clip((residual[1:] * residual[:-1]).sum(axis=0) / power, 0.0, 0.99)

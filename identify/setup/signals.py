@@ -7,9 +7,9 @@ from numpy.typing import NDArray
 from scipy import signal
 
 from armident.configs import RobotConfig
-from armident.identify.experiment import Experiment
 from armident.identify.setup.plausible import NO_LIMIT
 from armident.identify.setup.result import SetupFinding
+from armident.identify.signals.experiments import Experiment
 
 Array = NDArray[np.float64]
 
@@ -58,15 +58,7 @@ SAMPLES_UNUSABLE = 5.0
 
 
 def moving_joints(experiments: Sequence[Experiment], robot: RobotConfig) -> NDArray[np.bool_]:
-    """Return the mask (n,) of the joints that move.
-
-    Parameters
-    ----------
-    experiments
-        SI, joint side.
-    robot
-        The configuration.
-    """
+    """Return the mask (n,) of the joints that move. ``experiments``: SI, joint side."""
     usual = np.array([2 * np.pi if joint.type == "revolute" else 1.0 for joint in robot.joints])
     limits = np.array([j.limits.position[1] - j.limits.position[0] for j in robot.joints])
     whole = np.where(limits < NO_LIMIT, np.minimum(limits, usual), usual)
@@ -84,12 +76,7 @@ def moving_joints(experiments: Sequence[Experiment], robot: RobotConfig) -> NDAr
 def rest_findings(moving: NDArray[np.bool_], robot: RobotConfig) -> list[SetupFinding]:
     """Return a finding if nothing moves, or if single joints are at rest.
 
-    Parameters
-    ----------
-    moving
-        Mask (n,) of the joints that move.
-    robot
-        The configuration.
+    ``moving``: mask (n,) of the joints that move.
     """
     names = tuple(joint.name for joint in robot.joints)
     if not moving.any():
@@ -108,14 +95,7 @@ def clipped_findings(
 ) -> list[SetupFinding]:
     """Return the torques that stay at an extreme value, or never change.
 
-    Parameters
-    ----------
-    experiments
-        SI, joint side.
-    robot
-        The configuration.
-    moving
-        Mask (n,) of the joints that move.
+    ``experiments``: SI, joint side; ``moving``: mask (n,) of the joints that move.
     """
     findings = []
     to_motors = np.linalg.inv(robot.transmission_matrix)
@@ -169,15 +149,7 @@ def _runs(x: Array, tolerance: float) -> list[tuple[float, int, int]]:
 
 
 def rate_findings(experiments: Sequence[Experiment], robot: RobotConfig) -> list[SetupFinding]:
-    """Return a finding if the motion has fewer than ten samples per period.
-
-    Parameters
-    ----------
-    experiments
-        SI, joint side.
-    robot
-        The configuration.
-    """
+    """Return a finding if the motion has fewer than ten samples per period. ``experiments``: SI, joint side."""
     dt = experiments[0].dt
     highest = np.max([velocity_frequency(e.q, dt) for e in experiments], axis=0)
     slow = np.flatnonzero(highest * dt * LEAST_SAMPLES > 1.0)
@@ -196,12 +168,7 @@ def rate_findings(experiments: Sequence[Experiment], robot: RobotConfig) -> list
 def velocity_frequency(q: Array, dt: float) -> Array:
     """Return the frequency (Hz) below which `POWER_SHARE` of each joint's velocity power lies, (n,).
 
-    Parameters
-    ----------
-    q
-        Positions (N, n), rad or m.
-    dt
-        Sampling period, s.
+    ``q``: positions (N, n), rad or m.
     """
     frequency, power = signal.periodogram(np.diff(q, axis=0) / dt, 1 / dt, window="hann", axis=0)
     frequency, power = frequency[1:], power[1:]

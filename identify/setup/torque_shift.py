@@ -19,11 +19,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armident.configs import DataError
-from armident.identify.experiment import Experiment
 from armident.identify.regression.ar_noise import ArModel, fit_ar
 from armident.identify.setup.bench import Bench, make_bench
 from armident.identify.setup.fit import Hypothesis
 from armident.identify.setup.result import CONVENTIONS, TorqueShift
+from armident.identify.signals.experiments import Experiment
 
 Array = NDArray[np.float64]
 Motion = tuple[Array, Array, Array]
@@ -75,12 +75,7 @@ BREAKAWAY = 0.1
 class _Columns:
     """Regressors of one joint at the rows and at the working rate, for all segments.
 
-    Parameters
-    ----------
-    rows
-        Filtered and decimated, (M, c) per segment.
-    fine
-        At the working rate, (W, c) per segment.
+    ``rows``: filtered and decimated, (M, c) per segment; ``fine``: at the working rate, (W, c) per segment.
     """
 
     rows: list[Array]
@@ -95,18 +90,8 @@ def long_torque_shift(
     `torque_shift` is linear in the shift. Its estimate is repeated with the torques moved by the value of the round
     before, until it changes no more.
 
-    Parameters
-    ----------
-    experiments
-        The recordings.
-    bench
-        Bench of the same recordings.
-    h
-        Corrections of the signals; its shift is not used.
-    first_s
-        Value to begin with, s.
-    reach_s
-        Largest difference of the result from it, s.
+    ``bench``: bench of the same recordings. ``h``: corrections of the signals; its shift is not used. ``reach_s``:
+    largest difference of the result from it, s.
     """
     first, reach = first_s / bench.period, reach_s / bench.period
     shift = first
@@ -131,19 +116,8 @@ def long_torque_shift(
 def torque_shift(bench: Bench, h: Hypothesis, reach: float = RANGE) -> TorqueShift:
     """Estimate the common shift of the torques, and that of every joint.
 
-    Parameters
-    ----------
-    bench
-        Signals, made with the working rate `SHIFT_RATE`.
-    h
-        Corrections of the signals; its shift is not used.
-    reach
-        Largest shift, samples.
-
-    Raises
-    ------
-    numpy.linalg.LinAlgError
-        If the motion determines no shift.
+    ``bench``: signals, made with the working rate `SHIFT_RATE`. ``h``: corrections of the signals; its shift is not
+    used. ``reach``: largest shift, samples. Raises numpy.linalg.LinAlgError if the motion determines no shift.
     """
     segments = _shortened(bench)
     joints = [int(j) for j in np.flatnonzero(bench.moving)]

@@ -14,23 +14,10 @@ def butterworth(
 ) -> NDArray[np.float64]:
     """Zero-phase Butterworth low-pass along the first axis, in second-order sections.
 
-    Parameters
-    ----------
-    x
-        Signal, shape (N,) or (N, n).
-    dt
-        Sampling period, s.
-    cutoff_hz
-        Cut-off frequency of one pass, Hz; forward and reverse pass together have -6 dB there.
-    order
-        Filter order of one pass.
-    padlen
-        Number of samples of odd extension at each end; ``None``: ``3 * order``.
-
-    Raises
-    ------
-    DataError
-        If the cut-off is not below the Nyquist frequency or the signal is not longer than the padding.
+    ``x``: signal, shape (N,) or (N, n). ``cutoff_hz``: cut-off frequency of one pass, Hz; forward and reverse pass
+    together have -6 dB there. ``order``: filter order of one pass. ``padlen``: number of samples of odd extension at
+    each end; ``None``: ``3 * order``. Raises DataError if the cut-off is not below the Nyquist frequency or the signal
+    is not longer than the padding.
     """
     if cutoff_hz * dt >= 0.5:
         raise DataError(f"cut-off {cutoff_hz:g} Hz is not below half the sampling rate ({0.5 / dt:g} Hz)")
@@ -52,16 +39,6 @@ def _sections(order: int, cutoff: float) -> NDArray[np.float64]:
 def central_difference(x: NDArray[np.float64], dt: float) -> NDArray[np.float64]:
     """Derivative ``(x(k+1) - x(k-1)) / (2 dt)`` along the first axis, one-sided at both ends.
 
-    Parameters
-    ----------
-    x
-        Signal, shape (N,) or (N, n).
-    dt
-        Sampling period, s.
-
-    Returns
-    -------
-    ndarray
-        Shape of ``x``, in its unit per s.
+    ``x``: signal, shape (N,) or (N, n). Result: shape of ``x``, in its unit per s.
     """
     return np.gradient(x, dt, axis=0)

@@ -12,7 +12,8 @@ POWER_SHARE = 0.95
 """Fraction of the power of the velocity that lies below the bandwidth of the motion."""
 
 MARGIN = 5.0
-"""Ratio of the closed-loop bandwidth assumed for the filters to the bandwidth of the motion."""
+"""Ratio of the closed-loop bandwidth assumed for the filters to the bandwidth of the motion: inertia torques have the
+bandwidth of the acceleration, friction about reversals several harmonics more."""
 
 SIGNIFICANT = 10.0
 """Power relative to the noise floor above which a frequency counts as motion; white noise exceeds it once in 20000."""
@@ -27,17 +28,7 @@ def motion_bandwidth(q: Sequence[NDArray[np.float64]], dt: float) -> float:
     The noise floor of the encoder is estimated from the upper half of the position's spectrum. For slow motion the
     bandwidth is increased to ``PERIODS`` per shortest experiment: decimation would otherwise leave too few equations.
 
-    Parameters
-    ----------
-    q
-        Measured positions of each experiment, (N, n), rad or m.
-    dt
-        Sampling period, s.
-
-    Raises
-    ------
-    DataError
-        If no joint moves.
+    ``q``: measured positions of each experiment, (N, n), rad or m. Raises DataError if no joint moves.
     """
     highest = max((_velocity_bandwidth(positions, dt) for positions in q), default=0.0)
     if highest == 0:
@@ -67,12 +58,7 @@ def _velocity_bandwidth(q: NDArray[np.float64], dt: float) -> float:
 def position_noise(q: NDArray[np.float64], dt: float) -> NDArray[np.float64]:
     """Standard deviation of the white noise of measured positions, rad or m, (n,).
 
-    Parameters
-    ----------
-    q
-        Measured positions, (N, n), rad or m.
-    dt
-        Sampling period, s.
+    ``q``: measured positions, (N, n), rad or m.
     """
     frequency, _, position = _spectra(q, dt)
     noise: NDArray[np.float64] = np.sqrt(_noise_floor(frequency, position, dt) * 0.5 * dt)

@@ -26,12 +26,8 @@ class Decimation:
     The filter is symmetric and centred, so that it has zero phase. It is finite and needs no initial state. Samples
     whose window extends beyond the record are dropped.
 
-    Parameters
-    ----------
-    factor
-        Decimation factor: one sample of ``factor`` is kept.
-    taps
-        Symmetric impulse response, odd length, shape (m,).
+    ``factor``: decimation factor: one sample of ``factor`` is kept; ``taps``: symmetric impulse response, odd length,
+    shape (m,).
     """
 
     factor: int
@@ -68,27 +64,15 @@ class Decimation:
     def rows_of(self, begin: int, end: int) -> slice:
         """Output rows that depend on the input samples ``begin .. end - 1``, for a record without end.
 
-        Parameters
-        ----------
-        begin, end
-            First input sample, and the one after the last.
+        ``begin``, ``end``: first input sample, and the one after the last.
         """
         return slice(max(0, -(-(begin - self.taps.size + 1) // self.factor)), (end - 1) // self.factor + 1)
 
     def weights(self, rows: slice, begin: int, end: int) -> NDArray[np.float64]:
         """Filter coefficients of the input samples ``begin .. end - 1`` in output rows.
 
-        Parameters
-        ----------
-        rows
-            Output rows, with ``start`` and ``stop``.
-        begin, end
-            First input sample, and the one after the last.
-
-        Returns
-        -------
-        ndarray
-            Shape (rows, samples).
+        ``rows``: output rows, with ``start`` and ``stop``; ``begin``, ``end``: first input sample, and the one after
+        the last. Result: shape (rows, samples).
         """
         tap = np.arange(begin, end) - self.factor * np.arange(rows.start, rows.stop)[:, None]
         inside = (tap >= 0) & (tap < self.taps.size)
@@ -97,10 +81,7 @@ class Decimation:
     def __call__(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
         """Filter and decimate along the first axis: (N, ...) to (M, ...).
 
-        Raises
-        ------
-        DataError
-            If the record is shorter than the filter.
+        Raises DataError if the record is shorter than the filter.
         """
         count = self.count(x.shape[0])
         if count == 0:
@@ -113,15 +94,9 @@ class Decimation:
 def design(dt: float, cutoff_hz: float, factor: int | None = None) -> Decimation:
     """Design a low-pass with cut-off ``cutoff_hz`` and the decimation factor that it allows.
 
-    Parameters
-    ----------
-    dt
-        Sampling period, s.
-    cutoff_hz
-        Half-amplitude frequency, Hz (thesis: ``w_Fp >= 2 w_dyn``).
-    factor
-        Decimation factor; 1 gives the identity. ``None``: the largest factor whose Nyquist frequency is not below
-        ``cutoff_hz``, which is the thesis's ``n_d = w_nyq / w_Fp``.
+    ``cutoff_hz``: half-amplitude frequency, Hz (thesis: ``w_Fp >= 2 w_dyn``). ``factor``: decimation factor; 1 gives
+    the identity. ``None``: the largest factor whose Nyquist frequency is not below ``cutoff_hz``, which is the thesis's
+    ``n_d = w_nyq / w_Fp``.
     """
     if factor is None:
         factor = max(1, int(0.5 / (dt * cutoff_hz) + 1e-9))

@@ -4,27 +4,20 @@ import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from armident.configs import DataError, RobotConfig
 from armident.identify.signals.bandpass import butterworth, central_difference
+from armident.identify.signals.choices import NVR_RULES, DerivativesName, NvrRule
 from armident.identify.signals.irwsm import automatic_nvr, cross_validated_nvr, irwsm, optimal_nvr
-
-Method = Literal["irwsm", "irwsm2", "bandpass"]
-
-NvrRule = Literal["automatic", "cross-validation", "likelihood", "tracking-error"]
-"""Rule that determines the noise-variance ratio if no number is given."""
-
-NVR_RULES: tuple[NvrRule, ...] = ("automatic", "cross-validation", "likelihood", "tracking-error")
 
 NVR_BY_HAND = 1e-5
 """Noise-variance ratio chosen manually in the thesis (section 5.3.1)."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Derivatives:
     """Positions and their derivatives at the sampling instants.
 
@@ -52,7 +45,7 @@ class Derivatives:
 def differentiate(
     q: NDArray[np.float64],
     dt: float,
-    derivatives: Method = "irwsm",
+    derivatives: DerivativesName = "irwsm",
     nvr: float | Sequence[float] | NDArray[np.float64] | NvrRule | None = None,
     bandwidth_hz: float | None = None,
     *,
@@ -61,12 +54,14 @@ def differentiate(
 ) -> Derivatives:
     """Differentiate measured positions twice.
 
+    Raises DataError if a series is too short or not finite, or ``nvr`` is neither positive nor a rule. ``bandpass``: if
+    the bandwidth is missing. ``tracking-error``: if the reference or the resolution is missing, or a joint has no
+    tracking error.
+
     Parameters
     ----------
     q
         Measured positions, shape (N, n), rad or m.
-    dt
-        Sampling period, s.
     derivatives
         ``irwsm``: IRWSM 1, the level-slope smoother applied twice; ``irwsm2``: IRWSM 2, three states at once;
         ``bandpass``: zero-phase Butterworth of order 4 at five times ``bandwidth_hz``, then central differences.
@@ -90,13 +85,6 @@ def differentiate(
 
     The second pass of IRWSM 1 uses the ratio of the first pass: the noise after the first pass is not white, so that
     its ratio cannot be estimated. Only ``likelihood`` estimates a ratio for each pass, as the thesis does.
-
-    Raises
-    ------
-    DataError
-        If a series is too short or not finite, or ``nvr`` is neither positive nor a rule. ``bandpass``: if the
-        bandwidth is missing. ``tracking-error``: if the reference or the resolution is missing, or a joint has no
-        tracking error.
     """
     if derivatives == "bandpass":
         if bandwidth_hz is None:
@@ -123,19 +111,10 @@ def tracking_error_nvr(
 ) -> NDArray[np.float64]:
     """Noise-variance ratios approximated from the tracking error (thesis 5.25 to 5.27), shape (n,).
 
-    Parameters
-    ----------
-    error
-        Tracking error ``q_ref - q``, shape (N, n), rad or m.
-    order
-        2: variance of its difference (5.26, IRWSM 1); 3: of its second difference (5.27, IRWSM 2).
-    resolution
-        Encoder resolution: joint displacement per count, scalar or (n,), rad or m.
-
-    Raises
-    ------
-    DataError
-        If a resolution is not positive, or a joint has no tracking error.
+    ``error``: tracking error ``q_ref - q``, shape (N, n), rad or m. ``order``: 2: variance of its difference
+    (5.26, IRWSM 1); 3: of its second difference (5.27, IRWSM 2). ``resolution``: encoder resolution: joint displacement
+    per count, scalar or (n,), rad or m. Raises DataError if a resolution is not positive, or a joint has no tracking
+    error.
     """
     step = np.broadcast_to(np.asarray(resolution, dtype=np.float64), (error.shape[1],))
     if not (step > 0).all():
@@ -153,12 +132,8 @@ def tracking_error_nvr(
 def encoder_resolution(robot: RobotConfig) -> NDArray[np.float64]:
     """Joint displacement per count of the motor encoders, shape (n,), rad or m.
 
-    If several motors move a joint, their resolutions add as the square root of the sum of squares.
-
-    Raises
-    ------
-    DataError
-        If the configuration of a drive has no encoder resolution.
+    If several motors move a joint, their resolutions add as the square root of the sum of squares. Raises DataError if
+    the configuration of a drive has no encoder resolution.
     """
     steps = []
     for joint in robot.joints:
@@ -174,7 +149,7 @@ def encoder_resolution(robot: RobotConfig) -> NDArray[np.float64]:
 
 def _ratios(
     q: NDArray[np.float64],
-    derivatives: Method,
+    derivatives: DerivativesName,
     nvr: float | Sequence[float] | NDArray[np.float64] | NvrRule | None,
     q_ref: NDArray[np.float64] | None,
     resolution: float | Sequence[float] | NDArray[np.float64] | None,

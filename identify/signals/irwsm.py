@@ -19,10 +19,10 @@ too little smoothing.
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from armident.compiled import compiled
 from armident.configs import DataError
 
 LOG10_NVR_RANGE = {2: (-12.0, 4.0), 3: (-14.0, 4.0)}
@@ -38,15 +38,9 @@ _STENCIL = {2: np.array([1.0, -2.0, 1.0]), 3: np.array([-1.0, 3.0, -3.0, 1.0])}
 class Smoothed:
     """Smoothed series and its first difference.
 
-    Parameters
-    ----------
-    level
-        Smoothed series, shape (N,), in the unit of the series.
-    slope
-        First difference of ``level``, shape (N - 1,), per sample. Element k is the slope state of sample k: the
-        forward difference, which belongs to the instant k + 1/2.
-    nvr
-        Noise-variance ratio used.
+    ``level``: smoothed series, shape (N,), in the unit of the series. ``slope``: first difference of ``level``, shape
+    (N - 1,), per sample. Element k is the slope state of sample k: the forward difference, which belongs to the instant
+    k + 1/2. ``nvr``: noise-variance ratio used.
     """
 
     level: NDArray[np.float64]
@@ -57,21 +51,9 @@ class Smoothed:
 def irwsm(y: NDArray[np.float64], order: int, nvr: float) -> Smoothed:
     """Smooth a series with the integrated random walk of a given order.
 
-    Parameters
-    ----------
-    y
-        Series, shape (N,), N > 2 ``order``.
-    order
-        2: level and slope (IRWSM 1, 5.23); 3: level, slope and curvature (IRWSM 2, 5.24).
-    nvr
-        Noise-variance ratio ``var(kappa) / var(e)``, positive.
-
-    Raises
-    ------
-    DataError
-        If the series is too short or not finite.
-    ValueError
-        If ``order`` or ``nvr`` is out of range.
+    ``y``: series, shape (N,), N > 2 ``order``. ``order``: 2: level and slope (IRWSM 1, 5.23); 3: level, slope and
+    curvature (IRWSM 2, 5.24). ``nvr``: noise-variance ratio ``var(kappa) / var(e)``, positive. Raises DataError if the
+    series is too short or not finite; ValueError if ``order`` or ``nvr`` is out of range.
     """
     y = _checked(y, order)
     if not nvr > 0:
@@ -85,14 +67,8 @@ def negative_log_likelihood(w: NDArray[np.float64], order: int, nvr: float) -> f
 
     Equals ``(N - order) log(s2) + sum log nu(k)`` of a Kalman filter started from a diffuse state.
 
-    Parameters
-    ----------
-    w
-        Differences of the series, ``numpy.diff(y, n=order)``, shape (N - order,).
-    order
-        2 or 3, see :func:`irwsm`.
-    nvr
-        Noise-variance ratio, positive.
+    ``w``: differences of the series, ``numpy.diff(y, n=order)``, shape (N - order,); ``order``: 2 or 3, see
+    :func:`irwsm`; ``nvr``: noise-variance ratio, positive.
     """
     return float(_profile(w, _band(order, nvr), _transient(order, nvr)))
 
@@ -103,19 +79,9 @@ def optimal_nvr(y: NDArray[np.float64], order: int, tolerance: float = 0.02) -> 
     On measured positions the likelihood may follow the noise too closely (thesis section 5.3.1: modelling
     error and vibration count as dynamics). See :func:`automatic_nvr`.
 
-    Parameters
-    ----------
-    y
-        Series, shape (N,).
-    order
-        2 or 3, see :func:`irwsm`.
-    tolerance
-        Width of the final bracket, decades; near its optimum the likelihood is flat over a few hundredths.
-
-    Returns
-    -------
-    float
-        The ratio; 1.0 for a series whose differences are all zero: it determines no ratio.
+    ``y``: series, shape (N,). ``order``: 2 or 3, see :func:`irwsm`. ``tolerance``: width of the final bracket, decades;
+    near its optimum the likelihood is flat over a few hundredths. Returns the ratio; 1.0 for a series whose differences
+    are all zero: it determines no ratio.
     """
     w = _scaled_differences(y, order)
     if w is None:
@@ -130,14 +96,8 @@ def cross_validation(w: NDArray[np.float64], order: int, nvr: float) -> float:
     constant, the mean square error of predicting each sample from all others. The trace is that of a long series.
     Source: Craven and Wahba 1979.
 
-    Parameters
-    ----------
-    w
-        Differences of the series, ``numpy.diff(y, n=order)``, shape (N - order,).
-    order
-        2 or 3, see :func:`irwsm`.
-    nvr
-        Noise-variance ratio, positive.
+    ``w``: differences of the series, ``numpy.diff(y, n=order)``, shape (N - order,); ``order``: 2 or 3, see
+    :func:`irwsm`; ``nvr``: noise-variance ratio, positive.
     """
     squares = float(_residual_sum(w, _band(order, nvr), _STENCIL[order], _transient(order, nvr)))
     return float(np.log(squares) - 2 * np.log(1 - kept_share(order, nvr)))
@@ -149,19 +109,8 @@ def cross_validated_nvr(y: NDArray[np.float64], order: int, tolerance: float = 0
     The criterion assumes white measurement noise and nothing about the motion. Quantisation noise is white if the
     position changes by several counts per sample.
 
-    Parameters
-    ----------
-    y
-        Series, shape (N,).
-    order
-        2 or 3, see :func:`irwsm`.
-    tolerance
-        Width of the final bracket, decades.
-
-    Returns
-    -------
-    float
-        The ratio; 1.0 for a series whose differences are all zero: it determines no ratio.
+    ``y``: series, shape (N,); ``order``: 2 or 3, see :func:`irwsm`; ``tolerance``: width of the final bracket, decades.
+    Returns the ratio; 1.0 for a series whose differences are all zero: it determines no ratio.
     """
     w = _scaled_differences(y, order)
     if w is None:
@@ -176,19 +125,8 @@ def automatic_nvr(y: NDArray[np.float64], order: int, tolerance: float = 0.02) -
     of the third-order random walk depends less on the colour; for white noise its ratio is slightly too large. For
     order 2 the ratio of the third order is converted to the same half-power frequency, ``NVR^(1 / (2 order))``.
 
-    Parameters
-    ----------
-    y
-        Series, shape (N,).
-    order
-        2 or 3, see :func:`irwsm`.
-    tolerance
-        Width of the final bracket, decades.
-
-    Returns
-    -------
-    float
-        The ratio; 1.0 for a series whose differences are all zero: it determines no ratio.
+    ``y``: series, shape (N,); ``order``: 2 or 3, see :func:`irwsm`; ``tolerance``: width of the final bracket, decades.
+    Returns the ratio; 1.0 for a series whose differences are all zero: it determines no ratio.
     """
     validated = cross_validated_nvr(y, order, tolerance)
     likeliest = optimal_nvr(y, 3, tolerance)
@@ -200,12 +138,7 @@ def kept_share(order: int, nvr: float) -> float:
 
     This is the mean over frequency of ``NVR / (NVR + (2 - 2 cos w)^order)``, computed by partial fractions.
 
-    Parameters
-    ----------
-    order
-        2 or 3, see :func:`irwsm`.
-    nvr
-        Noise-variance ratio, positive.
+    ``order``: 2 or 3, see :func:`irwsm`; ``nvr``: noise-variance ratio, positive.
     """
     poles = nvr ** (1 / order) * np.exp(1j * np.pi * (2 * np.arange(order) + 1) / order)
     return float(np.sum(-poles / (np.sqrt(-poles) * np.sqrt(4 - poles))).real / order)
@@ -262,7 +195,7 @@ def _transient(order: int, nvr: float) -> int:
     return int(SETTLED * nvr ** (-0.5 / order)) + 10
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled()
 def _row(band, d, low, i, p):  # type: ignore[no-untyped-def]
     """Row i of ``V = L diag(d) L'``: fill ``low[i % (p + 1)]`` (distances 1..p) and return d_i.
 
@@ -279,7 +212,7 @@ def _row(band, d, low, i, p):  # type: ignore[no-untyped-def]
     return pivot
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled("f8[::1], f8[::1], i8")
 def _profile(w, band, transient):  # type: ignore[no-untyped-def]
     """``m log(w' V^-1 w) + log|V|`` in one forward sweep; after ``transient`` rows the factors are constant."""
     m, p = w.size, band.size - 1
@@ -311,7 +244,7 @@ def _profile(w, band, transient):  # type: ignore[no-untyped-def]
     return m * np.log(quadratic) + logdet
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled()
 def _forward(w, band, transient):  # type: ignore[no-untyped-def]
     """``L^-1 w`` with ``V = L diag(d) L'``, and the first rows of L and d; all later rows equal the last one."""
     m, p = w.size, band.size - 1
@@ -338,7 +271,7 @@ def _forward(w, band, transient):  # type: ignore[no-untyped-def]
     return z, rows, pivots
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled("f8[::1], f8[::1], f8[::1], i8")
 def _correction(w, band, stencil, transient):  # type: ignore[no-untyped-def]
     """``D' V^-1 w``, shape (m + order,); after ``transient`` rows the factors are constant."""
     m, p = w.size, band.size - 1
@@ -357,7 +290,7 @@ def _correction(w, band, stencil, transient):  # type: ignore[no-untyped-def]
     return out
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled("f8[::1], f8[::1], f8[::1], i8")
 def _residual_sum(w, band, stencil, transient):  # type: ignore[no-untyped-def]
     """``|D' V^-1 w|^2``; after ``transient`` rows the factors are constant."""
     m, p = w.size, band.size - 1

@@ -9,10 +9,10 @@ the noise-variance ratio. It has the same meaning as in :mod:`armident.identify.
 
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from armident.compiled import compiled
 from armident.configs import DataError
 
 PRIOR = 1e10
@@ -25,10 +25,8 @@ Array = NDArray[np.float64]
 class LiveDerivatives:
     """Filtered positions and derivatives of a batch; NaN before the first measurement of a joint.
 
-    Parameters
-    ----------
-    q, qd, qdd
-        Positions, velocities, accelerations, shape (M, n) each; rad or m, s. ``qdd`` is NaN for order 2.
+    ``q``, ``qd``, ``qdd``: positions, velocities, accelerations, shape (M, n) each; rad or m, s. ``qdd`` is NaN for
+    order 2.
     """
 
     q: Array
@@ -63,26 +61,14 @@ class LiveState:
 class VelocityFilter:
     """Causal filter for velocities and accelerations of n joints, sample by sample or batch by batch.
 
-    Parameters
-    ----------
-    n
-        Number of joints.
-    dt
-        Sampling period, s.
-    nvr
-        Noise-variance ratio, scalar or (n,): the same number as for the smoother of this order, for instance
-        ``automatic_nvr(q[:, j], order)`` of an earlier recording.
-    order
-        2: position and velocity; 3: acceleration as well, and no lag while it is constant.
+    ``nvr``: noise-variance ratio, scalar or (n,): the same number as for the smoother of this order, for instance
+    ``automatic_nvr(q[:, j], order)`` of an earlier recording. ``order``: 2: position and velocity; 3: acceleration as
+    well, and no lag while it is constant. Raises DataError if ``dt`` or a ratio is not positive, or ``order`` neither 2
+    nor 3.
 
     Notes
     -----
     ``F``, ``H``, ``Q`` and ``R`` are the matrices of the model in filterpy's notation; the unit of time is one sample.
-
-    Raises
-    ------
-    DataError
-        If ``dt`` or a ratio is not positive, or ``order`` neither 2 nor 3.
     """
 
     _saved = ("_x", "_p", "_squares", "_measured")
@@ -129,16 +115,9 @@ class VelocityFilter:
     def handle(self, samples: ArrayLike) -> LiveDerivatives:
         """Process measured positions and return their filtered values and derivatives.
 
-        Parameters
-        ----------
-        samples
-            One sample (n,) or a batch (M, n), rad or m, in the order of time. NaN: the measurement is missing and its
-            value is predicted.
-
-        Raises
-        ------
-        DataError
-            If the shape does not fit the number of joints, or a position is infinite.
+        ``samples``: one sample (n,) or a batch (M, n), rad or m, in the order of time. NaN: the measurement is missing
+        and its value is predicted. Raises DataError if the shape does not fit the number of joints, or a position is
+        infinite.
         """
         y = np.atleast_2d(np.asarray(samples, dtype=np.float64))
         if y.ndim != 2 or y.shape[1] != self.n:
@@ -173,7 +152,7 @@ def _driven(order: int) -> Array:
     return np.array([[1 / 20, 1 / 8, 1 / 6], [1 / 8, 1 / 3, 1 / 2], [1 / 6, 1 / 2, 1.0]])
 
 
-@numba.njit(cache=True)
+@compiled("f8[:, ::1], f8[::1], f8[:, ::1], f8[:, ::1], f8[:, :, ::1], f8[::1], i8[::1], f8[:, :, ::1]", nogil=False)
 def _filter(y, nvr, driven, x, p, squares, measured, out):  # type: ignore[no-untyped-def]
     """Predict and update every joint at every sample; ``x`` (n, order), ``p`` (n, order, order) in place."""
     order = driven.shape[0]
@@ -206,7 +185,7 @@ def _filter(y, nvr, driven, x, p, squares, measured, out):  # type: ignore[no-un
                 out[a, k, j] = x[j, a]
 
 
-@numba.njit(cache=True)
+@compiled(nogil=False)
 def _predict(x, p, nvr, driven, half):  # type: ignore[no-untyped-def]
     """``x = F x``, ``P = F P F' + nvr driven`` for the transition of one sample."""
     order = x.size
@@ -235,7 +214,7 @@ def _predict(x, p, nvr, driven, half):  # type: ignore[no-untyped-def]
             p[a, b] += nvr * driven[a, b]
 
 
-@numba.njit(cache=True)
+@compiled(nogil=False)
 def _update(x, p, innovation, variance, gain):  # type: ignore[no-untyped-def]
     """Measurement update in Joseph's form, which keeps the covariance symmetric and positive."""
     order = x.size

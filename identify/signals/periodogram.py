@@ -9,10 +9,7 @@ Array = NDArray[np.float64]
 def hann_window(samples: int) -> Array:
     """Symmetric Hann window of unit norm, so that windowed white noise keeps its power; shape (N,).
 
-    Parameters
-    ----------
-    samples
-        Length N of the window.
+    ``samples``: length N of the window.
     """
     window = np.hanning(samples)
     return np.asarray(window / np.sqrt(window @ window))
@@ -25,16 +22,7 @@ def periodogram(windowed: Array, padding: int = 1) -> Array:
     one-sided power density.
     scipy.signal.periodogram is not used: its one-sided density has half of this at the Nyquist frequency.
 
-    Parameters
-    ----------
-    windowed
-        Record multiplied by :func:`hann_window`, shape (N,).
-    padding
-        Zero-padding factor: the length of the DFT is ``padding N``.
-
-    Returns
-    -------
-    ndarray
-        Shape (padding N // 2 + 1,), in the squared unit of the record.
+    ``windowed``: record multiplied by :func:`hann_window`, shape (N,); ``padding``: zero-padding factor: the length of
+    the DFT is ``padding N``. Result: shape (padding N // 2 + 1,), in the squared unit of the record.
     """
     return np.asarray(np.abs(np.fft.rfft(windowed, padding * windowed.size)) ** 2)

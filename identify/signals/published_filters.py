@@ -15,28 +15,10 @@ def chebyshev_decimate(
     The filter is in second-order sections: as one transfer function it fails numerically for a ``factor`` above about
     30. The samples kept are those of MATLAB's ``decimate``, with the last one among them.
 
-    Parameters
-    ----------
-    x
-        Signal, shape (N, ...).
-    factor
-        Decimation factor: one sample of ``factor`` is kept.
-    order
-        Order of the Chebyshev filter (type I) of one pass.
-    ripple_db
-        Passband ripple of one pass, dB.
-    padlen
-        Number of samples of odd extension at each end.
-
-    Returns
-    -------
-    ndarray
-        Shape (M, ...), one row per index of :func:`kept_samples`.
-
-    Raises
-    ------
-    DataError
-        If the signal does not have more than ``padlen`` samples.
+    ``x``: signal, shape (N, ...); ``factor``: decimation factor: one sample of ``factor`` is kept; ``order``: order of
+    the Chebyshev filter (type I) of one pass; ``ripple_db``: passband ripple of one pass, dB; ``padlen``: number of
+    samples of odd extension at each end. Result: shape (M, ...), one row per index of :func:`kept_samples`. Raises
+    DataError if the signal does not have more than ``padlen`` samples.
     """
     if x.shape[0] <= padlen:
         raise DataError(f"decimating needs more than {padlen} samples, got {x.shape[0]}")
@@ -48,12 +30,7 @@ def chebyshev_decimate(
 def kept_samples(samples: int, factor: int) -> NDArray[np.int64]:
     """Indices of the samples that MATLAB's ``decimate`` keeps, shape (M,).
 
-    Parameters
-    ----------
-    samples
-        Number N of samples before decimation.
-    factor
-        Decimation factor.
+    ``samples``: number N of samples before decimation; ``factor``: decimation factor.
     """
     first = factor - (factor * (-(-samples // factor)) - samples) - 1
     return np.arange(first, samples, factor, dtype=np.int64)

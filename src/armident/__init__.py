@@ -5,6 +5,14 @@
 >>> result = armident.identify(recording, method="idim-ls")
 >>> result.parameters["zz1r"].unit
 'kg m^2'
+
+Recordings: `Recording.from_arrays`, `read_recording`, `import_recording`, `simulate_recording`, `capture`.
+Configurations: `load_robot`, `load_session`.
+Work: `check`, `identify` with `Options`, `diagnose`, `compare`, `predict`, `design_trajectory`.
+Results: `CheckedSetup`, `Identification` (`load_identification`) and its `RobotModel`, `Diagnosis`, `ChangeTest`,
+`TorquePrediction`, `Design`. They print, show themselves in a notebook, and have ``report`` and ``save``.
+Effects: `effects` lists them; `Effect`, `Linear`, `Shape`, `Place` and `Motion` make a new one.
+Errors: `ArmidentError`, and of it `ConfigError` and `DataError`.
 """
 
 import importlib
@@ -22,31 +30,38 @@ if TYPE_CHECKING:
     from armident.daq.recording import Recording as Recording
     from armident.daq.recording import read_recording as read_recording
     from armident.identify.api import ChangeTest as ChangeTest
+    from armident.identify.api import CheckedSetup as CheckedSetup
     from armident.identify.api import Design as Design
     from armident.identify.api import Diagnosis as Diagnosis
     from armident.identify.api import Effect as Effect
     from armident.identify.api import Identification as Identification
+    from armident.identify.api import Linear as Linear
+    from armident.identify.api import Motion as Motion
+    from armident.identify.api import Options as Options
+    from armident.identify.api import Place as Place
+    from armident.identify.api import RobotModel as RobotModel
+    from armident.identify.api import Shape as Shape
+    from armident.identify.api import TorquePrediction as TorquePrediction
     from armident.identify.api import check as check
     from armident.identify.api import compare as compare
     from armident.identify.api import design_trajectory as design_trajectory
     from armident.identify.api import diagnose as diagnose
     from armident.identify.api import effects as effects
-    from armident.identify.api import identify as identify
+    from armident.identify.api import load_identification as load_identification
     from armident.identify.api import predict as predict
-    from armident.identify.prediction import TorquePrediction as TorquePrediction
-    from armident.identify.robot_model import RobotModel as RobotModel
     from armident.virtual_robot.api import simulate_recording as simulate_recording
+
+    __version__: str
 
 _HOMES = {
     "armident.configs": ("ArmidentError", "ConfigError", "DataError", "load_robot", "load_session"),
     "armident.daq.api": ("capture", "import_recording"),
     "armident.daq.recording": ("Recording", "read_recording"),
     "armident.identify.api": (
-        "ChangeTest", "Design", "Diagnosis", "Effect", "Identification", "check", "compare", "design_trajectory",
-        "diagnose", "effects", "predict",
+        "ChangeTest", "CheckedSetup", "Design", "Diagnosis", "Effect", "Identification", "Linear", "Motion", "Options",
+        "Place", "RobotModel", "Shape", "TorquePrediction", "check", "compare", "design_trajectory", "diagnose",
+        "effects", "load_identification", "predict",
     ),
-    "armident.identify.prediction": ("TorquePrediction",),
-    "armident.identify.robot_model": ("RobotModel",),
     "armident.virtual_robot.api": ("simulate_recording",),
 }  # fmt: skip
 """Names of the public API by the module that defines them; a name is imported when it is first used."""
@@ -62,6 +77,10 @@ def __getattr__(name: str) -> Any:
     if name == "identify":
         # The package of this name is callable.
         return importlib.import_module("armident.identify")
+    if name == "__version__":
+        from importlib.metadata import version
+
+        return version("armident")
     if name not in _MODULES:
         raise AttributeError(f"module 'armident' has no attribute {name!r}")
     from armident.extras import named_extra
@@ -74,4 +93,4 @@ def __getattr__(name: str) -> Any:
 
 def __dir__() -> list[str]:
     """List the public names, for completion."""
-    return [name for name in globals() if name.startswith("__")] + __all__
+    return sorted({*(name for name in globals() if name.startswith("__")), "__version__", *__all__})

@@ -5,10 +5,10 @@ from contextlib import contextmanager
 
 EXTRAS: dict[str, tuple[str, ...]] = {
     "identify": (
-        "clarabel", "coal", "filterpy", "jinja2", "markupsafe", "matplotlib", "numba", "scipy", "sqlalchemy",
+        "clarabel", "coal", "filterpy", "jinja2", "markupsafe", "matplotlib", "scipy", "sqlalchemy",
         "threadpoolctl",
     ),
-    "virtual": ("clarabel", "numba", "pinocchio", "scipy"),
+    "virtual": ("clarabel", "pinocchio", "scipy"),
     "fleet": ("distributed",),
     "parquet": ("pyarrow",),
     "postgresql": ("psycopg",),
@@ -19,12 +19,7 @@ EXTRAS: dict[str, tuple[str, ...]] = {
 def needed_extra(error: ImportError, package: str = "") -> str | None:
     """Return the extra that brings the module which an import did not find, ``None`` if none does.
 
-    Parameters
-    ----------
-    error
-        The error of the import.
-    package
-        Package that imports; ``virtual_robot`` needs extra ``virtual``.
+    ``package``: package that imports; ``virtual_robot`` needs extra ``virtual``.
     """
     module = (error.name or "").partition(".")[0]
     found = [extra for extra, modules in EXTRAS.items() if module in modules]
@@ -36,12 +31,7 @@ def needed_extra(error: ImportError, package: str = "") -> str | None:
 def install_line(what: str, extras: Iterable[str]) -> str:
     """Return the line that names the missing extras and the command that installs them.
 
-    Parameters
-    ----------
-    what
-        What needs them, for example a command.
-    extras
-        Names of extras.
+    ``what``: what needs them, for example a command.
     """
     return f"{what} needs extra packages: pip install 'armident[{','.join(extras)}]'"
 
@@ -50,17 +40,8 @@ def install_line(what: str, extras: Iterable[str]) -> str:
 def named_extra(what: str, package: str) -> Iterator[None]:
     """Give the error of an import that lacks an extra the command that installs it.
 
-    Parameters
-    ----------
-    what
-        What is imported, for example a function of the public API.
-    package
-        Package that imports.
-
-    Raises
-    ------
-    ImportError
-        With the command, if a module of an extra is missing.
+    ``what``: what is imported, for example a function of the public API. Raises ImportError with the command, if a
+    module of an extra is missing.
     """
     try:
         yield
@@ -74,17 +55,8 @@ def named_extra(what: str, package: str) -> Iterator[None]:
 def require(what: str, *extras: str) -> None:
     """Check that the modules of extras can be found, without importing them.
 
-    Parameters
-    ----------
-    what
-        What needs them, for example a command.
-    extras
-        Names of extras.
-
-    Raises
-    ------
-    ConfigError
-        If modules are missing; names the command that installs all the extras that lack one.
+    ``what``: what needs them, for example a command. Raises ConfigError if modules are missing; names the command that
+    installs all the extras that lack one.
     """
     from importlib.util import find_spec
 

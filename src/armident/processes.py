@@ -64,10 +64,11 @@ def start_command(
     niceness: int = 0,
     own_session: bool = False,
     with_parent: bool = False,
-    stdin: bool = False,
     environment: Mapping[str, str] | None = None,
 ) -> "subprocess.Popen[bytes]":
     """Start ``python -m module words...`` with this interpreter.
+
+    Returns the started process.
 
     Parameters
     ----------
@@ -83,21 +84,14 @@ def start_command(
         Start a new session: signals of the terminal (Ctrl-C) then do not reach the process.
     with_parent
         Send SIGTERM to the process when the thread that started it ends, also by SIGKILL (Linux).
-    stdin
-        Connect standard input to a pipe instead of the null device.
     environment
         Variables added to the environment of this process.
-
-    Returns
-    -------
-    subprocess.Popen
-        The started process.
     """
     nice = ["nice", "-n", str(niceness)] if niceness else []
     parent = {PARENT_VARIABLE: str(os.getpid())} if with_parent else {}
     return subprocess.Popen(
         [*nice, sys.executable, "-m", module, *words],
-        stdin=subprocess.PIPE if stdin else subprocess.DEVNULL,
+        stdin=subprocess.DEVNULL,
         stdout=out,
         stderr=err,
         env={**os.environ, **parent, **(environment or {})},
@@ -165,13 +159,7 @@ class CommandProcess:
         self._final = (b"", b"")
 
     def start(self) -> Self:
-        """Start the process and return this object.
-
-        Raises
-        ------
-        ArmidentError
-            If the process is running already.
-        """
+        """Start the process and return this object. Raises ArmidentError if the process is running already."""
         if self.running:
             raise ArmidentError(f"{self.name} is running already")
         if self.log is None:
@@ -201,13 +189,7 @@ class CommandProcess:
 
     @property
     def process(self) -> Process:
-        """The started process.
-
-        Raises
-        ------
-        ArmidentError
-            Before `start`.
-        """
+        """The started process. Raises ArmidentError: before `start`."""
         if self._process is None:
             raise ArmidentError(f"{self.name} has not been started")
         return self._process
@@ -233,10 +215,7 @@ class CommandProcess:
     def tail(self, lines: int = TAIL_LINES) -> str:
         """Return the last lines of standard error, joined by ``" | "``.
 
-        Parameters
-        ----------
-        lines
-            Largest number of lines; empty lines do not count.
+        ``lines``: largest number of lines; empty lines do not count.
         """
         text = [line.strip() for line in self.errors().splitlines() if line.strip()]
         return " | ".join(text[-lines:]) or "it printed nothing"
@@ -250,54 +229,18 @@ class CommandProcess:
     def failure(self, problem: str) -> ArmidentError:
         """Return an error with the name, the problem, the log file and the end of standard error.
 
-        Parameters
-        ----------
-        problem
-            Rest of the sentence that begins with the name, for example ``"ended with exit code 1"``.
+        ``problem``: rest of the sentence that begins with the name, for example ``"ended with exit code 1"``.
         """
         return ArmidentError(self._message(problem))
-
-    def send_line(self, text: str) -> None:
-        """Write one line to standard input; needs ``start_command(..., stdin=True)``.
-
-        Parameters
-        ----------
-        text
-            The line, without its end.
-
-        Raises
-        ------
-        ProcessEnded
-            If the process has ended.
-        """
-        stdin = getattr(self.process, "stdin", None)
-        if stdin is None:
-            raise ArmidentError(f"{self.name} has no standard input")
-        try:
-            stdin.write(text.encode() + b"\n")
-        except BrokenPipeError as error:
-            with suppress(subprocess.TimeoutExpired):
-                self.process.wait(STOP_S)
-            raise ProcessEnded(self._message(f"ended with exit code {self.exit_code}")) from error
 
     def wait_for_line(self, text: str, timeout: float) -> str:
         """Wait for the next line of standard output that begins with ``text``, and return it.
 
         Lines up to the returned one are consumed: the next call begins after it.
 
-        Parameters
-        ----------
-        text
-            Beginning of the line; ``""`` for any line.
-        timeout
-            Longest time to wait, s.
-
-        Raises
-        ------
-        ProcessEnded
-            If the process ends before it prints such a line.
-        ProcessTimeout
-            If ``timeout`` passes before it prints such a line.
+        ``text``: beginning of the line; ``""`` for any line. ``timeout``: longest time to wait, s. Raises ProcessEnded
+        if the process ends before it prints such a line; ProcessTimeout if ``timeout`` passes before it prints such a
+        line.
         """
         until = time.monotonic() + timeout
         expected = f"before it printed {text!r}" if text else "before it printed a line"
@@ -317,25 +260,14 @@ class CommandProcess:
             time.sleep(POLL_S)
 
     def send_signal(self, number: signal.Signals) -> None:
-        """Send a signal; does nothing after the end of the process.
-
-        Parameters
-        ----------
-        number
-            The signal.
-        """
+        """Send a signal; does nothing after the end of the process."""
         if self.running:
             self.process.send_signal(number)
 
     def stop(self, timeout: float = STOP_S, number: signal.Signals = signal.SIGTERM) -> None:
         """End the process: send a signal, wait, and kill it if it still runs.
 
-        Parameters
-        ----------
-        timeout
-            Time between the signal and the kill, s.
-        number
-            The signal.
+        ``timeout``: time between the signal and the kill, s.
         """
         if self._process is None:
             return
@@ -370,18 +302,3 @@ class CommandProcess:
         files, self._files = self._files, None
         for file in files:
             file.close()
-
-
-def resident_bytes(pid: int) -> int:
-    """Return the resident memory of a process, bytes; 0 after its end (Linux, proc(5), ``statm``).
-
-    Parameters
-    ----------
-    pid
-        Number of the process.
-    """
-    try:
-        pages = Path(f"/proc/{pid}/statm").read_text(encoding="ascii").split()[1]
-    except (FileNotFoundError, ProcessLookupError):
-        return 0
-    return int(pages) * os.sysconf("SC_PAGE_SIZE")

@@ -70,8 +70,8 @@ def simulate(
     reference = load_trajectory(trajectory)
     identified = physics == "identified" or (physics is None and model is not None)
     if identified:
-        from armident.identify.saved_model import load_model
-        from armident.identify.simulated_recording import simulate_model
+        from armident.identify.identification.saved_model import load_model
+        from armident.identify.identification.simulated_recording import simulate_model
 
         if model is None:
             raise ConfigError("--physics identified: give the identified arm by --model")
@@ -122,7 +122,7 @@ def simulate(
 
 def _robot_of(document: Path | None) -> "RobotConfig":
     """Return the robot of an identification."""
-    from armident.identify.saved_model import load_model
+    from armident.identify.identification.saved_model import load_model
 
     assert document is not None
     return load_model(document).robot

@@ -19,13 +19,7 @@ class Notifier:
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) if self._address else None
 
     def ready(self, status: str) -> None:
-        """Report that the service has started.
-
-        Parameters
-        ----------
-        status
-            Status line for ``systemctl status``.
-        """
+        """Report that the service has started. ``status``: status line for ``systemctl status``."""
         self._send(f"READY=1\nSTATUS={status}")
 
     def progress(self, status: str) -> None:

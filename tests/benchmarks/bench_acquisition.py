@@ -63,20 +63,8 @@ TICKS = os.sysconf("SC_CLK_TCK")
 class Competitor:
     """One receiver.
 
-    Parameters
-    ----------
-    name
-        Name, also of its folder and its buses.
-    command
-        Program and arguments.
-    ready
-        Text that it prints when it receives.
-    channels
-        Its buses.
-    rate_hz
-        SYNCs per second that are sent to it.
-    seconds
-        Length of a window, s.
+    ``name``: also of its folder and its buses; ``command``: program and arguments; ``ready``: text that it prints when
+    it receives; ``rate_hz``: SYNCs per second that are sent to it; ``seconds``: length of a window, s.
     """
 
     name: str
@@ -191,12 +179,7 @@ def run() -> list[Row]:
 def rows(found: dict[str, Competitor], recorded: str) -> list[Row]:
     """Rows of the table.
 
-    Parameters
-    ----------
-    found
-        Receivers by name, measured.
-    recorded
-        Note on the completeness of the capture.
+    ``found``: receivers by name, measured; ``recorded``: note on the completeness of the capture.
     """
     pairs = (
         ("receive, CPU per frame / candump -l", "acqr", "acqd", ""),

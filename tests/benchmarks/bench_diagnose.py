@@ -10,7 +10,7 @@ MEASURE = """
 import json, resource, time
 from armident.configs import config_path, load_robot, load_trajectory
 from armident.identify.diagnosis.candidates import ColumnCache, candidates
-from armident.identify.diagnosis.diagnose import diagnose
+from armident.identify.diagnosis.diagnose import run_diagnosis
 from armident.identify.diagnosis.selection import StepwiseSelection
 from armident.identify.diagnosis.study import build_study
 from armident.identify.identification.from_recording import experiments_from_recording
@@ -25,7 +25,7 @@ scenario = load_scenario("scenarios/tx40_worn_joint2.yaml")
 experiments, _ = experiments_from_recording(simulate_recording(robot, trajectory, seed=1, scenario=scenario), robot)
 best = None
 for _ in range(2):
-    document = diagnose(experiments, [], robot).document
+    document = run_diagnosis(experiments, [], robot).document
     if best is None or document.timing_s["total"] < best.timing_s["total"]:
         best = document
 memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024

@@ -4,7 +4,7 @@ import json
 import subprocess
 import sys
 
-from armident.identify.identification.options import METHODS
+from armident.identify.estimators.methods import METHODS
 from tests.benchmarks.harness import Row
 
 MEASURE = """

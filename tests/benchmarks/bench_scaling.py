@@ -12,7 +12,7 @@ MEASURE = """
 import json, resource, sys, time
 import numpy as np
 from armident.configs import config_path, load_robot, load_trajectory
-from armident.identify.experiment import Experiment
+from armident.identify.signals.experiments import Experiment
 from armident.identify.identification.from_recording import experiments_from_recording
 from armident.identify.identification.options import Options
 from armident.identify.identification.pipeline import identify_experiment

@@ -53,15 +53,8 @@ def best_of(function: Callable[[], object], repeat: int = 3) -> float:
 def ratio_of_medians(ours: Sequence[float], alternative: Sequence[float]) -> tuple[float, float, float]:
     """Compare two figures over several interleaved rounds.
 
-    Parameters
-    ----------
-    ours, alternative
-        Figures of the rounds, one each, in the same unit; smaller is better.
-
-    Returns
-    -------
-    tuple
-        Ratio of the medians (> 1: ours is better), and the smallest and the largest ratio within a round.
+    ``ours``, ``alternative``: figures of the rounds, one each, in the same unit; smaller is better. Returns the ratio
+    of the medians (> 1: ours is better), and the smallest and the largest ratio within a round.
     """
     ratios = [theirs / mine for mine, theirs in zip(ours, alternative, strict=True)]
     return statistics.median(alternative) / statistics.median(ours), min(ratios), max(ratios)
@@ -70,15 +63,7 @@ def ratio_of_medians(ours: Sequence[float], alternative: Sequence[float]) -> tup
 def median_of_runs(runs: Sequence[Sequence[Row]]) -> list[Row]:
     """Combine the rows of several runs of the same benchmarks.
 
-    Parameters
-    ----------
-    runs
-        Rows of each run.
-
-    Returns
-    -------
-    list of Row
-        A row for each name of the first run: medians, the range of our figure, and the range of the ratio.
+    Returns a row for each name of the first run: medians, the range of our figure, and the range of the ratio.
     """
     combined = []
     for first in runs[0]:

@@ -168,12 +168,7 @@ class _FarmBus:
 class Farm:
     """Drives of a session in a thread of their own; with ``sync.role: consumer`` also the master that sends SYNC.
 
-    Parameters
-    ----------
-    session
-        Gives buses, nodes and SYNC.
-    robot
-        Gives the joints.
+    ``session``: gives buses, nodes and SYNC; ``robot``: gives the joints.
     """
 
     def __init__(self, session: SessionConfig, robot: RobotConfig) -> None:

@@ -20,20 +20,9 @@ def start_capture(
 ) -> ForkedProcess:
     """Start a capture; its stdout and stderr go to ``log`` with the suffixes ``.out`` and ``.err``.
 
-    Parameters
-    ----------
-    session
-        Session file.
-    out
-        Folder of the recordings.
-    log
-        Path of the two files of output, without suffix.
-    duration
-        Length of the capture, s; ``None``: until it is stopped.
-    receive_buffer
-        Receive buffer of the sockets, bytes; a short stop of the process overruns a small one.
-    listen_only
-        Send nothing.
+    ``log``: path of the two files of output, without suffix. ``duration``: length of the capture, s; ``None``: until it
+    is stopped. ``receive_buffer``: receive buffer of the sockets, bytes; a short stop of the process overruns a small
+    one. ``listen_only``: send nothing.
     """
     arguments = session, out, duration, receive_buffer, listen_only
     with log.with_suffix(".out").open("wb") as output, log.with_suffix(".err").open("wb") as errors:

@@ -7,9 +7,9 @@ from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from armident.compiled import compiled
 from armident.drivers.can.socketcan import Messages, RawSocket
 from armident.drivers.canopen.objects import COB_SYNC
 from armident.drivers.canopen.sync_loop import monotonic_ns, send_messages, sleep_until
@@ -31,7 +31,7 @@ def current_of(sync: Any, joint: Any) -> Any:
     return (sync * 31 + joint * 1009) % 32_749
 
 
-@njit(cache=True, nogil=True)
+@compiled(kept=True)
 def _send(descriptors, address, body, first, joints, period, count, lossy, control):  # type: ignore[no-untyped-def]
     spec = np.zeros(2, dtype=np.int64)
     base = monotonic_ns(spec) + period
@@ -62,16 +62,8 @@ def _send(descriptors, address, body, first, joints, period, count, lossy, contr
 class Sender:
     """Sends SYNC and TPDOs (position, current, status) of six drives, nodes 1 to 6, on some buses.
 
-    Parameters
-    ----------
-    channels
-        The buses; the drives are distributed evenly.
-    period_us
-        SYNC period, us.
-    count
-        Number of SYNCs.
-    lossy
-        Interval in SYNCs at which the last drive omits an answer; 0 for never.
+    ``channels``: the buses; the drives are distributed evenly. ``lossy``: interval in SYNCs at which the last drive
+    omits an answer; 0 for never.
     """
 
     def __init__(self, channels: Sequence[str], period_us: int, count: int = 2**40, lossy: int = 0) -> None:

@@ -31,22 +31,20 @@ import numpy as np
 import zenoh
 
 from armident.configs import ArmidentError, DataError, SessionConfig, load_robot, load_session
-from armident.configs.schema.session import IdentificationOptions
-from armident.daq.capture.files import capture_stamp
 from armident.daq.capture.publisher import Publisher
+from armident.daq.capture.recording_files import capture_stamp
 from armident.daq.recording import RecordingWriter, StreamLayout, read_recording, write_recording
 from armident.daq.streaming import Block, Keys, encode_event, open_session
 from armident.daq.streaming.codec import end_content, start_content
 from armident.identify.documents.files import load_document
 from armident.identify.documents.identification import IdentificationDocument
-from armident.identify.identification.options import Options
-from armident.identify.monitoring.history import History, recorded_at
-from armident.identify.monitoring.ledger import FILE, Ledger
-from armident.identify.monitoring.recorded import Captured, captured_in
+from armident.identify.monitoring.change.history import History, recorded_at
 from armident.identify.monitoring.reidentify.identify_once import identify_once
 from armident.identify.monitoring.reidentify.keep import HistoryEntry
 from armident.identify.monitoring.reidentify.publish import StatusPublisher
-from armident.identify.monitoring.worker import Worker
+from armident.identify.monitoring.worker.ledger import FILE, Ledger
+from armident.identify.monitoring.worker.recorded import Captured, captured_in
+from armident.identify.monitoring.worker.worker import Worker, options_of
 from tests.fixtures import arms
 
 BLOCK_ROWS = 500
@@ -61,7 +59,7 @@ def cell_of(folder: Path) -> SessionConfig:
     session = load_session("emps_cell.yaml")
     cell = "".join(letter if letter.isalnum() else "_" for letter in folder.name.lower())
     recording = session.recording.model_copy(update={"directory": folder})
-    options = IdentificationOptions(method="idim-ls")
+    options = {"method": "idim-ls"}
     return session.model_copy(update={"cell": cell, "recording": recording, "identification": options})
 
 
@@ -114,7 +112,7 @@ def job(folder: Path, path: Path) -> None:
     """Identify a recording as ``armident reidentify`` does after the motion, and enter it in the history."""
     session = cell_of(folder)
     recording, robot = read_recording(path), load_robot(session.robot)
-    options = Options(**session.identification.model_dump())
+    options = options_of(session)
     with StatusPublisher(session, robot) as publisher:
         done = identify_once(recording, robot, options, folder, publisher, lambda _: None)
     HistoryEntry(store_of(folder), recording, done.document, done.path).write()

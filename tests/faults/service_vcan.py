@@ -24,7 +24,7 @@ import yaml
 from armident.configs import ArmidentError, load_session
 from armident.daq.recording import read_recording
 from armident.drivers.vcan import ensure_vcan, remove_vcan
-from armident.identify.monitoring.recorded import captured_in
+from armident.identify.monitoring.worker.recorded import captured_in
 from tests.faults.service import (
     Audience,
     options_of_rounds,
@@ -64,14 +64,7 @@ REFUSED = 3
 class Service:
     """Commands of a cell with an arm on a bus, and the number of their kills.
 
-    Parameters
-    ----------
-    folder
-        Folder of the cell, whose recordings and results are in it.
-    bus
-        Name of the interface.
-    rng
-        Source of the random moments.
+    ``folder``: folder of the cell, whose recordings and results are in it; ``rng``: source of the random moments.
     """
 
     folder: Path

@@ -28,25 +28,14 @@ OF_SUFFIX: dict[str, Mutator] = {
 
 
 def folder_of(path: Path) -> bytes:
-    """Return the files of a folder as one input.
-
-    Parameters
-    ----------
-    path
-        The folder.
-    """
+    """Return the files of a folder as one input."""
     return _packed({str(f.relative_to(path)): f.read_bytes() for f in sorted(path.rglob("*")) if f.is_file()})
 
 
 def as_folder(data: bytes, path: Path) -> None:
     """Write the files of an input into a folder.
 
-    Parameters
-    ----------
-    data
-        The input, of `folder_of` or `spoil_one_file`.
-    path
-        The folder, which is made.
+    ``data``: the input, of `folder_of` or `spoil_one_file`; ``path``: the folder, which is made.
     """
     for name, content in _files(data).items():
         (path / name).parent.mkdir(parents=True, exist_ok=True)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel
 
-from armident.configs import load_robot, load_session, load_suite, load_trajectory
+from armident.configs import load_robot, load_session, load_trajectory
 from armident.configs.loading import HERE, load_scenario
 from armident.configs.yaml_loader import read_yaml
 from armident.daq.init.dh_table import from_dh_table
@@ -132,7 +132,6 @@ TARGETS = (
     _target("robot", _shipped("robots/tx40.yaml", "robots/emps.yaml", "robots/kuka*.yaml"), load_robot),
     _target("session", _shipped("cells/*.yaml"), load_session),
     _target("trajectory", _shipped("trajectories/*.yaml"), _load_trajectory),
-    _target("suite", _shipped("suites/*.yaml"), load_suite),
     _target("scenario", _shipped("scenarios/*.yaml"), load_scenario),
     Target("urdf", _urdf_seeds, spoil_text, _check_urdf),
     Target("dh-table", lambda: [table.encode() for table in DH_TABLES], spoil_text, _check_dh_table),

@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 
 from armident.configs import RobotConfig, SessionConfig, load_robot, load_session
-from armident.daq.interchange.bus_log import recording_from_log
-from armident.daq.interchange.exporting import export_recording
 from armident.daq.interchange.importing import import_recording
+from armident.daq.interchange.readers import Reader
 from armident.daq.recording import Recording, read_recording, write_recording
 from tests.fuzz.harness import FOREIGN_WORDS, MisreadError, Target
 from tests.fuzz.mutate import Mutator, either, forge_blf, forge_parquet, forge_zip, spoil_bytes, spoil_text
+from tests.unit.daq.formats import EXAMPLES, example
 from tests.unit.daq.test_recording import make_recording
 
 ROWS = 60
@@ -47,15 +47,14 @@ def _recording() -> Recording:
     return replace(made, session=session, streams={"samples": samples, "demand": demand}, gaps=(), marks=())
 
 
-def _exported(suffix: str) -> Callable[[], list[bytes]]:
+def _seeds(reader: Reader, suffix: str) -> Callable[[], list[bytes]]:
+    @cache  # once: a MAT file holds the second in which it was written
     def seeds() -> list[bytes]:
+        recording = _recording()
+        if not reader.session:
+            recording = replace(recording, streams={"samples": recording.samples})
         with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder, f"x{suffix}")
-            recording = _recording()
-            if suffix not in (".log", ".asc", ".blf", ".trc"):
-                recording = replace(recording, streams={"samples": recording.samples})
-            export_recording(recording, path)
-            return [path.read_bytes()]
+            return [example(reader, suffix, Path(folder), recording).read_bytes()]
 
     return seeds
 
@@ -63,17 +62,7 @@ def _exported(suffix: str) -> Callable[[], list[bytes]]:
 def check_consistent(recording: Recording, folder: Path) -> None:
     """Refuse a recording that cannot be written and read, or has not one row of numbers for every sample.
 
-    Parameters
-    ----------
-    recording
-        What was imported.
-    folder
-        Takes the file.
-
-    Raises
-    ------
-    MisreadError
-        If it is inconsistent.
+    ``recording``: what was imported; ``folder``: takes the file. Raises MisreadError if it is inconsistent.
     """
     for stream in recording.streams.values():
         for name, values in stream.raw.items():
@@ -92,53 +81,32 @@ def check_consistent(recording: Recording, folder: Path) -> None:
         raise MisreadError("what was imported is not what is read")
 
 
-def _check_table(suffix: str, seeds: Callable[[], list[bytes]]) -> Callable[[bytes, Path], bool]:
-    robot = load_robot("tx40.yaml")
+@cache
+def _cell() -> tuple[SessionConfig, RobotConfig]:
+    session = load_session("tx40_cell.yaml")
+    return session, load_robot("tx40.yaml")
+
+
+def _target(reader: Reader, suffix: str) -> Target:
+    seeds = _seeds(reader, suffix)
 
     def check(data: bytes, folder: Path) -> bool:
         path = folder / f"x{suffix}"
         path.write_bytes(data)
         choice = hashlib.sha256(data).digest()[0] % len(OPTIONS) if data not in seeds() else 0
-        options = OPTIONS[choice]
-        check_consistent(import_recording(path, robot, **options), folder)
+        options = {} if reader.session else OPTIONS[choice]
+        check_consistent(import_recording(path, _cell()[0 if reader.session else 1], **options), folder)
         return True
 
-    return check
+    return Target(f"import{suffix.replace('.', '-')}", seeds, MUTATORS.get(suffix, spoil_bytes), check)
 
 
-@cache
-def _cell() -> tuple[SessionConfig, RobotConfig]:
-    session = load_session("tx40_cell.yaml")
-    return session, load_robot(session.robot)
+MUTATORS: dict[str, Mutator] = {
+    ".npz": either(spoil_bytes, forge_zip, forge_zip),
+    ".parquet": either(spoil_bytes, forge_parquet, forge_parquet),
+    ".blf": either(spoil_bytes, forge_blf, forge_blf),
+    **dict.fromkeys((".csv", ".log", ".asc", ".trc"), either(spoil_text, spoil_bytes)),
+}
+"""Ways to spoil a format by its suffix; others are spoiled byte by byte."""
 
-
-def _check_log(suffix: str) -> Callable[[bytes, Path], bool]:
-    def check(data: bytes, folder: Path) -> bool:
-        path = folder / f"x{suffix}"
-        path.write_bytes(data)
-        check_consistent(recording_from_log(path, *_cell()), folder)
-        return True
-
-    return check
-
-
-def _table(suffix: str, mutate: Mutator) -> Target:
-    seeds = cache(_exported(suffix))  # once: a MAT file holds the second in which it was written
-    return Target(f"import{suffix.replace('.', '-')}", seeds, mutate, _check_table(suffix, seeds))
-
-
-def _log(suffix: str, mutate: Mutator) -> Target:
-    return Target(f"import{suffix.replace('.', '-')}", _exported(suffix), mutate, _check_log(suffix))
-
-
-TARGETS = (
-    _table(".csv", either(spoil_text, spoil_bytes)),
-    _table(".npz", either(spoil_bytes, forge_zip, forge_zip)),
-    _table(".mat", spoil_bytes),
-    _table(".parquet", either(spoil_bytes, forge_parquet, forge_parquet)),
-    _table(".mcap", spoil_bytes),
-    _log(".log", either(spoil_text, spoil_bytes)),
-    _log(".asc", either(spoil_text, spoil_bytes)),
-    _log(".blf", either(spoil_bytes, forge_blf, forge_blf)),
-    _log(".trc", either(spoil_text, spoil_bytes)),
-)
+TARGETS = tuple(_target(reader, suffix) for reader, suffix in EXAMPLES)

@@ -14,12 +14,12 @@ import pytest
 from armident.configs import SessionConfig
 from armident.daq.recording import read_recording
 from armident.daq.streaming import Keys, open_session
-from armident.identify.identification.api import identify_recording
-from armident.identify.monitoring.announcements import Announcements
-from armident.identify.monitoring.ledger import FILE, Entry, Ledger, LedgerError
-from armident.identify.monitoring.worker import Worker
-from armident.identify.monitoring.worker_link import WorkerLink
-from armident.identify.report.files import write_identification
+from armident.identify.identification.identify_recording import identify_recording
+from armident.identify.monitoring.worker.announcements import Announcements
+from armident.identify.monitoring.worker.ledger import FILE, Ledger, LedgerEntry, LedgerError
+from armident.identify.monitoring.worker.worker import Worker
+from armident.identify.monitoring.worker.worker_link import WorkerLink
+from armident.identify.report.robot_file import write_identification
 from tests.faults.service import Audience, cell_of
 from tests.integration.test_worker_failures import recorded
 
@@ -61,7 +61,7 @@ def nothing(_data: bytes | None, _size: int) -> None:
     """Take no message."""
 
 
-def entered(folder: Path, state: State, lease_s: float) -> Entry:
+def entered(folder: Path, state: State, lease_s: float) -> LedgerEntry:
     """Return a recording whose result or failure was entered by the process ``one``, and not announced."""
     made = recorded(cell_of(folder), "a")
     assert made.path is not None

@@ -19,7 +19,7 @@ from pathlib import Path
 import pytest
 
 REPOSITORY = Path(__file__).resolve().parents[2]
-GENERATED = ("docs/index.md", "docs/reference")
+GENERATED = "docs/reference"
 PAGES = sorted(
     page
     for path in (REPOSITORY / "docs").rglob("*.md")
@@ -41,14 +41,7 @@ TRAP = "trap 'code=$?; [ $code -eq 4 ] || { echo \"exit code $code: $BASH_COMMAN
 class Page:
     """Commands and Python of a page, in their order, and the reasons for which blocks do not run.
 
-    Parameters
-    ----------
-    commands, python
-        Code of the blocks.
-    reasons
-        Reason of each block that does not run.
-    languages
-        Language of every block.
+    ``commands``, ``python``: code of the blocks; ``reasons``: reason of each block that does not run.
     """
 
     commands: tuple[str, ...]

@@ -163,8 +163,8 @@ def test_a_missing_drive_is_named_with_its_joint(udp_bus: Bus) -> None:
     ("index", "sub", "value", "message"),
     [
         (od.DEVICE_TYPE, 0, 0x00030191, r"node 1 \(joint_1\): is no CiA 402 drive: .*profile 401 instead of 402"),
-        (od.ENCODER_RESOLUTION, 1, 65536, r"encoder has 65536/1 counts per turn \(608Fh\), robot tx40 says 196608"),
-        (od.RATED_CURRENT, 0, 1600, r"rated current is 1600 mA \(6075h\), robot tx40 says 2500 mA"),
+        (od.ENCODER_RESOLUTION, 1, 65536, r"encoder has 65536/1 counts per turn \(608Fh\), robot tx40 has 196608"),
+        (od.RATED_CURRENT, 0, 1600, r"rated current is 1600 mA \(6075h\), robot tx40 has 2500 mA"),
     ],
 )
 def test_a_wrong_node_is_refused_with_its_identity(

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from armident.configs import ArmidentError, config_path, load_robot
 from armident.configs.schema.session import Bus
 from armident.configs.units import counts_per_si
-from armident.daq.guard.run import guard
+from armident.daq.guard.guard_loop import guard
 from armident.drivers.can.frames import frame, frames
 from armident.drivers.can.udp import open_bus
 from armident.drivers.canopen.objects import (

@@ -15,8 +15,8 @@ import pytest
 import zenoh
 
 from armident.configs import RobotConfig, SessionConfig, load_robot, load_session
-from armident.daq.capture.files import open_series
 from armident.daq.capture.publisher import Publisher
+from armident.daq.capture.recording_files import open_series
 from armident.daq.capture.sink import Sink
 from armident.daq.matching.assembler import Batch, Rows
 from armident.daq.matching.streams import captured_streams

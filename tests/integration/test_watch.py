@@ -24,7 +24,7 @@ from armident.identify.monitoring.recursive.live_watch import LiveWatch, live_es
 from armident.identify.monitoring.recursive.replay import blocks_of
 from armident.identify.monitoring.recursive.saved_state import state_of
 from armident.identify.monitoring.recursive.watch import WatchOptions, watch_cell, watch_recordings
-from armident.identify.monitoring.stream_buffer import LARGEST_BLOCK
+from armident.identify.monitoring.worker.stream_buffer import LARGEST_BLOCK
 from tests.fixtures import arms
 from tests.integration.test_worker import blocks_of as published_blocks
 

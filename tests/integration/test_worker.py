@@ -17,15 +17,14 @@ import pytest
 import zenoh
 
 from armident.configs import SessionConfig, load_session
-from armident.configs.schema.session import IdentificationOptions
 from armident.daq.capture.publisher import Publisher
 from armident.daq.recording import Recording, StreamLayout, read_recording, write_recording
 from armident.daq.streaming import Block, Keys, encode_event, open_session
 from armident.daq.streaming.codec import end_content, start_content
 from armident.identify.documents.files import from_json, load_document
 from armident.identify.documents.identification import IdentificationDocument
-from armident.identify.identification.api import identify_recording
-from armident.identify.monitoring.worker import Worker
+from armident.identify.identification.identify_recording import identify_recording
+from armident.identify.monitoring.worker.worker import Worker
 from tests.fixtures import arms
 
 pytestmark = pytest.mark.slow
@@ -49,7 +48,7 @@ def captured(tmp_path_factory: pytest.TempPathFactory) -> Recording:
     return in_its_file("emps", tmp_path_factory.mktemp("recordings"))
 
 
-def in_a_cell(robot: str, name: str, options: IdentificationOptions) -> SessionConfig:
+def in_a_cell(robot: str, name: str, options: dict[str, str]) -> SessionConfig:
     """A cell of its own, so that tests beside each other do not hear each other."""
     return load_session(f"{robot}_cell.yaml").model_copy(
         update={"cell": f"test_{os.getpid()}_{abs(hash(name)) % 10**6}", "identification": options}
@@ -59,7 +58,7 @@ def in_a_cell(robot: str, name: str, options: IdentificationOptions) -> SessionC
 @pytest.fixture
 def session(request: pytest.FixtureRequest) -> SessionConfig:
     """A cell for one test."""
-    return in_a_cell("emps", request.node.name, IdentificationOptions(method="idim-ls"))
+    return in_a_cell("emps", request.node.name, {"method": "idim-ls"})
 
 
 def blocks_of(recording: Recording) -> Iterator[Block]:
@@ -107,7 +106,7 @@ def answers(session: SessionConfig, key: str) -> list[zenoh.Reply]:
 def test_stream_and_file_give_the_same_numbers_to_the_last_bit(tmp_path: Path) -> None:
     """Six joints and the method that needs the set points."""
     captured = in_its_file("tx40", tmp_path)
-    session = in_a_cell("tx40", "bits", IdentificationOptions())
+    session = in_a_cell("tx40", "bits", {})
     with Worker(session, captured.robot, tmp_path) as worker:
         publish(captured, session)
         assert worker.result(LONGEST_S) == 0
@@ -149,7 +148,9 @@ def test_a_capture_too_long_for_the_memory_is_read_from_its_file(
     monkeypatch: pytest.MonkeyPatch,
     capfd: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.setattr("armident.identify.monitoring.stream_buffer.MOST_BYTES", 10 * next(blocks_of(captured)).nbytes)
+    monkeypatch.setattr(
+        "armident.identify.monitoring.worker.stream_buffer.MOST_BYTES", 10 * next(blocks_of(captured)).nbytes
+    )
     with Worker(session, captured.robot, tmp_path) as worker:
         publish(captured, session)
         assert worker.result(LONGEST_S) == 0
@@ -178,7 +179,7 @@ def test_invalid_messages_are_logged_once_and_then_at_powers_of_ten(
 def test_a_block_that_never_comes_is_fetched_from_the_file(
     captured: Recording, session: SessionConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("armident.identify.monitoring.stream_buffer.MAX_WAITING_S", 1.0)
+    monkeypatch.setattr("armident.identify.monitoring.worker.stream_buffer.MAX_WAITING_S", 1.0)
     with Worker(session, captured.robot, tmp_path) as worker:
         publish(captured, session, leave_out=3)
         assert worker.result(LONGEST_S) == 0
@@ -193,7 +194,7 @@ def test_missing_blocks_without_a_file_end_with_exit_code_3_and_say_how_many(
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    monkeypatch.setattr("armident.identify.monitoring.stream_buffer.MAX_WAITING_S", 1.0)
+    monkeypatch.setattr("armident.identify.monitoring.worker.stream_buffer.MAX_WAITING_S", 1.0)
     with Worker(session, captured.robot, tmp_path) as worker:
         publish(captured, session, leave_out=3, path=tmp_path / "gone.mcap")
         assert worker.result(LONGEST_S) == 3

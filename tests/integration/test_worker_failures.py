@@ -14,25 +14,24 @@ import numpy as np
 import pytest
 
 from armident.configs import SessionConfig
-from armident.configs.schema.session import IdentificationOptions
 from armident.daq.recording import Recording, RecordingWriter, StreamLayout, read_recording, write_recording
 from armident.daq.streaming import Keys, encode_block, encode_event, open_session
 from armident.daq.streaming.codec import end_content, start_content
 from armident.identify.documents.files import load_document
 from armident.identify.documents.identification import IdentificationDocument
-from armident.identify.identification.api import identify_recording
-from armident.identify.monitoring import worker as module
-from armident.identify.monitoring.ledger import FILE, Ledger
-from armident.identify.monitoring.recorded import Captured
-from armident.identify.monitoring.stream_buffer import (
+from armident.identify.identification.identify_recording import identify_recording
+from armident.identify.monitoring.worker.ledger import FILE, Ledger
+from armident.identify.monitoring.worker.recorded import Captured
+from armident.identify.monitoring.worker.stream_buffer import (
     LARGEST_BLOCK,
     MOST_CAPTURES,
     MOST_STREAMS,
     StreamBuffer,
     drop_oldest,
 )
-from armident.identify.monitoring.worker import Worker
-from armident.identify.report.files import write_identification
+from armident.identify.monitoring.worker.worker import Worker
+from armident.identify.monitoring.worker.worker import worker as module
+from armident.identify.report.robot_file import write_identification
 from tests.fixtures import arms
 from tests.integration.test_worker import LONGEST_S, in_a_cell, publish
 from tests.unit.daq.test_streaming import blocks, events
@@ -43,7 +42,7 @@ pytestmark = pytest.mark.slow
 @pytest.fixture
 def session(request: pytest.FixtureRequest, tmp_path: Path) -> SessionConfig:
     """A cell whose recordings are in the folder of the test."""
-    session = in_a_cell("emps", request.node.name, IdentificationOptions(method="idim-ls"))
+    session = in_a_cell("emps", request.node.name, {"method": "idim-ls"})
     recording = session.recording.model_copy(update={"directory": tmp_path})
     return session.model_copy(update={"recording": recording})
 
@@ -215,7 +214,7 @@ class TestStreamBuffer:
     def test_captures_and_early_blocks_are_bounded_and_reported(
         self, session: SessionConfig, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        monkeypatch.setattr("armident.identify.monitoring.stream_buffer.MOST_EARLY_BYTES", 20_000)
+        monkeypatch.setattr("armident.identify.monitoring.worker.stream_buffer.MOST_EARLY_BYTES", 20_000)
         buffer = StreamBuffer()
         for k in range(5 * MOST_CAPTURES):
             for block in blocks(20):
@@ -233,7 +232,7 @@ class TestStreamBuffer:
     def test_blocks_without_rows_fill_the_memory_too(
         self, session: SessionConfig, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        monkeypatch.setattr("armident.identify.monitoring.stream_buffer.MOST_EARLY_BYTES", 100_000)
+        monkeypatch.setattr("armident.identify.monitoring.worker.stream_buffer.MOST_EARLY_BYTES", 100_000)
         buffer = StreamBuffer()
         block = next(iter(blocks(1)))
         none = np.empty(0, np.int64)
@@ -263,7 +262,7 @@ class TestStreamBuffer:
         waiting = {f"{k}": made for k in range(MOST_STREAMS + 3)}
         drop_oldest(waiting)
         assert list(waiting) == [f"{k}" for k in range(3, MOST_STREAMS + 3)]
-        monkeypatch.setattr("armident.identify.monitoring.stream_buffer.MOST_BYTES", 1)
+        monkeypatch.setattr("armident.identify.monitoring.worker.stream_buffer.MOST_BYTES", 1)
         drop_oldest(waiting)
         assert list(waiting) == [f"{MOST_STREAMS + 2}"]
 

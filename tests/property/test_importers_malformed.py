@@ -9,18 +9,17 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from armident.configs import ArmidentError
-from armident.daq.interchange.bus_log import SUFFIXES, recording_from_log, write_log
 from armident.daq.interchange.importing import import_recording
+from armident.daq.interchange.readers import RosBag
 from armident.daq.recording import Recording, write_recording
 from tests.fuzz.harness import FOREIGN_WORDS
-from tests.unit.daq.bags import mcap_bag, sqlite_bag, states
+from tests.unit.daq.bags import sqlite_bag, states
+from tests.unit.daq.formats import EXAMPLES, example
 from tests.unit.daq.tables import motion, written
-from tests.unit.daq.test_bus_log import ROBOT, SESSION, captured
+from tests.unit.daq.test_bus_log import SESSION, captured
 from tests.unit.daq.test_importing import TX40
 
-TABLES = (".csv", ".npz", ".mat", ".parquet")
-BAGS = {".mcap": mcap_bag, ".db3": sqlite_bag}
-FORMATS = [*TABLES, *BAGS, *SUFFIXES]
+FORMATS = {suffix: reader for reader, suffix in EXAMPLES} | {".db3": RosBag()}
 INSERTED = (b"", b"\n", b",", b";", b"nan", b"1e999", b"-", b"\0", b"\xff\xfe", b"9" * 400, b"#", b"(", b'"', b"0,5")
 
 
@@ -28,25 +27,15 @@ INSERTED = (b"", b"\n", b",", b";", b"nan", b"1e999", b"-", b"\0", b"\xff\xfe", 
 def valid(suffix: str) -> bytes:
     """Return a small file of a format."""
     with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder, f"a{suffix}")
-        if suffix in SUFFIXES:
-            write_log(captured(40), path)
-            return path.read_bytes()
-        if suffix in BAGS:
-            return BAGS[suffix](path, states()[:40]).read_bytes()
-        table = written(Path(folder, "t.csv"), motion(40))
-        if suffix == ".csv":
-            return table.read_bytes()
-        from armident.daq.interchange.exporting import export_recording
-
-        export_recording(import_recording(table, TX40), path)
-        return path.read_bytes()
+        if suffix == ".db3":
+            return sqlite_bag(Path(folder, "a.db3"), states()[:40]).read_bytes()
+        table = import_recording(written(Path(folder, "t.csv"), motion(40)), TX40)
+        recording = captured(40) if FORMATS[suffix].session else table
+        return example(FORMATS[suffix], suffix, Path(folder), recording).read_bytes()
 
 
 def read(path: Path) -> Recording:
-    if path.suffix in SUFFIXES:
-        return recording_from_log(path, SESSION, ROBOT)
-    return import_recording(path, TX40)
+    return import_recording(path, SESSION if FORMATS[path.suffix].session else TX40)
 
 
 def read_or_refused(path: Path) -> Recording | ArmidentError:
@@ -92,7 +81,7 @@ def check(suffix: str, data: bytes) -> None:
         write_recording(found, Path(folder, "out.mcap"))
 
 
-@pytest.mark.parametrize("suffix", FORMATS)
+@pytest.mark.parametrize("suffix", list(FORMATS))
 @settings(suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large], deadline=None)
 @given(changes=edits, cut=st.sampled_from([1.0, 1.0, 0.97, 0.6, 0.1]))
 def test_a_damaged_file_is_read_or_refused_in_one_line(
@@ -102,7 +91,7 @@ def test_a_damaged_file_is_read_or_refused_in_one_line(
 
 
 @pytest.mark.nightly
-@pytest.mark.parametrize("suffix", FORMATS)
+@pytest.mark.parametrize("suffix", list(FORMATS))
 @settings(max_examples=3000, suppress_health_check=list(HealthCheck), deadline=None)
 @given(changes=edits, cut=st.floats(0, 1))
 def test_thousands_of_damaged_files_are_read_or_refused_in_one_line(
@@ -111,7 +100,7 @@ def test_thousands_of_damaged_files_are_read_or_refused_in_one_line(
     check(suffix, damaged(valid(suffix), changes, cut))
 
 
-@pytest.mark.parametrize("suffix", FORMATS)
+@pytest.mark.parametrize("suffix", list(FORMATS))
 def test_the_undamaged_file_is_read(suffix: str) -> None:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, f"a{suffix}")

@@ -5,13 +5,13 @@ The axis is integrated apart from the package: 20 steps per sample of the method
 
 from itertools import pairwise
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 from scipy import signal
 
+from armident.compiled import compiled
 from armident.configs import RobotConfig
-from armident.identify.experiment import Experiment
+from armident.identify.signals.experiments import Experiment
 
 Floats = NDArray[np.float64]
 
@@ -63,18 +63,9 @@ def recorded(
 ) -> Experiment:
     """A recording of random moves, the same for every seed; the noise differs.
 
-    Parameters
-    ----------
-    seed
-        Seed of the noise.
-    torque, pole
-        Standard deviation of the noise of the recorded force, N, and its pole: AR(1).
-    position
-        Standard deviation of the white noise of the encoder, m; it passes through the controller.
-    count
-        Encoder resolution, m; 0: none.
-    moves
-        Number of moves.
+    ``torque``, ``pole``: standard deviation of the noise of the recorded force, N, and its pole: AR(1). ``position``:
+    standard deviation of the white noise of the encoder, m; it passes through the controller. ``count``: encoder
+    resolution, m; 0: none.
     """
     rng = np.random.default_rng(seed)
     reference = _reference(moves)
@@ -102,7 +93,7 @@ def _reference(moves: int) -> Floats:
     return np.concatenate(parts)
 
 
-@numba.njit(cache=True)
+@compiled(kept=True, nogil=False)
 def _simulate(reference: Floats, noise: Floats, count: float) -> tuple[Floats, Floats]:
     """Recorded positions and forces (N,)."""
     q, force = np.empty(reference.size), np.empty(reference.size)

@@ -23,8 +23,9 @@ from scipy import stats
 
 from armident.configs import RobotConfig, Trajectory, load_robot, load_trajectory
 from armident.identify.effects.terms import arm_model
+from armident.identify.estimators.methods import METHODS, Method
 from armident.identify.identification.from_recording import experiments_from_recording
-from armident.identify.identification.options import METHODS, Method, Options
+from armident.identify.identification.options import Options
 from armident.identify.identification.pipeline import identify_experiment
 from armident.virtual_robot.inertias import plant_parameters
 from armident.virtual_robot.offline import simulate_recording
@@ -49,16 +50,9 @@ ROOT = Path(__file__).resolve().parents[2]
 class Runs:
     """Estimates of R runs and the truth.
 
-    Parameters
-    ----------
-    names, truth
-        Base parameters and their true values (b,).
-    seeds
-        Shape (R,).
-    theta, covariance
-        Shapes (R, b) and (R, b, b).
-    converged, stepped_back
-        Shape (R,): whether the iterations ended, and whether IDIM-PIV handed over to IDIM-IV.
+    ``names``, ``truth``: base parameters and their true values (b,); ``seeds``: shape (R,); ``theta``, ``covariance``:
+    shapes (R, b) and (R, b, b); ``converged``, ``stepped_back``: shape (R,): whether the iterations ended, and whether
+    IDIM-PIV handed over to IDIM-IV.
     """
 
     names: tuple[str, ...]
@@ -173,14 +167,8 @@ def campaign(
 ) -> Runs:
     """Run every seed that is not stored yet and gather all of them.
 
-    Parameters
-    ----------
-    folder
-        Cache; the runs go into a subfolder named after :func:`fingerprint`.
-    noise
-        Scale of the plant's noise; 1 is that of table B.4's standard deviations.
-    jobs
-        Processes at once.
+    ``folder``: cache; the runs go into a subfolder named after :func:`fingerprint`. ``noise``: scale of the plant's
+    noise; 1 is that of table B.4's standard deviations. ``jobs``: processes at once.
     """
     folder = folder / fingerprint(method, noise)
     folder.mkdir(parents=True, exist_ok=True)

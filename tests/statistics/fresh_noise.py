@@ -28,16 +28,9 @@ Array = NDArray[np.float64]
 class Motion:
     """Decimated equations of a simulated recording, M instants of n joints.
 
-    Parameters
-    ----------
-    instants
-        Equations, with the noise of the simulation.
-    own_noise
-        That noise in the filtered torques, (M, n), N m.
-    samples
-        Number of samples that the filters need for them.
-    seconds
-        Duration of the recording, s.
+    ``instants``: equations, with the noise of the simulation; ``own_noise``: that noise in the filtered torques,
+    (M, n), N m; ``samples``: number of samples that the filters need for them; ``seconds``: duration of the recording,
+    s.
     """
 
     instants: tuple[Instant, ...]
@@ -49,14 +42,7 @@ class Motion:
 class MotionRecorder:
     """Makes motions of recordings, with the filters of an estimator.
 
-    Parameters
-    ----------
-    estimator
-        The estimator, whose filters are copied.
-    robot
-        The robot.
-    period
-        SYNC period of the recordings, s.
+    ``estimator``: whose filters are copied; ``period``: SYNC period of the recordings, s.
     """
 
     def __init__(self, estimator: RecursiveEstimator, robot: RobotConfig, period: float) -> None:
@@ -70,15 +56,7 @@ class MotionRecorder:
         self._decimation = self._equations.decimation
 
     def record(self, recording: Recording, seed: int) -> Motion:
-        """Return the equations of a recording.
-
-        Parameters
-        ----------
-        recording
-            Simulated with the noise of ``seed``.
-        seed
-            Seed of its noise.
-        """
+        """Return the equations of a recording. ``recording``: simulated with the noise of ``seed``."""
         self._instants.clear()
         self._first = -1
         self._equations.restart()
@@ -97,10 +75,7 @@ class MotionRecorder:
     def filtered(self, torque: Array) -> Array:
         """Return a torque (N, n) behind the low-pass, decimated, (M, n).
 
-        Parameters
-        ----------
-        torque
-            Torque of the joints, (N, n), N m.
+        ``torque``: torque of the joints, (N, n), N m.
         """
         taps, factor = self._decimation.taps, self._decimation.factor
         rows: Array = upfirdn(taps, torque, 1, factor, axis=0)
@@ -129,17 +104,7 @@ class MotionRecorder:
 
 @dataclass
 class FreshNoise:
-    """Torque noise of an arm, drawn anew at each call.
-
-    Parameters
-    ----------
-    robot
-        Robot with the name of a virtual arm, n joints.
-    period
-        Sampling period, s.
-    random
-        Generator.
-    """
+    """Torque noise of an arm, drawn anew at each call. ``robot``: robot with the name of a virtual arm, n joints."""
 
     robot: RobotConfig
     period: float
@@ -150,13 +115,7 @@ class FreshNoise:
         self._keep = float(np.exp(-2 * np.pi * DISTURBANCE_HZ * self.period))
 
     def draw(self, samples: int) -> Array:
-        """Return measurement noise less disturbance, (N, n), N m, as the virtual arm has them.
-
-        Parameters
-        ----------
-        samples
-            Number of samples N.
-        """
+        """Return measurement noise less disturbance, (N, n), N m, as the virtual arm has them."""
         shape = (samples, self.robot.n)
         white = self.random.standard_normal(shape) * self._white
         fresh = self.random.standard_normal(shape) * (self._slow * np.sqrt(1 - self._keep**2))
@@ -168,10 +127,7 @@ class FreshNoise:
 def held(torque: Array) -> Array:
     """Return the mean of each torque and the one before, (N, n), as the estimator takes it.
 
-    Parameters
-    ----------
-    torque
-        Torque held from each sample to the next, (N, n), N m.
+    ``torque``: torque held from each sample to the next, (N, n), N m.
     """
     return 0.5 * (torque + np.vstack([torque[:1], torque[:-1]]))
 
@@ -179,16 +135,8 @@ def held(torque: Array) -> Array:
 def repeat(estimator: RecursiveEstimator, motion: Motion, noise: Array, factor: Array) -> None:
     """Let an estimator take a motion with other noise and another friction.
 
-    Parameters
-    ----------
-    estimator
-        The estimator.
-    motion
-        The motion.
-    noise
-        Filtered noise, (M, n), N m, in place of the motion's own.
-    factor
-        Friction of each joint relative to the reference, (n,).
+    ``noise``: filtered noise, (M, n), N m, in place of the motion's own; ``factor``: friction of each joint relative to
+    the reference, (n,).
     """
     reference = estimator.reference
     joint = np.maximum(reference.place, 0)

@@ -23,14 +23,7 @@ CHUNK = 500
 def write_repeated(path: Path, minutes: float, robot: str = "tx40", motion: str = "tx40_excitation") -> int:
     """Write a recording of a shipped virtual arm that repeats a shipped motion; return its number of samples.
 
-    Parameters
-    ----------
-    path
-        File to write.
-    minutes
-        Least duration, min.
-    robot, motion
-        Names of the robot and of its trajectory.
+    ``minutes``: least duration, min; ``robot``, ``motion``: names of the robot and of its trajectory.
     """
     once = simulate_recording(load_robot(robot), load_trajectory(f"trajectories/{motion}.yaml"), 1)
     every = max(stream.every for stream in once.streams.values())

@@ -8,9 +8,9 @@ import argparse
 from dataclasses import replace
 
 from armident.configs import load_robot
-from armident.identify.experiment import Experiment
 from armident.identify.identification.from_recording import experiments_from_recording
 from armident.identify.setup.check import check_setup
+from armident.identify.signals.experiments import Experiment
 from tests.fixtures.arms import FAST, recording
 
 MOTIONS = (("tx40", "tx40_excitation"), ("tx40", "tx40_1"), ("tx40", "tx40_2"), ("emps", "emps_1"))

@@ -19,22 +19,19 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.io import loadmat
 
 from armident.configs import RobotConfig, load_robot
 from armident.configs.loading import parse
 from armident.daq.interchange.importing import import_recording
-from armident.identify.diagnosis.diagnose import Diagnosis, diagnose
-from armident.identify.experiment import Experiment
+from armident.identify.diagnosis.diagnose import DiagnosisResult, run_diagnosis
 from armident.identify.identification.from_recording import experiments_from_recording
+from armident.identify.signals.experiments import Experiment
 from tests.conftest import REPOSITORY
-
-FORCE_PER_VOLT = 35.15065
-STANDSTILL_S = 7.5
-TX40_DT = 2e-4
+from tests.reproduction.recordings import measured_emps, measured_recording
+from tests.tools.markdown import table as markdown_table
 
 MOST_CPU_S = 60.0
-"""Most CPU time of a diagnosis, s: design page of the diagnosis, principle 9."""
+"""Most CPU time of a diagnosis, s: one that takes longer is not repeated while a person waits."""
 MOST_MEMORY_GB = 2.0
 """Most memory of a diagnosis, GB: the same."""
 CERTAIN = 0.9
@@ -65,27 +62,16 @@ class Measured:
     training: tuple[Experiment, ...]
     validation: tuple[Experiment, ...] = ()
 
-    def diagnosed(self) -> Diagnosis:
+    def diagnosed(self) -> DiagnosisResult:
         """With the defaults."""
-        return diagnose(self.training, self.validation, self.robot)
+        return run_diagnosis(self.training, self.validation, self.robot)
 
 
 def emps(data: Path, name: str) -> Experiment:
     """EMPS, force in N."""
-    file = loadmat(data / "emps" / name)
-    columns = {k: v.astype(float).reshape(-1, 1) for k, v in file.items() if not k.startswith("__")}
-    return Experiment(q=columns["qm"], tau=FORCE_PER_VOLT * columns["vir"], q_ref=columns["qg"], dt=1e-3)
-
-
-def tx40(data: Path, robot: RobotConfig) -> Experiment:
-    """Staubli TX40 until it stands still, joint side."""
-    q, tau = (
-        np.loadtxt(data / "tx40" / name, delimiter=",", skiprows=1)[: round(STANDSTILL_S / TX40_DT)]
-        for name in ("pos_read_data.csv", "curr_data.csv")
-    )
-    ratios = robot.transmission_matrix
-    q = np.ascontiguousarray(np.linalg.solve(ratios, q.T).T)
-    return Experiment(q=q, tau=tau @ ratios, q_ref=None, dt=TX40_DT)
+    found = measured_emps(data, name)
+    assert found is not None, name
+    return found.experiment
 
 
 def kuka(data: Path, robot: RobotConfig, number: int) -> Experiment:
@@ -116,7 +102,7 @@ def _emps(data: Path, training: str, validation: str | None) -> Measured:
 
 def _tx40(data: Path, *, coupled: bool) -> Measured:
     robot = load_robot("tx40")
-    seen = tx40(data, robot)
+    seen = measured_recording(data).experiment
     return Measured(robot if coupled else robot.model_copy(update={"couplings": ()}), (seen,))
 
 
@@ -153,7 +139,7 @@ MACHINES: dict[str, tuple[str, Callable[[Path], Measured]]] = {
 """Title, and how it is loaded."""
 
 
-def said(found: Diagnosis) -> list[str]:
+def said(found: DiagnosisResult) -> list[str]:
     """Lines that tell a diagnosis."""
     document = found.document
     gap = document.gap.validation
@@ -169,8 +155,6 @@ def said(found: Diagnosis) -> list[str]:
         )
         gap_of_joint = f"{f.gap_before:.2f} -> {f.gap_after:.2f} %"
         lines.append(f"  {f.effect} of {where}, confidence {f.confidence:.2f}, {gap_of_joint}: {values}")
-    if document.considered:
-        lines.append("  considered: " + ", ".join(f"{f.effect} of {f.joint}" for f in document.considered))
     for u in document.unexplained:
         lines.append(f"  unexplained: {u.joint}, {100 * u.share_of_residual:.0f} % varies with {u.varies_with}")
     return lines
@@ -184,20 +168,9 @@ def _each(values: NDArray[np.float64]) -> str:
 class Row:
     """Result of one machine.
 
-    Parameters
-    ----------
-    name, title
-        Name and title of the machine.
-    cpu_s
-        CPU time of user and system, all of the process, s.
-    memory_gb
-        Largest resident memory of the process, GB.
-    before, after
-        Held-out error of all joints without and with the findings, percent.
-    flags
-        Limits that it exceeds.
-    lines
-        Lines that tell the diagnosis.
+    ``cpu_s``: CPU time of user and system, all of the process, s; ``memory_gb``: largest resident memory of the
+    process, GB; ``before``, ``after``: held-out error of all joints without and with the findings, percent; ``flags``:
+    limits that it exceeds; ``lines``: lines that tell the diagnosis.
     """
 
     name: str
@@ -210,18 +183,8 @@ class Row:
     lines: tuple[str, ...]
 
 
-def flags_of(found: Diagnosis, cpu_s: float, memory_gb: float) -> tuple[str, ...]:
-    """Limits that a diagnosis exceeds.
-
-    Parameters
-    ----------
-    found
-        The diagnosis.
-    cpu_s
-        Its CPU time, s.
-    memory_gb
-        Its largest memory, GB.
-    """
+def flags_of(found: DiagnosisResult, cpu_s: float, memory_gb: float) -> tuple[str, ...]:
+    """Limits that a diagnosis exceeds. ``cpu_s``: its CPU time, s; ``memory_gb``: its largest memory, GB."""
     flags = []
     if cpu_s > MOST_CPU_S:
         flags.append(f"over {MOST_CPU_S:.0f} s")
@@ -237,15 +200,7 @@ def flags_of(found: Diagnosis, cpu_s: float, memory_gb: float) -> tuple[str, ...
 
 
 def measured(name: str, data: Path) -> Row:
-    """Diagnose one machine; meant for a process of its own.
-
-    Parameters
-    ----------
-    name
-        Name of the machine.
-    data
-        Folder of the recordings.
-    """
+    """Diagnose one machine; meant for a process of its own. ``data``: folder of the recordings."""
     title, load = MACHINES[name]
     found = load(data).diagnosed()
     used = resource.getrusage(resource.RUSAGE_SELF)
@@ -258,31 +213,22 @@ def measured(name: str, data: Path) -> Row:
 def alone(name: str, data: Path) -> Row:
     """Diagnose one machine in a new process, so that memory and time are its own.
 
-    Parameters
-    ----------
-    name
-        Name of the machine.
-    data
-        Folder of the recordings.
+    ``data``: folder of the recordings.
     """
     with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
         return pool.submit(measured, name, data).result()
 
 
 def table(rows: list[Row]) -> str:
-    """Markdown table of the results.
-
-    Parameters
-    ----------
-    rows
-        Results of the machines.
-    """
-    lines = ["| machine | CPU, s | memory, GB | held-out error, % | flags |", "| --- | --- | --- | --- | --- |"]
-    lines += [
-        f"| {r.title} | {r.cpu_s:.0f} | {r.memory_gb:.2f} | {r.before:.2f} -> {r.after:.2f} | {'; '.join(r.flags)} |"
-        for r in rows
-    ]
-    return "\n".join(lines)
+    """Markdown table of the results."""
+    headings = ["machine", "CPU, s", "memory, GB", "held-out error, %", "flags"]
+    return markdown_table(
+        headings,
+        (
+            [r.title, f"{r.cpu_s:.0f}", f"{r.memory_gb:.2f}", f"{r.before:.2f} -> {r.after:.2f}", "; ".join(r.flags)]
+            for r in rows
+        ),
+    )
 
 
 def main() -> int:

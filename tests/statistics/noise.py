@@ -14,10 +14,11 @@ from numpy.typing import NDArray
 from scipy import signal
 
 from armident.configs import RobotConfig
-from armident.identify.experiment import Experiment
+from armident.identify.estimators.methods import Method
 from armident.identify.identification.from_recording import experiments_from_recording
-from armident.identify.identification.options import Method, Options
+from armident.identify.identification.options import Options
 from armident.identify.identification.pipeline import identify_experiment
+from armident.identify.signals.experiments import Experiment
 from armident.virtual_robot.offline import simulate_recording, with_encoder_counts
 from tests.statistics import axis
 from tests.statistics.coverage import ESSENTIAL, SIGMAS, trajectory, truth
@@ -41,14 +42,8 @@ FIRST_SEED = 501
 class Setting:
     """One kind of noise.
 
-    Parameters
-    ----------
-    name
-        Name in the table.
-    torque, pole
-        Torque noise over the rms torque, and its pole.
-    encoder
-        ``fine``, ``noisy`` (white) or ``coarse`` (counts).
+    ``name``: name in the table; ``torque``, ``pole``: torque noise over the rms torque, and its pole; ``encoder``:
+    ``fine``, ``noisy`` (white) or ``coarse`` (counts).
     """
 
     name: str
@@ -67,15 +62,7 @@ SETTINGS = (
 
 
 def axis_recording(setting: Setting, seed: int) -> Experiment:
-    """A recording of the axis.
-
-    Parameters
-    ----------
-    setting
-        Kind of noise.
-    seed
-        Seed of the noise.
-    """
+    """A recording of the axis. ``setting``: kind of noise."""
     rms = float(np.sqrt(np.mean(axis.recorded(0).tau ** 2)))
     position = ENCODER if setting.encoder == "noisy" else 0.0
     count = ENCODER if setting.encoder == "coarse" else 1e-7
@@ -92,12 +79,7 @@ def _noiseless_tx40(counts: float | None) -> Experiment:
 def tx40_recording(setting: Setting, seed: int) -> Experiment:
     """A recording of the virtual TX40; noise of the encoders is added to the recorded positions only.
 
-    Parameters
-    ----------
-    setting
-        Kind of noise.
-    seed
-        Seed of the noise.
+    ``setting``: kind of noise.
     """
     clean, rng = _noiseless_tx40(COARSE if setting.encoder == "coarse" else None), np.random.default_rng(seed)
     size = clean.tau.shape
@@ -114,18 +96,9 @@ def tx40_recording(setting: Setting, seed: int) -> Experiment:
 class Row:
     """Coverage of one robot, noise and method.
 
-    Parameters
-    ----------
-    robot, noise, method
-        Names.
-    covered
-        Share of intervals that hold the true value, of all runs and parameters.
-    least
-        Share of the parameter with the fewest.
-    scatter
-        Root mean square of the errors in standard deviations.
-    doubtful
-        Share of runs whose intervals are called doubtful.
+    ``covered``: share of intervals that hold the true value, of all runs and parameters; ``least``: share of the
+    parameter with the fewest; ``scatter``: root mean square of the errors in standard deviations; ``doubtful``: share
+    of runs whose intervals are called doubtful.
     """
 
     robot: str
@@ -147,16 +120,8 @@ def row(
 ) -> Row:
     """Identify simulated recordings and compare the intervals with the true values.
 
-    Parameters
-    ----------
-    name, robot
-        Robot and its name in the table.
-    record
-        ``record(setting, seed)`` to a recording.
-    setting, method
-        Kind of noise and method.
-    runs
-        Number of recordings.
+    ``name``, ``robot``: robot and its name in the table; ``record``: ``record(setting, seed)`` to a recording;
+    ``setting``, ``method``: kind of noise and method.
     """
     errors, doubts = [], 0
     for seed in range(FIRST_SEED, FIRST_SEED + runs):

@@ -21,7 +21,7 @@ from armident.configs import Trajectory, load_robot, load_trajectory
 from armident.configs.schema.scenario import HiddenEffect, Scenario
 from armident.daq.recording import Recording
 from armident.identify.documents.identification import IdentificationDocument
-from armident.identify.identification.api import identify_recording
+from armident.identify.identification.identify_recording import identify_recording
 from armident.identify.monitoring.recursive.estimator import RecursiveEstimator
 from armident.identify.monitoring.recursive.replay import blocks_of
 from armident.virtual_robot.offline import simulate_recording
@@ -138,16 +138,9 @@ def repeated_pieces(estimator: RecursiveEstimator, hours: float, seed: int) -> I
 def healthy_life(hours: float, seed: int = 1, *, simulated: bool = False, progress: bool = False) -> Life:
     """Let a healthy arm live on the estimator.
 
-    Parameters
-    ----------
-    hours
-        Length, h.
-    seed
-        Seed of the noise and of the order of motions.
-    simulated
-        True: every second is simulated and filtered; otherwise simulated motions are repeated with fresh noise.
-    progress
-        True to print a line for every tenth of an hour.
+    ``hours``: length, h. ``seed``: seed of the noise and of the order of motions. ``simulated``: True: every second is
+    simulated and filtered; otherwise simulated motions are repeated with fresh noise. ``progress``: True to print a
+    line for every tenth of an hour.
     """
     robot = load_robot("tx40")
     estimator = RecursiveEstimator(robot, reference(), 1.0 / PERIOD_S)
@@ -194,17 +187,9 @@ def seconds_to_alarm(
 ) -> float | None:
     """Time from the change of a joint's friction to its alarm, s; ``None``: no alarm, or one of another joint.
 
-    Parameters
-    ----------
-    joint, motion, seed
-        The joint, the trajectory that is repeated, and the seed of the noise.
-    factor
-        The new friction, relative to that before.
-    period
-        SYNC period, s.
-    lived
-        Estimator after a healthy life (which is copied) and the friction factors of the joints at its end; without
-        it, a new estimator sees the motion four times before the change.
+    ``joint``, ``motion``, ``seed``: the joint, the trajectory that is repeated, and the seed of the noise. ``factor``:
+    the new friction, relative to that before. ``lived``: estimator after a healthy life (which is copied) and the
+    friction factors of the joints at its end; without it, a new estimator sees the motion four times before the change.
     """
     robot = load_robot("tx40")
     syncs = round(BLOCK * PERIOD_S / period)

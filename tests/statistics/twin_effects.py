@@ -49,11 +49,11 @@ def span(limits: Limits) -> float:
 
 
 SIZES: dict[str, Callable[[Limits], dict[str, float]]] = {
-    "asymmetric_viscous_friction": lambda j: {"ratio": 0.5},
-    "asymmetric_coulomb_friction": lambda j: {"ratio": 0.3},
+    "asymmetric_viscous_friction": lambda j: {"fva": 0.005 * j.torque / j.velocity},
+    "asymmetric_coulomb_friction": lambda j: {"fca": 0.005 * j.torque},
     "stribeck_friction": lambda j: {"extra": 0.05 * j.torque},
     "nonlinear_viscous_friction": lambda j: {"thinning": 0.4},
-    "load_dependent_friction": lambda j: {"coefficient": 0.2},
+    "load_dependent_friction": lambda j: {"fcl": 0.2},
     "presliding_friction": lambda j: {"deflection": 1e-3 * j.velocity},
     "position_dependent_friction": lambda j: {"ratio": 0.5},
     "friction_drift": lambda j: {"change": 0.5, "time_constant": 2.0},
@@ -121,14 +121,7 @@ def healthy_signals(config: Path) -> Signals:
 def change(config: Path, effect: str, joint: int, other: int) -> tuple[float, float]:
     """Return the largest change of a signal by an effect, and the largest signal, over those of the healthy arm.
 
-    Parameters
-    ----------
-    config
-        Robot.
-    effect
-        Key of the effect.
-    joint, other
-        Joint of the effect, from 0, and the other joint of an effect between two.
+    ``joint``, ``other``: joint of the effect, from 0, and the other joint of an effect between two.
     """
     joints, spec = twin(config).robot.joints, EFFECTS[effect]
     place = joints[0 if spec.first_joint else joint]

@@ -38,15 +38,7 @@ def main(arguments: Sequence[str]) -> None:
 
 
 def build(python: str, folder: Path) -> Path:
-    """Return a wheel of the checkout.
-
-    Parameters
-    ----------
-    python
-        Python for which it is built.
-    folder
-        Folder of the wheel.
-    """
+    """Return a wheel of the checkout. ``python``: Python for which it is built."""
     run(python, "-m", "pip", "wheel", "-q", "--no-deps", "-w", str(folder), str(REPOSITORY), cwd=REPOSITORY)
     (wheel,) = folder.glob("*.whl")
     return wheel
@@ -55,14 +47,7 @@ def build(python: str, folder: Path) -> Path:
 def install(python: str, folder: Path, requirement: str) -> Path:
     """Install a wheel into a new environment and return its site-packages.
 
-    Parameters
-    ----------
-    python
-        Python of the environment.
-    folder
-        Folder of the environment.
-    requirement
-        The wheel, with extras in brackets.
+    ``requirement``: the wheel, with extras in brackets.
     """
     run(python, "-m", "venv", str(folder), cwd=folder.parent)
     run(str(folder / "bin/python"), "-m", "pip", "install", "-q", requirement, cwd=folder)
@@ -73,10 +58,7 @@ def install(python: str, folder: Path, requirement: str) -> Path:
 def size(packages: Path) -> str:
     """Return number and size of the packages, without what every environment holds.
 
-    Parameters
-    ----------
-    packages
-        The folder site-packages.
+    ``packages``: the folder site-packages.
     """
     present = (file for file in packages.rglob("*") if file.is_file() and not file.is_symlink())
     files = [file for file in present if not file.relative_to(packages).parts[0].startswith(OF_THE_ENVIRONMENT)]
@@ -87,15 +69,7 @@ def size(packages: Path) -> str:
 
 
 def run(*command: str, cwd: Path) -> None:
-    """Run a command outside the checkout's import path.
-
-    Parameters
-    ----------
-    command
-        The command.
-    cwd
-        Its working directory.
-    """
+    """Run a command outside the checkout's import path. ``cwd``: its working directory."""
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
     subprocess.run(command, cwd=cwd, env=environment | {"PIP_DISABLE_PIP_VERSION_CHECK": "1"}, check=True)
 

@@ -1,4 +1,4 @@
-"""Prints a hash of what the matcher makes of random streams of frames with faults, and how its loops are compiled.
+"""Prints a hash of what the matcher makes of random streams of frames with faults.
 
 It needs the base of armident alone, so that installations can be compared: ``python tests/tools/matched_streams.py``.
 ``--cost`` prints the processor time per frame of a stream without faults instead.
@@ -12,7 +12,6 @@ import numpy as np
 
 from armident.daq.matching.assembler import Assembler, Batch, TpdoStream
 from armident.drivers.can.frames import FD_FRAME, FRAME, Frames
-from armident.drivers.compiled import MODE
 
 PERIOD_NS = 200_000
 T0 = 1_700_000_000_000_000_000
@@ -21,28 +20,25 @@ JOINTS = 4
 
 
 def main() -> None:
-    """Print the mode of compilation, and the hash or the cost."""
+    """Print the hash or the cost."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--cost", action="store_true", help="Print the processor time per frame, us.")
     parser.add_argument("--seeds", type=int, default=8, help="Number of random streams.")
     options = parser.parse_args()
     if options.cost:
-        print(f"{MODE}: {cost_us():.2f} us a frame")
+        print(f"{cost_us():.2f} us a frame")
         return
     result = hashlib.sha256()
     for seed in range(options.seeds):
         for text in matched(seed):
             result.update(text)
-    print(f"{MODE}: {result.hexdigest()}")
+    print(result.hexdigest())
 
 
 def matched(seed: int) -> list[bytes]:
     """Return rows, gaps and counters of a stream with lost, late, repeated and short frames.
 
-    Parameters
-    ----------
-    seed
-        Seed of the faults; it also chooses packed samples, two buses and a foreign SYNC master.
+    ``seed``: seed of the faults; it also chooses packed samples, two buses and a foreign SYNC master.
     """
     random = np.random.default_rng(seed)
     pack, buses, foreign = (4 if seed % 3 == 2 else 1), 1 + seed % 2, seed % 4 == 3
@@ -62,13 +58,7 @@ def matched(seed: int) -> list[bytes]:
 
 
 def content(batch: Batch) -> list[bytes]:
-    """Return what a batch holds.
-
-    Parameters
-    ----------
-    batch
-        Result of the matcher.
-    """
+    """Return what a batch holds. ``batch``: result of the matcher."""
     arrays = [array for rows in batch.rows.values() for array in (rows.sync, rows.t_ns, rows.data)]
     return [*(np.ascontiguousarray(array).tobytes() for array in arrays), repr(batch.gaps).encode()]
 
@@ -76,16 +66,7 @@ def content(batch: Batch) -> list[bytes]:
 def faulty_frames(random: np.random.Generator, start: int, joints: list[int], pack: int) -> Frames:
     """Return the frames of a bus during `BATCH` SYNCs.
 
-    Parameters
-    ----------
-    random
-        Source of the faults.
-    start
-        Number of the first SYNC.
-    joints
-        Joints whose drives are on this bus.
-    pack
-        Samples in a TPDO.
+    ``start``: number of the first SYNC; ``joints``: joints whose drives are on this bus; ``pack``: samples in a TPDO.
     """
     found: list[tuple[int, int, int, int]] = []
     for k in range(start, start + BATCH):
@@ -109,10 +90,7 @@ def faulty_frames(random: np.random.Generator, start: int, joints: list[int], pa
 def cost_us(joints: int = 6, batches: int = 40) -> float:
     """Return the processor time per frame of a stream without faults, us.
 
-    Parameters
-    ----------
-    joints, batches
-        Number of drives, and of batches of `BATCH` SYNCs.
+    ``joints``, ``batches``: number of drives, and of batches of `BATCH` SYNCs.
     """
     stream = TpdoStream("samples", 1, tuple(range(0x181, 0x181 + joints)), 8)
     assembler = Assembler((stream,), [str(joint) for joint in range(joints)], PERIOD_NS)

@@ -46,8 +46,11 @@ VALUES = {
 }
 """Renamed words in the values of documents, old to new, also inside a longer text."""
 
-ADDED = {"further_recordings"}
-"""New keys, which older documents lack; null counts as absent."""
+OPTIONAL = {"further_recordings", "considered"}
+"""Keys that older or newer documents lack; null and an empty list count as absent."""
+
+EXTENDED = {"criteria"}
+"""Mappings to which newer documents add keys."""
 
 SKIPPED = {"timing_s", "versions", "path", "sha256"}
 """Keys whose values may differ wherever they stand: they tell of a run and its machine."""
@@ -105,18 +108,8 @@ TAKES: dict[str, tuple[str, ...]] = {
 class Case:
     """One command whose document is kept.
 
-    Parameters
-    ----------
-    name
-        Its folder.
-    command
-        ``identify`` or ``diagnose``.
-    recordings
-        Keys of ``TAKES``.
-    options
-        Further arguments.
-    needs
-        Case whose document the options name.
+    ``command``: ``identify`` or ``diagnose``; ``recordings``: keys of ``TAKES``; ``options``: further arguments;
+    ``needs``: case whose document the options name.
     """
 
     name: str
@@ -168,23 +161,9 @@ CASES: tuple[Case, ...] = (
 def record(armident: Path, data: Path, out: Path, recordings: Path | None, cases: Sequence[Case]) -> int:
     """Make the recordings, run the cases, and keep what comes out.
 
-    Parameters
-    ----------
-    armident
-        The command.
-    data
-        Folder of the measured data.
-    out
-        Folder of all cases; made if it is absent. Its recordings are used if it has any, its cases are run again.
-    recordings
-        Folder of recordings to use; those that it lacks are made.
-    cases
-        What to run.
-
-    Returns
-    -------
-    int
-        Exit code: 1 if a recording could not be made.
+    ``data``: folder of the measured data. ``out``: folder of all cases; made if it is absent. Its recordings are used
+    if it has any, its cases are run again. ``recordings``: folder of recordings to use; those that it lacks are made.
+    ``cases``: what to run. Returns the exit code: 1 if a recording could not be made.
     """
     (out / RECORDINGS).mkdir(parents=True, exist_ok=True)
     for name in dict.fromkeys(name for case in cases for name in case.recordings):
@@ -206,13 +185,7 @@ def record(armident: Path, data: Path, out: Path, recordings: Path | None, cases
 
 
 def provide(name: str, armident: Path, data: Path, out: Path, recordings: Path | None) -> str | None:
-    """Put a recording where the cases look for it.
-
-    Returns
-    -------
-    str or None
-        What went wrong.
-    """
+    """Put a recording where the cases look for it. Returns what went wrong."""
     target = out / recording_file(name)
     if recordings is not None and (kept := recordings / target.name).is_file():
         if kept.resolve() != target.resolve():
@@ -237,10 +210,7 @@ def provide(name: str, armident: Path, data: Path, out: Path, recordings: Path |
 def run(armident: Path, arguments: Sequence[str], folder: Path) -> tuple[int, str]:
     """Run the command in a folder.
 
-    Returns
-    -------
-    tuple of int and str
-        Exit code, and the last line on standard error if the command did not do its work.
+    Returns the exit code, and the last line on standard error if the command did not do its work.
     """
     done = subprocess.run(
         [str(armident), *arguments],
@@ -350,7 +320,9 @@ class Comparison:
         """Compare two objects, key by key."""
         for key in [*before, *(key for key in after if key not in before)]:
             place = f"{where}.{key}" if where else key
-            if key in SKIPPED or (key in ADDED and before.get(key) is None and after.get(key) is None):
+            if key in SKIPPED or (key in OPTIONAL and not before.get(key) and not after.get(key)):
+                continue
+            if key not in before and where.rpartition(".")[2] in EXTENDED:
                 continue
             if key not in before or key not in after:
                 self.differences.append(f"{place}: only {'before' if key in before else 'after'}")
@@ -443,13 +415,7 @@ def remarks(before: Mapping[str, Any], after: Mapping[str, Any]) -> list[str]:
 
 
 def compare_case(before: Path, after: Path) -> tuple[str, list[str]]:
-    """Compare the folders of one case.
-
-    Returns
-    -------
-    tuple of str and list of str
-        What was compared, and the differences.
-    """
+    """Compare the folders of one case. Returns what was compared, and the differences."""
     if absent := [str(folder) for folder in (before, after) if not (folder / RUN).is_file()]:
         return "nothing compared", [f"no {RUN} in {folder}" for folder in absent]
     old, new = (json.loads((folder / RUN).read_text(encoding="utf-8")) for folder in (before, after))
@@ -483,17 +449,8 @@ def compare_case(before: Path, after: Path) -> tuple[str, list[str]]:
 def compare(before: Path, after: Path, only: Sequence[str]) -> int:
     """Compare all cases of two folders and print a line for each.
 
-    Parameters
-    ----------
-    before, after
-        What ``record`` wrote.
-    only
-        Names of cases; empty: all that either folder has.
-
-    Returns
-    -------
-    int
-        Exit code: 0 if nothing differs, 1 if anything does, 2 if there is nothing to compare.
+    ``before``, ``after``: what ``record`` wrote. ``only``: names of cases; empty: all that either folder has. Returns
+    the exit code: 0 if nothing differs, 1 if anything does, 2 if there is nothing to compare.
     """
     there = {path.parent.name for folder in (before, after) for path in folder.glob(f"*/{RUN}")}
     known = [case.name for case in CASES]

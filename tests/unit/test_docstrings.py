@@ -1,10 +1,12 @@
-"""Every parameter of a public function and of a command is documented; no docstring begins with a question word."""
+"""Docstrings are complete where somebody outside calls (`DOOR`) and short elsewhere."""
 
 import ast
+import fnmatch
 import importlib.metadata
 import inspect
 import re
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any, get_type_hints
@@ -12,22 +14,54 @@ from typing import Any, get_type_hints
 import pytest
 
 import armident
+import armident.daq.recording
 from armident.daq.cli import GROUP
 from armident.identify.api import identify
 
-PACKAGES = ("configs", "drivers", "daq", "identify", "virtual_robot", "src/armident")
+PACKAGES = ("configs", "drivers", "daq", "identify", "virtual_robot", "src/armident", "src/armident/testing")
+DOOR: dict[str, set[str] | None] = {
+    "configs/__init__.py": None,
+    "configs/errors.py": None,
+    "configs/loading.py": None,
+    "configs/schema/*": None,
+    "daq/api.py": None,
+    "daq/recording/*": set(armident.daq.recording.__all__),
+    "identify/api/*": None,
+    "identify/documents/*": None,
+    "identify/effects/effect.py": None,
+    "identify/estimators/*": None,
+    "identify/model_export/exported_model.py": None,
+    "identify/robot/motion.py": {"Motion"},
+    "identify/identification/robot_model.py": None,
+    "src/armident/__init__.py": None,
+    "src/armident/testing/*": None,
+    "virtual_robot/api.py": None,
+}
+"""Files whose public objects have complete docstrings, with the names of these objects; ``None``: all."""
+FEW_LINES = 10
+"""Lines of code of a short function."""
+ENOUGH = 10
+"""Lines of a docstring that before the parameters that a short function may have even if its code is shorter."""
+FILLERS = re.compile(
+    r"an?|the|of|to|for|with|and|or|from|as|by|in|on|at|is|are|be|its?|their|this|that|these|which|each|every|given|used"
+    r"|values?|object|s|si"
+)
+"""Words that say nothing."""
 ROOT = Path(__file__).resolve().parents[2]
 RIDDLE = re.compile(r"(What|Whether|Which|How|Where|Who|That)\b")
 
 
-def documented(docstring: str | None) -> set[str]:
-    """Names in the Parameters section of a numpydoc docstring."""
+def section(docstring: str | None) -> str:
+    """Text of the Parameters section of a numpydoc docstring; empty if it has none."""
     match = re.search(
         r"Parameters\n-+\n(.*?)(?=\n\n[A-Z][A-Za-z ]+\n-+\n|\Z)", inspect.cleandoc(docstring or ""), re.DOTALL
     )
-    if match is None:
-        return set()
-    lines = [line for line in match[1].splitlines() if line and not line.startswith(" ")]
+    return match[1] if match else ""
+
+
+def documented(docstring: str | None) -> set[str]:
+    """Names in the Parameters section of a numpydoc docstring."""
+    lines = [line for line in section(docstring).splitlines() if line and not line.startswith(" ")]
     return {name.strip().lstrip("*") for line in lines for name in line.split(" : ")[0].split(",")}
 
 
@@ -54,17 +88,41 @@ def test_every_parameter_of_the_public_api_is_documented(
     assert not missing, f"{name}: not in its Parameters section: {', '.join(missing)}"
 
 
+@dataclass(frozen=True)
+class Place:
+    """A class, function or method, its names from the module on, and the parameters that base classes document."""
+
+    path: str
+    names: tuple[str, ...]
+    node: ast.ClassDef | ast.FunctionDef
+    inherited: frozenset[str] = frozenset()
+
+    def __str__(self) -> str:
+        return f"{self.path}:{self.node.lineno} {'.'.join(self.names)}"
+
+    @property
+    def docstring(self) -> str:
+        return ast.get_docstring(self.node) or ""
+
+    @property
+    def is_at_door(self) -> bool:
+        if any(name.startswith("_") for name in self.names):
+            return False
+        rows = [names for pattern, names in DOOR.items() if fnmatch.fnmatch(self.path, pattern)]
+        return any(names is None or self.names[0] in names for names in rows)
+
+
 @cache
-def functions() -> tuple[tuple[str, ast.FunctionDef, set[str]], ...]:
-    """Top-level functions and methods of every package, with their places and what base classes document of them."""
-    return tuple(_functions())
+def places() -> tuple[Place, ...]:
+    """Top-level functions, classes and methods of every package."""
+    return tuple(_places())
 
 
-def _functions() -> Iterator[tuple[str, ast.FunctionDef, set[str]]]:
+def _places() -> Iterator[Place]:
     modules = {
-        path.relative_to(ROOT): ast.parse(path.read_text(encoding="utf-8")).body
+        path.relative_to(ROOT).as_posix(): ast.parse(path.read_text(encoding="utf-8")).body
         for package in PACKAGES
-        for path in sorted((ROOT / package).glob("**/*.py" if package != "src/armident" else "*.py"))
+        for path in sorted((ROOT / package).glob("*.py" if package.startswith("src") else "**/*.py"))
     }
     classes = {node.name: node for body in modules.values() for node in body if isinstance(node, ast.ClassDef)}
 
@@ -77,32 +135,105 @@ def _functions() -> Iterator[tuple[str, ast.FunctionDef, set[str]]]:
 
     for path, body in modules.items():
         for node in body:
-            for member in node.body if isinstance(node, ast.ClassDef) else [node]:
+            if isinstance(node, ast.ClassDef | ast.FunctionDef):
+                yield Place(path, (node.name,), node)
+            for member in node.body if isinstance(node, ast.ClassDef) else []:
                 if isinstance(member, ast.FunctionDef):
-                    above = inherited(node, member.name) if isinstance(node, ast.ClassDef) else set()
-                    yield f"{path}:{member.lineno} {member.name}", member, above
+                    above = frozenset(inherited(node, member.name)) if isinstance(node, ast.ClassDef) else frozenset()
+                    yield Place(path, (node.name, member.name), member, above)
 
 
+def words(text: str) -> set[str]:
+    """Words of a text without fillers and endings; names are split."""
+    text = re.sub(r"([a-z0-9])([A-Z])", r"\1 \2", text).replace("_", " ").lower()
+    return {
+        re.sub(r"(?<=...)(s|es|ed|ing)$", "", word)
+        for word in re.findall(r"[a-z]+", text)
+        if not FILLERS.fullmatch(word)
+    }
+
+
+def restating(place: Place) -> Iterator[str]:
+    """Entries of a Parameters section whose words are all those of the name, the type and the summary."""
+    if not (entries := section(place.docstring)):
+        return
+    types = {a.arg: ast.unparse(a) for a in ast.walk(place.node) if isinstance(a, ast.arg)}
+    types |= {
+        ast.unparse(a.target): ast.unparse(a.annotation) for a in ast.walk(place.node) if isinstance(a, ast.AnnAssign)
+    }
+    summary = place.docstring.partition("\n")[0]
+    for names, text in re.findall(r"^(\S.*)\n((?:    .*\n?)+)", entries, re.MULTILINE):
+        own = words(names) | words(" ".join(types.get(name.strip(" *"), "") for name in names.split(",")))
+        said = words(re.sub(r",? (s|Hz|ns|us|ms)\.?$", "", text.strip()))
+        if (
+            not re.search(r"[\d`(:]|None|[Dd]efault|\bnot\b|\bonly\b", text)
+            and said & own
+            and said <= own | words(summary)
+        ):
+            yield f"{names}: {text.strip()}"
+
+
+@cache
 def commands() -> dict[str, Callable[..., Any]]:
     """Functions of the command line by the text ``module:function`` of their entry points."""
     return {point.value: point.load() for point in importlib.metadata.entry_points(group=GROUP)}
 
 
-@pytest.mark.slow
-def test_every_parameter_of_a_public_function_is_documented() -> None:
-    of_commands = {f"{value.partition(':')[0].replace('.', '/')} {value.partition(':')[2]}" for value in commands()}
+def is_fixture(node: ast.FunctionDef) -> bool:
+    """True for the fixtures of pytest, whose arguments are fixtures."""
+    return any("fixture" in ast.unparse(each) for each in node.decorator_list)
+
+
+def is_command(place: Place) -> bool:
+    """True for the functions of commands, whose docstrings are help texts."""
+    module = place.path.removeprefix("src/armident/").removesuffix(".py").replace("/", ".")
+    return f"armident.{module}:{place.names[-1]}" in commands() or any(
+        "typer" in ast.unparse(each) for each in place.node.decorator_list
+    )
+
+
+def test_every_parameter_at_the_door_is_documented() -> None:
     lacking = []
-    for place, node, inherited in functions():
-        path, _, rest = place.partition(":")
-        module = path.removeprefix("src/armident/").removesuffix(".py")
-        if f"armident/{module} {rest.partition(' ')[2]}" in of_commands:
-            continue
-        names = [a.arg for a in (*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs)]
-        names = [name for name in names if name not in ("self", "cls")]
-        missing = set(names) - documented(ast.get_docstring(node)) - inherited
-        if len(names) > 1 and not node.name.startswith("_") and missing:
-            lacking.append(f"{place}: {', '.join(sorted(missing))}")
+    for place in places():
+        if place.is_at_door and isinstance(place.node, ast.FunctionDef) and not is_fixture(place.node):
+            names = [a.arg for a in (*place.node.args.posonlyargs, *place.node.args.args, *place.node.args.kwonlyargs)]
+            names = [name for name in names if name not in ("self", "cls")]
+            missing = set(names) - documented(place.docstring) - place.inherited
+            if len(names) > 1 and missing:
+                lacking.append(f"{place}: document {', '.join(sorted(missing))}")
     assert not lacking, "\n".join(lacking)
+
+
+def test_no_entry_behind_the_door_restates_its_name() -> None:
+    found = [
+        f"{place}: drop the entry {entry}" for place in places() if not place.is_at_door for entry in restating(place)
+    ]
+    assert not found, "\n".join(found)
+
+
+def test_returns_and_raises_behind_the_door_are_sentences() -> None:
+    found = [
+        f"{place}: write the section {match[1]} as a sentence, or drop it"
+        for place in places()
+        if not place.is_at_door
+        and (match := re.search(r"^(Returns|Yields|Raises)\n-+$", place.docstring, re.MULTILINE))
+    ]
+    assert not found, "\n".join(found)
+
+
+def test_text_of_a_short_function_is_not_longer_than_its_code() -> None:
+    """Without its Parameters section, whose entries each say something."""
+    found = []
+    for place in places():
+        if isinstance(place.node, ast.ClassDef) or place.is_at_door or not place.docstring or is_command(place):
+            continue
+        first = place.node.body[0]
+        code = (place.node.end_lineno or 0) - (first.end_lineno or 0)
+        if code < FEW_LINES and (lines := len(place.docstring.partition("\n\nParameters\n")[0].splitlines())) > max(
+            code, ENOUGH
+        ):
+            found.append(f"{place}: {lines} lines of text for {code} lines of code")
+    assert not found, "\n".join(found)
 
 
 def test_every_parameter_of_a_command_has_a_help_text() -> None:
@@ -117,5 +248,5 @@ def test_every_parameter_of_a_command_has_a_help_text() -> None:
 
 
 def test_no_docstring_begins_with_a_question_word() -> None:
-    found = [place for place, node, _ in functions() if RIDDLE.match(ast.get_docstring(node) or "")]
+    found = [str(place) for place in places() if RIDDLE.match(place.docstring)]
     assert not found, "\n".join(found)

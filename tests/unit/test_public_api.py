@@ -1,6 +1,7 @@
 """``import armident``: quick to import, complete, and its results print, show themselves and convert."""
 
 import doctest
+import importlib.metadata
 import json
 import subprocess
 import sys
@@ -8,13 +9,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 import armident
 from armident.daq.recording import write_recording
 from tests.fixtures import arms
 
 REPOSITORY = Path(__file__).resolve().parents[2]
-DIAGNOSE = "armident.identify.api.diagnosis.diagnose"
+DIAGNOSE = "armident.identify.api.diagnosis_api.diagnose"
 
 
 @pytest.fixture(scope="module")
@@ -27,6 +29,92 @@ def result(recording: armident.Recording) -> armident.Identification:
     return armident.identify(recording, method="idim-ls")
 
 
+@pytest.fixture(scope="module")
+def axis() -> armident.Identification:
+    return armident.identify(arms.recording("emps", "emps_1", 1, period=arms.FAST), method="idim-ls")
+
+
+def motion(samples: int = 1500) -> tuple[NDArray[np.float64], ...]:
+    """Times, positions, torques and reference of an axis, (N,) each, within the limits of the EMPS."""
+    t = np.arange(samples) / 1000.0
+    return t, 0.1 * np.sin(5.0 * t), 40.0 * np.cos(5.0 * t), 0.1 * np.sin(5.0 * t + 0.01)
+
+
+def test_arrays_are_the_recording_of_a_file_that_holds_them(tmp_path: Path) -> None:
+    t, q, tau, reference = motion()
+    made = armident.Recording.from_arrays(t, q, tau, "emps", reference)
+    np.savez(tmp_path / "log.npz", t=t, q=q, tau=tau, qr=reference)
+    imported = armident.import_recording(tmp_path / "log.npz", "emps")
+    again = armident.read_recording(made.save(tmp_path / "run.mcap"))
+    assert made.sha256 == imported.sha256 == again.sha256
+    for other in (imported, again):
+        assert (other.robot, other.sample_rate_hz, other.gaps) == (made.robot, made.sample_rate_hz, made.gaps)
+        assert other.streams["samples"].fields == made.streams["samples"].fields
+    np.testing.assert_array_equal(made.samples.si("torque")[:, 0], tau)
+
+
+def test_arrays_with_uneven_times_name_the_next_step_and_can_be_resampled() -> None:
+    t, q, tau, _ = motion()
+    uneven = t + np.random.default_rng(1).normal(0.0, 1e-4, t.size)
+    with pytest.raises(armident.DataError, match=r"jitter.*resample_hz=1000 puts the samples on an even clock"):
+        armident.Recording.from_arrays(uneven, q, tau, "emps")
+    assert armident.Recording.from_arrays(uneven, q, tau, "emps", resample_hz=1000.0).sample_rate_hz == 1000.0
+    for wrong, message in (
+        ((t, q[:-1], tau), r"position: an array of shape \(1499,\); expected \(1500, 1\)"),
+        ((1000.0 * t, q, tau), "t has to be in s"),
+        ((t[::-1], q, tau), "time does not increase"),
+        ((t, 100.0 * q, tau), r"joint_1 reaches 10, its limit is 0\.3"),
+    ):
+        with pytest.raises(armident.DataError, match=message) as found:
+            armident.Recording.from_arrays(*wrong, robot="emps")
+        assert "--" not in str(found.value)
+
+
+def test_an_identification_read_back_stands_for_a_fresh_one(axis: armident.Identification, tmp_path: Path) -> None:
+    axis.save(tmp_path)
+    for path in (tmp_path, tmp_path / "identification.json"):
+        again = armident.load_identification(path)
+        assert (str(again), again.to_json(), again.verdict) == (str(axis), axis.to_json(), axis.verdict)
+        np.testing.assert_array_equal(again.covariance, axis.covariance)
+    assert "fv1" in again.report(tmp_path / "again.html").read_text()
+    assert not armident.compare(axis, again)
+    still = np.zeros((1, 1))
+    np.testing.assert_array_equal(again.model.inverse_dynamics(still, still, still + 1.0), [[axis.theta[[0, 3]].sum()]])
+    other = arms.recording("emps", "emps_2", 2, period=arms.FAST)
+    errors = [armident.predict(other, model).relative_error_pct for model in (axis, again, again.model, tmp_path)]
+    assert len(set(errors)) == 1
+    assert errors[0] < 2 * axis.relative_error_pct
+
+
+def test_every_result_prints_and_writes_its_document_and_its_report(
+    axis: armident.Identification, tmp_path: Path
+) -> None:
+    (recorded,) = axis.recordings
+    checked = armident.check(recorded)
+    for result in (axis, armident.predict(recorded, axis), armident.compare(axis, axis), checked):
+        folder = tmp_path / type(result).__name__
+        document, report, *_ = result.save(folder)
+        assert json.loads(document.read_text()) == json.loads(result.to_json()) == result.to_dict()
+        assert result.to_dict()["robot"] == "emps"
+        assert report.read_text().startswith("<!DOCTYPE html>")
+        assert str(result).splitlines()[0].startswith(("emps", "set-up: no mistake found"))
+        assert result._repr_html_().startswith("<p>")
+    assert checked.passed
+    assert checked.findings == ()
+
+
+def test_a_model_without_parameters_says_where_they_come_from() -> None:
+    with pytest.raises(ValueError, match=r"emps: .* give theta, or use result\.model"):
+        armident.RobotModel("emps").mass_matrix([[0.0]])
+
+
+def test_arguments_of_identify_replace_those_of_its_options() -> None:
+    recording = arms.recording("emps", "emps_1", 1, period=arms.FAST)
+    options = armident.Options(method="idim-iv", nvr="likelihood", bandwidth_hz=20.0)
+    used = armident.identify(recording, method="idim-ls", options=options).document.options
+    assert (used["method"], used["nvr"], used["bandwidth_hz"]) == ("idim-ls", "likelihood", 20.0)
+
+
 def test_importing_armident_imports_nothing_heavy() -> None:
     code = (
         "import sys, armident; print([m for m in ('numpy', 'scipy', 'numba', 'pydantic', 'can') if m in sys.modules])"
@@ -37,7 +125,9 @@ def test_importing_armident_imports_nothing_heavy() -> None:
 def test_every_name_of_the_api_is_there_and_is_listed() -> None:
     for name in armident.__all__:
         assert getattr(armident, name) is not None
-    assert set(armident.__all__) <= set(dir(armident))
+    assert {*armident.__all__, "__version__"} <= set(dir(armident))
+    assert armident.__version__ == importlib.metadata.version("armident")
+    assert all(name in (armident.__doc__ or "") for name in armident.__all__)
 
 
 def test_a_name_that_is_not_there_is_an_attribute_error() -> None:
@@ -128,7 +218,7 @@ def test_an_unchanged_arm_compares_as_unchanged(result: armident.Identification,
     test = armident.compare(folder, again)
     assert not test
     assert len(test.parameters) == len(result.names)
-    assert "no change" in str(test)
+    assert "has not changed" in str(test)
 
 
 def test_a_model_gives_the_torques_of_its_regressor(result: armident.Identification) -> None:
@@ -136,7 +226,7 @@ def test_a_model_gives_the_torques_of_its_regressor(result: armident.Identificat
     rng = np.random.default_rng(0)
     q, qd, qdd = rng.normal(size=(3, 50, 6))
     torque = model.regressor(q, qd, qdd) @ result.theta
-    assert np.allclose(model.inverse_dynamics(result.theta, q, qd, qdd), torque, rtol=1e-9, atol=1e-9)
+    assert np.allclose(model.inverse_dynamics(q, qd, qdd, theta=result.theta), torque, rtol=1e-9, atol=1e-9)
 
 
 def test_a_model_with_an_effect_needs_the_sampling_period() -> None:
@@ -148,18 +238,18 @@ def test_a_model_with_an_effect_needs_the_sampling_period() -> None:
     q = np.linspace(0.0, 0.2, 20)[:, None]
     theta = np.ones(len(model.names))
     with pytest.raises(ValueError, match="sampling period"):
-        model.inverse_dynamics(theta, q, q, q)
+        model.inverse_dynamics(q, q, q, theta=theta)
     torque = model.regressor(q, q, q, dt=1e-3) @ theta
-    assert np.allclose(model.inverse_dynamics(theta, q, q, q, dt=1e-3), torque, rtol=1e-9)
+    assert np.allclose(model.inverse_dynamics(q, q, q, theta=theta, dt=1e-3), torque, rtol=1e-9)
     with pytest.raises(armident.ConfigError, match="simulate"):
-        model.forward_dynamics(theta, q, q, q)
+        model.forward_dynamics(q, q, q, theta=theta)
 
 
 def test_the_closed_loop_follows_its_reference(result: armident.Identification) -> None:
-    run = armident.RobotModel("tx40").simulate(result.theta, "tx40_excitation", dt=1e-3)
+    run = armident.RobotModel("tx40").simulate("tx40_excitation", theta=result.theta, dt=1e-3)
     assert run.diverged_at is None
     reference = armident.design_trajectory("tx40", evaluations=0).trajectory.sample(1e-3)
-    again = armident.RobotModel("tx40").simulate(result.theta, reference, dt=1e-3)
+    again = armident.RobotModel("tx40").simulate(reference, theta=result.theta, dt=1e-3)
     assert np.abs(again.q - reference).max() < 0.1
 
 
@@ -185,12 +275,15 @@ def test_a_mistake_is_one_clear_line(call: object, expected: str) -> None:
     "module",
     [
         "armident",
-        "armident.identify.api.comparison",
-        "armident.identify.api.diagnosis",
-        "armident.identify.api.identification",
-        "armident.identify.api.prediction",
-        "armident.identify.api.trajectory",
-        "armident.identify.robot_model",
+        "armident.configs.loading",
+        "armident.daq.recording.model",
+        "armident.identify.api.comparison_api",
+        "armident.identify.api.diagnosis_api",
+        "armident.identify.api.identification_api",
+        "armident.identify.api.prediction_api",
+        "armident.identify.api.setup_api",
+        "armident.identify.api.trajectory_api",
+        "armident.identify.identification.robot_model",
         "armident.virtual_robot.api",
         "armident.identify.robot.arm",
     ],

@@ -9,9 +9,61 @@ import pinocchio
 from numpy.typing import NDArray
 
 from armident.configs import ConfigError
-from armident.virtual_robot.effects.hidden import Hidden
+from armident.virtual_robot.effects.spec import EffectSpec, Hidden, ParameterSpec, positive
 
 pin: Any = pinocchio
+
+EFFECTS: dict[str, EffectSpec] = {
+    "payload": EffectSpec(
+        "body",
+        "mass fixed to the joint's link, in that link's frame",
+        {
+            "mass": positive("kg", "mass"),
+            "x": ParameterSpec("m", "centre of mass", 0.0),
+            "y": ParameterSpec("m", "centre of mass", 0.0),
+            "z": ParameterSpec("m", "centre of mass", 0.1),
+            "radius": positive("m", "radius of gyration about every axis through the centre of mass", 0.05),
+        },
+    ),
+    "rotor_inertia": EffectSpec(
+        "body",
+        "additional rotor inertia; between two joints with ``other``",
+        {"inertia": ParameterSpec("kg m^2", "joint side")},
+        other="optional",
+    ),
+    "gravity_direction": EffectSpec(
+        "body",
+        "base mounted out of level",
+        {
+            "tilt": ParameterSpec("rad", "angle", None, -math.pi, math.pi),
+            "azimuth": ParameterSpec("rad", "horizontal axis of the tilt, from the base's x axis", 0.0),
+        },
+        first_joint=True,
+    ),
+    "slosh_payload": EffectSpec(
+        "body",
+        "liquid in a vessel on the joint's link, as a pendulum about the link's x axis",
+        {
+            "mass": positive("kg", "mass that swings"),
+            "length": positive("m", "length of the pendulum", 0.1),
+            "z": ParameterSpec("m", "position of its hinge in the link's frame", 0.05),
+            "damping": positive("-", "damping of the pendulum, of critical", 0.05, 2.0),
+        },
+        group="outside",
+    ),
+    "base_vibration": EffectSpec(
+        "body",
+        "horizontal vibration of the base",
+        {
+            "amplitude": ParameterSpec("m/s^2", "acceleration"),
+            "frequency": positive("Hz", "frequency", 4.0),
+            "azimuth": ParameterSpec("rad", "direction, from the base's y axis", 0.0),
+        },
+        first_joint=True,
+        group="outside",
+    ),
+}
+"""Effects of this module."""
 
 
 def change_bodies(model: Any, hidden: Sequence[Hidden]) -> None:
@@ -19,12 +71,7 @@ def change_bodies(model: Any, hidden: Sequence[Hidden]) -> None:
 
     A swinging mass is an additional joint after those of the arm.
 
-    Parameters
-    ----------
-    model
-        Pinocchio model with n joints.
-    hidden
-        Hidden effects.
+    ``model``: Pinocchio model with n joints; ``hidden``: hidden effects.
     """
     for h in hidden:
         if h.effect == "payload":
@@ -43,19 +90,8 @@ def change_bodies(model: Any, hidden: Sequence[Hidden]) -> None:
 def rest_angles(model: Any, hidden: Sequence[Hidden], q: NDArray[np.float64]) -> NDArray[np.float64]:
     """Rest angles of the swinging masses.
 
-    Parameters
-    ----------
-    model
-        Pinocchio model with the swinging masses.
-    hidden
-        Hidden effects.
-    q
-        Posture of the arm, rad or m, shape (n,).
-
-    Returns
-    -------
-    ndarray
-        Angles, rad, in Pinocchio's order, shape (S,).
+    ``model``: Pinocchio model with the swinging masses; ``hidden``: hidden effects; ``q``: posture of the arm,
+    rad or m, shape (n,). Returns angles, rad, in Pinocchio's order, shape (S,).
     """
     data = model.createData()
     swinging = [h for h in hidden if h.effect == "slosh_payload"]
@@ -71,17 +107,8 @@ def rest_angles(model: Any, hidden: Sequence[Hidden], q: NDArray[np.float64]) ->
 def hinge_damping(hidden: Sequence[Hidden], gravity: NDArray[np.float64]) -> NDArray[np.float64]:
     """Viscous coefficients of the swinging masses' hinges.
 
-    Parameters
-    ----------
-    hidden
-        Hidden effects.
-    gravity
-        Acceleration of gravity, m/s^2, shape (3,).
-
-    Returns
-    -------
-    ndarray
-        Coefficients, N m s/rad, shape (S,).
+    ``hidden``: hidden effects; ``gravity``: acceleration of gravity, m/s^2, shape (3,). Returns coefficients, N m
+    s/rad, shape (S,).
     """
     out = []
     for h in hidden:
@@ -94,19 +121,9 @@ def hinge_damping(hidden: Sequence[Hidden], gravity: NDArray[np.float64]) -> NDA
 def add_rotors(rotor: NDArray[np.float64], hidden: Sequence[Hidden], links: NDArray[np.float64]) -> None:
     """Add hidden rotor inertias to the rotors' matrix, in place.
 
-    Parameters
-    ----------
-    rotor
-        Rotor inertias, joint side, shape (n, n), changed in place.
-    hidden
-        Hidden effects.
-    links
-        Mass matrix of the links at the start, shape (n, n).
-
-    Raises
-    ------
-    ConfigError
-        If the resulting mass matrix is not positive definite.
+    ``rotor``: rotor inertias, joint side, shape (n, n), changed in place; ``hidden``: hidden effects; ``links``: mass
+    matrix of the links at the start, shape (n, n). Raises ConfigError if the resulting mass matrix is not positive
+    definite.
     """
     for h in hidden:
         if h.effect == "rotor_inertia":
@@ -121,19 +138,8 @@ def add_rotors(rotor: NDArray[np.float64], hidden: Sequence[Hidden], links: NDAr
 def tilted(gravity: NDArray[np.float64], tilt: float, azimuth: float) -> NDArray[np.float64]:
     """Gravity in the frame of a tilted base.
 
-    Parameters
-    ----------
-    gravity
-        Acceleration of gravity, m/s^2, shape (3,).
-    tilt
-        Angle of the tilt, rad.
-    azimuth
-        Angle of the horizontal axis of the tilt from the base's x axis, rad.
-
-    Returns
-    -------
-    ndarray
-        Acceleration of gravity, m/s^2, shape (3,).
+    ``gravity``: acceleration of gravity, m/s^2, shape (3,); ``tilt``: angle of the tilt, rad; ``azimuth``: angle of the
+    horizontal axis of the tilt from the base's x axis, rad. Returns the acceleration of gravity, m/s^2, shape (3,).
     """
     one, two = _horizontal(gravity)
     axis = math.cos(azimuth) * one + math.sin(azimuth) * two
@@ -144,17 +150,8 @@ def tilted(gravity: NDArray[np.float64], tilt: float, azimuth: float) -> NDArray
 def base_vibrations(hidden: Sequence[Hidden], gravity: NDArray[np.float64]) -> NDArray[np.float64]:
     """Vibrations of the base.
 
-    Parameters
-    ----------
-    hidden
-        Hidden effects.
-    gravity
-        Acceleration of gravity, m/s^2, shape (3,).
-
-    Returns
-    -------
-    ndarray
-        Amplitude vector (m/s^2) and angular frequency (rad/s) of each vibration, shape (V, 4).
+    ``hidden``: hidden effects; ``gravity``: acceleration of gravity, m/s^2, shape (3,). Returns the amplitude vector
+    (m/s^2) and angular frequency (rad/s) of each vibration, shape (V, 4).
     """
     one, two = _horizontal(gravity)
     rows = []

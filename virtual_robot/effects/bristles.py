@@ -4,26 +4,46 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from armident.compiled import PLAIN, compiled
 from armident.configs import ConfigError, RobotConfig
-from armident.virtual_robot.effects.hidden import Hidden
+from armident.virtual_robot.effects.spec import AUTO, EffectSpec, Hidden, ParameterSpec, positive
 
 COLUMNS = 7
 """Columns of a bristle: joint, Coulomb friction, extra at rest, Stribeck velocity, exponent, stiffness, damping."""
 
+EFFECTS: dict[str, EffectSpec] = {
+    "stribeck_friction": EffectSpec(
+        "bristle",
+        "LuGre bristle in place of Coulomb friction, with more friction at low speed",
+        {
+            "extra": positive("N m", "break-away friction above Coulomb friction"),
+            "velocity": positive("rad/s", "Stribeck velocity; 2 % of the joint's limit unless given", AUTO),
+            "exponent": positive("-", "exponent of the decrease", 2.0, 4.0),
+            "deflection": positive(
+                "rad", "bristle deflection when sliding; 4 us times the velocity limit unless given", AUTO
+            ),
+            "damping": ParameterSpec("-", "damping of the stuck joint, of critical", 0.02, 0.0, 1.0),
+        },
+    ),
+    "presliding_friction": EffectSpec(
+        "bristle",
+        "Dahl bristle in place of Coulomb friction: elastic before it slides",
+        {
+            "deflection": positive("rad", "bristle deflection when sliding"),
+            "damping": ParameterSpec("-", "damping of the stuck joint, of critical", 0.0, 0.0, 1.0),
+        },
+    ),
+}
+"""Effects of this module."""
 
-@njit(cache=True, error_model="numpy")
+
+@compiled("f8[::1], f8", **PLAIN)
 def sliding_level(row, qd):  # type: ignore[no-untyped-def]
     """Magnitude of the friction (N m) when sliding, and its slope over ``abs(qd)``.
 
-    Parameters
-    ----------
-    row
-        Row of `bristle_table`, shape (COLUMNS,).
-    qd
-        Velocity of the joint, rad/s or m/s.
+    ``row``: row of `bristle_table`, shape (COLUMNS,); ``qd``: velocity of the joint, rad/s or m/s.
     """
     speed = abs(qd)
     ratio = (speed / row[3]) ** row[4]
@@ -31,18 +51,12 @@ def sliding_level(row, qd):  # type: ignore[no-untyped-def]
     return row[1] + bump, -bump * row[4] * ratio / max(speed, 1e-12)
 
 
-@njit(cache=True, error_model="numpy")
+@compiled(**PLAIN)
 def bristle_rate(row, z, qd):  # type: ignore[no-untyped-def]
     """Rate of a bristle's deflection, ``qd - abs(qd) z stiffness / g(qd)``, and its slopes over ``z`` and ``qd``.
 
-    Parameters
-    ----------
-    row
-        Row of `bristle_table`, shape (COLUMNS,).
-    z
-        Deflection, rad or m.
-    qd
-        Velocity of the joint, rad/s or m/s.
+    ``row``: row of `bristle_table`, shape (COLUMNS,); ``z``: deflection, rad or m; ``qd``: velocity of the joint, rad/s
+    or m/s.
     """
     level, fall = sliding_level(row, qd)
     pull = row[5] / level
@@ -55,26 +69,10 @@ def bristle_table(
 ) -> NDArray[np.float64]:
     """Parameters of the bristles; Stribeck and presliding friction of one joint share a bristle.
 
-    Parameters
-    ----------
-    hidden
-        Hidden effects.
-    robot
-        The robot.
-    friction
-        fv, fc and offset of the healthy arm (further columns are ignored), shape (n, 3 or more).
-    inertia
-        Inertia about each joint at the start, for the critical damping, shape (n,).
-
-    Returns
-    -------
-    ndarray
-        One row per bristle, shape (B, COLUMNS).
-
-    Raises
-    ------
-    ConfigError
-        If a joint has no Coulomb friction for a bristle to replace.
+    ``hidden``: hidden effects; ``friction``: fv, fc and offset of the healthy arm (further columns are ignored), shape
+    (n, 3 or more); ``inertia``: inertia about each joint at the start, for the critical damping, shape (n,). Returns
+    one row per bristle, shape (B, COLUMNS). Raises ConfigError if a joint has no Coulomb friction for a bristle to
+    replace.
     """
     rows: list[NDArray[np.float64]] = []
     mine = [h for h in hidden if h.target == "bristle"]

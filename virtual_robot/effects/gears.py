@@ -4,11 +4,11 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from armident.compiled import PLAIN, compiled
 from armident.configs import ConfigError, RobotConfig
-from armident.virtual_robot.effects.hidden import Hidden
+from armident.virtual_robot.effects.spec import AUTO, EffectSpec, Hidden, ParameterSpec, positive
 
 COLUMNS = 6
 """Columns of a gear: coordinates of motor and link (-1: the base), stiffness, damping, gap, rounding of the gap."""
@@ -19,8 +19,35 @@ MOTOR_SHARE = 0.3
 ROUNDING = 0.004
 """Distance over which a contact closes on either side of its edge, relative to the gap."""
 
+EFFECTS: dict[str, EffectSpec] = {
+    "joint_elasticity": EffectSpec(
+        "gear",
+        "two masses: the motor, with encoder and friction, drives the link through a spring",
+        {
+            "stiffness": positive("N m/rad", "stiffness between motor and link"),
+            "damping": ParameterSpec("-", "damping of motor against link, of critical", 0.05, 0.0, 2.0),
+            "motor_inertia": positive(
+                "kg m^2", "inertia of the motor, joint side; the robot's own, or 0.3 of the total if it has none", AUTO
+            ),
+        },
+    ),
+    "backlash": EffectSpec(
+        "gear",
+        "two masses: the motor drives the link through a gap",
+        {
+            "gap": positive("rad", "total play"),
+            "stiffness": positive(
+                "N m/rad", "stiffness of the contact; motor against link at 100 Hz unless given", AUTO
+            ),
+            "damping": ParameterSpec("-", "damping in contact, of critical", 0.1, 0.0, 2.0),
+            "motor_inertia": positive("kg m^2", "as for joint_elasticity", AUTO),
+        },
+    ),
+}
+"""Effects of this module."""
 
-@njit(cache=True, error_model="numpy")
+
+@compiled(**PLAIN)
 def _press(way, rounding):  # type: ignore[no-untyped-def]
     """Compression of a contact that has closed by ``way`` (negative: open), and its slope."""
     if way <= -rounding:
@@ -30,16 +57,12 @@ def _press(way, rounding):  # type: ignore[no-untyped-def]
     return (way + rounding) ** 2 / (4.0 * rounding), (way + rounding) / (2.0 * rounding)
 
 
-@njit(cache=True, error_model="numpy")
+@compiled("f8[::1], f8, f8", **PLAIN)
 def gear_torque(row, twist, rate):  # type: ignore[no-untyped-def]
     """Torque between motor and link (N m), and its slopes over twist and rate.
 
-    Parameters
-    ----------
-    row
-        Row of `gear_rows`, shape (COLUMNS,).
-    twist, rate
-        Position of the motor relative to the link (rad or m), and its rate.
+    ``row``: row of `gear_rows`, shape (COLUMNS,); ``twist``, ``rate``: position of the motor relative to the link
+    (rad or m), and its rate.
     """
     if row[4] == 0.0:
         return row[2] * twist + row[3] * rate, row[2], row[3]
@@ -52,12 +75,7 @@ def gear_torque(row, twist, rate):  # type: ignore[no-untyped-def]
 def twist_under(row: NDArray[np.float64], torque: float) -> float:
     """Twist (rad or m) of a gear at rest under a torque.
 
-    Parameters
-    ----------
-    row
-        Row of `gear_rows`, shape (COLUMNS,).
-    torque
-        Transmitted torque, N m or N.
+    ``row``: row of `gear_rows`, shape (COLUMNS,); ``torque``: transmitted torque, N m or N.
     """
     end = torque / float(row[2]) + math.copysign(float(row[4]), torque)
     low, high = min(0.0, end), max(0.0, end)
@@ -79,30 +97,11 @@ def gear_rows(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Parameters of the elastic gears; the link of gear e has coordinate n + e.
 
-    Parameters
-    ----------
-    hidden
-        Hidden effects.
-    robot
-        The robot.
-    rotor
-        Rotor inertias, joint side, shape (n, n).
-    mass
-        Mass matrix of the links alone at the start, shape (n, n).
-    least
-        Least inertia at each joint if all others are free, over the postures, shape (n,).
-
-    Returns
-    -------
-    rows
-        One row per elastic gear, shape (G, COLUMNS).
-    moved
-        Inertia of the links that is assigned to the motor, by gear, shape (G,).
-
-    Raises
-    ------
-    ConfigError
-        If the inertia of the motor exceeds that of motor and link together.
+    ``hidden``: hidden effects; ``rotor``: rotor inertias, joint side, shape (n, n); ``mass``: mass matrix of the links
+    alone at the start, shape (n, n); ``least``: least inertia at each joint if all others are free, over the postures,
+    shape (n,). Returns ``rows``: one row per elastic gear, shape (G, COLUMNS); ``moved``: inertia of the links that is
+    assigned to the motor, by gear, shape (G,). Raises ConfigError if the inertia of the motor exceeds that of motor and
+    link together.
     """
     rows, moved = [], []
     mine = [h for h in hidden if h.target == "gear"]

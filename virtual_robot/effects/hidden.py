@@ -1,82 +1,24 @@
 """Validation of the effects of a scenario against the catalogue and the robot."""
 
 import math
-from dataclasses import dataclass
 
 from armident.configs import ConfigError, RobotConfig
 from armident.configs.schema.scenario import HiddenEffect, Scenario
-from armident.virtual_robot.effects.catalogue import EFFECTS, ParameterSpec, Target
-
-REPEATABLE = ("cogging_torque", "torque_bump", "position_dependent_friction", "encoder_eccentricity", "mains_ripple")
-"""Effects that one joint may have several times, such as harmonics."""
-
-
-@dataclass(frozen=True)
-class Hidden:
-    """Validated hidden effect.
-
-    Parameters
-    ----------
-    effect
-        Name of the effect.
-    joint, other
-        Numbers of its joints; ``other`` is -1 if there is none.
-    values
-        Parameters including defaults; ``AUTO`` (NaN): derived from the robot.
-    where
-        Name of the entry in messages.
-    """
-
-    effect: str
-    joint: int
-    other: int
-    values: dict[str, float]
-    where: str
-
-    @property
-    def target(self) -> Target:
-        """Target of the effect."""
-        return EFFECTS[self.effect].target
-
-    def __getitem__(self, name: str) -> float:
-        return self.values[name]
-
-    def value_or(self, name: str, otherwise: float) -> float:
-        """Value of a parameter, or a default derived from the robot.
-
-        Parameters
-        ----------
-        name
-            Name of the parameter.
-        otherwise
-            Value if the parameter is ``AUTO``.
-        """
-        value = self.values[name]
-        return otherwise if math.isnan(value) else value
+from armident.virtual_robot.effects.catalogue import EFFECTS
+from armident.virtual_robot.effects.spec import Hidden, ParameterSpec
 
 
 def hidden_effects(scenario: Scenario | None, robot: RobotConfig, where: str = "scenario") -> tuple[Hidden, ...]:
     """Validate the effects of a scenario.
 
-    Parameters
-    ----------
-    scenario
-        The scenario; ``None``: no effects.
-    robot
-        The robot.
-    where
-        Name of the scenario in messages.
-
-    Raises
-    ------
-    ConfigError
-        If an entry is invalid; names the entry and the expected value.
+    ``scenario``: the scenario; ``None``: no effects. Raises ConfigError if an entry is invalid; names the entry and the
+    expected value.
     """
     out: list[Hidden] = []
     for k, entry in enumerate(() if scenario is None else scenario.effects):
         checked = _checked(entry, robot, f"{where}: effects[{k}]")
         same = [h for h in out if (h.effect, h.joint, h.other) == (checked.effect, checked.joint, checked.other)]
-        if same and entry.effect not in REPEATABLE:
+        if same and not checked.spec.repeatable:
             raise ConfigError(f"{checked.where}: {entry.joint} has {entry.effect} already ({same[0].where})")
         out.append(checked)
     return tuple(out)
@@ -100,14 +42,15 @@ def _checked(entry: HiddenEffect, robot: RobotConfig, at: str) -> Hidden:
         raise ConfigError(f"{at}.other: expected another joint than {entry.joint}")
     joint = joints.index(entry.joint)
     other = -1 if entry.other is None else joints.index(entry.other)
-    return Hidden(entry.effect, joint, other, _values(entry, robot.joints[joint].type, at), at)
+    return Hidden(entry.effect, joint, other, _values(entry, robot.joints[joint].type, at), at, effect)
 
 
 def _values(entry: HiddenEffect, kind: str, at: str) -> dict[str, float]:
     known = EFFECTS[entry.effect].parameters
     for name in entry.parameters:
         if name not in known:
-            raise ConfigError(f"{at}.parameters.{name}: unknown ({entry.effect} takes {', '.join(known)})")
+            takes = ", ".join(f"{one} ({parameter.unit})" for one, parameter in known.items())
+            raise ConfigError(f"{at}.parameters.{name}: unknown ({entry.effect} takes {takes})")
     values: dict[str, float] = {}
     for name, parameter in known.items():
         if name in entry.parameters and parameter.only not in (None, kind):

@@ -4,17 +4,95 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from armident.compiled import PLAIN, compiled
 from armident.configs import RobotConfig
 from armident.virtual_robot.effects.forces import waves
-from armident.virtual_robot.effects.hidden import Hidden
+from armident.virtual_robot.effects.spec import (
+    AUTO,
+    PER_TURN,
+    PHASE,
+    PITCH,
+    EffectSpec,
+    Hidden,
+    ParameterSpec,
+    flag,
+    positive,
+)
 
 Vector = NDArray[np.float64]
 
+EFFECTS: dict[str, EffectSpec] = {
+    "drive_gain_error": EffectSpec(
+        "drive",
+        "true torque per unit of the drive's signal differs from the configured one",
+        {"error": ParameterSpec("-", "true gain over configured gain, minus 1", None, -0.9, 5.0)},
+    ),
+    "drive_gain_saturation": EffectSpec(
+        "drive",
+        "torque less than proportional to the signal by magnetic saturation: i / sqrt(1 + (i / i_s)^2)",
+        {
+            "drop": positive("-", "share of the torque lost at ``torque``", None, 0.9),
+            "torque": positive("N m", "torque of that loss; half of the joint's limit unless given", AUTO),
+        },
+    ),
+    "sign_error": EffectSpec(
+        "report",
+        "a signal of the drive is recorded with the wrong sign",
+        {"torque": flag("1: the torque signal", 1.0), "position": flag("1: the position and the demand", 0.0)},
+    ),
+    "joint_order": EffectSpec(
+        "report",
+        "signals of two drives are exchanged in the recording",
+        {"torque": flag("1: the torque signals", 1.0), "position": flag("1: the positions and the demands", 1.0)},
+        other="required",
+    ),
+    "time_delay": EffectSpec(
+        "report",
+        "the torque signal is reported late",
+        {"delay": ParameterSpec("s", "delay, whole samples or not", None, 0.0, 1.0)},
+    ),
+    "encoder_eccentricity": EffectSpec(
+        "report",
+        "periodic error of the measured position, which the drive follows",
+        {
+            "amplitude": ParameterSpec("rad", "amplitude, joint side"),
+            "per_turn": PER_TURN,
+            "phase": PHASE,
+            "motor": flag("1: turns of the motor; 0: of the joint, metres of a prismatic one", 0.0),
+            "pitch": PITCH,
+        },
+        repeatable=True,
+    ),
+    "actuator_bandwidth": EffectSpec(
+        "drive",
+        "first-order lag between the torque reported and the torque applied",
+        {"time_constant": positive("s", "time constant", None, 1.0)},
+    ),
+    "mains_ripple": EffectSpec(
+        "report",
+        "interference of the mains frequency in the torque signal",
+        {
+            "amplitude": ParameterSpec("N m", "amplitude, joint side"),
+            "frequency": positive("Hz", "frequency", 50.0),
+            "phase": PHASE,
+        },
+        group="outside",
+        repeatable=True,
+    ),
+    "current_crosstalk": EffectSpec(
+        "report",
+        "the torque signal contains a share of another drive's",
+        {"share": ParameterSpec("-", "joint torque read per joint torque of the other", None, -1.0, 1.0)},
+        other="required",
+        group="outside",
+    ),
+}
+"""Effects of this module."""
 
-@njit(cache=True, error_model="numpy")
+
+@compiled("f8[::1], f8[:, ::1], f8[:, ::1]", **PLAIN)
 def _measured(q, encoders, to_joints):  # type: ignore[no-untyped-def]
     """Joint positions (n,) with encoder errors; rows of joint, amplitude, phase and wave numbers (n,)."""
     n = q.size
@@ -30,7 +108,7 @@ def _measured(q, encoders, to_joints):  # type: ignore[no-untyped-def]
     return out
 
 
-@njit(cache=True, error_model="numpy")
+@compiled("f8[::1], f8[::1], f8[::1], f8[::1], f8[::1], f8, f8[:, ::1]", **PLAIN)
 def _applied(signal, level, knee, lag, lagging, period, torque):  # type: ignore[no-untyped-def]
     """Joint torques (n,) of signals (n,); ``lagging`` is advanced in place."""
     n = signal.size
@@ -50,7 +128,7 @@ def _applied(signal, level, knee, lag, lagging, period, torque):  # type: ignore
     return out
 
 
-@njit(cache=True, error_model="numpy")
+@compiled("f8[::1], f8[:, ::1], i8, f8[::1], f8[:, ::1], f8[:, ::1], f8", **PLAIN)
 def _reported(signal, past, newest, delay, leak, ripples, t):  # type: ignore[no-untyped-def]
     """Signals (n,) as reported at ``t``; row ``newest`` of the ring ``past`` (L, n) receives the present ones.
 
@@ -72,7 +150,7 @@ def _reported(signal, past, newest, delay, leak, ripples, t):  # type: ignore[no
     return out
 
 
-@njit(cache=True, error_model="numpy")
+@compiled("f8[::1], f8[::1], f8[::1], i2[::1]", **PLAIN)
 def _permille(signal, noise, permille, out):  # type: ignore[no-untyped-def]
     """Write signals (n,) with noise as numbers of the bus, int16, to ``out`` (n,)."""
     for j in range(signal.size):
@@ -80,7 +158,7 @@ def _permille(signal, noise, permille, out):  # type: ignore[no-untyped-def]
         out[j] = np.int16(min(max(raw, -32768.0), 32767.0))
 
 
-@njit(cache=True, error_model="numpy")
+@compiled("i2[::1], i8[::1], i8[::1], i8, i8, i2[::1]", "i4[::1], i8[::1], i8[::1], i8, i8, i4[::1]", **PLAIN)
 def _rewired(own, origin, sign, low, high, out):  # type: ignore[no-untyped-def]
     """Write numbers (n,) of permuted drives with changed signs, limited to the bus's range, to ``out`` (n,)."""
     for j in range(own.size):
@@ -90,14 +168,8 @@ def _rewired(own, origin, sign, low, high, out):  # type: ignore[no-untyped-def]
 class Signals:
     """Hidden errors of positions and signals, applied once per control period.
 
-    Parameters
-    ----------
-    hidden
-        Hidden effects; only those with target ``drive`` or ``report`` are used.
-    robot
-        Transmission and drives.
-    period
-        Control period, s.
+    ``hidden``: hidden effects; only those with target ``drive`` or ``report`` are used. ``robot``: transmission and
+    drives.
 
     Attributes
     ----------
@@ -120,7 +192,7 @@ class Signals:
         self._encoders = np.array(encoders).reshape(len(encoders), 3 + n)
         self._to_joints = np.linalg.inv(ratio) * np.diag(ratio)
 
-        self._torque = ratio.T * gain
+        self._torque = np.ascontiguousarray(ratio.T * gain)
         self._level, self._knee, self._lag = np.ones(n), np.full(n, np.inf), np.zeros(n)
         self._lagging = np.zeros(n)
         for h in mine:
@@ -163,13 +235,7 @@ class Signals:
                         origin[both], sign[both] = origin[turned], sign[turned]
 
     def measured(self, q: Vector) -> Vector:
-        """Joint positions as measured by the encoders, shape (n,).
-
-        Parameters
-        ----------
-        q
-            Joint positions, rad or m, shape (n,).
-        """
+        """Joint positions as measured by the encoders, shape (n,). ``q``: joint positions, rad or m, shape (n,)."""
         if not len(self._encoders):
             return q
         out: Vector = _measured(q, self._encoders, self._to_joints)
@@ -178,10 +244,7 @@ class Signals:
     def applied(self, signal: Vector) -> Vector:
         """Joint torques of the motors over the next period, N m or N, shape (n,).
 
-        Parameters
-        ----------
-        signal
-            Signals of the drives, A, V or N m, shape (n,).
+        ``signal``: signals of the drives, A, V or N m, shape (n,).
         """
         out: Vector = _applied(signal, self._level, self._knee, self._lag, self._lagging, self._period, self._torque)
         return out
@@ -189,10 +252,7 @@ class Signals:
     def reported(self, signal: Vector) -> Vector:
         """Reported signals at the present time, without noise, in the drives' own order, shape (n,).
 
-        Parameters
-        ----------
-        signal
-            Signals of the drives, A, V or N m, shape (n,).
+        ``signal``: signals of the drives, A, V or N m, shape (n,).
         """
         newest = -self._periods % len(self._past)
         out: Vector = _reported(
@@ -204,38 +264,22 @@ class Signals:
     def on_the_bus(self, signal: Vector, noise: Vector, permille: Vector, out: NDArray[np.int16]) -> None:
         """Write the reported signals with noise as numbers of the bus.
 
-        Parameters
-        ----------
-        signal, noise
-            Signals of the drives, and their noise, shape (n,).
-        permille
-            Numbers per unit of the signal, shape (n,).
-        out
-            Numbers of the bus, int16, shape (n,), written in place.
+        ``signal``, ``noise``: signals of the drives, and their noise, shape (n,); ``permille``: numbers per unit of the
+        signal, shape (n,); ``out``: numbers of the bus, int16, shape (n,), written in place.
         """
         _permille(self.reported(signal), noise, permille, out)
 
     def rewired_torque(self, own: NDArray[np.int16], out: NDArray[np.int16]) -> None:
         """Write the torque signals under the names and signs of the recording.
 
-        Parameters
-        ----------
-        own
-            Numbers in the drives' own order, shape (n,).
-        out
-            Recorded numbers, shape (n,), written in place.
+        ``own``: numbers in the drives' own order, shape (n,); ``out``: recorded numbers, shape (n,), written in place.
         """
         _rewired(own, self.torque_from, self.torque_sign, -32768, 32767, out)
 
     def rewired_position(self, own: NDArray[np.int32], out: NDArray[np.int32]) -> None:
         """Write positions or demands under the names and signs of the recording.
 
-        Parameters
-        ----------
-        own
-            Counts in the drives' own order, shape (n,).
-        out
-            Recorded counts, shape (n,), written in place.
+        ``own``: counts in the drives' own order, shape (n,); ``out``: recorded counts, shape (n,), written in place.
         """
         _rewired(own, self.position_from, self.position_sign, -(2**31), 2**31 - 1, out)
 

@@ -28,12 +28,8 @@ class BlockOrder:
     def add(self, block: Block, now_s: float) -> Iterator[Block]:
         """Take a block, and yield those whose turn has come.
 
-        Parameters
-        ----------
-        block
-            A block of any capture. The first one of another capture releases those that wait.
-        now_s
-            Time on a monotonic clock, s.
+        ``block``: a block of any capture. The first one of another capture releases those that wait. ``now_s``: time on
+        a monotonic clock, s.
         """
         if block.capture != self._capture:
             yield from self._released(float("inf"))
@@ -45,10 +41,7 @@ class BlockOrder:
     def overdue(self, now_s: float) -> Iterator[Block]:
         """Yield blocks that have waited long enough, and those after them whose turn has come.
 
-        Parameters
-        ----------
-        now_s
-            Time on a monotonic clock, s.
+        ``now_s``: time on a monotonic clock, s.
         """
         yield from self._released(now_s)
 

@@ -26,12 +26,7 @@ class FrictionTest:
     ``exp(h)`` for the threshold h, because the ratio has a mean of at most one while the friction is healthy
     (Lorden 1971).
 
-    Parameters
-    ----------
-    n
-        Number of joints.
-    settings
-        Changes, false-alarm rate and memories.
+    ``settings``: changes, false-alarm rate and memories.
     """
 
     _saved = ("sums", "level", "spread", "spread_weight", "last", "last_std", "alarm", "alarm_change", "windows")
@@ -55,14 +50,9 @@ class FrictionTest:
     def add(self, change: Array, std: Array, instant: int, valid: NDArray[np.bool_]) -> None:
         """Add the estimate of a window.
 
-        Parameters
-        ----------
-        change, std
-            Relative change of each joint's friction and its standard deviation, (n,), 1.
-        instant
-            Number of the decimated instant at its end; it dates an alarm.
-        valid
-            Mask (n,) of the joints with enough excitation; the others raise no alarm.
+        ``change``, ``std``: relative change of each joint's friction and its standard deviation, (n,), 1. ``instant``:
+        number of the decimated instant at its end; it dates an alarm. ``valid``: mask (n,) of the joints with enough
+        excitation; the others raise no alarm.
         """
         self.windows += 1
         known = np.isfinite(change) & np.isfinite(std)

@@ -31,14 +31,8 @@ EARLIER = 2
 class Instant:
     """Equations of all joints at one decimated instant.
 
-    Parameters
-    ----------
-    x, z
-        Filtered regressor at the measured motion, and at the motion that the reference predicts, (n, b) each.
-    y
-        Filtered torques (n,), N m or N.
-    moving
-        Share (n,) of the low-pass window in which each joint moves, 1.
+    ``x``, ``z``: filtered regressor at the measured motion, and at the motion that the reference predicts, (n, b) each;
+    ``y``: filtered torques (n,), N m or N; ``moving``: share (n,) of the low-pass window in which each joint moves, 1.
     """
 
     x: Array
@@ -50,32 +44,24 @@ class Instant:
 class StreamEquations:
     """Turns rows of the stream into equations; a gap starts the filters anew.
 
-    Velocities and accelerations of measured and of reference positions come from the same live filter, so that
-    both have the same delay. Position, velocity and torque are delayed by the delay of the acceleration. The drives
-    follow their reference with a first-order lag, which is estimated per joint from the following error.
+    Velocities and accelerations of measured and of reference positions come from the same live filter, so that both
+    have the same delay. Position, velocity and torque are delayed by the delay of the acceleration. The drives follow
+    their reference with a first-order lag, which is estimated per joint from the following error. Raises DataError if
+    the sampling rate is too low for the bandwidth.
 
     Parameters
     ----------
     model
         The arm, n joints and b base parameters, without additional terms.
-    dt
-        Sampling period, s.
     bandwidth_hz
         Closed-loop bandwidth, Hz.
     with_reference
         True if the rows have reference positions; without them the instruments are the measured regressor.
-    settings
-        Thresholds.
     take
         Called with each `Instant`.
     lead
         Number of samples by which the torque leads the position, from -1 to `EARLIER`: recorded torque k belongs to
         the instant ``k + lead``. A drive that holds its torque until the next sample has 0.5.
-
-    Raises
-    ------
-    DataError
-        If the sampling rate is too low for the bandwidth.
     """
 
     _saved = (
@@ -141,12 +127,7 @@ class StreamEquations:
     def add(self, sync: NDArray[np.int64], values: Array) -> None:
         """Take over rows; complete pieces are computed.
 
-        Parameters
-        ----------
-        sync
-            SYNC numbers (N,).
-        values
-            Position, torque and reference, (N, w).
+        ``sync``: SYNC numbers (N,); ``values``: position, torque and reference, (N, w).
         """
         begin = 0
         if sync.size and int(sync[0]) != self.next_sync >= 0:
@@ -263,15 +244,7 @@ class StreamEquations:
 
 
 def slow_velocity(model: ArmModel, settings: RecursiveSettings) -> Array:
-    """Velocity (n,) above which each joint counts as moving, rad/s or m/s.
-
-    Parameters
-    ----------
-    model
-        The arm.
-    settings
-        Thresholds.
-    """
+    """Velocity (n,) above which each joint counts as moving, rad/s or m/s."""
     slow: Array = np.tan(settings.moving_sign * np.pi / 2) / model.smoothing
     configured = model.robot.friction.velocity_threshold
     return slow if configured is None else np.maximum(slow, np.asarray(configured))
@@ -283,10 +256,7 @@ def acceleration_delay(nvr: float) -> float:
     The steady state of the filter follows ``k^3 / 6``, whose acceleration is k, with a constant delay; its velocity
     and position then have errors, but no delay of first order.
 
-    Parameters
-    ----------
-    nvr
-        Noise-variance ratio of a filter of order 3.
+    ``nvr``: noise-variance ratio of a filter of order 3.
     """
     length = int(40 / nvr ** (1 / 6)) + 40
     k = np.arange(length, dtype=np.float64)

@@ -103,25 +103,10 @@ class RecursiveEstimator:
     instrumental-variable estimator: a Kalman filter whose gain and covariance have the instruments in place of the
     regressor. Results do not depend on how the stream is cut into blocks.
 
-    Parameters
-    ----------
-    robot
-        Configuration of the arm, n joints.
-    reference
-        Identification of the healthy arm.
-    sample_rate_hz
-        Rate of SYNC, 1/s.
-    with_reference
-        True if reference positions are recorded. Without them the instruments are the measured regressor.
-    settings
-        Widths, thresholds and memories.
-
-    Raises
-    ------
-    ConfigError
-        If the configuration has effects.
-    DataError
-        If the reference is of another robot or unusable, or the sampling rate is too low.
+    ``robot``: configuration of the arm, n joints. ``reference``: identification of the healthy arm. ``sample_rate_hz``:
+    rate of SYNC, 1/s. ``with_reference``: True if reference positions are recorded. Without them the instruments are
+    the measured regressor. ``settings``: widths, thresholds and memories. Raises ConfigError if the configuration has
+    effects; DataError if the reference is of another robot or unusable, or the sampling rate is too low.
 
     Notes
     -----
@@ -190,16 +175,9 @@ class RecursiveEstimator:
     def handle(self, block: SampleBlock) -> None:
         """Process a block of any stream of the capture.
 
-        Parameters
-        ----------
-        block
-            Consecutive rows; later blocks of a stream follow earlier ones. Repeated rows are skipped, and missing ones
-            start the filters anew.
-
-        Raises
-        ------
-        DataError
-            If the block has other joints than the robot, or lacks position or torque.
+        ``block``: consecutive rows; later blocks of a stream follow earlier ones. Repeated rows are skipped, and
+        missing ones start the filters anew. Raises DataError if the block has other joints than the robot, or lacks
+        position or torque.
         """
         if self.matcher.add(block):
             self.start_capture(begun=True)
@@ -207,10 +185,7 @@ class RecursiveEstimator:
     def handle_instant(self, instant: Instant) -> None:
         """Process the equations of a decimated instant, which `handle` makes of the stream: noise, gates, update.
 
-        Parameters
-        ----------
-        instant
-            Regressors, instruments and torques.
+        ``instant``: regressors, instruments and torques.
         """
         reference, s = self.reference, self.settings
         moving = instant.moving >= s.moving_share
@@ -237,10 +212,7 @@ class RecursiveEstimator:
     def start_capture(self, *, begun: bool = False) -> None:
         """Expect the blocks of another capture: filters start anew, estimates stay.
 
-        Parameters
-        ----------
-        begun
-            True if its first block has been taken over already.
+        ``begun``: True if its first block has been taken over already.
         """
         if not begun:
             self.matcher.start_capture()
@@ -292,12 +264,8 @@ class RecursiveEstimator:
     def load(self, path: Path) -> None:
         """Continue from a saved state, to the last bit as if it had not been interrupted.
 
-        Raises
-        ------
-        ConfigError
-            If there is no such file.
-        DataError
-            If the state is of another version, robot, reference or setting.
+        Raises ConfigError if there is no such file; DataError if the state is of another version, robot, reference or
+        setting.
         """
         restore_state(self, read_state(path, self._identity))
 

@@ -1,24 +1,18 @@
 """Compiled loops of the recursive estimator; no result depends on the number of threads or of rows in a call."""
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from armident.compiled import compiled
 
 Array = NDArray[np.float64]
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled("f8[:, ::1], f8[:, ::1], f8[:, ::1]")
 def to_joint_side(raw: Array, factor: Array, out: Array) -> None:
     """Multiply every row by a matrix.
 
-    Parameters
-    ----------
-    raw
-        Rows (N, n).
-    factor
-        Matrix (n, n): ``out[k] = factor @ raw[k]``.
-    out
-        Output array (N, n).
+    ``raw``: rows (N, n); ``factor``: matrix (n, n): ``out[k] = factor @ raw[k]``; ``out``: output array (N, n).
     """
     for k in range(raw.shape[0]):
         for i in range(raw.shape[1]):
@@ -28,18 +22,12 @@ def to_joint_side(raw: Array, factor: Array, out: Array) -> None:
             out[k, i] = total
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled("f8[:, ::1], f8[::1], f8[::1]")
 def first_order_lag(x: Array, share: Array, state: Array) -> None:
     """Filter every column with a first-order lag, in place.
 
-    Parameters
-    ----------
-    x
-        Signals (N, n).
-    share
-        Share (n,) of the difference that the output makes up per sample, 1.
-    state
-        Last output (n,); changed in place.
+    ``x``: signals (N, n). ``share``: share (n,) of the difference that the output makes up per sample, 1. ``state``:
+    last output (n,); changed in place.
     """
     for k in range(x.shape[0]):
         for j in range(x.shape[1]):
@@ -47,24 +35,13 @@ def first_order_lag(x: Array, share: Array, state: Array) -> None:
             x[k, j] = state[j]
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled("f8[:, ::1], f8[::1], i8, i8, i8, f8[:, ::1]")
 def low_pass(data: Array, taps: Array, factor: int, seen: int, done: int, rows: Array) -> None:
     """Add the contribution of further samples to the decimated rows that are not complete.
 
-    Parameters
-    ----------
-    data
-        Samples (N, c), the first of them number ``seen``.
-    taps
-        Impulse response (m,).
-    factor
-        Decimation factor.
-    seen
-        Number of samples before these.
-    done
-        Number of the decimated row that ``rows`` begins with.
-    rows
-        Incomplete rows (r, c); changed in place.
+    ``data``: samples (N, c), the first of them number ``seen``. ``taps``: impulse response (m,). ``factor``: decimation
+    factor. ``seen``: number of samples before these. ``done``: number of the decimated row that ``rows`` begins with.
+    ``rows``: incomplete rows (r, c); changed in place.
     """
     for k in range(data.shape[0]):
         at = seen + k
@@ -77,7 +54,7 @@ def low_pass(data: Array, taps: Array, factor: int, seen: int, done: int, rows: 
                 row[c] += weight * data[k, c]
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled("f8[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[::1], f8[::1], b1[::1]")
 def update(
     state: Array, covariance: Array, x: Array, z: Array, y: Array, variance: Array, use: NDArray[np.bool_]
 ) -> None:
@@ -86,20 +63,9 @@ def update(
     With ``z = x`` it is the update of a Kalman filter. Young's symmetric form: the gain and the covariance have the
     instruments, the innovation has the measured regressor.
 
-    Parameters
-    ----------
-    state
-        Estimate (b,); changed in place.
-    covariance
-        Its covariance (b, b); changed in place.
-    x, z
-        Regressor and instruments, (n, b) each.
-    y
-        Torques (n,).
-    variance
-        Variance of each equation, (n,).
-    use
-        Mask (n,) of the equations to use.
+    ``state``: estimate (b,); changed in place. ``covariance`` (b, b); changed in place. ``x``, ``z``: regressor and
+    instruments, (n, b) each. ``y``: torques (n,). ``variance``: variance of each equation, (n,). ``use``: mask (n,) of
+    the equations to use.
     """
     b = state.size
     gain = np.empty(b)
@@ -127,20 +93,14 @@ def update(
                 covariance[k, i] = value
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled("f8[:, ::1], f8[:, ::1], f8[::1], f8[:, ::1], f8[:, ::1], f8[::1], f8[::1], b1[::1]")
 def add_products(
     sums: Array, squares: Array, right: Array, x: Array, z: Array, y: Array, variance: Array, use: NDArray[np.bool_]
 ) -> None:
     """Add the weighted products ``z' x``, ``z' z`` and ``z' y`` of an instant.
 
-    Parameters
-    ----------
-    sums, squares
-        Sums of ``z' x`` and of ``z' z``, (b, b) each; changed in place.
-    right
-        Sum of ``z' y``, (b,); changed in place.
-    x, z, y, variance, use
-        As in `update`.
+    ``sums``, ``squares``: sums of ``z' x`` and of ``z' z``, (b, b) each; changed in place. ``right``: sum of ``z' y``,
+    (b,); changed in place. ``x``, ``z``, ``y``, ``variance``, ``use``: as in `update`.
     """
     for j in range(y.size):
         if not use[j]:
@@ -156,21 +116,12 @@ def add_products(
                 squares[i, k] += scaled * z[j, k]
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled("f8[:, ::1], f8[:, ::1]")
 def solve(matrix: Array, right: Array) -> bool:
     """Solve ``matrix x = right`` by elimination with partial pivoting, in place.
 
-    Parameters
-    ----------
-    matrix
-        Matrix (b, b); overwritten.
-    right
-        Right sides (b, r); overwritten by the solutions.
-
-    Returns
-    -------
-    bool
-        ``False`` if the matrix is singular.
+    ``matrix`` (b, b); overwritten. ``right``: right sides (b, r); overwritten by the solutions. Returns ``False`` if
+    the matrix is singular.
     """
     b = matrix.shape[0]
     for i in range(b):
@@ -201,7 +152,7 @@ def solve(matrix: Array, right: Array) -> bool:
     return True
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled("f8[::1], b1[::1], f8, f8[:, ::1], b1[:, ::1], f8[:, ::1], f8[:, ::1]")
 def add_residuals(
     residual: Array,
     use: NDArray[np.bool_],

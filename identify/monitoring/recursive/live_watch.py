@@ -20,7 +20,7 @@ from armident.identify.monitoring.recursive.block_order import BlockOrder
 from armident.identify.monitoring.recursive.estimator import RecursiveEstimator, RecursiveResult
 from armident.identify.monitoring.recursive.report import document
 from armident.identify.monitoring.recursive.rows import SampleBlock
-from armident.identify.monitoring.stream_buffer import LARGEST_BLOCK
+from armident.identify.monitoring.worker.stream_buffer import LARGEST_BLOCK
 
 log = logging.getLogger(__name__)
 
@@ -39,14 +39,7 @@ WAITING_BYTES = 256 << 20
 class Watch:
     """Hands blocks to the estimator, and results to a listener every `SHOWN_S` of the stream.
 
-    Parameters
-    ----------
-    estimator
-        The estimator.
-    rate_hz
-        Rate of SYNC, 1/s.
-    show
-        Takes each result.
+    ``rate_hz``: rate of SYNC, 1/s; ``show``: takes each result.
     """
 
     def __init__(self, estimator: RecursiveEstimator, rate_hz: float, show: Callable[[RecursiveResult], None]) -> None:
@@ -64,17 +57,7 @@ class Watch:
 
 
 class LiveWatch:
-    """Subscribes to the stream of a cell and publishes the results of the estimator.
-
-    Parameters
-    ----------
-    session
-        Configuration of the cell.
-    robot
-        Configuration of its robot.
-    estimator
-        The estimator.
-    """
+    """Subscribes to the stream of a cell and publishes the results of the estimator."""
 
     def __init__(self, session: SessionConfig, robot: RobotConfig, estimator: RecursiveEstimator) -> None:
         self._robot = robot
@@ -116,16 +99,8 @@ class LiveWatch:
     ) -> None:  # fmt: skip
         """Process blocks until a stop.
 
-        Parameters
-        ----------
-        stop
-            Set to end.
-        show
-            Takes each result.
-        save
-            Called every `SAVED_S`.
-        duration
-            Time after which to end, s; ``None``: only at the stop.
+        ``stop``: set to end. ``show``: takes each result. ``save``: called every `SAVED_S`. ``duration``: time after
+        which to end, s; ``None``: only at the stop.
         """
 
         def publish(result: RecursiveResult) -> None:
@@ -197,16 +172,6 @@ class LiveWatch:
 
 
 def live_estimator(session: SessionConfig, robot: RobotConfig, reference: IdentificationDocument) -> RecursiveEstimator:
-    """Return the estimator for the streams of a cell.
-
-    Parameters
-    ----------
-    session
-        Configuration of the cell.
-    robot
-        Configuration of its robot.
-    reference
-        Identification of the healthy arm.
-    """
+    """Return the estimator for the streams of a cell. ``reference``: identification of the healthy arm."""
     with_reference = any("demand" in stream.objects for stream in session.streams.values())
     return RecursiveEstimator(robot, reference, 1.0 / session.sync_period, with_reference=with_reference)

@@ -17,14 +17,7 @@ class RunningNoise:
     A friction torque is nearly constant within a move. Slow residuals therefore disturb its estimate as a white noise
     of this long-run variance does. It is never below the variance itself.
 
-    Parameters
-    ----------
-    n
-        Number of joints.
-    rate_hz
-        Rate of the residuals, 1/s.
-    settings
-        Memory, and the least amount of motion.
+    ``settings``: memory, and the least amount of motion.
     """
 
     _saved = ("past", "known", "sums", "counts", "seen")
@@ -54,12 +47,7 @@ class RunningNoise:
     def add(self, residual: Array, use: NDArray[np.bool_]) -> None:
         """Add the residuals of an instant.
 
-        Parameters
-        ----------
-        residual
-            Residuals (n,), N m or N.
-        use
-            Mask (n,) of the residuals that count.
+        ``residual`` (n,), N m or N; ``use``: mask (n,) of the residuals that count.
         """
         self.seen += use
         add_residuals(residual, use, self._keep, self.past, self.known, self.sums, self.counts)

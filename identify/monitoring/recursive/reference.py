@@ -83,10 +83,7 @@ def torque_lead(document: IdentificationDocument) -> float:
     The limits are those of the check of the set-up: a drive holds its torque until the next sample (0.5), unless joints
     that know it to a quarter of a sample agree on another lead, by 0.1 to 1 sample, within three standard deviations.
 
-    Parameters
-    ----------
-    document
-        Identification of the arm.
+    ``document``: identification of the arm.
     """
     found = np.array(list((document.torque_delay_samples or {}).values())).reshape(-1, 2)
     samples, std = found[np.isfinite(found).all(axis=1) & (found[:, 1] <= KNOWN_LEAD) & (found[:, 1] > 0)].T
@@ -107,21 +104,9 @@ def torque_lead(document: IdentificationDocument) -> float:
 def reference_from(document: IdentificationDocument, robot: RobotConfig, settings: RecursiveSettings) -> Reference:
     """Return the reference of an identification document.
 
-    Parameters
-    ----------
-    document
-        Identification of the arm.
-    robot
-        Configuration of the arm.
-    settings
-        Widths of the random walk.
-
-    Raises
-    ------
-    ConfigError
-        If the configuration has effects, which the stream does not compute.
-    DataError
-        If the document is unusable, of another robot, or has other parameters.
+    ``document``: identification of the arm; ``settings``: widths of the random walk. Raises ConfigError if the
+    configuration has effects, which the stream does not compute; DataError if the document is unusable, of another
+    robot, or has other parameters.
     """
     if robot.effects:
         raise ConfigError(f"robot {robot.name!r} has effects: armident watch needs a configuration without them")

@@ -14,16 +14,7 @@ from armident.daq.recording import Recording, StreamLayout
 class RecordedBlock:
     """Consecutive rows of one recorded stream.
 
-    Parameters
-    ----------
-    layout
-        Layout of the stream.
-    sync
-        SYNC numbers (N,).
-    t_ns
-        Receive times (N,), ns UTC.
-    raw
-        Raw values of every field, (N, n) each.
+    ``sync``: SYNC numbers (N,); ``t_ns``: receive times (N,), ns UTC; ``raw``: raw values of every field, (N, n) each.
     """
 
     layout: StreamLayout
@@ -38,15 +29,7 @@ def has_reference(recording: Recording) -> bool:
 
 
 def blocks_of(recording: Recording, syncs: int) -> Iterator[RecordedBlock]:
-    """Yield the streams of a recording in pieces.
-
-    Parameters
-    ----------
-    recording
-        The recording.
-    syncs
-        Number of SYNCs per piece.
-    """
+    """Yield the streams of a recording in pieces."""
     joints = [joint.name for joint in recording.robot.joints]
     layouts = {name: StreamLayout.of(stream, joints) for name, stream in recording.streams.items()}
     sync = recording.samples.sync

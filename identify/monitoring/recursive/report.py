@@ -18,10 +18,7 @@ DRIFTED = 0.06
 def joint_states(result: RecursiveResult) -> list[str]:
     """State of each joint: ``alarm``, ``drifted``, ``unchanged``, ``too little motion`` or ``no motion``.
 
-    Parameters
-    ----------
-    result
-        State of the estimator.
+    ``result``: state of the estimator.
     """
     states = []
     for j in range(result.valid.size):
@@ -37,12 +34,7 @@ def joint_states(result: RecursiveResult) -> list[str]:
 def document(result: RecursiveResult, robot: RobotConfig) -> dict[str, Any]:
     """Return the document that ``armident watch`` publishes and prints; values that are not valid are null.
 
-    Parameters
-    ----------
-    result
-        State of the estimator.
-    robot
-        Configuration of the arm.
+    ``result``: state of the estimator.
     """
     states = joint_states(result)
     joints = [
@@ -86,15 +78,7 @@ def document(result: RecursiveResult, robot: RobotConfig) -> dict[str, Any]:
 
 
 def friction_table(result: RecursiveResult, robot: RobotConfig) -> Table:
-    """Return the table of ``armident watch``: one row per joint.
-
-    Parameters
-    ----------
-    result
-        State of the estimator.
-    robot
-        Configuration of the arm.
-    """
+    """Return the table of ``armident watch``: one row per joint. ``result``: state of the estimator."""
     table = Table(title=f"{robot.name}: {result.motion_s:.0f} s of motion")
     for heading in ("joint", "excitation", "friction / reference", "evidence, nats", "state"):
         table.add_column(heading, justify="left" if heading in ("joint", "state") else "right")

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from armident.configs import DataError, RobotConfig
 from armident.daq.recording import Field, StreamLayout
+from armident.identify.identification.set_points import between_set_points
 from armident.identify.monitoring.recursive.kernels import to_joint_side
 
 Array = NDArray[np.float64]
@@ -85,20 +86,8 @@ class RowMatcher:
     def add(self, block: SampleBlock) -> bool:
         """Take over a block; rows that are complete are handed over.
 
-        Parameters
-        ----------
-        block
-            A block of any stream.
-
-        Returns
-        -------
-        bool
-            True if the block begins another capture: its SYNC numbers begin anew at a later time.
-
-        Raises
-        ------
-        DataError
-            If the block has other joints than the robot, or lacks position or torque.
+        ``block``: a block of any stream. Returns True if the block begins another capture: its SYNC numbers begin anew
+        at a later time. Raises DataError if the block has other joints than the robot, or lacks position or torque.
         """
         layout = block.layout
         names = tuple(joint.name for joint in self._robot.joints)
@@ -155,15 +144,8 @@ class RowMatcher:
         ready = int(np.searchsorted(self.sync, last, side="right"))
         if ready:
             sync, values = self.sync[:ready], self.values[:ready]
-            before = np.searchsorted(knots, sync, side="right") - 1
-            low = np.clip(before, 0, max(knots.size - 2, 0))
-            high = np.minimum(low + 1, knots.size - 1)
-            width = knots[high] - knots[low]
-            exact = (before >= 0) & (knots[np.maximum(before, 0)] == sync)
-            known = exact | ((before >= 0) & (width == self.demand_every))
-            share = np.where(width > 0, (sync - knots[low]) / np.maximum(width, 1), 0.0)[:, None]
+            known, low, high, share = between_set_points(knots, self.demand_every, sync)
             reference = self.knots[low] + share * (self.knots[high] - self.knots[low])
-            reference[exact] = self.knots[before[exact]]
             self.without_reference += int(np.count_nonzero(~known))
             self._hand_over(sync[known], np.hstack([values, reference])[known])
             self.sync, self.values = self.sync[ready:], self.values[ready:]

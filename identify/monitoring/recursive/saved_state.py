@@ -29,15 +29,7 @@ class HasState(Protocol):
 
 
 def state_of(owner: HasState, prefix: str = "") -> dict[str, NDArray[Any]]:
-    """Return copies of the state of an object by name.
-
-    Parameters
-    ----------
-    owner
-        The object.
-    prefix
-        Beginning of every name.
-    """
+    """Return copies of the state of an object by name. ``prefix``: beginning of every name."""
     found: dict[str, NDArray[Any]] = {}
     for name in owner._saved:
         value = getattr(owner, name)
@@ -51,19 +43,8 @@ def state_of(owner: HasState, prefix: str = "") -> dict[str, NDArray[Any]]:
 def restore_state(owner: HasState, arrays: dict[str, NDArray[Any]], prefix: str = "") -> None:
     """Give an object a state.
 
-    Parameters
-    ----------
-    owner
-        The object.
-    arrays
-        Arrays of `state_of`.
-    prefix
-        Beginning of every name.
-
-    Raises
-    ------
-    DataError
-        If an array is missing or has another number of dimensions.
+    ``arrays``: arrays of `state_of`; ``prefix``: beginning of every name. Raises DataError if an array is missing or
+    has another number of dimensions.
     """
     for name in owner._saved:
         value = getattr(owner, name)
@@ -79,14 +60,7 @@ def restore_state(owner: HasState, arrays: dict[str, NDArray[Any]], prefix: str 
 def write_state(path: Path, arrays: dict[str, NDArray[Any]], identity: dict[str, str]) -> None:
     """Write a state so that a reader sees all of it or none.
 
-    Parameters
-    ----------
-    path
-        File to write (NumPy ``.npz``).
-    arrays
-        The state.
-    identity
-        Robot and reference that it belongs to.
+    ``path``: file to write (NumPy ``.npz``); ``identity``: robot and reference that it belongs to.
     """
     buffer = io.BytesIO()
     head = np.frombuffer(json.dumps({"schema": SCHEMA, **identity}).encode(), dtype=np.uint8)
@@ -107,19 +81,8 @@ def write_state(path: Path, arrays: dict[str, NDArray[Any]], identity: dict[str,
 def read_state(path: Path, identity: dict[str, str]) -> dict[str, NDArray[Any]]:
     """Read a state that `write_state` wrote.
 
-    Parameters
-    ----------
-    path
-        The file.
-    identity
-        Robot and reference that the state must belong to.
-
-    Raises
-    ------
-    ConfigError
-        If the file is missing.
-    DataError
-        If it is no state, or one of another version, robot or reference.
+    ``identity``: robot and reference that the state must belong to. Raises ConfigError if the file is missing;
+    DataError if it is no state, or one of another version, robot or reference.
     """
     try:
         with np.load(path, allow_pickle=False) as content:

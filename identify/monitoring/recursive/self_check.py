@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from armident.compiled import SHIPPED
 from armident.configs import ArmidentError
 from armident.identify.monitoring.recursive.kernels import update
 
@@ -16,10 +17,7 @@ TOLERANCE = 1e-9
 def check_update() -> None:
     """Compare the compiled update with filterpy on a small case, once per process.
 
-    Raises
-    ------
-    ArmidentError
-        If they differ: the compiled code of this machine is wrong.
+    Raises ArmidentError if they differ: the compiled code of this machine is wrong.
     """
     from filterpy.kalman import KalmanFilter
 
@@ -39,6 +37,4 @@ def check_update() -> None:
         covariance += oracle.Q
         update(state, covariance, x, x, y, variance, np.ones(n, np.bool_))
     if max(np.abs(state - oracle.x[:, 0]).max(), np.abs(covariance - oracle.P).max()) > TOLERANCE:
-        raise ArmidentError(
-            "the compiled update differs from filterpy's: remove the folder NUMBA_CACHE_DIR and try again"
-        )
+        raise ArmidentError(f"the compiled update differs from filterpy's: remove the folder {SHIPPED} and try again")

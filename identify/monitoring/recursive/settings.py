@@ -79,11 +79,6 @@ class RecursiveSettings:
         """Threshold of the log-likelihood ratio, nats, for both directions of all joints together.
 
         The mean number of windows to a false alarm is at least ``exp(threshold)`` (Lorden 1971).
-
-        Parameters
-        ----------
-        joints
-            Number of joints.
         """
         return math.log(2 * joints * 3600.0 / self.window_s * self.false_alarm_hours)
 

@@ -35,16 +35,9 @@ REPLAY_SYNCS = 1000
 class WatchOptions:
     """Options of ``armident watch``.
 
-    Parameters
-    ----------
-    reference
-        Identification of the healthy arm.
-    state
-        File of the saved state; ``None``: none is kept.
-    as_json
-        One JSON document per line in place of the table.
-    duration
-        Time after which a live watch ends, s; ``None``: at a signal.
+    ``reference``: identification of the healthy arm. ``state``: file of the saved state; ``None``: none is kept.
+    ``as_json``: one JSON document per line in place of the table. ``duration``: time after which a live watch ends, s;
+    ``None``: at a signal.
     """
 
     reference: Path
@@ -56,12 +49,7 @@ class WatchOptions:
 class Screen:
     """Shows results: JSON lines, a table that is renewed on a terminal, or one line per change of state.
 
-    Parameters
-    ----------
-    robot
-        Configuration of the arm.
-    as_json
-        Print JSON lines.
+    ``as_json``: print JSON lines.
     """
 
     def __init__(self, robot: RobotConfig, as_json: bool) -> None:
@@ -106,24 +94,9 @@ class Screen:
 def watch_recordings(paths: Sequence[Path], config: Path | None, options: WatchOptions) -> int:
     """Carry out ``armident watch RECORDING``.
 
-    Parameters
-    ----------
-    paths
-        Recordings of one robot in the order of time.
-    config
-        Robot configuration; ``None``: that of the first recording.
-    options
-        Options.
-
-    Returns
-    -------
-    int
-        4 after an alarm, 3 if no joint had enough excitation, otherwise 0.
-
-    Raises
-    ------
-    ConfigError, DataError
-        If a file is wrong, or the reference does not fit.
+    ``paths``: recordings of one robot in the order of time. ``config``: robot configuration; ``None``: that of the
+    first recording. Returns 4 after an alarm, 3 if no joint had enough excitation, otherwise 0. Raises ConfigError or
+    DataError if a file is wrong, or the reference does not fit.
     """
     reference = load_document(options.reference, IdentificationDocument)
     first = read_recording(paths[0])
@@ -168,22 +141,8 @@ def _load_state(estimator: RecursiveEstimator, path: Path | None) -> None:
 def watch_cell(config: Path | None, options: WatchOptions) -> int:
     """Carry out ``armident watch --config SESSION`` until SIGTERM or SIGINT.
 
-    Parameters
-    ----------
-    config
-        Session configuration.
-    options
-        Options.
-
-    Returns
-    -------
-    int
-        4 after an alarm, otherwise 0.
-
-    Raises
-    ------
-    ConfigError, DataError
-        If a file is wrong, or the reference does not fit.
+    ``config``: session configuration. Returns 4 after an alarm, otherwise 0. Raises ConfigError or DataError if a file
+    is wrong, or the reference does not fit.
     """
     if config is None:
         raise ConfigError("give a RECORDING, or --config SESSION for the live stream of a cell")

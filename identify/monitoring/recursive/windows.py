@@ -16,13 +16,8 @@ Array = NDArray[np.float64]
 class WindowEstimate:
     """Estimate of one window.
 
-    Parameters
-    ----------
-    difference
-        Parameters less the reference, (b,), SI.
-    change, std
-        Relative change of each joint's friction and its standard deviation, (n,), 1; NaN and infinite where the
-        joint has no friction or did not move.
+    ``difference``: parameters less the reference, (b,), SI. ``change``, ``std``: relative change of each joint's
+    friction and its standard deviation, (n,), 1; NaN and infinite where the joint has no friction or did not move.
     """
 
     difference: Array
@@ -31,13 +26,7 @@ class WindowEstimate:
 
 
 class Window:
-    """Products of the equations since the last estimate.
-
-    Parameters
-    ----------
-    reference
-        Reference with n joints and b parameters.
-    """
+    """Products of the equations since the last estimate. ``reference``: reference with n joints and b parameters."""
 
     _saved = ("sums", "squares", "right", "instants")
 
@@ -54,16 +43,8 @@ class Window:
     def add(self, instant: Instant, residual: Array, variance: Array, use: NDArray[np.bool_]) -> None:
         """Add the equations of an instant.
 
-        Parameters
-        ----------
-        instant
-            Regressor and instruments.
-        residual
-            Torques less those of the reference, (n,), N m or N.
-        variance
-            Variance of each equation, (n,).
-        use
-            Mask (n,) of the equations to use.
+        ``instant``: regressor and instruments; ``residual``: torques less those of the reference, (n,), N m or N;
+        ``variance``: variance of each equation, (n,); ``use``: mask (n,) of the equations to use.
         """
         add_products(self.sums, self.squares, self.right, instant.x, instant.z, residual, variance, use)
         self.instants += 1
@@ -90,19 +71,9 @@ def friction_change(reference: Reference, difference: Array, covariance: Array) 
     The generalised least-squares estimate of c in ``d = c f`` from the differences d of both parameters, their
     covariance V and the reference f: ``c = f' V^-1 d / f' V^-1 f``, with the variance ``1 / f' V^-1 f``.
 
-    Parameters
-    ----------
-    reference
-        Reference with n joints.
-    difference
-        Parameters less the reference, (b,), SI.
-    covariance
-        Covariance of the parameters, (b, b).
-
-    Returns
-    -------
-    change, std
-        (n,) each, 1; NaN and infinite where the reference has no friction.
+    ``reference``: reference with n joints; ``difference``: parameters less the reference, (b,), SI; ``covariance``:
+    covariance of the parameters, (b, b). Returns ``change``, ``std``: (n,) each, 1; NaN and infinite where the
+    reference has no friction.
     """
     n = reference.friction.shape[0]
     change, std = np.full(n, np.nan), np.full(n, np.inf)

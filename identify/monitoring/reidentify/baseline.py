@@ -6,7 +6,7 @@ from pathlib import Path
 from armident.configs import ConfigError, DataError
 from armident.identify.documents.files import load_document, to_json, write_atomically
 from armident.identify.documents.identification import IdentificationDocument
-from armident.identify.monitoring.history import History
+from armident.identify.monitoring.change.history import History
 
 
 @dataclass(frozen=True)
@@ -28,21 +28,9 @@ class Baseline:
 def baseline_of(file: Path | None, history: History | None, robot: str, cell: str) -> Baseline:
     """Return the baseline of the robot in a cell.
 
-    Parameters
-    ----------
-    file
-        Baseline given by the user; ``None``: the first run in the history.
-    history
-        Database of identifications; ``None`` if it cannot be read, with a file that exists.
-    robot, cell
-        Names of robot and cell.
-
-    Raises
-    ------
-    ConfigError
-        If ``file`` is missing although the history has runs of this arm: probably a misspelt name.
-    DataError
-        If it is of another robot.
+    ``file``: baseline given by the user; ``None``: the first run in the history. ``history``: database of
+    identifications; ``None`` if it cannot be read, with a file that exists. Raises ConfigError if ``file`` is missing
+    although the history has runs of this arm: probably a misspelt name; DataError if it is of another robot.
     """
     first = None if history is None else history.first(robot, cell)
     if file is None:

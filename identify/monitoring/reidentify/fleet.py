@@ -15,13 +15,13 @@ from armident.daq.recording import Recording, read_recording
 from armident.extras import install_line
 from armident.identify.documents.files import from_json, load_document, to_json
 from armident.identify.documents.identification import IdentificationDocument
-from armident.identify.identification.api import identify_recording
+from armident.identify.identification.identify_recording import identify_recording
 from armident.identify.identification.options import Options
-from armident.identify.monitoring.change_test import ParameterChangeTest, compare
-from armident.identify.monitoring.history import History
-from armident.identify.monitoring.reidentify.options import ReidentifyOptions
+from armident.identify.monitoring.change.change_test import ParameterChangeTest, compare
+from armident.identify.monitoring.change.history import History
+from armident.identify.monitoring.reidentify.reidentify_options import ReidentifyOptions
 from armident.identify.monitoring.reidentify.summary import change_lines
-from armident.identify.report.files import write_identification
+from armident.identify.report.robot_file import write_identification
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -62,24 +62,9 @@ def fleet_command(pattern: str, asked: ReidentifyOptions, *, as_json: bool) -> i
     Recordings are compared in the order of their names: with the baseline, or with the first run of the arm (robot and
     cell) in the history. A failed recording does not stop the others.
 
-    Parameters
-    ----------
-    pattern
-        Glob pattern of the recordings.
-    asked
-        Options of the command.
-    as_json
-        Print JSON on stdout.
-
-    Returns
-    -------
-    int
-        Exit code: 0, `DRIFTED` or `FAILED`.
-
-    Raises
-    ------
-    ConfigError
-        If nothing matches, the scheduler does not answer, or neither it nor workers are given.
+    ``pattern``: glob pattern of the recordings; ``as_json``: print JSON on stdout. Returns the exit code: 0, `DRIFTED`
+    or `FAILED`. Raises ConfigError if nothing matches, the scheduler does not answer, or neither it nor workers are
+    given.
     """
     paths = [Path(name).resolve() for name in sorted(glob.glob(pattern, recursive=True))]
     if not paths:
@@ -111,17 +96,8 @@ def fleet_command(pattern: str, asked: ReidentifyOptions, *, as_json: bool) -> i
 def cluster(scheduler: str | None, workers: int | None) -> "Iterator[Client]":
     """Yield a client of a Dask scheduler, or of a local cluster.
 
-    Parameters
-    ----------
-    scheduler
-        Address of a scheduler.
-    workers
-        Number of local processes, without a scheduler.
-
-    Raises
-    ------
-    ConfigError
-        If Dask is not installed, the scheduler does not answer, or both or none are given.
+    ``scheduler``: address of a scheduler; ``workers``: number of local processes, without a scheduler. Raises
+    ConfigError if Dask is not installed, the scheduler does not answer, or both or none are given.
     """
     if scheduler is None and workers is None:
         raise ConfigError("--recordings: needs --scheduler ADDRESS, or --workers N for processes on this machine")
@@ -149,19 +125,8 @@ def cluster(scheduler: str | None, workers: int | None) -> "Iterator[Client]":
 def identify_one(path: str, robot: RobotConfig | None, out: str) -> Identified:
     """Identify one recording on a worker of the cluster.
 
-    Parameters
-    ----------
-    path
-        Recording.
-    robot
-        Configuration; ``None``: that of the recording.
-    out
-        Folder of the result.
-
-    Raises
-    ------
-    ArmidentError
-        For any failure, as other exceptions may not be picklable.
+    ``robot``: configuration; ``None``: that of the recording. Raises ArmidentError for any failure, as other exceptions
+    may not be picklable.
     """
     try:
         recording = read_recording(Path(path))

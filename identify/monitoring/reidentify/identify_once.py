@@ -12,13 +12,13 @@ from armident.configs import ArmidentError, DataError, RobotConfig
 from armident.daq.recording import Recording
 from armident.identify.documents.files import load_document, to_json
 from armident.identify.documents.identification import IdentificationDocument
-from armident.identify.identification.api import identify_recording
+from armident.identify.identification.identify_recording import identify_recording
 from armident.identify.identification.options import Options
-from armident.identify.monitoring.ledger import FILE, Ledger, LedgerError, LedgerUnusable, unique_owner
-from armident.identify.monitoring.recorded import captured_in, result_of
 from armident.identify.monitoring.reidentify.publish import StatusPublisher
 from armident.identify.monitoring.reidentify.record_run import Say
-from armident.identify.report.files import write_identification
+from armident.identify.monitoring.worker.ledger import FILE, Ledger, LedgerError, LedgerUnusable, unique_owner
+from armident.identify.monitoring.worker.recorded import captured_in, result_of
+from armident.identify.report.robot_file import write_identification
 
 RENEW_S = 1.0
 """Interval at which the lease is renewed, s."""
@@ -45,16 +45,9 @@ class _NotPublished(Exception):
 class _Recorded:
     """Recording that is to be identified and announced once.
 
-    Parameters
-    ----------
-    digest, name
-        Hash of the recording and its name, without suffix.
-    identify
-        Returns its identification, from the file if there is one.
-    publisher
-        Publishes results and failures.
-    published
-        True if the result or the failure was published by this process.
+    ``digest``, ``name``: hash of the recording and its name, without suffix; ``identify``: returns its identification,
+    from the file if there is one; ``publisher``: publishes results and failures; ``published``: True if the result or
+    the failure was published by this process.
     """
 
     digest: str
@@ -88,27 +81,9 @@ def identify_once(
 
     Without a ledger that can be written the result is announced all the same.
 
-    Parameters
-    ----------
-    recording
-        The recording.
-    robot
-        Configuration of its robot.
-    options
-        Options of the identification.
-    out
-        Folder of the results, with the ledger that the workers use.
-    publisher
-        Publishes the result, or the reason why there is none.
-    say
-        Takes lines of progress.
-
-    Raises
-    ------
-    DataError
-        If the recording cannot be identified.
-    ArmidentError
-        If the result cannot be written.
+    ``out``: folder of the results, with the ledger that the workers use; ``publisher``: publishes the result, or the
+    reason why there is none; ``say``: takes lines of progress. Raises DataError if the recording cannot be identified;
+    ArmidentError if the result cannot be written.
     """
     path = recording.path
     beside = [] if path is None else captured_in((path.parent,), robot.name)
@@ -215,8 +190,8 @@ def _identified(recording: Recording, robot: RobotConfig, options: Options, fold
         path, _ = write_identification(outcome, folder)
     except OSError as error:
         raise ArmidentError(
-            f"{error.filename or folder}: the result cannot be written: {error.strerror}; mend that, "
-            f"then a worker of the cell identifies the recording, or: armident identify {recording.path}"
+            f"{error.filename or folder}: the result cannot be written: {error.strerror}; fix this; "
+            f"a worker of the cell then identifies the recording, or run armident identify {recording.path}"
         ) from error
     return OnceIdentified(outcome.document, path, ours=True)
 

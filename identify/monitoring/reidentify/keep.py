@@ -8,9 +8,9 @@ from pathlib import Path
 from armident.configs import ConfigError
 from armident.daq.recording import Recording
 from armident.identify.documents.identification import IdentificationDocument
-from armident.identify.monitoring.change_test import ParameterChangeTest
-from armident.identify.monitoring.history import History
-from armident.identify.monitoring.history_schema import wait_and_try
+from armident.identify.monitoring.change.change_test import ParameterChangeTest
+from armident.identify.monitoring.change.history import History
+from armident.identify.monitoring.change.history_schema import wait_and_try
 from armident.identify.monitoring.reidentify.record_run import Say
 
 RETRY_S = 60.0
@@ -20,17 +20,8 @@ RETRY_S = 60.0
 def history_or_reason(store: str, needed: bool) -> tuple[History | None, str | None]:
     """Return the history, or ``None`` and the reason why it cannot be opened.
 
-    Parameters
-    ----------
-    store
-        SQLAlchemy URL of the history.
-    needed
-        True if the run needs the history: no other baseline is given.
-
-    Raises
-    ------
-    ConfigError
-        If it is needed and cannot be opened.
+    ``store``: SQLAlchemy URL of the history; ``needed``: True if the run needs the history: no other baseline is given.
+    Raises ConfigError if it is needed and cannot be opened.
     """
     try:
         return History(store), None
@@ -44,14 +35,8 @@ def history_or_reason(store: str, needed: bool) -> tuple[History | None, str | N
 class HistoryEntry:
     """A run and its comparison, to be entered in the history.
 
-    Parameters
-    ----------
-    store
-        SQLAlchemy URL of the history.
-    recording, document, path
-        Recording, its identification, and the file of that.
-    baseline, drift
-        Baseline and result of the comparison, if there was one.
+    ``store``: SQLAlchemy URL of the history; ``baseline``, ``drift``: baseline and result of the comparison, if there
+    was one.
     """
 
     store: str
@@ -64,10 +49,7 @@ class HistoryEntry:
     def write(self) -> None:
         """Write the entry; what the history has already is not written again.
 
-        Raises
-        ------
-        ConfigError
-            If the database cannot be written.
+        Raises ConfigError if the database cannot be written.
         """
         history = History(self.store)
         facts = History.facts(self.recording)
@@ -79,12 +61,7 @@ class HistoryEntry:
     def write_or_say(self, say: Say, seconds: float = 0.0) -> bool:
         """Write the entry; if the database refuses it, say why and return False.
 
-        Parameters
-        ----------
-        say
-            Takes lines of progress.
-        seconds
-            Time for which a refused entry is tried again, s.
+        ``say``: takes lines of progress; ``seconds``: time for which a refused entry is tried again, s.
         """
         return wait_and_try(self.write, seconds, say)
 
@@ -93,12 +70,7 @@ class HistoryEntry:
 def kept(entry: HistoryEntry, say: Say) -> Iterator[None]:
     """Write an entry before the block, and try a refused one again after it, also if it ends with an error.
 
-    Parameters
-    ----------
-    entry
-        The entry.
-    say
-        Takes lines of progress.
+    ``say``: takes lines of progress.
     """
     written = entry.write_or_say(say)
     try:

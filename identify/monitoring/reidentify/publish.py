@@ -10,8 +10,8 @@ import zenoh
 from armident.configs import ConfigError, RobotConfig, SessionConfig
 from armident.daq.streaming import Announcer, Keys, open_session
 from armident.daq.streaming.announcer import longest_retry_s
-from armident.daq.streaming.session import configuration
-from armident.identify.monitoring.status_messages import failure_status, status
+from armident.daq.streaming.zenoh_session import configuration
+from armident.identify.monitoring.worker.status_messages import failure_status, status
 
 log = logging.getLogger(__name__)
 
@@ -23,13 +23,6 @@ class StatusPublisher:
     """Publishes status and results of one job.
 
     It listens on the port of the worker if no worker runs, and on a free port otherwise.
-
-    Parameters
-    ----------
-    session
-        Configuration of the cell.
-    robot
-        Configuration of its robot.
     """
 
     def __init__(self, session: SessionConfig, robot: RobotConfig) -> None:
@@ -58,15 +51,7 @@ class StatusPublisher:
         self._put(self._keys.status, status("reidentify", state, **more))
 
     def failure(self, message: str, name: str, sha256: str) -> None:
-        """Publish why a recording cannot be identified.
-
-        Parameters
-        ----------
-        message
-            The reason.
-        name, sha256
-            Name of the recording and its hash.
-        """
+        """Publish why a recording cannot be identified. ``name``, ``sha256``: name of the recording and its hash."""
         self._put(self._keys.status, failure_status("reidentify", message, name, sha256))
 
     def result(self, text: str) -> bool:

@@ -32,12 +32,7 @@ def start_process(words: Sequence[str], out: IO[bytes], err: IO[bytes]) -> Proce
 
     Signals of the terminal then reach this process only, which signals the guard before the capture.
 
-    Parameters
-    ----------
-    words
-        Words of the command.
-    out, err
-        Files of standard output and standard error.
+    ``out``, ``err``: files of standard output and standard error.
     """
     return start_command(words, out, err, own_session=True, with_parent=True)
 
@@ -51,25 +46,9 @@ class Interrupted(ArmidentError):
 def record_run(config: Path, out: Path, say: Say, start: Start = start_process) -> Recording:
     """Play the set points of a session once under a guard and return the recording.
 
-    Parameters
-    ----------
-    config
-        Session configuration, checked.
-    out
-        Folder of the recording.
-    say
-        Takes lines of progress.
-    start
-        Starts guard and capture.
-
-    Raises
-    ------
-    ConfigError
-        If bus or drives are missing, or not as configured.
-    ArmidentError
-        If the guard stopped the arm, or a drive failed. The recording is kept.
-    Interrupted
-        On SIGINT and SIGTERM.
+    ``config``: session configuration, checked; ``say``: takes lines of progress; ``start``: starts guard and capture.
+    Raises ConfigError if bus or drives are missing, or not as configured. Raises ArmidentError if the guard stopped the
+    arm, or a drive failed. The recording is kept. Raises Interrupted on SIGINT and SIGTERM.
     """
     # The guard runs from before the first motion until after the last.
     with _interruptible(), _command(["guard", "--config", str(config)], start) as guard:

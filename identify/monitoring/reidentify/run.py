@@ -27,13 +27,13 @@ from armident.identify.effects.terms import arm_model
 from armident.identify.excitation.point_to_point import sample_trajectory
 from armident.identify.excitation.previous_estimate import previous_estimate
 from armident.identify.identification.options import Options
-from armident.identify.monitoring.change_test import Inconclusive, ParameterChangeTest, compare
+from armident.identify.monitoring.change.change_test import Inconclusive, ParameterChangeTest, compare
 from armident.identify.monitoring.reidentify.baseline import Baseline, baseline_of
 from armident.identify.monitoring.reidentify.identify_once import identify_once
 from armident.identify.monitoring.reidentify.keep import HistoryEntry, history_or_reason, kept
-from armident.identify.monitoring.reidentify.options import ReidentifyOptions
 from armident.identify.monitoring.reidentify.publish import StatusPublisher
 from armident.identify.monitoring.reidentify.record_run import Say, record_run, start_process
+from armident.identify.monitoring.reidentify.reidentify_options import ReidentifyOptions
 from armident.identify.monitoring.reidentify.summary import change_lines, finding_lines
 from armident.processes import Start
 
@@ -82,23 +82,9 @@ class Outcome:
 def reidentify_command(asked: ReidentifyOptions, *, as_json: bool) -> int:
     """Carry out ``armident reidentify`` without ``--recordings``.
 
-    Parameters
-    ----------
-    asked
-        Options of the command.
-    as_json
-        Print the result as JSON.
-
-    Returns
-    -------
-    int
-        Exit code: 0, or `DRIFTED`.
-
-    Raises
-    ------
-    ConfigError, DataError, ArmidentError
-        Before the motion: if configuration, trajectory, baseline or history are wrong. Later: if bus, drives or guard
-        end the motion, or the recording cannot be identified.
+    ``as_json``: print the result as JSON. Returns the exit code: 0, or `DRIFTED`. Raises ConfigError or DataError or
+    ArmidentError: before the motion: if configuration, trajectory, baseline or history are wrong. Later: if bus, drives
+    or guard end the motion, or the recording cannot be identified.
     """
     for option, given in (("--scheduler", asked.scheduler), ("--workers", asked.workers)):
         if given is not None:
@@ -123,25 +109,10 @@ def reidentify_command(asked: ReidentifyOptions, *, as_json: bool) -> int:
 def prepare(config: Path, baseline: Path | None, store: str, out: Path | None, false_alarms: float) -> Job:
     """Load and check the inputs of a job.
 
-    Parameters
-    ----------
-    config
-        Session configuration.
-    baseline
-        Identification to compare with; ``None``: the first run in the history.
-    store
-        SQLAlchemy URL of the history.
-    out
-        Folder of recordings and results; ``None``: that of the session.
-    false_alarms
-        Probability of a false alarm.
-
-    Raises
-    ------
-    ConfigError
-        If the session has no set points, or the trajectory exceeds the limits of the robot.
-    DataError
-        If the baseline is of another robot or model.
+    ``config``: session configuration. ``baseline``: identification to compare with; ``None``: the first run in the
+    history. ``store``: SQLAlchemy URL of the history. ``out``: folder of recordings and results; ``None``: that of the
+    session. ``false_alarms``: probability of a false alarm. Raises ConfigError if the session has no set points, or the
+    trajectory exceeds the limits of the robot; DataError if the baseline is of another robot or model.
     """
     session = load_session(config)
     robot = load_robot(session.robot)
@@ -167,21 +138,8 @@ def check_trajectory(session: SessionConfig, robot: RobotConfig, baseline: Basel
 
     Torques are predicted with the parameters of the baseline; without one only the guard checks them.
 
-    Parameters
-    ----------
-    session
-        Names the trajectory.
-    robot
-        Limits.
-    baseline
-        Parameters.
-
-    Raises
-    ------
-    ConfigError
-        If a limit is exceeded; the message names joint and limit.
-    DataError
-        If the baseline is of another model.
+    ``session``: names the trajectory. Raises ConfigError if a limit is exceeded; the message names joint and limit.
+    Raises DataError if the baseline is of another model.
     """
     assert session.setpoints is not None
     name = str(session.setpoints.trajectory)
@@ -202,26 +160,9 @@ def check_trajectory(session: SessionConfig, robot: RobotConfig, baseline: Basel
 def carry_out(job: Job, announcer: StatusPublisher, say: Say, start: Start = start_process) -> Outcome:
     """Carry out a job, store its result in the history, and publish it.
 
-    Parameters
-    ----------
-    job
-        Result of `prepare`.
-    announcer
-        Publisher on Zenoh.
-    say
-        Takes lines of progress.
-    start
-        Starts guard and capture.
-
-    Returns
-    -------
-    Outcome
-        Identification, comparison and diagnosis.
-
-    Raises
-    ------
-    ArmidentError
-        If the motion was stopped, or the recording cannot be identified or compared.
+    ``job``: result of `prepare`; ``announcer``: publisher on Zenoh; ``say``: takes lines of progress; ``start``: starts
+    guard and capture. Returns the identification, comparison and diagnosis. Raises ArmidentError if the motion was
+    stopped, or the recording cannot be identified or compared.
     """
     say(f"{job.robot.name} in cell {job.session.cell}; baseline: {job.baseline.name}")
     if job.warning is not None:
@@ -342,13 +283,7 @@ def _beside(recording: Recording, out: Path, suffix: str) -> Path:
 
 
 def entry(job: Job, outcome: Outcome) -> dict[str, Any]:
-    """Return the result as a document.
-
-    Parameters
-    ----------
-    job, outcome
-        Inputs and result of the job.
-    """
+    """Return the result as a document. ``job``, ``outcome``: inputs and result of the job."""
     drift = outcome.drift
     return {
         "robot": job.robot.name,
@@ -365,13 +300,7 @@ def entry(job: Job, outcome: Outcome) -> dict[str, Any]:
 
 
 def show(job: Job, outcome: Outcome) -> None:
-    """Print the result.
-
-    Parameters
-    ----------
-    job, outcome
-        Inputs and result of the job.
-    """
+    """Print the result. ``job``, ``outcome``: inputs and result of the job."""
     drift = outcome.drift
     if not outcome.changed:
         print("\n".join(outcome.words))

@@ -6,11 +6,12 @@ import numpy as np
 
 from armident.configs import RobotConfig
 from armident.identify.documents.diagnosis import DiagnosisDocument
-from armident.identify.monitoring.change_test import ParameterChangeTest
+from armident.identify.monitoring.change.change_test import ParameterChangeTest
 
 _NAME = re.compile(r"([a-z]+)(\d+)r?(?:_\d+)?$")
 CLEAR = 2.0
-"""Least difference, in standard deviations, of a parameter that is listed for a changed group."""
+"""Least difference, in standard deviations, of a parameter that is listed for a changed group: by chance one in 20 has
+it, and the group as a whole has been tested before."""
 
 _SHARED = ("ia", "fv", "fc")
 """Kinds of parameters of a coupling of two joints."""
@@ -31,12 +32,7 @@ def change_lines(drift: ParameterChangeTest, robot: RobotConfig) -> list[str]:
 
     A single line if only all parameters together have changed; none without a change.
 
-    Parameters
-    ----------
-    drift
-        The comparison.
-    robot
-        Names of the joints.
+    ``robot``: names of the joints.
     """
     lines = [_line(drift, name, robot) + f", p = {_p_text(_p_value(drift, name))}" for name in drift.changed]
     for group in drift.changed_groups:
@@ -94,12 +90,7 @@ def finding_lines(diagnosis: DiagnosisDocument) -> list[str]:
 def place_of(name: str, robot: RobotConfig) -> str:
     """Return the joint, or the two joints of a coupling, of a base parameter.
 
-    Parameters
-    ----------
-    name
-        Base parameter.
-    robot
-        Names of joints and couplings.
+    ``name``: base parameter; ``robot``: names of joints and couplings.
     """
     for coupling in robot.couplings:
         if name in {kind + coupling.name for kind in _SHARED}:

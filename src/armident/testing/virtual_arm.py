@@ -85,6 +85,8 @@ class VirtualArms:
     ) -> VirtualArm:
         """Start a virtual arm and wait until its drives answer.
 
+        Raises ArmidentError if a configuration is wrong, an arm is running already, or the arm does not start.
+
         Parameters
         ----------
         config
@@ -98,11 +100,6 @@ class VirtualArms:
             SYNC period in place of the session's, us; all streams and set points are then on every SYNC.
         model, arm_seed, draw_masses
             Where masses and friction come from, as in ``armident robot``.
-
-        Raises
-        ------
-        ArmidentError
-            If a configuration is wrong, an arm is running already, or the arm does not start.
         """
         if self._arm is not None and self._arm.process.running:
             raise ArmidentError("virtual_arm: an arm is on this bus already; stop() it first")
@@ -163,19 +160,9 @@ class Captures:
     ) -> Recording:
         """Record to a file, and read it.
 
-        Parameters
-        ----------
-        arm
-            A virtual arm, or a session file.
-        duration_s
-            Length of the recording, s; ``None``: to the end of the trajectory of the session.
-        timeout_s
-            Longest time, s.
-
-        Raises
-        ------
-        ArmidentError
-            If the capture fails or takes longer.
+        ``arm``: a virtual arm, or a session file. ``duration_s``: length of the recording, s; ``None``: to the end of
+        the trajectory of the session. ``timeout_s``: longest time, s. Raises ArmidentError if the capture fails or
+        takes longer.
         """
         config = arm.config if isinstance(arm, VirtualArm) else Path(arm)
         number = next(_numbers)

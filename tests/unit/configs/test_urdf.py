@@ -18,7 +18,7 @@ from armident.configs.mdh import modified_dh
 from armident.configs.urdf import mdh_of
 from armident.configs.urdf_origin import fixed_axis_angles, rotation, rotation_of_quaternion
 from armident.configs.urdf_tree import read_chain
-from armident.daq.guard.limits import limits_of
+from armident.daq.guard.motion_limits import motion_limits_of
 from armident.daq.recording import Recording, Stream, read_recording, write_recording
 from armident.daq.recording.model import Field
 from armident.identify.effects.drive import NOMINAL_TORQUE, motor_limit
@@ -316,7 +316,7 @@ def test_a_file_that_is_no_urdf_is_refused(tmp_path: Path, text: str, words: str
         ({"urdf_keys": ", base: b, tip: a"}, r"arm\.urdf: link 'a' \(urdf\.tip\) is not moved by link 'b'"),
         ({"urdf_keys": ", tipp: a"}, r"arm\.yaml: urdf\.tipp: unknown key; did you mean 'tip'\?"),
         ({"joints": "- {name: j9}"}, r"arm\.yaml: joints\[0\]\.name: the chain has no joint 'j9'; it has j1, j2"),
-        ({"joints": "- {name: j1}\n- {name: J1}"}, r"arm\.yaml: joints\[1\]\.name: 'J1' is there twice"),
+        ({"joints": "- {name: j1}\n- {name: J1}"}, r"arm\.yaml: joints\[1\]\.name: duplicate joint 'J1'"),
         ({"joints": "- {name: j1, mdh: {r: 1}}"}, r"arm\.yaml: joints\[0\]\.mdh: unknown key"),
         ({"joints": "- {name: j1, limits: {velocity: -1}}"}, r"joints\[0\]\.limits\.velocity: input should be greater"),
         ({"controller": "{kp: [1.0], kv: [1.0]}"}, r"arm\.yaml: controller: expected 2 numbers in kp and in kv"),
@@ -370,7 +370,7 @@ def test_an_acceleration_and_a_transmission_are_needed_only_where_the_arm_moves(
         "move.yaml: to move the arm, the robot configuration needs also limits.acceleration of j1, j2; "
         "limits.position of j2; limits.velocity of j2; limits.torque of j2; transmission (2 rows of 2 numbers)"
     )
-    for needs in (limits_of, design_trajectory):
+    for needs in (motion_limits_of, design_trajectory):
         with pytest.raises(ConfigError, match=r"robot arm: to move the arm, .* transmission"):
             needs(robot)
 

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from armident.configs import load_robot, load_session
 from armident.daq.capture.batches import PIECE_NS, FileBoundaries, SamplesFirst, pieces
-from armident.daq.capture.files import open_series
 from armident.daq.capture.publisher import Publisher
+from armident.daq.capture.recording_files import open_series
 from armident.daq.capture.sink import Sink
 from armident.daq.matching.assembler import Assembler, Batch, Rows
 from armident.daq.matching.streams import captured_streams

@@ -10,7 +10,8 @@ from typer.testing import CliRunner
 
 from armident.configs import ConfigError, DataError, load_robot, load_session
 from armident.daq.cli import application
-from armident.daq.interchange.bus_log import SUFFIXES, recording_from_log, write_log
+from armident.daq.interchange.bus_log import recording_from_log, write_log
+from armident.daq.interchange.readers import BusLog
 from armident.daq.matching.streams import captured_streams
 from armident.daq.recording import Recording, Stream, read_recording, write_recording
 
@@ -38,7 +39,7 @@ def captured(rows: int = 3000, lost: slice = slice(0)) -> Recording:
     return Recording(None, ROBOT, SESSION, 1e9 / PERIOD_NS, streams)
 
 
-@pytest.mark.parametrize("suffix", SUFFIXES)
+@pytest.mark.parametrize("suffix", BusLog.suffixes)
 def test_a_recording_survives_the_round_trip_through_every_log_format(tmp_path: Path, suffix: str) -> None:
     recording = captured()
     write_log(recording, tmp_path / f"bus{suffix}")

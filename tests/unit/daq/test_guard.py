@@ -6,8 +6,8 @@ from numpy.typing import NDArray
 
 from armident.configs import RobotConfig, SessionConfig, load_robot, load_session, load_trajectory
 from armident.configs.units import counts_per_si
-from armident.daq.guard.limits import limits_of
 from armident.daq.guard.monitor import MotionMonitor
+from armident.daq.guard.motion_limits import motion_limits_of
 from armident.daq.matching.streams import bus_numbers, node_ids
 from armident.drivers.can.frames import Frames, frames
 from armident.drivers.canopen.objects import COB_HEARTBEAT, COB_SYNC, TpdoLayout, rpdo_cob, tpdo_cob
@@ -41,7 +41,7 @@ def on_the_bus(robot: RobotConfig, q: NDArray[np.float64], current: NDArray[np.i
 
 
 def monitor_of(session: SessionConfig, robot: RobotConfig) -> MotionMonitor:
-    return MotionMonitor(session, robot, limits_of(robot))
+    return MotionMonitor(session, robot, motion_limits_of(robot))
 
 
 def test_a_motion_within_the_limits_is_no_alarm(session: SessionConfig, robot: RobotConfig) -> None:
@@ -94,7 +94,7 @@ def test_the_following_error_is_that_of_the_demand_which_the_drives_send(
 ) -> None:
     """Set points that the drives do not follow yet are no following error of drives that send their demand."""
     q = np.zeros(robot.n)
-    q[joint] = 1.02 * limits_of(robot).following[joint]
+    q[joint] = 1.02 * motion_limits_of(robot).following[joint]
     ahead = np.rint(robot.transmission_matrix @ q * counts_per_si(robot)).astype(np.int64)
     far = [int(count).to_bytes(4, "little", signed=True) for count in ahead]
     still = on_the_bus(robot, np.zeros((10, robot.n)))

@@ -11,10 +11,11 @@ import pytest
 import yaml
 from typer.testing import CliRunner, Result
 
+import armident
 from armident.configs import ConfigError, load_robot, load_session
 from armident.configs.blanks import MARK, pattern
 from armident.daq.cli import GROUP, application
-from armident.daq.init.command import InitOptions, run_init
+from armident.daq.init.initialize import InitOptions, run_init
 from armident.daq.init.questionnaire import questionnaire
 from armident.daq.interchange.exporting import export_recording
 from armident.daq.recording import read_recording, write_recording
@@ -24,7 +25,7 @@ from tests.unit.configs.test_urdf import transform
 
 COMMANDS = {
     "doctor": "armident.daq.commands:doctor",
-    "init": "armident.daq.init.cli:init",
+    "init": "armident.daq.init.init_command:init",
     "import": "armident.daq.commands:import_",
     "identify": "armident.identify.cli:identify",
     "trajectory": "armident.identify.cli:trajectory",
@@ -204,6 +205,28 @@ def test_a_mark_in_a_list_makes_the_list_blank_and_unknown_keys_are_always_neede
     (tmp_path / "b.yaml").write_text(yaml.safe_dump(content))
     with pytest.raises(ConfigError, match="bandwidth_hz"):
         load_robot(tmp_path / "b.yaml", "identify")
+
+
+def test_python_takes_what_init_wrote_and_refuses_it_where_a_value_is_needed(tmp_path: Path, arm: Path) -> None:
+    assert run("init", str(arm), "--out", str(tmp_path / "cell")).exit_code == 0
+    robot = armident.load_robot(tmp_path / "cell")
+    assert robot.blanks
+    assert robot == armident.load_robot(tmp_path / "cell/robot.yaml")
+    assert armident.RobotModel(tmp_path / "cell").n == armident.RobotModel(robot).n == 6
+    t = np.arange(1000) / 500.0
+    q = 0.6 * np.sin(2 * np.pi * t[:, None] + np.arange(6))
+    recording = armident.Recording.from_arrays(t, q, 5.0 * q, robot=tmp_path / "cell")
+    assert armident.check(recording).document.robot == robot.name
+    assert run("init", "--axes", "2", "--out", str(tmp_path / "bare")).exit_code == 0
+    bare = armident.load_robot(tmp_path / "bare")
+    for call in (
+        armident.RobotModel,
+        armident.design_trajectory,
+        lambda one: armident.simulate_recording(one, "emps_1"),
+    ):
+        for given in (bare, tmp_path / "bare"):
+            with pytest.raises(ConfigError, match=r"joints\[\]\.mdh of"):
+                call(given)
 
 
 def test_existing_files_are_kept(tmp_path: Path, arm: Path) -> None:

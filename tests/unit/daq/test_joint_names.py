@@ -111,7 +111,7 @@ def test_chosen_names_replace_all_comparison() -> None:
 def test_names_that_fit_one_joint_twice_are_refused() -> None:
     with pytest.raises(DataError, match=r"Joint_1 and JOINT-1 fit the same joint"):
         match_joints(["Joint_1", "JOINT-1", *NAMES[1:]], TX40)
-    with pytest.raises(DataError, match=r"joint name joint_2 is there twice"):
+    with pytest.raises(DataError, match=r"duplicate joint name joint_2"):
         match_joints([*NAMES, "joint_2"], TX40)
 
 

@@ -1,6 +1,7 @@
 """LeRobot data sets: files, names of joints, and damaged parts."""
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -88,3 +89,39 @@ def test_times_of_a_lerobot_data_set_that_are_no_numbers_are_refused(tmp_path: P
     pyarrow.parquet.write_table(table, data)
     with pytest.raises(DataError, match="timestamp has rows of unequal lengths, or values that are no numbers"):
         import_recording(data, TX40)
+
+
+def _exchanged(table: dict[str, list[object]]) -> None:
+    table["episode_index"] = table.pop("action")
+
+
+def _immense(table: dict[str, list[object]]) -> None:
+    table["observation.effort"][46] = [1.0, 1.0, 1.0, 1e308, 1.0, 1.0]
+
+
+def _without_episodes(table: dict[str, list[object]]) -> None:
+    table["episode_index"] = [None] * len(table["timestamp"])
+    table["timestamp"][19] = -1.0
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (_exchanged, "episode_index has values that are no numbers, or not one for every timestamp"),
+        (_immense, r"1e\+308"),
+        (_without_episodes, "episode_index has values that are no numbers"),
+    ],
+)
+def test_columns_of_a_lerobot_data_set_with_odd_values_are_refused_in_one_line(
+    tmp_path: Path, change: Callable[[dict[str, list[object]]], None], words: str
+) -> None:
+    import pyarrow
+    import pyarrow.parquet
+
+    data = lerobot(tmp_path / "a", [f"joint_{j + 1}.pos" for j in range(N)])
+    table = pyarrow.parquet.read_table(data).to_pydict()
+    change(table)
+    pyarrow.parquet.write_table(pyarrow.table(table), data)
+    with pytest.raises(DataError, match=words) as caught:
+        import_recording(tmp_path / "a", TX40)
+    assert "\n" not in str(caught.value)

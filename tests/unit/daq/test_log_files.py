@@ -165,7 +165,9 @@ def test_a_log_with_another_sync_period_than_the_session_is_refused(tmp_path: Pa
     path, _ = lines_of(tmp_path, ".log")
     for period_us, said in ((1000, "1 ms"), (250, "0.25 ms"), (100, "0.1 ms")):
         other = SESSION.model_copy(update={"sync": SESSION.sync.model_copy(update={"period_us": period_us})})
-        with pytest.raises(DataError, match=rf"SYNC comes every 0\.2 ms \(5000 Hz\).*says {said} \(sync\.period_us"):
+        with pytest.raises(
+            DataError, match=rf"SYNC comes every 0\.2 ms \(5000 Hz\).*every {said} in the session \(sync\.period_us"
+        ):
             recording_from_log(path, other, ROBOT)
         command = ["import", str(path), "--config", "tx40_cell.yaml", "--out", str(tmp_path / "a.mcap")]
         assert CliRunner().invoke(application(["import"]), command).exit_code == 0

@@ -145,24 +145,6 @@ def test_the_command_prints_the_missing_parts(tmp_path: Path) -> None:
     assert len(data) > 0
 
 
-def test_the_former_name_of_the_command_still_works(tmp_path: Path) -> None:
-    torn(make_recording(1000), tmp_path / "r.mcap", 0.6)
-    shown = CliRunner().invoke(application(["heal"]), ["heal", str(tmp_path / "r.mcap")])
-    assert shown.exit_code == 0
-    assert "heal is now recover" in shown.stderr
-    assert "r.mcap: recovered: " in shown.stdout
-
-
-def test_missing_parts_of_a_file_recovered_by_version_0_1_are_read(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    torn(make_recording(1000), tmp_path / "r.mcap", 0.6)
-    monkeypatch.setattr("armident.daq.recording.recovery.RECOVERED", "armident.healed")
-    found = recover_recording(tmp_path / "r.mcap")
-    assert found.missing is not None
-    assert read_recording(tmp_path / "r.mcap").missing == found.missing
-
-
 WRITE_UNTIL_KILLED = """
 import sys
 from pathlib import Path

@@ -10,8 +10,8 @@ import yaml
 
 from armident.configs import ConfigError, SessionConfig, load_robot, load_session
 from armident.configs.loading import HERE
-from armident.daq.capture.files import limits, open_series
 from armident.daq.capture.plan import CapturePlan
+from armident.daq.capture.recording_files import limits, open_series
 from armident.daq.capture.reload import Reloader, differences
 from armident.daq.logs import LineFormatter
 from armident.daq.matching.streams import captured_streams

@@ -127,7 +127,7 @@ def test_rows_that_a_tool_left_out_are_counted(recording: Recording, tmp_path: P
 
 def test_recordings_that_a_tool_has_joined_are_refused(recording: Recording, tmp_path: Path) -> None:
     twice = rewritten(source_of(recording), tmp_path / "twice.mcap", copies=2)
-    with pytest.raises(DataError, match=r"twice\.mcap: topic /samples: .*are there twice, or .* several recordings"):
+    with pytest.raises(DataError, match=r"twice\.mcap: topic /samples: .*duplicate messages, or several recordings"):
         read_recording(twice)
 
 

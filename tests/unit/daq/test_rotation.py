@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from armident.configs import ConfigError
-from armident.daq.capture.files import capture_stamp, next_time
+from armident.daq.capture.recording_files import capture_stamp, next_time
 from armident.daq.recording import (
     Mark,
     QueuedSeries,

@@ -14,8 +14,19 @@ from armident.configs import ArmidentError, ConfigError
 from armident.configs.loading import HERE
 from armident.daq import service
 from armident.daq.cli import application
-from armident.daq.service import ACCOUNT, CACHE, HEADER, SETTINGS, STATE, UNITS, System, install, steps
-from armident.daq.service_state import status, uninstall
+from armident.daq.service import (
+    ACCOUNT,
+    CACHE,
+    HEADER,
+    SETTINGS,
+    STATE,
+    UNITS,
+    System,
+    install,
+    status,
+    steps,
+    uninstall,
+)
 
 needs_root = pytest.mark.skipif(os.geteuid() != 0, reason="owners of files are set by root only")
 
@@ -42,7 +53,7 @@ def test_a_dry_run_prints_every_part_and_changes_nothing(image: Path) -> None:
     lines = install("line3", image, dry_run=True)
     assert list(contents(image)) == before
     parts = [line for line in lines if line.startswith("to do: ")]
-    units = {file.name for file in (HERE / "systemd").iterdir()}
+    units = {file.name for file in (HERE / "systemd").glob("*@.*")}
     assert units <= {line.rpartition("/")[2] for line in parts if "unit" in line}
     for part in ("group armident", "user armident", "/etc/armident ", "/var/lib/armident/line3 "):
         assert any(part in line for line in parts), part
@@ -60,7 +71,7 @@ def test_a_second_run_finds_nothing_to_do(image: Path) -> None:
 def test_the_recordings_belong_to_the_user_of_the_units_and_the_settings_to_root(image: Path) -> None:
     install("line3", image)
     system = System(image, Path("/opt/armident/bin/armident"))
-    user, group = system.user_id(), system.group_id()
+    user, group = system.id_of(ACCOUNT, "passwd"), system.id_of(ACCOUNT, "group")
     assert user is not None
     assert group is not None
     assert f"{ACCOUNT}:x:{user}:{group}::/var/lib/armident:/usr/sbin/nologin" in (image / "etc/passwd").read_text()
@@ -92,7 +103,8 @@ def test_a_second_cell_adds_its_folder_only(image: Path) -> None:
     install("line3", image)
     lines = install("line4", image)
     assert [line for line in lines if line.startswith("done")] == [
-        "done: folder /var/lib/armident/line4 (armident:armident, 0755)"
+        "done: folders /etc/tmpfiles.d/armident-line4.conf",
+        "done: folder /var/lib/armident/line4 (armident:armident, 0755)",
     ]
 
 
@@ -172,8 +184,8 @@ def test_the_units_agree_with_the_account_and_the_folders(image: Path) -> None:
 
 
 def test_a_command_of_the_system_that_fails_is_one_line(image: Path) -> None:
-    with pytest.raises(ArmidentError, match=r"groupadd.*no-such-option") as caught:
-        System(image, Path("/x")).run("groupadd", "--no-such-option")
+    with pytest.raises(ArmidentError, match=r"systemd-sysusers.*no-such-option") as caught:
+        System(image, Path("/x")).run("systemd-sysusers", "--no-such-option")
     assert "\n" not in str(caught.value)
 
 
@@ -215,6 +227,7 @@ def test_a_removed_cell_keeps_its_recordings_and_its_configuration(image: Path) 
     assert [line.replace("done: ", "to do: ") for line in done] == planned
     assert not link.is_symlink()
     assert not list((image / UNITS).glob("armident-*"))
+    assert not list((image / "etc/tmpfiles.d").iterdir())
     assert not (image / CACHE).exists()
     assert recording.stat().st_size == 2_000_000
     assert session.read_text() == "schema: armident/session/1\n"
@@ -231,7 +244,8 @@ def test_units_stay_while_another_cell_uses_them(image: Path) -> None:
     enable(image, "armident-worker@line3.service", "multi-user.target")
     lines = uninstall("line3", image)
     assert lines[0] == "done: disable armident-worker@line3.service (multi-user.target.wants)"
-    assert len(list((image / UNITS).glob("armident-*"))) == len(list((HERE / "systemd").iterdir()))
+    assert (image / "etc/tmpfiles.d/armident-line4.conf").is_file()
+    assert len(list((image / UNITS).glob("armident-*"))) == len(list((HERE / "systemd").glob("*@.*")))
     assert any(line.startswith("kept: unit files, for line4 ") for line in lines)
 
 
@@ -249,7 +263,7 @@ def test_a_unit_of_other_origin_is_not_removed(image: Path) -> None:
 def test_the_status_names_every_part_with_its_state(image: Path) -> None:
     lines, complete = status("line3", image)
     assert not complete
-    assert "missing or different: system group armident" in lines
+    assert "missing or different: system group armident and user armident, without login" in lines
     install("line3", image)
     session_of(image, "line3")
     install("line3", image)

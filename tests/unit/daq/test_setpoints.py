@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 
 from armident.configs import load_robot, load_session
 from armident.configs.units import counts_per_si
-from armident.daq.capture.setpoints import NOISE_COUNTS, REST_SPAN_S, REST_STEP_S, StandstillDetector
+from armident.daq.capture.setpoint_source import NOISE_COUNTS, REST_SPAN_S, REST_STEP_S, StandstillDetector
 
 SESSION, ROBOT = load_session("tx40_cell.yaml"), load_robot("tx40.yaml")
 SPAN = round(REST_SPAN_S / SESSION.sync_period)

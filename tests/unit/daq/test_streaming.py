@@ -29,7 +29,7 @@ from armident.daq.streaming import (
     open_session,
 )
 from armident.daq.streaming.codec import VERSION, end_content, start_content
-from armident.daq.streaming.session import endpoints
+from armident.daq.streaming.zenoh_session import endpoints
 
 ROBOT = load_robot("tx40.yaml")
 JOINTS = tuple(joint.name for joint in ROBOT.joints)

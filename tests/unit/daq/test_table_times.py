@@ -17,7 +17,7 @@ from tests.unit.daq.test_importing import PANDA, TX40, moving_panda
 def test_a_unit_of_times_that_is_not_read_is_refused(tmp_path: Path, unit: str) -> None:
     values = motion() * np.append(1 / 60, np.ones(2 * N))
     path = written(tmp_path / "a.csv", values, [f"time [{unit}]", *NAMES[1:]])
-    with pytest.raises(DataError, match=f"the column of times states the unit '{unit}', expected s, ms, us or ns"):
+    with pytest.raises(DataError, match=f"the time column states the unit '{unit}', expected s, ms, us or ns"):
         import_recording(path, TX40)
 
 
@@ -90,7 +90,7 @@ def test_slow_motion_and_low_rates_are_seconds(tmp_path: Path) -> None:
 def test_a_rate_that_contradicts_the_times_is_refused_with_both(tmp_path: Path) -> None:
     path = written(tmp_path / "a.csv", motion())
     for rate in (500.0, 998.0 * 1.02, 5000.0):
-        with pytest.raises(DataError, match=rf"--rate {rate:g} contradicts the column of times: .* 1000 Hz"):
+        with pytest.raises(DataError, match=rf"--rate {rate:g} contradicts the time column: .* 1000 Hz"):
             import_recording(path, TX40, rate_hz=rate)
     assert import_recording(path, TX40, rate_hz=1000.0).sample_rate_hz == 1000.0
 
@@ -147,7 +147,7 @@ def test_rows_that_are_there_twice_are_taken_once(tmp_path: Path) -> None:
     values = motion()
     found = import_recording(written(tmp_path / "a.csv", values[np.sort(np.append(np.arange(400), [7, 90]))]), TX40)
     assert same(found, values)
-    assert "2 rows are there twice" in found.metadata["source_remarks"]
+    assert "2 duplicate rows with the same time" in found.metadata["source_remarks"]
 
 
 def jittering(rows: int = 3000, share: float = 0.2) -> np.ndarray:
@@ -204,5 +204,5 @@ def test_polled_rows_with_times_are_put_on_the_clock_of_the_controller(tmp_path:
     assert found.sha256 == asked_for.sha256
     assert abs(len(found.samples.sync) - len(q)) < 30
     assert "polled samples put on a clock of 1000 Hz" in found.metadata["source_remarks"]
-    with pytest.raises(DataError, match=r"the motion takes .* at the 250 Hz of --resample, but .* by the column"):
+    with pytest.raises(DataError, match=r"the motion takes .* at the 250 Hz of --resample, but .* by the time column"):
         import_recording(path, PANDA, resample_hz=250.0)

@@ -68,7 +68,7 @@ def test_units_in_names_are_converted_and_said(tmp_path: Path) -> None:
     assert found.sample_rate_hz == pytest.approx(1000)
     assert "times are in ms" in found.metadata["source_remarks"]
     assert "q1 [deg] from deg" in found.metadata["source_remarks"]
-    with pytest.raises(DataError, match="--time-unit us contradicts the name of the column, which says ms"):
+    with pytest.raises(DataError, match="--time-unit us contradicts the name of the time column, which states ms"):
         import_recording(tmp_path / "a.csv", TX40, time_unit="us")
 
 
@@ -241,7 +241,7 @@ def test_rows_of_other_topics_are_passed_over_and_rows_of_one_time_joined(tmp_pa
     found = import_recording(tmp_path / "a.csv", TX40)
     assert same(found, values)
     assert not found.gaps
-    assert "100 rows without positions and efforts passed over" in found.metadata["source_remarks"]
+    assert "100 rows without positions and efforts ignored" in found.metadata["source_remarks"]
     (tmp_path / "b.csv").write_text("\n".join([",".join(names), *rows]).replace(",31.5", ",").replace("0.0", "0.1", 1))
     shifted = [r if k % 3 else f"{float(r.split(',')[0]) + 2e-4:.9g}," + r.split(",", 1)[1] for k, r in enumerate(rows)]
     (tmp_path / "b.csv").write_text("\n".join([",".join(names), *shifted]) + "\n")
@@ -262,7 +262,7 @@ def test_positions_in_degrees_and_torques_in_mn_m_name_the_option(tmp_path: Path
     endless = TX40.model_copy(update={"joints": tuple(j.model_copy(update={"limits": free}) for j in TX40.joints)})
     values[:, 1 : N + 1] *= 180 / np.pi
     remarks = import_recording(written(tmp_path / "c.csv", values), endless).metadata["source_remarks"]
-    assert "times the limit, as of positions in degrees (--units position=deg)" in remarks
+    assert "times the limit; check for positions in degrees (--units position=deg)" in remarks
     assert "source_remarks" not in import_recording(written(tmp_path / "d.csv", motion()), endless).metadata
 
 
@@ -290,7 +290,7 @@ def test_values_that_overflow_are_refused_without_warnings(tmp_path: Path) -> No
     path = written(tmp_path / "a.csv", values)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        with pytest.raises(DataError, match=r"line 9, column q3: 1e\+308 is no measurement"):
+        with pytest.raises(DataError, match=r"line 9, column q3: 1e\+308 is too large for a measurement"):
             import_recording(path, TX40)
 
 

@@ -12,8 +12,8 @@ import pytest
 
 from armident.configs import ConfigError
 from armident.configs.schema.session import RecordingOptions
-from armident.daq.capture.files import chunk_duration_ns
 from armident.daq.capture.health import DiskCheck
+from armident.daq.capture.recording_files import chunk_duration_ns
 from armident.daq.recording import (
     Gap,
     Mark,

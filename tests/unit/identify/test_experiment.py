@@ -11,10 +11,10 @@ import armident
 from armident.configs import DataError
 from armident.daq.cli import application
 from armident.daq.recording import write_recording
-from armident.identify.commands import FOUND
+from armident.identify.cli.result_commands import FOUND
 from armident.identify.documents.diagnosis import DiagnosisDocument
 from armident.identify.documents.files import load_document
-from armident.identify.experiment import Experiment, check_one_rate
+from armident.identify.signals.experiments import Experiment, check_one_rate
 from tests.fixtures.arms import FAST, recording
 
 

@@ -16,8 +16,8 @@ from armident.daq.cli import GROUP, application
 from armident.daq.recording import write_recording
 from armident.identify.documents.files import load_document, to_json
 from armident.identify.documents.identification import IdentificationDocument
-from armident.identify.monitoring.comparison import joint_of
-from armident.identify.saved_model import load_model
+from armident.identify.identification.saved_model import load_model
+from armident.identify.monitoring.change.comparison import joint_of
 from tests.fixtures.arms import FAST, recording
 from tests.fixtures.diagnoses import SPRING
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from armident.configs import ConfigError
-from armident.identify.streamed import OnDisk, Streamed, chosen, kept, mapped
+from armident.identify.signals.streamed import OnDisk, Streamed, chosen, kept, mapped
 
 
 def test_items_on_disk_come_back_by_number_slice_and_in_threads() -> None:

@@ -33,11 +33,11 @@ def emps() -> RobotConfig:
 
 
 EXAMPLES: dict[str, dict[str, float]] = {
-    "asymmetric_viscous_friction": {"ratio": 0.2},
-    "asymmetric_coulomb_friction": {"ratio": 0.2},
+    "asymmetric_viscous_friction": {"fva": 0.2},
+    "asymmetric_coulomb_friction": {"fca": 0.2},
     "stribeck_friction": {"extra": 2.0},
     "nonlinear_viscous_friction": {"thinning": 0.3},
-    "load_dependent_friction": {"coefficient": 0.1},
+    "load_dependent_friction": {"fcl": 0.1},
     "presliding_friction": {"deflection": 1e-3},
     "position_dependent_friction": {"ratio": 0.3},
     "friction_drift": {"change": 0.3},
@@ -169,6 +169,8 @@ def test_the_slope_of_a_hidden_torque_is_its_derivative(tx40: RobotConfig, effec
         ("joint_spring", "joint_9", None, {"stiffness": 1.0}, r"effects\[0\]\.joint: 'joint_9'"),
         ("joint_spring", "joint_1", None, {}, "needs stiffness"),
         ("joint_spring", "joint_1", None, {"stiffness": 1.0, "damping": 1.0}, "parameters.damping: unknown"),
+        ("asymmetric_viscous_friction", "joint_1", None, {"ratio": 0.2}, r"takes fva \(N m s/rad\)"),
+        ("asymmetric_viscous_friction", "joint_1", None, {"fva": 9.0}, "at most the friction 8, found 9"),
         ("stribeck_friction", "joint_1", None, {"extra": 1.0, "velocity": 0.0}, "velocity: expected a number above 0"),
         ("payload", "joint_6", None, {"mass": -1.0}, "mass: expected a number above 0"),
         ("friction_drift", "joint_1", None, {"change": -2.0}, "change: expected a number from -1 up to 10"),

@@ -35,13 +35,13 @@ class Joint2:
 
 
 def test_asymmetric_viscous_friction_is_a_fifth_up_forwards_and_a_fifth_down_backwards(tx40: RobotConfig) -> None:
-    extra = Joint2(tx40, "asymmetric_viscous_friction", ratio=0.2)
+    extra = Joint2(tx40, "asymmetric_viscous_friction", fva=0.2 * FV2)
     assert extra(0.0, 1.5) == pytest.approx(0.2 * FV2 * 1.5)
     assert extra(0.0, -1.5) == pytest.approx(0.2 * FV2 * 1.5)
 
 
 def test_asymmetric_coulomb_friction_is_an_offset_in_motion_and_gone_at_rest(tx40: RobotConfig) -> None:
-    extra = Joint2(tx40, "asymmetric_coulomb_friction", ratio=0.2, velocity=0.05)
+    extra = Joint2(tx40, "asymmetric_coulomb_friction", fca=0.2 * FC2, velocity=0.05)
     for side in (1.0, -1.0):
         assert extra(0.0, side * 1.0) == pytest.approx(0.2 * FC2, rel=1e-6)
         assert extra(0.0, side * 0.05) == pytest.approx(0.75 * 0.2 * FC2)
@@ -132,7 +132,7 @@ def test_dirt_sticks_once_in_every_interval_at_times_that_the_seed_gives(tx40: R
 
 
 def test_friction_that_grows_with_the_load_takes_its_share_of_every_acceleration(emps: RobotConfig) -> None:
-    plant = Plant(emps, [0.0], hide("load_dependent_friction", "joint_1", coefficient=0.2))
+    plant = Plant(emps, [0.0], hide("load_dependent_friction", "joint_1", fcl=0.2))
     mass, fv, fc, off, smoothing = 95.1089, 203.5034, 20.3935, -3.1648, 5000.0
     force = 120.0
 
@@ -156,7 +156,7 @@ def test_friction_that_grows_with_the_load_takes_its_share_of_every_acceleration
 def test_a_joint_that_holds_a_weight_has_more_friction_than_one_that_does_not(tx40: RobotConfig) -> None:
     """Joint 2 falls from horizontal and from upright: load-dependent friction slows only the first motion."""
     fallen = {}
-    for name, effect in (("healthy", None), ("loaded", hide("load_dependent_friction", "joint_2", coefficient=0.3))):
+    for name, effect in (("healthy", None), ("loaded", hide("load_dependent_friction", "joint_2", fcl=0.3))):
         plant = Plant(tx40, [0.0, 1.2, 0.5, 0.0, 0.0, 0.0], effect)
         plant.brake[[0, 2, 3, 4, 5]] = 1e9
         for _ in range(250):
@@ -170,8 +170,8 @@ def test_a_joint_that_holds_a_weight_has_more_friction_than_one_that_does_not(tx
 
 
 NO_STRENGTH = {
-    "asymmetric_viscous_friction": {"ratio": 0.0},
-    "asymmetric_coulomb_friction": {"ratio": 0.0},
+    "asymmetric_viscous_friction": {"fva": 0.0},
+    "asymmetric_coulomb_friction": {"fca": 0.0},
     "position_dependent_friction": {"ratio": 0.0},
     "friction_drift": {"change": 0.0},
     "coupling_friction": {"coulomb": 0.0},

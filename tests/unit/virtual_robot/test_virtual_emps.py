@@ -14,11 +14,12 @@ from armident.configs import ConfigError, RobotConfig, Trajectory, load_robot, l
 from armident.configs.schema.trajectory import Move
 from armident.daq.recording import Recording, read_recording
 from armident.drivers.canopen.bus_load import check_fits
-from armident.identify.experiment import Experiment
+from armident.identify.estimators.methods import Method
 from armident.identify.identification.from_recording import experiments_from_recording
-from armident.identify.identification.options import Method, Options
+from armident.identify.identification.options import Options
 from armident.identify.identification.pipeline import identify_experiment
 from armident.identify.signals.differentiate import differentiate
+from armident.identify.signals.experiments import Experiment
 from armident.virtual_robot import noise, servo
 from armident.virtual_robot.arm import Arm
 from armident.virtual_robot.inertias import HERE, plant_parameters

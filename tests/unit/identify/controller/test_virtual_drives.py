@@ -13,12 +13,12 @@ from armident.identify.controller.parametric import ControlLaw, identify_paramet
 from armident.identify.effects.terms import arm_model
 from armident.identify.estimators.auxiliary_model import AuxiliaryModel
 from armident.identify.estimators.idim_iv import idim_iv
-from armident.identify.experiment import Experiment
 from armident.identify.identification.equations import equations
 from armident.identify.identification.from_recording import experiments_from_recording
 from armident.identify.robot.simulation import Simulation, simulate
 from armident.identify.signals.decimate import design
 from armident.identify.signals.differentiate import Derivatives, differentiate
+from armident.identify.signals.experiments import Experiment
 from armident.virtual_robot.inertias import plant_parameters
 from armident.virtual_robot.plant import Plant
 from armident.virtual_robot.servo import CONTROL_PERIOD, VELOCITY_FILTER_HZ, gains

@@ -1,4 +1,4 @@
-"""Confirmation of a finding by data that chose nothing."""
+"""Confirmation of a finding by data that are not used for selection."""
 
 import numpy as np
 import pytest

@@ -9,14 +9,14 @@ from armident.configs.schema.scenario import HiddenEffect
 from armident.identify.effects.effect import Place
 from armident.identify.effects.registry import catalogue
 from armident.identify.effects.terms import arm_model, entry_of
-from armident.identify.identification.api import identify_recording
+from armident.identify.identification.identify_recording import identify_recording
 from armident.identify.identification.options import Options
-from armident.identify.report.files import robot_yaml
+from armident.identify.report.robot_file import robot_yaml
 from tests.fixtures.arms import FAST, recording
 from tests.fixtures.diagnoses import diagnosis
 
 MOTION = "tx40_excitation"
-WORN = HiddenEffect(effect="asymmetric_viscous_friction", joint="joint_2", parameters={"ratio": 0.2})
+WORN = HiddenEffect(effect="asymmetric_viscous_friction", joint="joint_2", parameters={"fva": 0.2 * 5.5})
 
 RATES = [pytest.param(FAST, 1, id="1 kHz"), pytest.param(None, 3, id="5 kHz", marks=pytest.mark.nightly)]
 """One repetition at 1 kHz, and three at the rate of the drives."""

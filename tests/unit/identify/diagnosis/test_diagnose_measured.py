@@ -5,14 +5,14 @@ from pathlib import Path
 import pytest
 
 from armident.configs import load_robot
-from armident.identify.diagnosis.diagnose import Diagnosis
+from armident.identify.diagnosis.diagnose import DiagnosisResult
 from armident.identify.diagnosis.findings import gap_of
 from armident.identify.diagnosis.model_state import with_report_part
 from armident.identify.diagnosis.selection import StepwiseSelection
 from armident.identify.diagnosis.study import build_study
 from armident.identify.documents.diagnosis import Gap
 from tests.fixtures.diagnoses import measured_diagnosis
-from tests.statistics.measured import tx40
+from tests.reproduction.recordings import measured_recording
 
 pytestmark = pytest.mark.slow
 
@@ -20,13 +20,13 @@ OTHER_LAWS = "other laws of friction over the velocity compete with it: docs/dia
 
 
 @pytest.fixture(scope="module")
-def worn_screw(shared_data: Path) -> Diagnosis:
+def worn_screw(shared_data: Path) -> DiagnosisResult:
     """EMPS, found on one recording and judged on the other."""
     return measured_diagnosis(shared_data, "emps_pulses", "emps")
 
 
 @pytest.fixture(scope="module")
-def uncoupled_wrist(shared_data: Path) -> Diagnosis:
+def uncoupled_wrist(shared_data: Path) -> DiagnosisResult:
     """TX40 whose model does not know that motor 6 turns with joint 5, too."""
     return measured_diagnosis(shared_data, "tx40_uncoupled", "tx40")
 
@@ -35,11 +35,13 @@ def uncoupled_wrist(shared_data: Path) -> Diagnosis:
 def coupled_wrist(shared_data: Path) -> tuple[Gap, Gap]:
     """Errors of the model that knows it, on the same parts of the recording."""
     robot = load_robot("tx40")
-    state = with_report_part(StepwiseSelection(build_study([tx40(shared_data, robot)], [], robot)).start())
+    state = with_report_part(
+        StepwiseSelection(build_study([measured_recording(shared_data).experiment], [], robot)).start()
+    )
     return gap_of(state, held=False), gap_of(state, held=True)
 
 
-def test_the_worn_screw_of_the_emps_is_named_first(worn_screw: Diagnosis) -> None:
+def test_the_worn_screw_of_the_emps_is_named_first(worn_screw: DiagnosisResult) -> None:
     finding = worn_screw.document.findings[0]
     assert finding.effect == "asymmetric_viscous_friction"
     # The published asymmetric fit: 166.7061 and 240.4236 N s/m. Its residual is not white.
@@ -48,13 +50,13 @@ def test_the_worn_screw_of_the_emps_is_named_first(worn_screw: Diagnosis) -> Non
 
 
 @pytest.mark.xfail(strict=True, reason=OTHER_LAWS)
-def test_the_worn_screw_of_the_emps_is_certain(worn_screw: Diagnosis) -> None:
+def test_the_worn_screw_of_the_emps_is_certain(worn_screw: DiagnosisResult) -> None:
     finding = worn_screw.document.findings[0]
     assert finding.effect == "asymmetric_viscous_friction"
     assert finding.confidence > 0.9
 
 
-def test_the_worn_screw_closes_the_gap_on_the_recording_that_was_not_used(worn_screw: Diagnosis) -> None:
+def test_the_worn_screw_closes_the_gap_on_the_recording_that_was_not_used(worn_screw: DiagnosisResult) -> None:
     gap = worn_screw.document.gap
     # The published fits miss 4.0834 and 3.1117 % of the training force: a drop to 76 %.
     assert gap.train.after.all < 0.78 * gap.train.before.all
@@ -62,7 +64,9 @@ def test_the_worn_screw_closes_the_gap_on_the_recording_that_was_not_used(worn_s
 
 
 @pytest.mark.xfail(strict=True, reason=OTHER_LAWS)
-def test_the_rest_of_the_emps_is_unexplained_and_only_convincing_effects_are_stated(worn_screw: Diagnosis) -> None:
+def test_the_rest_of_the_emps_is_unexplained_and_only_convincing_effects_are_stated(
+    worn_screw: DiagnosisResult,
+) -> None:
     document = worn_screw.document
     stated = {f.effect for f in document.findings}
     assert stated <= {"asymmetric_viscous_friction", "presliding_friction", "nonlinear_viscous_friction"}
@@ -75,7 +79,7 @@ def test_the_rest_of_the_emps_is_unexplained_and_only_convincing_effects_are_sta
 
 
 @pytest.mark.nightly
-def test_the_uncoupled_wrist_of_the_tx40_is_named_first(uncoupled_wrist: Diagnosis) -> None:
+def test_the_uncoupled_wrist_of_the_tx40_is_named_first(uncoupled_wrist: DiagnosisResult) -> None:
     finding = uncoupled_wrist.document.findings[0]
     assert (finding.effect, finding.joint, finding.other) == ("coupling_friction", "joint_5", "joint_6")
     assert finding.confidence > 0.9
@@ -87,7 +91,7 @@ def test_the_uncoupled_wrist_of_the_tx40_is_named_first(uncoupled_wrist: Diagnos
 
 @pytest.mark.nightly
 def test_the_wrist_coupling_closes_the_gap_of_joints_5_and_6(
-    uncoupled_wrist: Diagnosis, coupled_wrist: tuple[Gap, Gap]
+    uncoupled_wrist: DiagnosisResult, coupled_wrist: tuple[Gap, Gap]
 ) -> None:
     gap = uncoupled_wrist.document.gap
     before = gap.train.before.by_joint

@@ -10,7 +10,7 @@ import pytest
 
 from armident.configs.schema.scenario import HiddenEffect
 from armident.daq.recording import write_recording
-from armident.identify.diagnosis.diagnose import diagnose
+from armident.identify.diagnosis.diagnose import run_diagnosis
 from armident.identify.documents.diagnosis import Finding
 from armident.identify.identification.from_recording import experiments_from_recording
 from tests.fixtures.arms import recording
@@ -29,9 +29,9 @@ from armident.identify.effects.effect import Effect, Linear, Shape
 class TightSpot(Effect):
     name = "tight_spot"
     title = "a tight spot"
-    says = "something pushes back near one position"
+    description = "something pushes back near one position"
     reference = "the machine's log book"
-    needs = "motion across the spot"
+    required_motion = "motion across the spot"
     linear = (Linear("height", ("N m", "N")),)
     shapes = (Shape("position", ("rad", "m")),)
 
@@ -48,7 +48,7 @@ def test_the_resulting_model_has_no_gap_on_a_new_recording() -> None:
     first = diagnosis("emps", "emps_1", 1, *WORN_AND_SPRUNG)
     assert {f.effect for f in first.document.findings} == {hidden.effect for hidden in WORN_AND_SPRUNG}
     experiments, _ = experiments_from_recording(recording("emps", "emps_1", 2, *WORN_AND_SPRUNG), first.robot)
-    assert diagnose(experiments, [], first.robot).document.verdict == "no_gap"
+    assert run_diagnosis(experiments, [], first.robot).document.verdict == "no_gap"
 
 
 def test_what_could_hide_does_up_to_the_size_that_is_told_and_no_further() -> None:
@@ -73,7 +73,7 @@ def test_other_friction_of_one_joint_is_another_number_and_no_structure() -> Non
 
 
 def test_a_structural_effect_is_no_other_number() -> None:
-    worn = HiddenEffect(effect="asymmetric_viscous_friction", joint="joint_2", parameters={"ratio": 0.2})
+    worn = HiddenEffect(effect="asymmetric_viscous_friction", joint="joint_2", parameters={"fva": 0.2 * 5.5})
     (finding,) = against_baseline(4, worn)
     assert (finding.kind, finding.effect, finding.joint) == ("structure", "asymmetric_viscous_friction", "joint_2")
 

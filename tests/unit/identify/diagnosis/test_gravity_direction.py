@@ -7,9 +7,9 @@ from numpy.typing import NDArray
 from armident.configs import DataError, RobotConfig, load_robot
 from armident.configs.schema.robot import Effect
 from armident.identify.effects.terms import arm_model
-from armident.identify.experiment import Experiment
 from armident.identify.identification.options import Options
 from armident.identify.identification.pipeline import identify_experiment
+from armident.identify.signals.experiments import Experiment
 
 pytestmark = pytest.mark.slow
 

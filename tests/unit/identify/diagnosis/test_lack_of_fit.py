@@ -12,14 +12,15 @@ from scipy.signal import lfilter
 from armident.configs import load_robot
 from armident.configs.schema.scenario import HiddenEffect
 from armident.identify.diagnosis.criteria import Criteria
-from armident.identify.diagnosis.free_functions import free_functions, hats
-from armident.identify.diagnosis.hints import HINTS, hint_of
-from armident.identify.diagnosis.lack_of_fit import MOST_DEVIATIONS, Dependence, LackOfFit, limited
+from armident.identify.diagnosis.free_functions import free_functions
+from armident.identify.diagnosis.lack_of_fit import LackOfFit, ResidualDependence, limited
 from armident.identify.diagnosis.noise_beyond import noise_beyond
-from armident.identify.diagnosis.regression import Fit, fit
+from armident.identify.diagnosis.regression import IvFit, fit_model
 from armident.identify.diagnosis.spectral_lines import strongest_line
-from armident.identify.diagnosis.stretch import Stretch
+from armident.identify.diagnosis.stretch import MotionStretch
 from armident.identify.diagnosis.study import Study, build_study
+from armident.identify.diagnosis.variables import VARIABLES, hint_of
+from armident.identify.effects.free_shapes import hats
 from armident.identify.identification.from_recording import experiments_from_recording
 from armident.identify.regression.equations import applied
 from tests.fixtures.arms import FAST, recording
@@ -28,6 +29,7 @@ pytestmark = pytest.mark.slow
 
 Array = NDArray[np.float64]
 
+DEVIATIONS = Criteria.robust_deviations
 BUMP = 5.0
 """Height of the hidden bump, N m; the noise of joint 2 in the band of the comparison is 3 N m."""
 
@@ -44,9 +46,9 @@ def studied(name: str, motion: str, *effects: HiddenEffect, seed: int, repeats: 
 
 
 @cache
-def emps() -> tuple[Study, Fit]:
+def emps() -> tuple[Study, IvFit]:
     study = studied("emps", "emps_excitation", seed=1)
-    return study, fit(study)
+    return study, fit_model(study)
 
 
 def of_coloured_noise(seed: int) -> LackOfFit:
@@ -55,7 +57,7 @@ def of_coloured_noise(seed: int) -> LackOfFit:
     rng = np.random.default_rng(seed)
     size = float(np.sqrt(np.mean(np.concatenate(found.left) ** 2)))
 
-    def noisy(part: str) -> tuple[Stretch, ...]:
+    def noisy(part: str) -> tuple[MotionStretch, ...]:
         rows = found.equations.train if part == "train" else found.equations.held
         out = []
         for stretch, own in zip(getattr(study, part), rows, strict=True):
@@ -64,7 +66,7 @@ def of_coloured_noise(seed: int) -> LackOfFit:
             out.append(replace(stretch, y=np.where(y == 0, 0.0, applied(own.x, found.theta) + 0.4 * size * noise)))
         return tuple(out)
 
-    return LackOfFit(fit(replace(study, train=noisy("train"), held=noisy("held"))), Criteria())
+    return LackOfFit(fit_model(replace(study, train=noisy("train"), held=noisy("held"))))
 
 
 @cache
@@ -90,11 +92,11 @@ def test_healthy_arms_have_no_dependence() -> None:
 
 
 @cache
-def strange() -> tuple[tuple[Dependence, ...], tuple[Dependence, ...]]:
+def strange() -> tuple[tuple[ResidualDependence, ...], tuple[ResidualDependence, ...]]:
     """Dependences of the residual of an arm with two effects outside the catalogue, and the unexplained ones."""
     bump = HiddenEffect(effect="torque_bump", joint="joint_2", parameters={"torque": BUMP, "position": 0.3})
     ripple = HiddenEffect(effect="mains_ripple", joint="joint_3", parameters={"amplitude": 1.0, "frequency": 100.0})
-    found = LackOfFit(fit(studied("tx40", "tx40_excitation", bump, ripple, seed=40, repeats=3)), Criteria())
+    found = LackOfFit(fit_model(studied("tx40", "tx40_excitation", bump, ripple, seed=40, repeats=3)))
     return found.dependences, found.unexplained
 
 
@@ -127,10 +129,10 @@ def test_each_unexplained_dependence_is_listed_once() -> None:
 
 def test_every_set_of_functions_has_its_own_key_and_a_hint() -> None:
     study = studied("tx40", "tx40_excitation", seed=7)
-    motions = [study.motion(s, "simulated", fit(study).theta) for s in study.train]
+    motions = [study.motion(s, "simulated", fit_model(study).theta) for s in study.train]
     every = list(free_functions(study, motions, 0))
     assert len({(f.kind, f.other, f.knots) for f in every}) == len(every)
-    assert {f.kind for f in every} | {"frequency", "motion", "transients"} == set(HINTS)
+    assert {f.kind for f in every} | {"frequency", "motion"} == set(VARIABLES)
     text = hint_of("torque of another joint", "joint_3", "joint_2", "1 N m")
     assert text.startswith("The torque of joint_3 follows that of joint_2: look for")
 
@@ -185,9 +187,9 @@ def test_a_few_large_residuals_are_limited_and_a_large_residual_is_not() -> None
     residual = np.concatenate([rng.standard_normal(1000), 50.0 * rng.standard_normal(1000), np.zeros(10)])
     residual[[3, 900]] = 200.0, -300.0
     joints = [slice(0, 1000), slice(1000, 2000), slice(2000, 2010)]
-    found = limited(residual, joints)
-    assert np.abs(found[:1000]).max() < 1.2 * MOST_DEVIATIONS
+    found = limited(residual, joints, DEVIATIONS)
+    assert np.abs(found[:1000]).max() < 1.2 * DEVIATIONS
     assert found[3] == -found[900] > 0.0
-    unusual = np.abs(residual) > MOST_DEVIATIONS * np.repeat([1.0, 50.0, 1.0], [1000, 1000, 10])
+    unusual = np.abs(residual) > DEVIATIONS * np.repeat([1.0, 50.0, 1.0], [1000, 1000, 10])
     assert np.mean(found[~unusual] == residual[~unusual]) > 0.999
     np.testing.assert_array_equal(found[2000:], 0.0)

@@ -5,7 +5,7 @@ import pytest
 
 from armident.configs.schema.robot import Effect
 from armident.configs.schema.scenario import HiddenEffect
-from armident.identify.diagnosis.model_state import acted_on, padded, viscous_friction_rises, with_report_part
+from armident.identify.diagnosis.model_state import acted_on, rigid_parameters, viscous_friction_rises, with_report_part
 from armident.identify.effects.terms import arm_model
 from tests.fixtures.arms import hide
 from tests.fixtures.diagnoses import SPRING, selection, with_effects
@@ -32,7 +32,7 @@ def test_the_configuration_contains_the_values() -> None:
 def test_a_larger_model_begins_with_the_rigid_parameters_of_the_smaller_one() -> None:
     first = selection(1, SPRING)[1]
     state = with_effects(first, TERM)
-    start = padded(first.fit, state.study.model)
+    start = rigid_parameters(first.fit, state.study.model)
     rigid = state.study.model.base.b - state.study.model.e
     np.testing.assert_array_equal(start[:rigid], first.fit.theta[:rigid])
     assert not start[rigid:].any()
@@ -40,7 +40,7 @@ def test_a_larger_model_begins_with_the_rigid_parameters_of_the_smaller_one() ->
 
 def test_a_correction_of_the_recordings_acts_on_all_joints_also_beside_a_term() -> None:
     first = selection(
-        5, hide("asymmetric_viscous_friction", "joint_2", ratio=0.3), arm="tx40", motion="tx40_excitation"
+        5, hide("asymmetric_viscous_friction", "joint_2", fva=0.3 * 5.5), arm="tx40", motion="tx40_excitation"
     )[1]
     term = Effect(effect="asymmetric_viscous_friction", joint="joint_2")
     correction = Effect(effect="drive_gain_error", joint="joint_4", parameters={"gain_error": 0.05})

@@ -8,10 +8,10 @@ import pytest
 from armident.configs import DataError, RobotConfig, load_robot
 from armident.configs.schema.scenario import HiddenEffect
 from armident.daq.recording import Recording
-from armident.identify.diagnosis.baseline import cautious, compared
+from armident.identify.diagnosis.baseline_comparison import conservative_fit, with_baseline
 from armident.identify.diagnosis.candidates import ColumnCache
-from armident.identify.diagnosis.numbers import NumbersFinding, stale_numbers
-from armident.identify.diagnosis.regression import Fit, fit
+from armident.identify.diagnosis.changed_parameters import NumbersFinding, stale_numbers
+from armident.identify.diagnosis.regression import IvFit, fit_model
 from armident.identify.diagnosis.study import build_study
 from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.identification.from_recording import experiments_from_recording
@@ -41,14 +41,14 @@ def baseline() -> IdentificationDocument:
     return tx40_baseline()
 
 
-def studied(robot: RobotConfig, data: Recording) -> tuple[Fit, ColumnCache]:
+def studied(robot: RobotConfig, data: Recording) -> tuple[IvFit, ColumnCache]:
     study = build_study(experiments_from_recording(data, robot)[0], [], robot)
-    found = fit(study)
+    found = fit_model(study)
     return found, ColumnCache(study, found.theta)
 
 
 @pytest.fixture(scope="module")
-def clean(robot: RobotConfig, recorded: Recorded) -> tuple[Fit, ColumnCache]:
+def clean(robot: RobotConfig, recorded: Recorded) -> tuple[IvFit, ColumnCache]:
     return studied(robot, recorded(1))
 
 
@@ -57,7 +57,9 @@ def only(findings: list[NumbersFinding]) -> NumbersFinding:
     return finding
 
 
-def test_numbers_of_the_same_plant_still_hold(clean: tuple[Fit, ColumnCache], baseline: IdentificationDocument) -> None:
+def test_numbers_of_the_same_plant_still_hold(
+    clean: tuple[IvFit, ColumnCache], baseline: IdentificationDocument
+) -> None:
     assert stale_numbers(*clean, baseline) == []
 
 
@@ -97,7 +99,7 @@ def test_a_constant_torque_is_an_offset(
 
 
 def test_what_no_effect_explains_is_told_by_its_names(
-    clean: tuple[Fit, ColumnCache], baseline: IdentificationDocument
+    clean: tuple[IvFit, ColumnCache], baseline: IdentificationDocument
 ) -> None:
     std = {p.name: p.std for p in baseline.parameters}
     # An inertia of a link in the middle, far outside its errors: no payload, friction or gain does that.
@@ -114,16 +116,16 @@ def test_what_no_effect_explains_is_told_by_its_names(
 
 
 def test_differences_between_recordings_are_as_large_as_their_covariances_say(
-    clean: tuple[Fit, ColumnCache], baseline: IdentificationDocument
+    clean: tuple[IvFit, ColumnCache], baseline: IdentificationDocument
 ) -> None:
-    comparison = compared(cautious(clean[0]), baseline)
+    comparison = with_baseline(conservative_fit(clean[0]), baseline)
     z = comparison.whitened(comparison.difference)
     # 61 squares of standard normal numbers: their mean is within 0.5 of 1 but once in 200 times.
     assert 0.5 < float(np.mean(z**2)) < 1.5
 
 
 def test_a_baseline_of_another_model_is_refused(
-    clean: tuple[Fit, ColumnCache], baseline: IdentificationDocument
+    clean: tuple[IvFit, ColumnCache], baseline: IdentificationDocument
 ) -> None:
     fewer = baseline.model_copy(update={"parameters": baseline.parameters[1:]})
     with pytest.raises(DataError, match="zz1r"):

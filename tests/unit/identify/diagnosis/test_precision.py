@@ -10,10 +10,10 @@ from armident.configs import RobotConfig
 from armident.configs.schema.robot import Effect
 from armident.identify.diagnosis.candidates import Candidate, ColumnCache, candidates
 from armident.identify.diagnosis.model_state import ModelState, fitted, with_entries
-from armident.identify.diagnosis.precision import p_value, standard_deviations
+from armident.identify.diagnosis.precision import p_value_of_effect, standard_deviations
 from armident.identify.diagnosis.screening import contained
 from armident.identify.diagnosis.study import build_study
-from armident.identify.experiment import Experiment
+from armident.identify.signals.experiments import Experiment
 from tests.fixtures import setups
 from tests.fixtures.diagnoses import SPRING, selection
 
@@ -44,8 +44,8 @@ def test_parameters_of_an_effect_that_is_there_differ_from_zero_and_others_do_no
         fitted(first.study, with_entries(first.robot, [SPRING_OF_JOINT_1]), first)
         for first in (selection(1, SPRING)[1], selection(1)[1])
     )
-    assert p_value(present, SPRING_OF_JOINT_1) < 1e-12
-    assert p_value(absent, SPRING_OF_JOINT_1) > 1e-3
+    assert p_value_of_effect(present, SPRING_OF_JOINT_1) < 1e-12
+    assert p_value_of_effect(absent, SPRING_OF_JOINT_1) > 1e-3
 
 
 @pytest.mark.slow
@@ -55,7 +55,9 @@ def test_the_test_of_one_parameter_is_that_of_its_standard_deviation() -> None:
     number = list(state.robot.effects).index(SPRING_OF_JOINT_1)
     (value,), _ = state.values_of(state.term_of(SPRING_OF_JOINT_1))
     deviations = value / standard_deviations(state)[number]["ks"]
-    assert p_value(state, SPRING_OF_JOINT_1) == pytest.approx(float(stats.chi2.sf(deviations**2, 1)), rel=1e-6)
+    assert p_value_of_effect(state, SPRING_OF_JOINT_1) == pytest.approx(
+        float(stats.chi2.sf(deviations**2, 1)), rel=1e-6
+    )
 
 
 def test_the_value_of_a_correction_is_tested_too() -> None:
@@ -64,7 +66,7 @@ def test_the_value_of_a_correction_is_tested_too() -> None:
     wrong = [replace(e, tau=e.tau * np.array([1.0, 1.25, 1.0, 1.0])) for e in experiments]
     entry = Effect(effect="drive_gain_error", joint=robot.joints[1].name, parameters={"gain_error": 0.25})
     exact = robot.model_copy(update={"effects": (entry,)})
-    assert p_value(fitted(build_study(wrong, [], exact), exact, None), entry) < 1e-12
+    assert p_value_of_effect(fitted(build_study(wrong, [], exact), exact, None), entry) < 1e-12
 
 
 def test_an_inertia_of_two_parallel_joints_belongs_to_the_rigid_model() -> None:
@@ -88,4 +90,4 @@ def test_what_rigid_model_and_term_both_give_belongs_to_the_rigid_model() -> Non
     assert np.isfinite(state.fit.theta).all()
     np.testing.assert_array_equal(values[:4], 0.0)
     np.testing.assert_allclose(state.score.rms, first.score.rms, rtol=0.02)
-    assert p_value(state, entry) > 1e-6
+    assert p_value_of_effect(state, entry) > 1e-6

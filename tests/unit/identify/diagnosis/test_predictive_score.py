@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from armident.configs.schema.robot import Effect
-from armident.identify.diagnosis.comparison import gain
+from armident.identify.diagnosis.candidate_comparison import gain
 from armident.identify.diagnosis.predictive_score import BLOCKS, FOLDS, fold_of
 from tests.fixtures.diagnoses import SPRING, selection, with_effects
 

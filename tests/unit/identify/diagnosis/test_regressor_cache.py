@@ -7,7 +7,7 @@ import pytest
 
 from armident.configs import load_robot
 from armident.configs.schema.robot import Effect
-from armident.identify.diagnosis.equations import regressors
+from armident.identify.diagnosis.model_equations import regressors
 from armident.identify.diagnosis.regressor_cache import Arrays, RegressorCache
 from armident.identify.diagnosis.stretch import KINDS
 from armident.identify.diagnosis.study import Study, build_study
@@ -40,7 +40,7 @@ def test_the_array_that_was_not_used_for_the_longest_time_goes_first() -> None:
             computed.append(key)
             return (np.zeros(10),)
 
-        return cache.get(key, "signals", made)
+        return cache.get(key, made)
 
     for key in ("a", "b", "a", "c", "a", "b"):
         get(key)
@@ -49,7 +49,7 @@ def test_the_array_that_was_not_used_for_the_longest_time_goes_first() -> None:
 
 def test_an_array_larger_than_the_memory_is_returned_all_the_same() -> None:
     cache = RegressorCache(most_bytes=8)
-    assert cache.get("a", "signals", lambda: (np.ones(10),))[0].sum() == 10.0
+    assert cache.get("a", lambda: (np.ones(10),))[0].sum() == 10.0
 
 
 def test_cached_regressors_are_those_of_a_fresh_study(study: Study) -> None:

@@ -10,8 +10,8 @@ from armident.configs.schema.scenario import HiddenEffect
 from armident.identify.diagnosis.candidates import ColumnCache, candidates
 from armident.identify.diagnosis.corrections import screened_correction
 from armident.identify.diagnosis.model_state import fitted as model_of
-from armident.identify.diagnosis.regression import Fit
-from armident.identify.diagnosis.screening import directions_beside, score_statistics
+from armident.identify.diagnosis.regression import IvFit
+from armident.identify.diagnosis.screening import orthogonal_directions, score_statistics
 from armident.identify.diagnosis.study import build_study
 from armident.identify.identification.from_recording import experiments_from_recording
 from armident.identify.regression.iv_regression import IvRegression
@@ -23,7 +23,7 @@ DELAY = 0.006
 
 
 @pytest.fixture(scope="module")
-def fitted() -> Fit:
+def fitted() -> IvFit:
     """TX40 whose third torque is recorded late, at 1 kHz."""
     robot = load_robot("tx40")
     hidden = HiddenEffect(effect="time_delay", joint="joint_3", parameters={"delay": DELAY})
@@ -35,7 +35,7 @@ def fitted() -> Fit:
 @pytest.mark.parametrize(
     "name", ["stribeck_friction", "coupling_friction", "cogging_torque", "joint_elasticity", "time_delay"]
 )
-def test_every_shape_of_a_grid_gets_the_statistic_that_it_has_by_itself(fitted: Fit, name: str) -> None:
+def test_every_shape_of_a_grid_gets_the_statistic_that_it_has_by_itself(fitted: IvFit, name: str) -> None:
     """By the projection of the residual on the instruments beside the model, made for one shape alone."""
     bench = ColumnCache(fitted.study, fitted.theta)
     candidate = next(c for c in candidates(bench) if c.effect.name == name)
@@ -43,14 +43,16 @@ def test_every_shape_of_a_grid_gets_the_statistic_that_it_has_by_itself(fitted: 
     columns = bench.grid(candidate.effect, candidate.place, grid, fitted.noise)
     found = score_statistics(fitted, columns, len(grid))
     for shapes, statistic in zip(grid, found, strict=True):
-        basis = directions_beside(fitted, bench.instruments(candidate.effect, candidate.place, shapes, fitted.noise))
+        basis = orthogonal_directions(
+            fitted, bench.instruments(candidate.effect, candidate.place, shapes, fitted.noise)
+        )
         assert basis is not None
         alone = float(np.sum((basis[0].T @ fitted.residual) ** 2))
         # Through Gram matrices: directions of a thousandth of the columns are kept, so six digits of the square are.
         assert statistic == pytest.approx(alone, rel=1e-5, abs=1e-6)
 
 
-def test_a_shape_without_an_effect_has_no_statistic_and_spoils_no_other(fitted: Fit) -> None:
+def test_a_shape_without_an_effect_has_no_statistic_and_spoils_no_other(fitted: IvFit) -> None:
     columns = np.random.default_rng(0).standard_normal((fitted.regression.rows[2].shape[0], 4))
     whole = score_statistics(fitted, [(2, columns)], 4)
     columns[:, 1], columns[5, 2] = 0.0, np.nan
@@ -60,7 +62,7 @@ def test_a_shape_without_an_effect_has_no_statistic_and_spoils_no_other(fitted: 
     assert np.isnan(score_statistics(fitted, [], 3)).all()
 
 
-def test_products_are_made_anew_only_where_the_noise_is_another(fitted: Fit) -> None:
+def test_products_are_made_anew_only_where_the_noise_is_another(fitted: IvFit) -> None:
     noise = list(fitted.noise)
     noise[4] = replace(noise[4], variance=2.0 * noise[4].variance)
     known = IvRegression.of(fitted.equations, noise, fitted.regression)
@@ -70,7 +72,7 @@ def test_products_are_made_anew_only_where_the_noise_is_another(fitted: Fit) -> 
         np.testing.assert_array_equal(getattr(known.solution, name), getattr(fresh.solution, name))
 
 
-def test_statistics_of_a_parameter_with_the_wrong_sign_are_zero(fitted: Fit) -> None:
+def test_statistics_of_a_parameter_with_the_wrong_sign_are_zero(fitted: IvFit) -> None:
     bench = ColumnCache(fitted.study, fitted.theta)
     candidate = next(c for c in candidates(bench) if c.effect.name == "stribeck_friction" and c.effect.law == "")
     columns = bench.grid(candidate.effect, candidate.place, candidate.grid, fitted.noise)

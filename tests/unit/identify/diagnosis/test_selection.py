@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from armident.configs.schema.robot import Effect
+from armident.identify.diagnosis.candidate_comparison import Addition, SelectionStep, advantage
 from armident.identify.diagnosis.candidates import Candidate, Shapes
-from armident.identify.diagnosis.comparison import Addition, Step, advantage
 from armident.identify.diagnosis.criteria import Criteria
-from armident.identify.diagnosis.diagnose import diagnose
+from armident.identify.diagnosis.diagnose import run_diagnosis
 from armident.identify.diagnosis.model_state import ModelState
 from armident.identify.diagnosis.selected import Selected
 from armident.identify.diagnosis.selection import StepwiseSelection
-from armident.identify.diagnosis.shortlist import Contested, shortlist
+from armident.identify.diagnosis.shortlist import Incumbent, shortlist
 from armident.identify.effects.registry import known
 from armident.identify.effects.terms import arm_model
 from armident.identify.identification.from_recording import experiments_from_recording
@@ -25,7 +25,7 @@ pytestmark = pytest.mark.slow
 FRICTION = Effect(effect="asymmetric_viscous_friction", joint="joint_1")
 
 
-def addition_of(step: Step, key: str) -> Addition:
+def addition_of(step: SelectionStep, key: str) -> Addition:
     """The addition of an effect with a law."""
     return next(a for a in step.ranked if a.candidate.effect.key == key)
 
@@ -126,11 +126,11 @@ def test_an_effect_beside_which_a_finding_stays_does_not_take_its_place() -> Non
 
 
 def test_only_effects_on_a_joint_of_a_finding_compete_with_it() -> None:
-    worn = hide("asymmetric_viscous_friction", "joint_2", ratio=0.3)
-    steps, first = selection(5, worn, arm="tx40", motion="tx40_excitation")
-    every = shortlist(first, steps.criteria, None)
+    worn = hide("asymmetric_viscous_friction", "joint_2", fva=0.3 * 5.5)
+    _, first = selection(5, worn, arm="tx40", motion="tx40_excitation")
+    every = shortlist(first, None)
     joints = np.arange(6) == 1
-    chosen = shortlist(first, steps.criteria, Contested(0.0, joints))
+    chosen = shortlist(first, Incumbent(0.0, joints))
     motion = first.study.motion(first.study.train[0], "measured", first.fit.theta)
 
     def acts(candidate: Candidate, shapes: Shapes) -> bool:
@@ -178,7 +178,7 @@ def test_of_two_laws_that_predict_as_well_the_simpler_one_is_preferred() -> None
     linear, cubic = addition_of(step, "joint_spring"), addition_of(step, "joint_spring/cubic")
     assert len(linear.candidate.effect.linear) < len(cubic.candidate.effect.linear)
     ranked = tuple(sorted((linear, cubic), key=lambda a: -a.log_likelihood))
-    close = StepwiseSelection(steps.study, replace(steps.criteria, close=1e9))
+    close = StepwiseSelection(replace(steps.study, criteria=replace(steps.criteria, close=1e9)))
     admitted = close.admitted(replace(step, ranked=ranked, passing=ranked))
     assert admitted is linear
 
@@ -188,7 +188,7 @@ def test_a_named_effect_that_explains_half_comes_before_a_better_term_without_a_
     step = steps.step(first)
     named = addition_of(step, "joint_spring")
     effect = known("unnamed/time")
-    nameless = replace(named, made=replace(named.made, candidate=replace(named.candidate, effect=effect)))
+    nameless = replace(named, fitted=replace(named.fitted, candidate=replace(named.candidate, effect=effect)))
     for factor, expected in ((1.9, "joint_spring"), (2.1, "unnamed")):
         better = replace(nameless, share=factor * named.share)
         both = replace(step, ranked=(better, named), passing=(better, named))
@@ -201,7 +201,7 @@ def test_an_effect_below_the_limit_of_the_user_is_negligible() -> None:
     _, first = selection(1, SPRING)
     robot = first.robot
     experiments, _ = experiments_from_recording(recording("emps", "emps_1", 1, SPRING, period=FAST), robot)
-    document = diagnose(experiments, [], robot, criteria=Criteria(material_pct=50.0)).document
+    document = run_diagnosis(experiments, [], robot, criteria=Criteria(material_pct=50.0)).document
     assert [f.effect for f in document.findings] == []
     assert "joint_spring" in {n.effect for n in document.negligible}
 

@@ -12,9 +12,9 @@ from armident.identify.diagnosis.precision import standard_deviations
 from armident.identify.diagnosis.selection import StepwiseSelection
 from armident.identify.diagnosis.study import Study, _aligned, build_study
 from armident.identify.effects.drive import Correction
-from armident.identify.effects.recorded import put_right
+from armident.identify.effects.recording_corrections import corrected_experiments
 from armident.identify.effects.registry import known
-from armident.identify.experiment import Experiment
+from armident.identify.signals.experiments import Experiment
 from tests.fixtures import setups
 
 Array = NDArray[np.float64]
@@ -53,10 +53,10 @@ def test_a_torque_correction_gives_the_equations_of_corrected_recordings(experim
     np.testing.assert_allclose(corrected.volume, [0.0, -np.log(1.25), 0.0, 0.0], atol=0.01)
 
 
-def test_the_gain_of_a_drive_that_reports_too_much_is_put_right(experiments: list[Experiment]) -> None:
+def test_the_gain_of_a_drive_that_reports_too_much_is_corrected(experiments: list[Experiment]) -> None:
     robot = setups.random_arm(3, 4)
     entry = Effect(effect="drive_gain_error", joint=robot.joints[2].name, parameters={"gain_error": -0.3})
-    found = put_right(reported(experiments, 2, -0.3), robot.model_copy(update={"effects": (entry,)}))
+    found = corrected_experiments(reported(experiments, 2, -0.3), robot.model_copy(update={"effects": (entry,)}))
     for own, true in zip(found, experiments, strict=True):
         np.testing.assert_allclose(own.tau, true.tau, rtol=1e-12)
 

@@ -7,17 +7,17 @@ from numpy.typing import NDArray
 from armident.configs import RobotConfig, load_robot
 from armident.configs.loading import parse
 from armident.configs.schema.robot import Effect as Entry
-from armident.identify.diagnosis.diagnose import diagnose
+from armident.identify.diagnosis.diagnose import run_diagnosis
 from armident.identify.effects.effect import Effect, Place
+from armident.identify.effects.free_shapes import FreeShape
 from armident.identify.effects.registry import catalogue
-from armident.identify.effects.tables import FreeShape
 from armident.identify.effects.terms import arm_model, entry_of
-from armident.identify.experiment import Experiment
 from armident.identify.identification.from_recording import experiments_from_recording
 from armident.identify.identification.options import Options
 from armident.identify.identification.pipeline import identify_experiment
-from armident.identify.report.files import robot_yaml
+from armident.identify.report.robot_file import robot_yaml
 from armident.identify.robot.motion import Motion
+from armident.identify.signals.experiments import Experiment
 from tests.fixtures.arms import FAST, recording
 from tests.fixtures.diagnoses import SPRING
 
@@ -112,8 +112,9 @@ def test_diagnose_accepts_a_model_with_a_table_and_names_nothing_that_it_contain
     shapes = dict(zip(names, (float(q.min()), float(q.max())), strict=True))
     entry = Entry(effect="joint_spring", law=catalogue()[key].law, joint="joint_1", parameters=shapes)
     known = robot.model_copy(update={"effects": (*robot.effects, entry)})
-    document = diagnose(experiments, [], known).document
+    document = run_diagnosis(experiments, [], known).document
     assert "joint_spring" not in {f.effect for f in document.findings}
     assert (
-        document.gap.validation.before.all < 0.5 * diagnose(experiments, [], robot).document.gap.validation.before.all
+        document.gap.validation.before.all
+        < 0.5 * run_diagnosis(experiments, [], robot).document.gap.validation.before.all
     )

@@ -12,13 +12,13 @@ from armident.configs.schema.robot import Effect as Entry
 from armident.configs.schema.robot import Limits
 from armident.identify.effects.effect import Place
 from armident.identify.effects.friction import dahl
-from armident.identify.effects.recorded import put_right
+from armident.identify.effects.recording_corrections import corrected_experiments
 from armident.identify.effects.registry import catalogue
 from armident.identify.effects.rotor import rotors
 from armident.identify.effects.terms import arm_model
 from armident.identify.effects.transmission import crossing, swinging
-from armident.identify.experiment import Experiment
 from armident.identify.robot.motion import Motion
+from armident.identify.signals.experiments import Experiment
 from armident.virtual_robot.inertias import plant_parameters
 
 DT = 1e-3
@@ -297,13 +297,13 @@ def test_saturation_grows_with_the_cube_of_the_torque(axis: Motion) -> None:
     np.testing.assert_allclose(found, current - tau, rtol=2e-3, atol=1e-9)
 
 
-def test_a_recording_of_a_saturated_motor_is_put_right_to_its_end(axis: Motion) -> None:
+def test_a_recording_of_a_saturated_motor_is_corrected_to_its_end(axis: Motion) -> None:
     robot, tau = axis.model.robot, axis.torque[:, :1]
     knee = 1.1 * np.abs(tau).max()
     loss = robot.joints[0].limits.torque ** 2 / (2 * knee**2)
     entry = Entry(effect="drive_gain_saturation", joint=robot.joints[0].name, parameters={"gain_loss": loss})
     current = Experiment(axis.q, tau / np.sqrt(1 - (tau / knee) ** 2), None, axis.dt)
-    (found,) = put_right([current], robot.model_copy(update={"effects": (entry,)}))
+    (found,) = corrected_experiments([current], robot.model_copy(update={"effects": (entry,)}))
     np.testing.assert_allclose(found.tau, tau, rtol=1e-9, atol=1e-12)
 
 

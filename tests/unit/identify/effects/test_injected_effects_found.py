@@ -9,10 +9,10 @@ from threadpoolctl import threadpool_limits
 from armident.configs import RobotConfig, load_robot
 from armident.configs.schema.scenario import HiddenEffect
 from armident.daq.recording import Recording
-from armident.identify.diagnosis.comparison import Step
+from armident.identify.diagnosis.candidate_comparison import SelectionStep
 from armident.identify.diagnosis.selection import StepwiseSelection
 from armident.identify.diagnosis.study import build_study
-from armident.identify.effects.recorded import of_recording
+from armident.identify.effects.recording_corrections import of_recording
 from armident.identify.identification.from_recording import experiments_from_recording
 from tests.fixtures.arms import FAST, recording
 
@@ -39,10 +39,10 @@ class Case:
 
 
 TX40 = (
-    Case("tx40", "asymmetric_viscous_friction", "joint_2", {"ratio": 0.1}, {"fva": 0.55}),
-    Case("tx40", "asymmetric_coulomb_friction", "joint_2", {"ratio": 0.3}),
+    Case("tx40", "asymmetric_viscous_friction", "joint_2", {"fva": 0.55}, {"fva": 0.55}),
+    Case("tx40", "asymmetric_coulomb_friction", "joint_2", {"fca": 2.472}),
     Case("tx40", "nonlinear_viscous_friction", "joint_1", {"thinning": 0.2}),
-    Case("tx40", "load_dependent_friction", "joint_3", {"coefficient": 0.2}, {"fcl": 0.2}),
+    Case("tx40", "load_dependent_friction", "joint_3", {"fcl": 0.2}, {"fcl": 0.2}),
     Case("tx40", "presliding_friction", "joint_1", {"deflection": 0.03}),
     Case("tx40", "position_dependent_friction", "joint_4", {"ratio": 0.2}, {"fpc": 0.514, "fps": 0.0}),
     Case("tx40", "friction_drift", "joint_1", {"change": 0.25}),
@@ -62,8 +62,8 @@ TX40 = (
 MISSED = pytest.mark.xfail(strict=True, reason="the stepwise selection misses it: docs/diagnosis.md, What is missed")
 STRIBECK = Case("tx40", "stribeck_friction", "joint_5", {"extra": 1.2, "velocity": 0.36})
 EMPS = (
-    Case("emps", "asymmetric_viscous_friction", "joint_1", {"ratio": 0.05}),
-    Case("emps", "load_dependent_friction", "joint_1", {"coefficient": 0.03}, {"fcl": 0.03}),
+    Case("emps", "asymmetric_viscous_friction", "joint_1", {"fva": 10.175}),
+    Case("emps", "load_dependent_friction", "joint_1", {"fcl": 0.03}, {"fcl": 0.03}),
     Case("emps", "presliding_friction", "joint_1", {"deflection": 0.001}),
     Case("emps", "position_dependent_friction", "joint_1", {"ratio": 0.05}),
     Case("emps", "friction_drift", "joint_1", {"change": 0.1}),
@@ -97,7 +97,7 @@ def known_of(case: Case) -> RobotConfig:
     return robot
 
 
-def first_step(data: Recording, whole: RobotConfig, known: RobotConfig) -> tuple[StepwiseSelection, Step]:
+def first_step(data: Recording, whole: RobotConfig, known: RobotConfig) -> tuple[StepwiseSelection, SelectionStep]:
     """Comparison of all candidates beside a model that lacks at most one effect."""
     experiments, _ = experiments_from_recording(data, whole)
     with threadpool_limits(1):

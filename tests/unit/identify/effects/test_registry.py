@@ -18,9 +18,9 @@ class EndStop(Effect):
 
     name = "end_stop"
     title = "a soft end stop"
-    says = "the joint runs into something soft on one side"
+    description = "the joint runs into something soft on one side"
     reference = "the machine's drawing"
-    needs = "motion into the stop"
+    required_motion = "motion into the stop"
     linear = (Linear("kstop", ("N m/rad", "N/m"), sign=1),)
 
     def columns(self, motion: Motion, place: Place, shapes: Mapping[str, float]) -> NDArray[np.float64]:
@@ -87,7 +87,7 @@ class Untitled(Effect):
     [
         ("end_stop", "expected an Effect, got str"),
         (Unfinished, "abstract.*columns"),
-        (Untitled, "an effect needs title, says, reference, needs, linear"),
+        (Untitled, "an effect needs title, description, reference, required_motion, linear"),
         ((EndStop, EndStop), "'end_stop' exists already"),
     ],
     ids=["text", "abstract", "untitled", "twice"],

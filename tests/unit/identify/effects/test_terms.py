@@ -12,13 +12,14 @@ from armident.identify.controller.nominal import nominal_controller
 from armident.identify.effects.registry import catalogue
 from armident.identify.effects.terms import arm_model
 from armident.identify.effects.wiring import rewired
-from armident.identify.experiment import Experiment
-from armident.identify.identification.api import identify_recording
-from armident.identify.identification.options import Method, Options
+from armident.identify.estimators.methods import Method
+from armident.identify.identification.identify_recording import identify_recording
+from armident.identify.identification.options import Options
 from armident.identify.robot.relaxation import simulate_with_terms
 from armident.identify.robot.simulation import simulate
 from armident.identify.signals.bandpass import butterworth
 from armident.identify.signals.differentiate import Derivatives
+from armident.identify.signals.experiments import Experiment
 from armident.virtual_robot.inertias import plant_parameters
 from tests.fixtures.arms import FAST, recording
 
@@ -167,7 +168,7 @@ def _on_joint_1(torque: Any, robot: RobotConfig) -> Any:
 @pytest.mark.slow
 @pytest.mark.parametrize("method", ["idim-ls", "idim-iv", "idim-piv", "didim"])
 def test_every_method_estimates_a_term_with_the_rest(robot: RobotConfig, method: Method) -> None:
-    worn = HiddenEffect(effect="asymmetric_viscous_friction", joint="joint_2", parameters={"ratio": 0.4})
+    worn = HiddenEffect(effect="asymmetric_viscous_friction", joint="joint_2", parameters={"fva": 0.4 * 5.5})
     data = recording("tx40", "tx40_excitation", 3, worn, period=FAST)
     known = with_effects(robot, Effect(effect="asymmetric_viscous_friction", joint="joint_2"))
     document = identify_recording(data, known, Options(method=method)).document
@@ -231,7 +232,7 @@ def test_terms_of_the_wrist_coupling_are_those_of_the_configured_coupling(robot:
     )
 
 
-def test_exchanged_drives_are_put_right_before_anything_else(robot: RobotConfig) -> None:
+def test_exchanged_drives_are_corrected_before_anything_else(robot: RobotConfig) -> None:
     rng = np.random.default_rng(6)
     right = Experiment(rng.normal(size=(20, 6)), rng.normal(size=(20, 6)), rng.normal(size=(20, 6)), DT)
     swapped = with_effects(
@@ -249,11 +250,11 @@ def test_exchanged_drives_are_put_right_before_anything_else(robot: RobotConfig)
     np.testing.assert_allclose(again.tau, right.tau)
 
 
-def test_every_entry_of_the_catalogue_says_what_it_is(robot: RobotConfig) -> None:
+def test_every_entry_of_the_catalogue_is_described(robot: RobotConfig) -> None:
     for effect in catalogue().values():
         assert effect.title, effect.name
-        assert effect.says, effect.name
+        assert effect.description, effect.name
         assert effect.reference, effect.name
-        assert effect.needs, effect.name
+        assert effect.required_motion, effect.name
         names = [p.name for p in effect.linear] + [shape.name for shape in effect.shapes]
         assert len(set(names)) == len(names)

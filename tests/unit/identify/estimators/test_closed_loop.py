@@ -7,11 +7,12 @@ import pytest
 
 from armident.configs import load_robot
 from armident.identify.estimators.idim_piv import idim_piv
-from armident.identify.experiment import Experiment
+from armident.identify.estimators.methods import Method
 from armident.identify.identification import solvers as methods
 from armident.identify.identification.from_recording import experiments_from_recording
-from armident.identify.identification.options import Method, Options
+from armident.identify.identification.options import Options
 from armident.identify.identification.pipeline import identify_experiment
+from armident.identify.signals.experiments import Experiment
 from tests.fixtures.arms import recording
 
 pytestmark = pytest.mark.slow

@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 
 from armident.configs import load_robot
 from armident.identify.effects.terms import arm_model
-from armident.identify.experiment import Experiment
+from armident.identify.estimators.methods import Method
+from armident.identify.estimators.reason import Reason
 from armident.identify.identification.equations import (
     EQUATIONS_PER_PARAMETER,
     LS_CUTOFF,
@@ -19,11 +20,10 @@ from armident.identify.identification.equations import (
     least_rows,
     sufficient,
 )
-from armident.identify.identification.options import Method
 from armident.identify.identification.solvers import decimation_of
-from armident.identify.identification.verdict import Reason
 from armident.identify.signals.decimate import design
 from armident.identify.signals.differentiate import differentiate
+from armident.identify.signals.experiments import Experiment
 
 DT = 5e-3
 SAMPLES = (5000, 5000)

@@ -14,7 +14,6 @@ from armident.identify.effects.terms import arm_model
 from armident.identify.estimators.auxiliary_model import AuxiliaryModel
 from armident.identify.estimators.idim_ls import idim_ls
 from armident.identify.estimators.idim_piv import idim_piv
-from armident.identify.experiment import Experiment
 from armident.identify.identification.auxiliary_loop import closed_loop
 from armident.identify.identification.equations import PIV_CUTOFF, Prepared, equations
 from armident.identify.identification.from_recording import experiments_from_recording
@@ -26,6 +25,7 @@ from armident.identify.regression.iv import iv_products
 from armident.identify.robot.arm import ArmModel
 from armident.identify.signals.decimate import design
 from armident.identify.signals.differentiate import Derivatives, differentiate
+from armident.identify.signals.experiments import Experiment
 from armident.virtual_robot.inertias import plant_parameters
 from tests.fixtures.arms import recording
 

@@ -8,12 +8,12 @@ from armident.identify.effects.terms import arm_model
 from armident.identify.estimators.idim_iv import idim_iv
 from armident.identify.estimators.idim_ls import idim_ls
 from armident.identify.estimators.measured_instruments import MotionInstruments
-from armident.identify.experiment import Experiment
 from armident.identify.identification.equations import equations
 from armident.identify.robot.arm import ArmModel
 from armident.identify.signals.bandpass import butterworth, central_difference
 from armident.identify.signals.decimate import design
 from armident.identify.signals.differentiate import Derivatives
+from armident.identify.signals.experiments import Experiment
 
 DT = 1e-3
 THETA = np.array([95.0, 200.0, 20.0, -3.0])

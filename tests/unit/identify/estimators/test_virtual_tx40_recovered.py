@@ -10,11 +10,12 @@ from scipy import stats
 
 from armident.configs import RobotConfig, load_robot
 from armident.identify.effects.terms import arm_model
-from armident.identify.experiment import Experiment
+from armident.identify.estimators.methods import Method
 from armident.identify.identification.from_recording import experiments_from_recording
-from armident.identify.identification.options import Method, Options
+from armident.identify.identification.identification_result import IdentificationResult
+from armident.identify.identification.options import Options
 from armident.identify.identification.pipeline import identify_experiment
-from armident.identify.identification.result import Identification
+from armident.identify.signals.experiments import Experiment
 from armident.virtual_robot.inertias import plant_parameters
 from tests.fixtures import arms
 
@@ -45,11 +46,11 @@ def recorded() -> list[Experiment]:
     return list(experiments_from_recording(arms.recording("tx40", "tx40_excitation", 1, noise=1.0), robot())[0])
 
 
-def identified(seed: int = 1, noise: float = 1.0, method: Method = "idim-piv") -> Identification:
+def identified(seed: int = 1, noise: float = 1.0, method: Method = "idim-piv") -> IdentificationResult:
     return arms.identified("tx40", "tx40_excitation", seed, method, noise=noise).result
 
 
-def essential(result: Identification) -> list[int]:
+def essential(result: IdentificationResult) -> list[int]:
     return [result.names.index(name) for name in ESSENTIAL]
 
 

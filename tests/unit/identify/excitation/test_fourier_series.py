@@ -9,8 +9,8 @@ import pytest
 from armident.configs import ConfigError, RobotConfig, Trajectory, load_robot, load_trajectory
 from armident.configs.schema.trajectory import Fourier
 from armident.identify.effects.terms import arm_model
-from armident.identify.excitation.cli import TrajectoryOptions, trajectory_command
 from armident.identify.excitation.design import design_trajectory, predict_precision
+from armident.identify.excitation.trajectory_command import TrajectoryOptions, trajectory_command
 
 pytestmark = pytest.mark.slow
 
@@ -105,7 +105,6 @@ def test_a_trajectory_outside_the_limits_is_refused_by_name(tmp_path: Path) -> N
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"shape": "circle"}, "--shape circle: expected moves or fourier"),
         ({"harmonics": 5}, "only for Fourier series"),
         ({"picture": Path("a.gif")}, r"--picture a\.gif: expected a name that ends in"),
         ({"look_at": Path("b.yaml")}, "give --out FILE for a new trajectory, or --look-at FILE"),

@@ -8,11 +8,11 @@ from scipy.io import loadmat
 
 from armident.configs import load_robot
 from armident.identify.effects.terms import arm_model
-from armident.identify.experiment import Experiment
 from armident.identify.identification.equations import published_equations
+from armident.identify.identification.identification_result import IdentificationResult
 from armident.identify.identification.options import ControllerName, Options
 from armident.identify.identification.pipeline import identify_experiment
-from armident.identify.identification.result import Identification
+from armident.identify.signals.experiments import Experiment
 
 FORCE_PER_VOLT = 35.15065
 NAMES = ("m1", "fv1", "fc1", "off1")
@@ -33,11 +33,11 @@ def emps(shared_data: Path) -> Experiment:
 
 
 @pytest.fixture(scope="module")
-def ls(emps: Experiment) -> Identification:
+def ls(emps: Experiment) -> IdentificationResult:
     return identify_experiment(emps, load_robot("emps"), Options(method="idim-ls"))
 
 
-def test_idim_ls_prints_the_published_digits(ls: Identification) -> None:
+def test_idim_ls_prints_the_published_digits(ls: IdentificationResult) -> None:
     assert ls.names == NAMES
     assert [f"{value:.4f}" for value in ls.theta] == ["95.1089", "203.5034", "20.3935", "-3.1648"]
     assert f"{ls.relative_error_pct:.4f}" == "4.0834"
@@ -52,7 +52,7 @@ def test_condition_number_is_the_published_one(emps: Experiment) -> None:
 
 
 def test_irwsm_without_any_knowledge_of_bandwidths_agrees_with_the_published_fit(
-    emps: Experiment, ls: Identification
+    emps: Experiment, ls: IdentificationResult
 ) -> None:
     free = identify_experiment(emps, load_robot("emps"), Options(method="idim-ls", derivatives="irwsm"))
     # Residuals of the published model are serially correlated, so the fits differ by 2 rather than 1 of its std.
@@ -82,7 +82,7 @@ def test_crc_finds_the_recorded_gains(emps: Experiment) -> None:
     assert response["fit_pct"] > 99.9
 
 
-def test_prefilter_that_contradicts_the_instruments_is_not_believed(emps: Experiment, ls: Identification) -> None:
+def test_prefilter_that_contradicts_the_instruments_is_not_believed(emps: Experiment, ls: IdentificationResult) -> None:
     found = identify_experiment(emps, load_robot("emps"))
     assert found.method == "idim-piv"
     assert found.converged

@@ -23,16 +23,16 @@ from armident.identify.effects.terms import arm_model
 from armident.identify.estimators.auxiliary_model import AuxiliaryModel
 from armident.identify.estimators.didim import didim
 from armident.identify.estimators.idim_iv import idim_iv
-from armident.identify.experiment import Experiment
 from armident.identify.identification.equations import equations, published_equations
+from armident.identify.identification.identification_result import relative_torque_errors
 from armident.identify.identification.options import Options
 from armident.identify.identification.pipeline import identify_experiment
-from armident.identify.identification.result import relative_errors
 from armident.identify.robot.controller import DiscreteController
 from armident.identify.robot.simulation import Simulation, simulate
 from armident.identify.signals.bandpass import butterworth, central_difference
 from armident.identify.signals.decimate import design
 from armident.identify.signals.differentiate import differentiate
+from armident.identify.signals.experiments import Experiment
 
 pytestmark = pytest.mark.slow
 
@@ -119,7 +119,7 @@ def test_cross_test_on_the_pulses_prints_the_published_digits(plain: Axis, pulse
     assert robot.preprocessing is not None
     fitted = identify_experiment(plain.experiment, robot, Options(method="idim-ls"))
     blocks = published_equations(arm_model(robot), [pulsed.experiment], robot.preprocessing)
-    assert f"{relative_errors(blocks, fitted.theta)[0]:.4f}" == "5.9824"
+    assert f"{relative_torque_errors(blocks, fitted.theta)[0]:.4f}" == "5.9824"
 
 
 def published_loop(dt: float) -> DiscreteController:

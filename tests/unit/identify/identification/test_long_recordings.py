@@ -9,11 +9,12 @@ import pytest
 
 from armident.daq.recording import Recording
 from armident.identify.documents.identification import IdentificationDocument
+from armident.identify.estimators.methods import Method
 from armident.identify.identification import from_recording
-from armident.identify.identification.api import identify_recording
 from armident.identify.identification.from_recording import StretchRule, experiments_from_recording
-from armident.identify.identification.options import Method, Options
-from armident.identify.streamed import Streamed
+from armident.identify.identification.identify_recording import identify_recording
+from armident.identify.identification.options import Options
+from armident.identify.signals.streamed import Streamed
 from tests.fixtures import arms
 
 EDGES = 0.2

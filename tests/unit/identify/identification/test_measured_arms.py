@@ -27,17 +27,17 @@ from armident.identify.effects.terms import arm_model
 from armident.identify.estimators.idim_iv import idim_iv
 from armident.identify.estimators.idim_ls import idim_ls
 from armident.identify.estimators.measured_instruments import MotionInstruments
-from armident.identify.experiment import Experiment
 from armident.identify.identification.equations import LS_CUTOFF, PIV_CUTOFF, decimated_rows, equations, least_rows
 from armident.identify.identification.from_recording import experiments_from_recording
+from armident.identify.identification.identification_result import IdentificationResult, relative_torque_errors
 from armident.identify.identification.options import Options
 from armident.identify.identification.pipeline import identify_experiment
-from armident.identify.identification.result import Identification, relative_errors
 from armident.identify.identification.solvers import decimation_of
 from armident.identify.regression.equations import ExperimentEquations
 from armident.identify.signals.bandpass import butterworth
 from armident.identify.signals.decimate import Decimation, design
 from armident.identify.signals.differentiate import Derivatives, differentiate
+from armident.identify.signals.experiments import Experiment
 
 pytestmark = pytest.mark.slow
 
@@ -95,7 +95,7 @@ def parts(experiment: Experiment) -> tuple[Experiment, Experiment]:
     return part(slice(None, cut)), part(slice(cut, None))
 
 
-def least_squares(experiments: Sequence[Experiment], robot: RobotConfig) -> Identification:
+def least_squares(experiments: Sequence[Experiment], robot: RobotConfig) -> IdentificationResult:
     return identify_experiment(experiments, robot, Options(method="idim-ls"))
 
 
@@ -115,7 +115,7 @@ def prepared(
 def prediction_error(theta: np.ndarray, robot: RobotConfig, experiments: Sequence[Experiment]) -> float:
     """Relative torque error in percent on held-out recordings."""
     blocks, _, _ = prepared(robot, experiments, theta)
-    return relative_errors(blocks, theta)[0]
+    return relative_torque_errors(blocks, theta)[0]
 
 
 def held_out_error(robot: RobotConfig, training: Sequence[Experiment], unseen: Sequence[Experiment]) -> float:
@@ -155,7 +155,7 @@ def test_too_low_a_bandwidth_leaves_the_kuka_ten_equations_per_parameter_all_the
     enough = decimation_of("idim-ls", dt, 0.6, None, samples=lengths, rows=rows)
     blocks = equations(model, slow, [differentiate(e.q, dt) for e in slow], enough)
     assert sum(b.y.size for b in blocks) >= 10 * model.base.b
-    assert relative_errors(blocks, idim_ls(blocks, model.base.names).theta)[0] < 1.7
+    assert relative_torque_errors(blocks, idim_ls(blocks, model.base.names).theta)[0] < 1.7
 
 
 @pytest.mark.parametrize("left_out", [0, 1])

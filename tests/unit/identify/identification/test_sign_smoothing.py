@@ -8,12 +8,13 @@ from pydantic import ValidationError
 
 from armident.configs import RobotConfig, load_robot
 from armident.identify.effects.terms import arm_model
-from armident.identify.experiment import Experiment
-from armident.identify.identification.options import Method, Options
+from armident.identify.estimators.methods import Method
+from armident.identify.identification.options import Options
 from armident.identify.identification.pipeline import identify_experiment
 from armident.identify.identification.sign_smoothing import SATURATION, with_sign_smoothing
 from armident.identify.robot.controller import DiscreteController
 from armident.identify.robot.simulation import simulate
+from armident.identify.signals.experiments import Experiment
 
 DT = 1e-3
 MASS, VISCOUS, COULOMB = 40.0, 60.0, 15.0

@@ -6,10 +6,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from armident.identify.identification.options import Method, Options
+from armident.identify.estimators.methods import Method
+from armident.identify.identification.identification_criteria import IdentificationCriteria
+from armident.identify.identification.identification_result import IdentificationResult
+from armident.identify.identification.options import Options
 from armident.identify.identification.pipeline import identify_experiment
-from armident.identify.identification.result import Identification
-from armident.identify.identification.simulated_bias import RELEVANT_BIAS, SIMULATION_ERROR, SimulatedBias, corrected
+from armident.identify.identification.simulated_bias import SIMULATION_ERROR, SimulatedBias, corrected
 from armident.identify.regression.ar_noise import ArModel
 from armident.identify.regression.equations import Estimate, ExperimentEquations
 from armident.identify.signals.differentiate import differentiate
@@ -23,7 +25,7 @@ RUNS = 6
 
 
 @cache
-def noisy(seed: int, method: Method) -> Identification:
+def noisy(seed: int, method: Method) -> IdentificationResult:
     return identify_experiment(axis.recorded(seed, torque=1.0, position=ENCODER), axis.robot(), Options(method=method))
 
 
@@ -81,7 +83,7 @@ def test_estimate_without_relevant_bias_stays_as_it_is() -> None:
 def test_document_holds_the_bias_that_was_subtracted() -> None:
     found = noisy(0, "idim-iv")
     assert found.bias is not None
-    assert np.max(np.abs(found.bias) / found.std) > RELEVANT_BIAS
+    assert np.max(np.abs(found.bias) / found.std) > IdentificationCriteria.max_bias_std
 
 
 def test_instruments_pass_the_bandpass_of_the_measured_positions(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -10,10 +10,10 @@ import pytest
 from armident.configs import ConfigError
 from armident.identify.documents.files import to_json
 from armident.identify.effects.terms import arm_model
-from armident.identify.identification.api import IdentificationOutcome, identify_recording
-from armident.identify.identification.options import METHODS, Method, Options, parse_decimation, parse_nvr
-from armident.identify.identification.solvers import MEASURED
-from armident.identify.report.identification import identification_report
+from armident.identify.estimators.methods import METHODS, Method, estimator
+from armident.identify.identification.identify_recording import IdentificationOutcome, identify_recording
+from armident.identify.identification.options import Options, parse_decimation, parse_nvr
+from armident.identify.report.identification_report import identification_report
 from armident.virtual_robot.inertias import plant_parameters
 from tests.fixtures.arms import recording
 
@@ -27,7 +27,12 @@ def identified(options: Options, robot: str = "tx40") -> IdentificationOutcome:
 
 def options(method: Method) -> Options:
     """Options; output-error methods need an exact controller: its law instead of an impulse response."""
-    return Options(method=method, controller="crc" if method in MEASURED else "parametric")
+    return Options(method=method, controller="crc" if estimator(method).measured else "parametric")
+
+
+def test_the_list_of_estimators_is_that_of_their_modules() -> None:
+    assert [estimator(method).name for method in METHODS] == list(METHODS)
+    assert sum(estimator(method).solve is None for method in METHODS) == 1
 
 
 OTHERS = [m for m in METHODS if m not in {"clie", "cloe", "idim-ls"}]

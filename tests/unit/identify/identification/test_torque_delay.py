@@ -6,14 +6,14 @@ from numpy.typing import NDArray
 
 from armident.configs import load_robot
 from armident.identify.effects.terms import arm_model
-from armident.identify.experiment import Experiment
 from armident.identify.identification.torque_delay import HELD, TorqueDelay, torque_delay
 from armident.identify.robot.arm import ArmModel
 from armident.identify.robot.controller import DiscreteController
 from armident.identify.robot.simulation import Simulation, simulate
 from armident.identify.signals.decimate import Decimation, design
 from armident.identify.signals.differentiate import Derivatives, differentiate
-from armident.identify.thesis.emps_derivatives import DURATIONS, polynomial_moves
+from armident.identify.signals.experiments import Experiment
+from tests.reproduction.emps_derivatives import DURATIONS, polynomial_moves
 
 DT = 1e-3
 THETA = np.array([96.0, 205.0, 20.0, -3.0])

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from armident.configs import load_robot
-from armident.identify.experiment import Experiment
-from armident.identify.identification.options import Method, Options
+from armident.identify.estimators.methods import Method
+from armident.identify.identification.identification_result import IdentificationResult
+from armident.identify.identification.options import Options
 from armident.identify.identification.pipeline import identify_experiment
-from armident.identify.identification.result import Identification
+from armident.identify.signals.experiments import Experiment
 from tests.tx40_reference import TABLE_B4, published_estimate
 
 pytestmark = pytest.mark.slow
@@ -34,7 +35,7 @@ def tx40(shared_data: Path) -> Experiment:
 
 
 @pytest.fixture(scope="module")
-def results(tx40: Experiment) -> dict[str, Identification]:
+def results(tx40: Experiment) -> dict[str, IdentificationResult]:
     methods: tuple[Method, ...] = ("idim-ls", "idim-iv", "idim-piv")
     return {method: identify_experiment(tx40, load_robot("tx40"), Options(method=method)) for method in methods}
 
@@ -46,7 +47,7 @@ def published(shared_data: Path) -> dict[str, tuple[tuple[float, float], tuple[f
 
 @pytest.mark.parametrize("method", ["idim-ls", "idim-iv", "idim-piv"])
 def test_all_61_base_parameters_are_determined_with_5_1_percent_error(
-    results: dict[str, Identification], method: str
+    results: dict[str, IdentificationResult], method: str
 ) -> None:
     found = results[method]
     assert len(found.names) == 61
@@ -57,7 +58,7 @@ def test_all_61_base_parameters_are_determined_with_5_1_percent_error(
 @pytest.mark.parametrize("method", ["idim-ls", "idim-iv", "idim-piv"])
 @pytest.mark.parametrize("column", [0, 1], ids=["OLS", "WLS"])
 def test_parameters_the_source_is_sure_of_agree_within_three_of_its_std(
-    results: dict[str, Identification],
+    results: dict[str, IdentificationResult],
     published: dict[str, tuple[tuple[float, float], tuple[float, float]]],
     method: str,
     column: int,
@@ -72,26 +73,26 @@ def test_parameters_the_source_is_sure_of_agree_within_three_of_its_std(
 
 @pytest.mark.parametrize("method", ["idim-ls", "idim-iv", "idim-piv"])
 def test_parameters_agree_with_table_b4_within_three_of_the_theses_std(
-    results: dict[str, Identification], method: str
+    results: dict[str, IdentificationResult], method: str
 ) -> None:
     theta = dict(zip(results[method].names, results[method].theta, strict=True))
     for name, (value, percent) in TABLE_B4.items():
         assert abs(theta[name] - value) <= 3 * abs(value) * percent / 100, name
 
 
-def test_without_a_reference_it_says_so_and_uses_the_smoothed_motion(results: dict[str, Identification]) -> None:
+def test_without_a_reference_it_says_so_and_uses_the_smoothed_motion(results: dict[str, IdentificationResult]) -> None:
     found = results["idim-iv"]
     assert found.controller["kind"] == "nominal"
     assert any("no reference trajectory" in warning for warning in found.warnings)
 
 
-def test_residuals_are_white_once_their_noise_model_is_known(results: dict[str, Identification]) -> None:
+def test_residuals_are_white_once_their_noise_model_is_known(results: dict[str, IdentificationResult]) -> None:
     outside = [w.fraction_outside_2sigma for w in results["idim-piv"].whiteness]
     # One of 20 lags is expected outside the band; three more of 120 joints and lags are chance.
     assert np.mean(outside) <= 0.075
 
 
-def test_wrist_coupling_is_seen(results: dict[str, Identification]) -> None:
+def test_wrist_coupling_is_seen(results: dict[str, IdentificationResult]) -> None:
     found = results["idim-piv"]
     essential = dict(zip(found.names, found.essential, strict=True))
     assert essential["fvm6"]

@@ -1,7 +1,9 @@
 """Verdict of an identification: each defect has one line, impossible results are unusable, healthy ones trustworthy."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,31 +15,28 @@ from armident.identify.documents.files import from_json, to_json
 from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.effects.terms import arm_model
 from armident.identify.estimators.diagnostics import Diagnostics
-from armident.identify.experiment import Experiment
-from armident.identify.identification.criteria import IdentificationCriteria
+from armident.identify.estimators.methods import METHODS, Method
+from armident.identify.estimators.reason import Reason
+from armident.identify.identification.checks.convergence import convergence, loop
+from armident.identify.identification.checks.delay import delay
+from armident.identify.identification.checks.error import error
+from armident.identify.identification.checks.excitation import workspace_postures
+from armident.identify.identification.checks.residual import instruments, residual
 from armident.identify.identification.equations import Prepared
-from armident.identify.identification.excitation_check import workspace_postures
 from armident.identify.identification.from_recording import experiments_from_recording
+from armident.identify.identification.identification_criteria import IdentificationCriteria
+from armident.identify.identification.identification_result import IdentificationResult
 from armident.identify.identification.motion_dependence import motion_dependence
 from armident.identify.identification.moving_joints import joint_ranges, moving_joints
-from armident.identify.identification.options import METHODS, Method, Options
+from armident.identify.identification.options import Options
 from armident.identify.identification.pipeline import identify_experiment
-from armident.identify.identification.result import Identification
-from armident.identify.identification.result_check import (
-    CHECK,
-    convergence_reasons,
-    delay_reasons,
-    error_reasons,
-    instrument_reasons,
-    loop_reasons,
-    residual_reasons,
-)
 from armident.identify.identification.torque_delay import TorqueDelay
-from armident.identify.identification.verdict import Reason, judge
+from armident.identify.identification.verdict import judge
 from armident.identify.regression.equations import Estimate, ExperimentEquations
-from armident.identify.setup.result import TorqueShift
+from armident.identify.setup.result import SetupCheck, SetupFinding
 from armident.identify.signals.decimate import design
-from armident.identify.signals.differentiate import differentiate
+from armident.identify.signals.differentiate import Derivatives, differentiate
+from armident.identify.signals.experiments import Experiment
 from armident.virtual_robot.offline import simulate_recording
 from tests.fixtures.arms import FAST, identified, recording, trajectory
 
@@ -68,22 +67,26 @@ def motion(*targets: list[float]) -> Trajectory:
     return Trajectory.model_validate({"schema": "armident/trajectory/1", "start": [0.0] * 6, "moves": moves})
 
 
-@dataclass(frozen=True)
-class Finding:
-    kind: str = "torque_unit"
-    joints: tuple[str, ...] = ("joint_1",)
-    probability: float = 0.999
-    message: str = "The torques are in kN m."
-    remedy: str = "joints[].drive.gain: multiply by 1000"
-    decisive: bool = True
+def judged(method: Method = "idim-piv", **parts: Any) -> Any:
+    """Parts of an identification that one check uses."""
+    robot = parts.pop("robot", None)
+    prepared = SimpleNamespace(model=SimpleNamespace(robot=robot), signals=())
+    return SimpleNamespace(options=Options(method), prepared=prepared, unusable=False, solution=None, **parts)
 
 
-@dataclass(frozen=True)
-class Setup:
-    findings: tuple[Finding, ...] = ()
-    joints_not_understood: tuple[str, ...] = ()
-    tried: tuple[str, ...] = ("signs", "order")
-    torque_shift: TorqueShift | None = None
+WRONG_UNIT = SetupFinding(
+    "torque_unit",
+    ("joint_1",),
+    0.999,
+    "The torques are in kN m.",
+    "joints[].drive.gain: multiply by 1000",
+    decisive=True,
+)
+
+
+def set_up(*findings: SetupFinding, not_understood: tuple[str, ...] = ()) -> SetupCheck:
+    """A check of the set-up with these findings."""
+    return SetupCheck(findings, (), (), not_understood, ("signs", "order"), None)
 
 
 @pytest.mark.slow
@@ -217,15 +220,15 @@ def test_too_few_equations_are_doubtful(healthy: list[Experiment], arm: RobotCon
 
 def test_late_torques_are_doubtful_in_one_line(arm: RobotConfig) -> None:
     late = TorqueDelay(np.array([-5.5, -5.4, 0.4, 0.6, 0.5, 9.0]), np.array([0.2] * 5 + [8.0]), FAST, True)
-    (reason,) = delay_reasons(late, arm, CRITERIA)
+    (reason,) = delay(judged(robot=arm, statistics=SimpleNamespace(delay=late)), CRITERIA)
     assert reason.level == "doubtful"
     assert "(joint_1 -5.5 +- 0.2 and joint_2 -5.4 +- 0.2; expected is 0.5)" in reason.message
-    assert delay_reasons(None, arm, CRITERIA) == []
+    assert delay(judged(robot=arm, statistics=SimpleNamespace(delay=None)), CRITERIA) == []
 
 
 def test_the_parameters_do_not_depend_on_the_verdict(healthy: list[Experiment], arm: RobotConfig) -> None:
     one = identify_experiment(healthy, arm, LEAST_SQUARES)
-    other = identify_experiment(healthy, arm, LEAST_SQUARES, setup=Setup((Finding(),)))
+    other = identify_experiment(healthy, arm, LEAST_SQUARES, setup=set_up(WRONG_UNIT))
     assert other.verdict.level == "unusable"
     np.testing.assert_array_equal(one.theta, other.theta)
     np.testing.assert_array_equal(one.std, other.std)
@@ -233,7 +236,7 @@ def test_the_parameters_do_not_depend_on_the_verdict(healthy: list[Experiment], 
 
 
 def test_a_decisive_finding_of_the_set_up_is_unusable_and_comes_first() -> None:
-    verdict = judge([Reason("unusable", "The model leaves 80 %", "check")], Setup((Finding(),)))
+    verdict = judge([Reason("unusable", "The model leaves 80 %", "check")], set_up(WRONG_UNIT))
     assert verdict.level == "unusable"
     assert verdict.reasons[0].kind == "setup"
     assert verdict.reasons[0].message == "The torques are in kN m (probability 1.00)"
@@ -243,28 +246,28 @@ def test_a_decisive_finding_of_the_set_up_is_unusable_and_comes_first() -> None:
 
 def test_a_refusal_states_the_finding_of_the_set_up_too(healthy: list[Experiment], arm: RobotConfig) -> None:
     turned = changed(healthy, lambda e: replace(e, tau=-e.tau))
-    sign = replace(Finding(), kind="torque_sign", message="the torque of joint_1 has the wrong sign", remedy="turn it")
+    sign = replace(WRONG_UNIT, kind="torque_sign", message="the torque of joint_1 has the wrong sign", remedy="turn it")
     with pytest.raises(DataError, match=r"Set-up: The torque of joint_1 has the wrong sign .* Next: turn it"):
-        identify_experiment(turned, arm, Options(method="didim"), setup=Setup((sign,)))
+        identify_experiment(turned, arm, Options(method="didim"), setup=set_up(sign))
 
 
 def test_other_findings_are_doubtful_and_joints_not_understood_unusable() -> None:
-    assert judge([], Setup((replace(Finding(), decisive=False),))).level == "doubtful"
-    verdict = judge([], Setup(joints_not_understood=("joint_4", "joint_5")))
+    assert judge([], set_up(replace(WRONG_UNIT, decisive=False))).level == "doubtful"
+    verdict = judge([], set_up(not_understood=("joint_4", "joint_5")))
     assert verdict.level == "unusable"
     assert "joint_4 and joint_5 (tried: signs, order)" in verdict.reasons[0].message
-    assert judge([], Setup()).level == "trustworthy"
+    assert judge([], set_up()).level == "trustworthy"
 
 
 def test_set_up_and_result_state_each_defect_once() -> None:
     error = Reason("unusable", "The model leaves more than 33 % of the torque of joint_4 (69 %)", "check", "joint_4")
-    (reason,) = judge([error], Setup(joints_not_understood=("joint_4",))).reasons
+    (reason,) = judge([error], set_up(not_understood=("joint_4",))).reasons
     assert reason.message == f"{error.message}; no hypothesis of the set-up explains it (tried: signs, order)"
     rest = Reason("doubtful", "joint_4 does not move", "move it", kind="excitation")
-    still = replace(Finding(), kind="joint_at_rest", decisive=False)
-    assert judge([rest], Setup((still,))).reasons == (rest,)
+    still = replace(WRONG_UNIT, kind="joint_at_rest", decisive=False)
+    assert judge([rest], set_up(still)).reasons == (rest,)
     late = Reason("doubtful", "The torque belongs to the position some samples later", "clocks", kind="delay")
-    (reason,) = judge([late], Setup((replace(Finding(), kind="time_shift"),))).reasons
+    (reason,) = judge([late], set_up(replace(WRONG_UNIT, kind="time_shift"))).reasons
     assert reason.kind == "setup"
 
 
@@ -272,38 +275,63 @@ def test_each_line_stands_once_and_the_worst_comes_first() -> None:
     doubt, bad = Reason("doubtful", "a", "x"), Reason("unusable", "b", "y")
     verdict = judge([doubt, bad, doubt])
     assert verdict.reasons == (bad, doubt)
-    assert verdict.sentence == "unusable: b (and 1 more)"
-    assert judge([]).sentence == "trustworthy"
 
 
 def test_iterations_without_end_are_doubtful() -> None:
     estimate = Estimate(np.ones(2), np.eye(2), (), (), 20, False, "stopped after 20 iterations")
-    (reason,) = convergence_reasons("idim-iv", estimate)
+    (reason,) = convergence(judged("idim-iv", found=SimpleNamespace(estimate=estimate)), CRITERIA)
     assert reason.level == "doubtful"
     assert "stopped after 20 iterations" in reason.message
-    assert convergence_reasons("idim-iv", replace(estimate, converged=True)) == []
+    settled = SimpleNamespace(estimate=replace(estimate, converged=True))
+    assert convergence(judged("idim-iv", found=settled), CRITERIA) == []
 
 
 @pytest.mark.parametrize(("method", "level"), [("didim", "unusable"), ("idim-piv", "doubtful")])
 def test_a_diverging_loop_is_unusable_where_the_estimate_comes_from_it(method: Method, level: str) -> None:
-    (reason,) = loop_reasons(method, diverges=True, velocity_error=None, criteria=CRITERIA)
+
+    def reasons(speed: float | None) -> list[Reason]:
+        """Reasons of a loop that moves at a share of the measured velocity, or diverges."""
+        measured = Derivatives(np.ones((9, 1)), np.ones((9, 1)), np.zeros((9, 1)), None)
+        runs = None if speed is None else [replace(measured, qd=speed * measured.qd)]
+        parts = judged(method, found=SimpleNamespace(controller={"kind": "crc"}))
+        parts.solution, parts.prepared.signals = SimpleNamespace(runs=runs), [measured]
+        return loop(parts, CRITERIA)
+
+    (reason,) = reasons(None)
     assert reason.level == level
     assert "diverges" in reason.message
-    (reason,) = loop_reasons(method, diverges=False, velocity_error=1.07, criteria=CRITERIA)
+    (reason,) = reasons(2.07)
     assert "misses the measured velocities by 107 %" in reason.message
-    assert loop_reasons(method, diverges=False, velocity_error=0.04, criteria=CRITERIA) == []
+    assert reasons(1.04) == []
 
 
 def diagnostics() -> Diagnostics:
     return identified("tx40", "tx40_excitation", 1).result.diagnostics
 
 
-def test_coloured_residuals_have_one_line_for_all_joints() -> None:
+def residuals_of(tests: Diagnostics, monkeypatch: pytest.MonkeyPatch, method: Method, *moving: str) -> list[Reason]:
+    """Reasons of residuals that do not depend on the motion, with some joints that move."""
+    monkeypatch.setattr("armident.identify.identification.checks.residual.motion_dependence", lambda *_: [])
+    support = SimpleNamespace(moving=[joint.joint in moving for joint in tests.joints])
+    statistics, parts = (
+        SimpleNamespace(diagnostics=tests),
+        SimpleNamespace(blocks=(), estimate=SimpleNamespace(theta=())),
+    )
+    return residual(judged(method, support=support, statistics=statistics, found=parts, ls=parts), CRITERIA)
+
+
+def instruments_of(tests: Diagnostics, parameters: int) -> list[Reason]:
+    """Reasons of the instruments of an estimate."""
+    found = SimpleNamespace(estimate=SimpleNamespace(theta=np.zeros(parameters)))
+    return instruments(judged(statistics=SimpleNamespace(diagnostics=tests), found=found), CRITERIA)
+
+
+def test_coloured_residuals_have_one_line_for_all_joints(monkeypatch: pytest.MonkeyPatch) -> None:
     tests = diagnostics()
     coloured = replace(tests, joints=tuple(replace(joint, white=False) for joint in tests.joints[:2]))
-    (reason,) = residual_reasons("idim-piv", coloured, ["joint_1", "joint_2"], CRITERIA)
+    (reason,) = residuals_of(coloured, monkeypatch, "idim-piv", "joint_1", "joint_2")
     assert reason.message.startswith("The residuals are not noise: serially correlated at joint_1 and joint_2")
-    (reason,) = residual_reasons("idim-piv", coloured, ["joint_2"], CRITERIA)
+    (reason,) = residuals_of(coloured, monkeypatch, "idim-piv", "joint_2")
     assert reason.joint == "joint_2"
 
 
@@ -338,26 +366,29 @@ def test_noise_does_not_depend_on_the_motion(healthy: list[Experiment], arm: Rob
     assert positive <= 1
 
 
-def test_standard_deviations_that_neglect_correlation_are_doubtful() -> None:
+def test_standard_deviations_that_neglect_correlation_are_doubtful(monkeypatch: pytest.MonkeyPatch) -> None:
     tests = replace(diagnostics(), serial_std_ratio=2.0)
-    (reason,) = residual_reasons("idim-ls", tests, [], CRITERIA)
+    (reason,) = residuals_of(tests, monkeypatch, "idim-ls")
     assert "2.0 times too small" in reason.message
-    assert residual_reasons("idim-piv", tests, [], CRITERIA) == []
+    assert residuals_of(tests, monkeypatch, "idim-piv") == []
 
 
 def test_weak_instruments_are_named() -> None:
-    (reason,) = instrument_reasons(replace(diagnostics(), weak_instruments=("ia6", "zz6")), 61, CRITERIA)
+    (reason,) = instruments_of(replace(diagnostics(), weak_instruments=("ia6", "zz6")), 61)
     assert "of ia6 and zz6 are weak" in reason.message
     every = replace(diagnostics(), weak_instruments=("a", "b"))
-    assert "of all 2 parameters" in instrument_reasons(every, 2, CRITERIA)[0].message
+    assert "of all 2 parameters" in instruments_of(every, 2)[0].message
 
 
-def errors_of(rest: np.ndarray, error: float, ls_error: float) -> list[Reason]:
-    """Reasons of one joint whose residual is ``rest`` (M,)."""
-    one = load_robot("emps")
-    block = ExperimentEquations(rest[:, None], np.zeros((rest.size, 1, 4)), np.ones((rest.size, 1), bool), rest)
-    given = np.array([error]), np.array([True])
-    return error_reasons(one, [block], np.zeros(4), *given, CRITERIA, CHECK, np.array([ls_error]))
+def errors_of(rest: np.ndarray, error_pct: float, ls_error_pct: float) -> list[Reason]:
+    """Reasons of one joint whose residual is ``rest`` (M,), with these relative errors."""
+    torque, size = rest / error_pct * 100, rest.size
+    other = torque * ls_error_pct / 100
+    x = np.stack([torque - rest, torque - other], axis=1)[:, None, :]
+    block = ExperimentEquations(torque[:, None], x, np.ones((size, 1), bool), rest)
+    found, ls = (SimpleNamespace(estimate=SimpleNamespace(theta=theta), blocks=[block]) for theta in np.eye(2))
+    moving = SimpleNamespace(moving=np.array([True]))
+    return error(judged(robot=load_robot("emps"), found=found, ls=ls, support=moving), CRITERIA)
 
 
 def test_a_torque_that_is_white_noise_is_doubtful_and_a_model_error_unusable() -> None:
@@ -394,6 +425,6 @@ def test_an_endless_joint_has_its_recorded_range_as_workspace(arm: RobotConfig) 
 def test_no_result_with_an_error_above_its_torque_counts_as_converged(
     healthy: list[Experiment], arm: RobotConfig
 ) -> None:
-    found: Identification = identify_experiment(healthy, arm, LEAST_SQUARES)
+    found: IdentificationResult = identify_experiment(healthy, arm, LEAST_SQUARES)
     assert found.converged
     assert found.relative_error_pct < 100.0

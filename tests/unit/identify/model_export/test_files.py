@@ -175,7 +175,7 @@ def test_mujoco_has_springs_couplings_rotors_and_a_tilted_base_of_the_effects(tm
     assert not [o for o in sheet.omitted if "coupling of joint_3" in o.part or "spring" in o.part]
     motion = random_motion(model.robot, np.random.default_rng(4))
     smooth = np.array([0.0 if name.startswith(("fc", "off")) else 1.0 for name in model.arm.names])
-    expected = model.model.inverse_dynamics(model.theta * smooth, *motion, dt=1e-3)
+    expected = model.model.inverse_dynamics(*motion, theta=model.theta * smooth, dt=1e-3)
     assert relative_error(mujoco_torque(files[0], motion), expected) < 1e-9
 
 

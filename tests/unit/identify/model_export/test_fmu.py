@@ -75,7 +75,7 @@ def integrated(model: ExportedModel, state: Floats, torques: Floats) -> Floats:
     n, rows, forward = model.arm.n, [], model.model.forward_dynamics
 
     def rate(_: float, x: Floats, tau: Floats) -> Floats:
-        ddq = forward(model.theta, x[None, :n], x[None, n:], tau[None])
+        ddq = forward(x[None, :n], x[None, n:], tau[None])
         return np.concatenate([x[n:], ddq[0]])
 
     for tau in torques:
@@ -102,7 +102,7 @@ def test_an_fmu_moves_as_the_forward_dynamics_of_the_model(model: ExportedModel,
     expected = integrated(model, np.concatenate([q, dq]), torques)
     assert np.abs(np.array(rows) - expected).max() < TOLERANCE
     last = expected[-1][None]
-    ddq = model.model.forward_dynamics(model.theta, last[:, :6], last[:, 6:], torques[-1:])[0]
+    ddq = model.model.forward_dynamics(last[:, :6], last[:, 6:], torques[-1:])[0]
     assert acceleration == pytest.approx(ddq, rel=1e-3, abs=1e-2)
 
 

@@ -6,7 +6,7 @@ import pytest
 from armident.configs import DataError
 from armident.identify.documents.base import RecordingReference
 from armident.identify.documents.identification import IdentificationDocument, Parameter
-from armident.identify.monitoring.change_test import FALSE_ALARMS, Inconclusive, compare
+from armident.identify.monitoring.change.change_test import FALSE_ALARMS, Inconclusive, compare
 
 NAMES = [f"p{k}" for k in range(30)]
 TRUTH = np.linspace(0.5, 20.0, 30)

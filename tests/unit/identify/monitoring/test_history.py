@@ -19,8 +19,8 @@ from armident.configs import ConfigError
 from armident.daq.cli import application
 from armident.identify.documents.files import to_json
 from armident.identify.documents.identification import IdentificationDocument
-from armident.identify.monitoring import history_schema
-from armident.identify.monitoring.history import History, recorded_at
+from armident.identify.monitoring.change import history_schema
+from armident.identify.monitoring.change.history import History, recorded_at
 from tests.fixtures.postgresql import postgresql, programs
 from tests.unit.identify.monitoring.test_change_test import TRUTH, C, identified
 

@@ -9,15 +9,15 @@ import pytest
 
 from armident.configs import ArmidentError, DataError, config_path, load_session
 from armident.daq.recording import Recording, read_recording, write_recording
-from armident.identify.identification.api import identify_recording
-from armident.identify.monitoring import history_schema
-from armident.identify.monitoring import ledger as ledger_module
-from armident.identify.monitoring.history import History
-from armident.identify.monitoring.ledger import FILE, Ledger
+from armident.identify.identification.identify_recording import identify_recording
+from armident.identify.monitoring.change import history_schema
+from armident.identify.monitoring.change.history import History
 from armident.identify.monitoring.reidentify import identify_once, keep, run
 from armident.identify.monitoring.reidentify.baseline import Baseline
 from armident.identify.monitoring.reidentify.publish import StatusPublisher
 from armident.identify.monitoring.reidentify.run import Job, carry_out
+from armident.identify.monitoring.worker.ledger import FILE, Ledger
+from armident.identify.monitoring.worker.worker import ledger as ledger_module
 from tests.fixtures import arms
 
 pytestmark = pytest.mark.slow
@@ -153,7 +153,7 @@ def test_a_failure_is_published_once_with_its_reason(
 def test_a_result_that_cannot_be_written_is_one_line_and_left_to_a_worker(tmp_path: Path, recorded: Recording) -> None:
     work = job(tmp_path, arms.recording("emps", "emps_excitation", 1))
     (tmp_path / "emps-20260105T060000-000Z.identification").write_text("a file is where the folder belongs")
-    with pytest.raises(ArmidentError, match=r"the result cannot be written: .*; mend that, then a worker"):
+    with pytest.raises(ArmidentError, match=r"the result cannot be written: .*; fix this; a worker"):
         carry_out(work, cast(StatusPublisher, Published()), lambda _: None)
     entry = Ledger(tmp_path / FILE, "worker").claim(recorded.sha256)
     assert entry is not None

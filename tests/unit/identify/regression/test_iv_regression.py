@@ -79,11 +79,11 @@ def test_parameters_and_instruments_beside_are_those_of_the_formulas(given: Give
     columns[found.rows_of[0], :2] = 0.0
     expected = np.linalg.solve(z.T @ x, z.T @ columns)
     np.testing.assert_allclose(found.absorbed(columns), expected, rtol=1e-8, atol=1e-10)
-    beside = found.beside(columns)
+    beside = found.orthogonalized(columns)
     np.testing.assert_allclose(beside, columns - z @ np.linalg.solve(x.T @ z, x.T @ columns), atol=1e-9)
     np.testing.assert_allclose(beside.T @ x / np.linalg.norm(x, axis=0), 0.0, atol=1e-9)
     parts = [(j, columns[own]) for j, own in enumerate(found.rows_of)]
-    gram, score = found.products_beside(parts, 2)
+    gram, score = found.orthogonal_products(parts, 2)
     for k in range(2):
         own = beside[:, 2 * k : 2 * k + 2]
         np.testing.assert_allclose(gram[k], own.T @ own, rtol=1e-9)

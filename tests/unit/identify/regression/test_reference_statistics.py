@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy import linalg, signal, stats
 
-from armident.identify.diagnosis.spectral_lines import Line
+from armident.identify.diagnosis.spectral_lines import SpectralLine
 from armident.identify.estimators.instrument_tests import LAGS_PER_ROOT_SAMPLE, instrument_relevance
 from armident.identify.estimators.residual_tests import breusch_pagan, ljung_box
 from armident.identify.regression.ar_noise import WHITE, fit_ar, levinson_durbin
@@ -162,7 +162,7 @@ def test_holm_of_small_families() -> None:
 def test_fishers_combination_of_two_p_values(train: float, held: float) -> None:
     """With four degrees of freedom the chi-square tail is ``x (1 - ln x)``, x the product of the p-values."""
     empty = np.empty(0)
-    combined = Line(10.0, train, held, 0.1, 1.0, empty, empty, empty).p_value
+    combined = SpectralLine(10.0, train, held, 0.1, 1.0, empty, empty, empty).p_value
     logarithm = np.log(train) + np.log(held)
     assert combined == pytest.approx(np.exp(logarithm) * (1 - logarithm), rel=1e-9)
     assert combined == pytest.approx(float(stats.chi2.sf(-2 * logarithm, 4)), rel=1e-9)

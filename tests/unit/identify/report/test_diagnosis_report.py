@@ -6,21 +6,21 @@ import re
 import numpy as np
 import pytest
 
-from armident.identify.diagnosis.diagnose import Diagnosis
-from armident.identify.report.diagnosis import SHOWN, diagnosis_report, followed_variable, telling_stretch
+from armident.identify.diagnosis.diagnose import DiagnosisResult
+from armident.identify.report.diagnosis_report import SHOWN, diagnosis_report, followed_variable, telling_stretch
 from tests.fixtures import diagnoses
 from tests.fixtures.diagnoses import WORN_AND_SPRUNG
 
 
 @pytest.fixture(scope="module")
-def diagnosis() -> Diagnosis:
+def diagnosis() -> DiagnosisResult:
     found = diagnoses.diagnosis("emps", "emps_1", 1, *WORN_AND_SPRUNG)
     assert {f.effect for f in found.document.findings} == {h.effect for h in WORN_AND_SPRUNG}
     return found
 
 
 @pytest.mark.slow
-def test_the_curves_without_and_with_a_finding_are_those_of_its_errors(diagnosis: Diagnosis) -> None:
+def test_the_curves_without_and_with_a_finding_are_those_of_its_errors(diagnosis: DiagnosisResult) -> None:
     def error(torque: np.ndarray) -> float:
         rest = diagnosis.measured - torque
         return float(100 * np.linalg.norm(rest) / np.linalg.norm(diagnosis.measured))
@@ -33,7 +33,7 @@ def test_the_curves_without_and_with_a_finding_are_those_of_its_errors(diagnosis
 
 
 @pytest.mark.slow
-def test_every_finding_has_a_picture_of_its_own_in_a_page_that_needs_no_other_file(diagnosis: Diagnosis) -> None:
+def test_every_finding_has_a_picture_of_its_own_in_a_page_that_needs_no_other_file(diagnosis: DiagnosisResult) -> None:
     page = diagnosis_report(diagnosis, diagnosis.document)
     sources = re.findall(r'(?:src|href)="([^"]*)"', page)
     assert all(source.startswith("data:image/svg+xml;base64,") for source in sources)
@@ -45,7 +45,7 @@ def test_every_finding_has_a_picture_of_its_own_in_a_page_that_needs_no_other_fi
 
 
 @pytest.mark.slow
-def test_a_loop_that_diverges_leaves_out_its_table_and_nothing_else(diagnosis: Diagnosis) -> None:
+def test_a_loop_that_diverges_leaves_out_its_table_and_nothing_else(diagnosis: DiagnosisResult) -> None:
     assert diagnosis.document.simulated is not None
     assert "Simulated closed loop" in diagnosis_report(diagnosis, diagnosis.document)
     partly = diagnosis.document.model_copy(update={"simulated": None})
@@ -55,7 +55,7 @@ def test_a_loop_that_diverges_leaves_out_its_table_and_nothing_else(diagnosis: D
 
 
 @pytest.mark.slow
-def test_a_finding_is_drawn_over_what_it_follows(diagnosis: Diagnosis) -> None:
+def test_a_finding_is_drawn_over_what_it_follows(diagnosis: DiagnosisResult) -> None:
     over = {}
     for finding, own in zip(diagnosis.document.findings, diagnosis.own, strict=True):
         assert own is not None
@@ -80,7 +80,7 @@ def test_a_long_recording_is_drawn_where_the_finding_changes_most() -> None:
 
 
 @pytest.mark.slow
-def test_the_verdict_and_the_next_step_stand_before_the_findings(diagnosis: Diagnosis) -> None:
+def test_the_verdict_and_the_next_step_stand_before_the_findings(diagnosis: DiagnosisResult) -> None:
     page = diagnosis_report(diagnosis, diagnosis.document)
     card = page.index('<div class="verdict doubtful"><b>explained</b>')
     assert card < page.index("<p>Next: identify with the findings") < page.index('class="finding"')
@@ -88,7 +88,7 @@ def test_the_verdict_and_the_next_step_stand_before_the_findings(diagnosis: Diag
 
 
 @pytest.mark.slow
-def test_held_out_torques_are_drawn_of_both_models(diagnosis: Diagnosis) -> None:
+def test_held_out_torques_are_drawn_of_both_models(diagnosis: DiagnosisResult) -> None:
     page = diagnosis_report(diagnosis, diagnosis.document)
     found = re.search(r'<script type="application/json">(.*?)</script>', page)
     assert found is not None

@@ -1,46 +1,32 @@
-"""Glossary: no parameter, verdict, dependence or key without an entry; the page in docs is the one of the code."""
+"""Glossary: texts of effects, documents and variables; a report has the terms that it mentions."""
 
-from pathlib import Path
+from copy import copy
 from typing import get_args
 
 import pytest
 
 from armident.configs import load_robot
-from armident.identify.diagnosis.free_functions import Kind
-from armident.identify.documents.diagnosis import (
-    BeforeAfter,
-    DiagnosisDocument,
-    Finding,
-    Gap,
-    Gaps,
-    Unexplained,
-    Verdict,
-)
-from armident.identify.documents.diagnosis_version_1 import EVIDENCE_1
+from armident.identify.diagnosis.variables import Kind
+from armident.identify.documents.diagnosis import DiagnosisDocument, Finding, Negligible, Verdict
+from armident.identify.effects.effect import Linear
 from armident.identify.effects.registry import catalogue
 from armident.identify.effects.terms import arm_model
-from armident.identify.effects.wiring import Wiring
 from armident.identify.report import glossary
 
-PAGE = Path(__file__).resolve().parents[4] / "docs" / "glossary.md"
 
-
-def test_the_page_is_the_one_of_the_code() -> None:
-    text = PAGE.read_text(encoding="utf-8")
-    assert text == glossary.markdown(), "run: python -m armident.identify.report.glossary"
-
-
-def test_every_parameter_of_every_effect_is_explained() -> None:
-    assert set(glossary.EFFECT_PARAMETERS) == set(catalogue())
-    text = PAGE.read_text(encoding="utf-8")
+def test_every_parameter_of_every_effect_is_explained_by_its_class() -> None:
     for effect in catalogue().values():
-        names = [p.name for p in effect.linear] + [s.name for s in effect.shapes]
-        texts = glossary.EFFECT_PARAMETERS[effect.key]
-        assert set(names) == set(texts) or isinstance(effect, Wiring), effect.key
-        section = text.split(f"### {effect.key}\n")[1].split("\n#")[0]
-        for name, meaning in texts.items():
-            assert f"| `{name}` |" in section
-            assert meaning in section
+        for parameter in effect.parameters_of_entry:
+            assert parameter.meaning.endswith("."), f"{effect.key}: {parameter.name}"
+            assert glossary.GlossaryEntry(parameter.name, parameter.meaning, parameter.unit) in glossary.effect_entries(
+                effect
+            )
+
+
+def test_a_parameter_without_a_meaning_is_explained_by_its_effect() -> None:
+    spring = copy(catalogue()["joint_spring"])
+    spring.linear = (Linear("ks", ("N m/rad", "N/m")),)
+    assert [entry.text for entry in glossary.effect_entries(spring)] == [spring.description]
 
 
 @pytest.mark.parametrize("robot", ["tx40", "emps", "panda", "kuka_lwr4"])
@@ -61,26 +47,28 @@ def test_names_from_the_thesis_are_of_their_kinds() -> None:
     assert glossary.base_entry("nothing") is None
 
 
-def test_every_verdict_and_every_dependence_is_explained() -> None:
-    terms = {entry.name for entry in glossary.DIAGNOSIS_TERMS}
-    assert set(get_args(Verdict)) <= terms
-    assert {entry.name for entry in glossary.DEPENDENCES} == set(get_args(Kind))
+def test_every_verdict_and_every_variable_is_explained() -> None:
+    assert [entry.name for entry in glossary.verdict_entries()] == [v.replace("_", " ") for v in get_args(Verdict)]
+    assert {entry.name for entry in glossary.variable_entries()} == set(get_args(Kind))
 
 
-def test_the_terms_of_a_report_are_explained() -> None:
-    names = {e.name for e in (*glossary.IDENTIFICATION_TERMS, *glossary.DIAGNOSIS_TERMS, *glossary.CONVENTIONS)}
-    wanted = {
-        "essential", "relative standard deviation", "whiteness", "NVR", "gap", "gap without derivative noise",
-        "detection limit", "held out", "noise floor", "confidence", "alternatives", "considered", "suffix r",
-        "joint side",
-    }  # fmt: skip
-    assert wanted <= names
-    assert "gap_without_derivative_noise" in EVIDENCE_1.values()
+def test_the_keys_of_documents_are_terms_with_the_text_of_the_schema() -> None:
+    found = {entry.name: entry.text for entry in glossary.all_terms()}
+    for key, name in (("noise_floor", "noise floor"), ("change_of_torque_pct", "change of torque")):
+        kind = Negligible if key.endswith("pct") else DiagnosisDocument
+        assert found[name] == kind.model_json_schema()["properties"][key]["description"].replace("``", "`")
 
 
-def test_a_report_carries_the_entries_that_it_uses() -> None:
-    gap = Gap(all=5.0, by_joint={"joint_1": 5.0})
-    both = BeforeAfter(before=gap, after=gap)
+def test_a_report_has_the_terms_that_it_mentions() -> None:
+    page = (
+        "<p>Noise floor 1 %; confidence.</p><p>Methods: idim-iv, SEP-PEM.</p>"
+        '<img src="data:x,NVR"><script>essential</script>'
+    )
+    names = {entry.name for entry in glossary.mentioned(page)}
+    assert names == {"noise floor", "confidence", "IDIM-IV", "DIDIM, CLIE, CLOE, SEP-PEM"}
+
+
+def test_findings_have_the_entries_of_their_own_parameters() -> None:
     finding = Finding(
         effect="joint_spring",
         joint="joint_1",
@@ -93,22 +81,5 @@ def test_a_report_carries_the_entries_that_it_uses() -> None:
         evidence={},
     )
     changed = finding.model_copy(update={"effect": "changed_parameters", "kind": "numbers", "parameters": {"fv2": 1.0}})
-    left = Unexplained(joint="joint_1", share_of_residual=0.1, varies_with="torque of joint_2", hint="h")
-    document = DiagnosisDocument(
-        robot="tx40",
-        recordings=[],
-        verdict="partly_explained",
-        findings=[finding, changed],
-        unexplained=[left],
-        gap=Gaps(train=both, validation=both),
-        noise_floor=gap,
-        recommended_experiment=None,
-        model=None,
-        timing_s={},
-        versions={},
-        warnings=[],
-    )
-    names = {entry.name for entry in glossary.diagnosis_entries(document)}
-    assert {"ks (joint spring)", "fv", "partly_explained", "unexplained", "torque of another joint"} <= names
-    assert {"changed_parameters", "baseline"} <= names
-    assert not {"no_gap", "transients", "torque", "fva", "simulated closed loop"} & names
+    names = [entry.name for entry in glossary.finding_entries([finding, changed])]
+    assert names == ["ks (joint spring)", "fv"]

@@ -6,8 +6,8 @@ import pytest
 from rich.console import Console
 from rich.table import Table
 
+from armident.identify.cli.print_table import print_table
 from armident.identify.effects.listing import effects_command
-from armident.identify.print_table import print_table
 
 NAMES = ("load_dependent_coulomb_friction", "transmission_elasticity_with_backlash")
 CELLS = [

@@ -8,10 +8,10 @@ from markupsafe import escape
 
 from armident.identify.documents.files import load_document
 from armident.identify.documents.identification import IdentificationDocument, VerdictReason
-from armident.identify.identification.api import IdentificationOutcome, identify_recording
+from armident.identify.identification.identify_recording import IdentificationOutcome, identify_recording
 from armident.identify.identification.options import Options
-from armident.identify.report.files import write_identification
-from armident.identify.report.identification import identification_report
+from armident.identify.report.identification_report import identification_report
+from armident.identify.report.robot_file import write_identification
 from tests.fixtures.arms import FAST, recording
 
 

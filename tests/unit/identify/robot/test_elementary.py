@@ -2,24 +2,24 @@
 
 import numpy as np
 
+from armident.compiled import ARITHMETIC, compiled
 from armident.identify.robot.chain import Floats
-from armident.identify.robot.compiled import compiled
 from armident.identify.robot.elementary import arctangents, padded, sines_cosines
 
 
-@compiled
+@compiled(kept=True, **ARITHMETIC)
 def turned(angle: Floats, sine: Floats, cosine: Floats) -> None:
     """A kernel around the inlined helper."""
     sines_cosines(angle, sine, cosine)
 
 
-@compiled
+@compiled(kept=True, **ARITHMETIC)
 def bent(x: Floats, out: Floats, slope: Floats) -> None:
     """A kernel around the inlined helper."""
     arctangents(x, out, slope)
 
 
-@compiled
+@compiled(kept=True, **ARITHMETIC)
 def lanes(n: int) -> int:
     """A kernel around the inlined helper."""
     return padded(n)

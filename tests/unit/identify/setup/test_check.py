@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from armident.configs import DataError, RobotConfig, load_robot
-from armident.identify.experiment import Experiment
 from armident.identify.identification.from_recording import experiments_from_recording
 from armident.identify.setup.check import check_setup
+from armident.identify.signals.experiments import Experiment
 from tests.fixtures import setups
 from tests.fixtures.arms import FAST, recording
 

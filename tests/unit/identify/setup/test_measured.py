@@ -8,9 +8,9 @@ from scipy.io import loadmat
 
 from armident.configs import RobotConfig, load_robot
 from armident.daq.interchange.importing import import_recording
-from armident.identify.experiment import Experiment
 from armident.identify.identification.from_recording import experiments_from_recording
 from armident.identify.setup.check import check_setup
+from armident.identify.signals.experiments import Experiment
 from tests.fixtures import setups
 
 pytestmark = pytest.mark.slow

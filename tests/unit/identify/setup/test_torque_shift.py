@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from armident.configs import RobotConfig, load_robot
+from armident.identify.diagnosis.criteria import Criteria
 from armident.identify.diagnosis.setup_stage import set_up
-from armident.identify.experiment import Experiment
 from armident.identify.identification.equations import aligned_torque
 from armident.identify.identification.from_recording import experiments_from_recording
 from armident.identify.identification.options import Options
@@ -20,6 +20,7 @@ from armident.identify.setup.check import check_setup
 from armident.identify.setup.fit import Hypothesis
 from armident.identify.setup.result import TorqueShift, with_torque_shift
 from armident.identify.setup.torque_shift import long_torque_shift
+from armident.identify.signals.experiments import Experiment
 from tests.fixtures import setups
 from tests.fixtures.arms import FAST, recording
 from tests.statistics.late_torques import moved
@@ -109,7 +110,7 @@ def test_a_shift_that_was_applied_is_not_found_again(healthy: list[Experiment], 
 
 
 def test_the_diagnosis_begins_with_aligned_experiments(healthy: list[Experiment], arm: RobotConfig) -> None:
-    stage = set_up(late(healthy, np.full(arm.n, LATE)), (), arm)
+    stage = set_up(late(healthy, np.full(arm.n, LATE)), (), arm, Criteria())
     assert [e.torque_shift for e in stage.training] == pytest.approx([LATE, LATE], abs=0.1)
     assert stage.findings == ()
     assert any("samples" in line for line in stage.warnings)

@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 from scipy import signal
 
 from armident.configs import DataError, load_robot
+from armident.identify.signals.choices import DerivativesName
 from armident.identify.signals.differentiate import (
     NVR_BY_HAND,
-    Method,
     differentiate,
     encoder_resolution,
     tracking_error_nvr,
@@ -36,7 +36,7 @@ def error(found: NDArray[np.float64], truth: NDArray[np.float64]) -> float:
 
 
 @pytest.mark.parametrize("method", ["irwsm", "irwsm2"])
-def test_velocity_and_acceleration_sit_at_the_sample(method: Method) -> None:
+def test_velocity_and_acceleration_sit_at_the_sample(method: DerivativesName) -> None:
     q, qd, qdd = motion()
     found = differentiate(q[:, None], DT, method, nvr=1.0)
     # Half a sample at 5 Hz would be an error of w dt / 2 = 1.6 %, the central difference's own is (w dt)^2 / 6.

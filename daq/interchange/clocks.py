@@ -1,0 +1,314 @@
+"""Clocks of imported samples: unit of their times, sample numbers with gaps, agreement with a stated rate."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armident.configs import ConfigError, DataError, RobotConfig, SessionConfig
+from armident.daq.recording import Gap, Stream
+from armident.drivers.can.frames import Frames
+from armident.drivers.canopen.objects import COB_SYNC
+
+UNITS: Mapping[str, float] = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+"""Units of times, s."""
+SLOWEST_HZ, FASTEST_HZ = 10.0, 100e3
+"""Sampling rates of recordings of arms; a rate beyond them may be that of times in another unit, 1/s."""
+SLOWEST_SHARE, FASTEST_SHARE = 2e-3, 3.0
+"""Shares of the joints' velocity limits that a motion reaches; beyond them times may be in another unit."""
+SHORTEST_STEP_S = 1e-9
+"""Resolution of the times of a recording, s: shorter steps are none."""
+EVEN = 0.01
+"""Largest deviation of a step from the period, relative, of samples that are taken as even."""
+_WHOLE = 0.1
+"""Largest distance of a step over a hole from a whole number of periods, periods; long holes need none."""
+_LONG_HOLE = 5
+"""Steps from this number of periods on are holes whatever their length."""
+RATE_TOLERANCE = 0.01
+"""Largest relative difference of a stated rate from that of the times."""
+_MOST_MISSING = 0.5
+"""Share of missing samples above which the usual step is not the period."""
+MOST_NUMBERS = 2.0**53
+"""Largest sample number that a floating-point number holds exactly."""
+_JITTER = 3.0
+"""Longest step of even samples whose times jitter, periods; longer ones are holes of an unknown length."""
+POLLED_SHARE = 0.01
+"""Share of rows that repeat the row before above which samples were polled."""
+EQUAL = 0.01
+"""Share of equal times above which times have too few digits to tell the instants of the samples."""
+_WINDOWS = 200
+"""Velocities are differences over this part of the recording."""
+AMBIGUOUS = 0.25
+"""Distance, periods, of a step between stamps from a whole number above which missing samples cannot be counted."""
+
+PERIOD_TOLERANCE = 0.02
+"""Largest difference of the SYNC periods of log and session, relative.
+
+Clocks of computers and adapters agree to 0.1 %; the next period that a session can mean differs by far more.
+"""
+_FEWEST = 10
+"""SYNCs below which a log tells no period."""
+_CLOCK_STEP_NS = 20_000_000
+"""Difference of times and SYNC numbers above which a clock was set: masters are late by less on an idle machine, ns."""
+_HOLE_PERIODS = 10
+"""Steps longer than this number of usual ones are not counted: SYNCs may be lacking there."""
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+
+class JitterError(DataError):
+    """Times that are no sampling instants of one clock."""
+
+
+@dataclass(frozen=True)
+class Clock:
+    """Sampling rate (1/s), number of each sample from 0 (N,), and sentences on what was assumed."""
+
+    rate_hz: float
+    numbers: Ints
+    notes: tuple[str, ...] = ()
+
+
+def in_seconds(
+    times: Floats, q: Floats, robot: RobotConfig, *, named: str = "", stated: str | None = None
+) -> tuple[Floats, tuple[str, ...]]:
+    """Return times (N,) in seconds, and notes, from the unit that is ``stated``, or ``named`` in the file, or seconds.
+
+    A unit is refused if only another one gives a rate and velocities, of positions ``q`` (N, n), that an arm can have.
+    """
+    if stated is not None and stated not in UNITS:
+        raise ConfigError(f"--time-unit: expected one of {', '.join(UNITS)}, found {stated}")
+    if named and named not in UNITS and stated is None:
+        raise DataError(f"the time column states the unit {named!r}, expected s, ms, us or ns: convert the times")
+    named = named if named in UNITS else ""
+    if stated is not None and named and stated != named:
+        raise DataError(f"--time-unit {stated} contradicts the name of the time column, which states {named}")
+    unit = stated or named or "s"
+    steps = np.diff(times)
+    step = float(np.median(steps[steps > 0])) if np.any(steps > 0) else 0.0
+    if step <= 0.0:
+        return times * UNITS[unit], ()
+    share = _velocity_share(times, q, robot)
+    others = [u for u in UNITS if u != unit and _plausible(step * UNITS[u], share / UNITS[u])]
+    implausible = not _plausible(step * UNITS[unit], share / UNITS[unit])
+    # A unit that is stated is believed, unless the rate is beyond every recording.
+    if implausible and others and (not (stated or named) or step * UNITS[unit] < 1.0 / FASTEST_HZ):
+        moved = f" and joints at {100 * share / UNITS[unit]:.2g} % of their velocity limits" if share else ""
+        raise DataError(
+            f"a step of {step:.6g} {unit} is a rate of {1.0 / (step * UNITS[unit]):.6g} Hz{moved}; in {others[0]} it "
+            f"would be {1.0 / (step * UNITS[others[0]]):.6g} Hz: --time-unit {others[0]} reads it so"
+        )
+    note = (f"times are in {unit}, the unit in the column name",) if named and named != "s" and not stated else ()
+    return (times - times[0]) * UNITS[unit], note
+
+
+def _plausible(step_s: float, share: float) -> bool:
+    return 1.0 / FASTEST_HZ <= step_s <= 1.0 / SLOWEST_HZ and (share == 0.0 or SLOWEST_SHARE <= share <= FASTEST_SHARE)
+
+
+def _velocity_share(times: Floats, q: Floats, robot: RobotConfig) -> float:
+    """Return the largest velocity over the limit of its joint, with times as they are; 0 if nothing moves."""
+    apart = max(1, len(q) // _WINDOWS)
+    elapsed = times[apart:] - times[:-apart]
+    valid = elapsed > 0
+    if not valid.any():
+        return 0.0
+    limits = np.array([joint.limits.velocity or np.inf for joint in robot.joints])
+    speeds = np.abs(q[apart:] - q[:-apart])[valid] / elapsed[valid][:, None] / limits
+    return float(np.quantile(speeds.max(axis=1), 0.99))
+
+
+def repeated_share(values: Floats) -> float:
+    """Return the share of rows (N, columns) that repeat the row before; longer runs are standstill."""
+    same = np.all(values[1:] == values[:-1], axis=1)
+    change = np.flatnonzero(np.concatenate([[True], ~same, [True]]))
+    runs = np.diff(change) - 1
+    return float(runs[runs <= 2].sum()) / max(1, len(same))
+
+
+def clock_of(times: Floats, rate_hz: float | None, repeated: float = 0.0) -> Clock:
+    """Return the clock of samples by their times (N,), s; missing samples are missing numbers.
+
+    Raises `JitterError` if the steps are too uneven to tell how many samples are missing, and DataError if the times
+    contradict ``rate_hz``.
+    """
+    steps = np.diff(times)
+    if steps.size == 0:
+        raise DataError("a single row is not a recording")
+    median = float(np.median(steps))
+    usual = median if median > 0 else float(steps.max())
+    if 0.0 < usual < SHORTEST_STEP_S:
+        raise DataError(
+            f"steps of {usual:.3g} s are shorter than 1 ns, the resolution of a recording; state the unit of the times "
+            "with --time-unit, or another column with --map time=NAME"
+        )
+    if times[-1] <= times[0]:
+        raise DataError("all times are equal; give the sampling rate with --rate, and omit the times: --map time=-")
+    if median <= 0 or np.any(steps <= 0):
+        return _jittering(times, rate_hz, repeated, f"{int(np.sum(steps <= 0))} of {steps.size} steps are 0")
+    ratio = steps / median
+    advance = np.maximum(np.rint(ratio), 1.0)
+    allowed = np.where(advance == 1, EVEN, np.where(advance < _LONG_HOLE, _WHOLE, 0.5))
+    uneven = np.flatnonzero(np.abs(ratio - advance) > allowed)
+    if uneven.size:
+        return _jittering(times, rate_hz, repeated, f"{uneven.size} of {steps.size} steps")
+    single = steps[advance == 1]
+    measured = float(single.size / single.sum())
+    if advance.sum() > MOST_NUMBERS:
+        raise DataError(
+            f"time column inconsistent: {times.size} samples at {median:.6g} s do not span "
+            f"{float(times[-1] - times[0]):.6g} s; give the time column with --map time=NAME"
+        )
+    missing = int(advance.sum()) - steps.size
+    if missing > _MOST_MISSING * advance.sum() and np.any(advance > 1) and (advance > 1).mean() > EVEN:
+        raise DataError(f"{missing} of {int(advance.sum()) + 1} samples are missing at {measured:.6g} Hz")
+    if rate_hz is not None and abs(rate_hz / measured - 1.0) > RATE_TOLERANCE:
+        raise DataError(
+            f"--rate {rate_hz:g} contradicts the time column: steps of {median:.6g} s, {measured:.6g} Hz; "
+            f"omit --rate, or give the rate of a conversion with --resample {rate_hz:g}"
+        )
+    return Clock(rate_hz or measured, np.append(0, np.cumsum(advance)).astype(np.int64))
+
+
+def _jittering(times: Floats, rate_hz: float | None, repeated: float, how: str) -> Clock:
+    """Return the clock of even samples at a stated rate whose times jitter; refuse anything else."""
+    steps = np.diff(times)
+    mean = steps.size / float(times[-1] - times[0])
+    low, high = np.quantile(steps, [0.01, 0.99])
+    spread = f"steps of {low:.4g} to {high:.4g} s, {mean:.6g} Hz on average ({how})"
+    if repeated > POLLED_SHARE:
+        raise JitterError(
+            f"the times jitter: {spread}, and {100 * repeated:.1f} % of the rows repeat the row before: the samples "
+            "were polled; --resample RATE, with the rate of the controller, puts them on its clock"
+        )
+    if rate_hz is None and float(np.mean(steps == 0)) > EQUAL:
+        raise JitterError(
+            f"the times have too few digits: {spread}; --rate {two_digits(mean):g} if the samples are even, "
+            "or write the times with more digits"
+        )
+    # Missing samples lower the mean; the median of times with few digits is one of two values.
+    median = float(np.median(steps))
+    typical = two_digits(1.0 / median if 0 < _JITTER * median < steps.max() else mean)
+    if rate_hz is None:
+        raise JitterError(f"the times jitter: {spread}; --resample {typical:g} puts the samples on an even clock")
+    on_clock = f"--resample {rate_hz:g} puts the samples on an even clock, with"
+    if abs(rate_hz / mean - 1.0) > RATE_TOLERANCE:
+        raise JitterError(
+            f"--rate {rate_hz:g} contradicts the time column: {spread}; {on_clock} gaps where some are missing"
+        )
+    longest = float(steps.max())
+    if longest > _JITTER * max(1.0 / mean, float(np.quantile(steps[steps > 0], 0.99))):
+        raise JitterError(f"no sample for {longest:.6g} s, and the times jitter: {spread}; {on_clock} a gap there")
+    late = times - times[0] - np.arange(times.size) / mean
+    note = f"times jitter by {1e3 * float(np.ptp(late)):.4g} ms; rows are taken as even samples at {rate_hz:g} Hz"
+    return Clock(rate_hz, np.arange(times.size, dtype=np.int64), (note,))
+
+
+def two_digits(rate: float) -> float:
+    """Return a rate with two digits, for advice."""
+    return float(f"{rate:.2g}")
+
+
+def stamped_clock(t_ns: Ints, rate_hz: float | None = None) -> Clock:
+    """Return the clock of stamped messages, ns, (N,): a stamp may jitter by a quarter period at a stated rate."""
+    steps_ns = np.diff(t_ns)
+    steps = steps_ns / 1e9
+    if steps.size == 0:
+        raise DataError("a single sample is not a recording")
+    if steps.min() <= 0:
+        raise DataError(f"the time of sample {int(np.argmin(steps)) + 2} is not after that of the one before")
+    median = float(np.median(steps))
+    single = steps_ns[np.abs(steps - median) <= AMBIGUOUS * median]
+    measured = single.size * 1e9 / float(single.sum())
+    period = 1.0 / measured
+    if rate_hz is not None and abs(rate_hz / measured - 1.0) > RATE_TOLERANCE:
+        raise DataError(
+            f"--rate {rate_hz:g} contradicts the times of the samples, whose usual step of {period:.6g} s "
+            f"is a rate of {measured:.6g} Hz"
+        )
+    advance = np.round(steps / period)
+    error = np.abs(steps / period - advance)
+    tolerance = EVEN if rate_hz is None else AMBIGUOUS
+    uneven = np.flatnonzero((error > np.where(advance == 1, tolerance, AMBIGUOUS)) | (advance < 1))
+    if uneven.size:
+        k = int(uneven[0])
+        raise DataError(
+            f"the step of {steps[k]:.6g} s before sample {k + 2} is not a whole number of periods of {period:.6g} s "
+            f"({uneven.size} of {steps.size} steps): the times jitter; "
+            f"--resample {two_digits(measured):g} puts the samples on an even clock"
+        )
+    return Clock(measured if rate_hz is None else rate_hz, np.append(0, np.cumsum(advance)).astype(np.int64))
+
+
+def gaps_and_counters(streams: Mapping[str, Stream]) -> tuple[tuple[Gap, ...], dict[str, int]]:
+    """Return the gaps between the sample numbers of streams, and the counters of a recording."""
+    gaps: list[Gap] = []
+    counters: dict[str, int] = {}
+    for name, stream in streams.items():
+        sync = stream.sync
+        holes = np.flatnonzero(np.diff(sync) > 1)
+        gaps += [Gap(name, int(sync[k]) + 1, int(sync[k + 1]) - 1, reason="not in the source") for k in holes]
+        lost = int((np.diff(sync)[holes] - 1).sum())
+        counters |= {f"{name}.expected": sync.size + lost, f"{name}.rows": sync.size, f"{name}.in_gaps": lost}
+    return tuple(gaps), counters
+
+
+def clock_steps(numbers: Ints, t_ns: Ints, session: SessionConfig) -> list[str]:
+    """Return a sentence if the times of SYNCs, ns, (N,), step where their numbers, (N,), do not."""
+    period = session.sync.period_us * 1000
+    late = np.diff(t_ns) - np.diff(numbers) * period
+    limit = max(_CLOCK_STEP_NS, (session.sync.counter or 0) * period * 0.9)
+    steps = np.flatnonzero(np.abs(late) > limit)
+    if not steps.size:
+        return []
+    k = int(steps[0])
+    more = f" (and at {steps.size - 1} more)" if steps.size > 1 else ""
+    turns = ", or whole turns of the counter are missing there" if session.sync.counter and late[k] > 0 else ""
+    return [
+        f"times step by {late[k] * 1e-9:+.4g} s at SYNC {numbers[k + 1]}{more}, where the SYNCs go on: "
+        f"the clock was set{turns}"
+    ]
+
+
+def check_sync_period(path: Path, frames: Frames, session: SessionConfig) -> None:
+    """Refuse a log whose SYNCs, among the frames of one bus (N,), come at another period than that of the session."""
+    syncs = frames[frames["can_id"] == COB_SYNC]
+    counted = session.sync.counter and np.all(syncs["length"] > 0)
+    steps = np.diff(syncs["data"][:, 0].astype(np.int64)) % session.sync.counter if counted else None
+    found = sync_period_ns(syncs["t_ns"], steps)
+    if found is None:
+        return
+    period, uncertainty = found
+    expected = session.sync.period_us * 1000
+    if abs(period - expected) > PERIOD_TOLERANCE * expected + uncertainty:
+        raise DataError(
+            f"{path}: SYNC comes every {period * 1e-6:.4g} ms ({1e9 / period:.4g} Hz) in this log, "
+            f"but every {expected * 1e-6:.4g} ms in the session (sync.period_us: {session.sync.period_us}): "
+            "use the session that the log was recorded with"
+        )
+
+
+def sync_period_ns(t_ns: Ints, steps: Ints | None) -> tuple[float, float] | None:
+    """Return the mean SYNC period and its uncertainty, ns; ``None`` if there are too few SYNCs.
+
+    ``t_ns`` are the times of the SYNCs (N,), ``steps`` the periods between them by their counter (N - 1,), or one each.
+    """
+    if t_ns.size < _FEWEST:
+        return None
+    elapsed = np.diff(t_ns).astype(np.float64)
+    periods = np.ones(elapsed.size) if steps is None else steps.astype(np.float64)
+    # Coarse time stamps make a median of 0.
+    usual = float(np.median(elapsed)) or float(np.mean(elapsed))
+    counted = (elapsed >= 0) & (elapsed <= _HOLE_PERIODS * max(usual, 1.0)) & (periods > 0) & (periods <= _HOLE_PERIODS)
+    total = float(periods[counted].sum())
+    if counted.sum() < _FEWEST - 1 or not total:
+        return None
+    period = float(elapsed[counted].sum()) / total
+    if period <= 0:
+        return None
+    late = np.cumsum(np.where(counted, elapsed - period * periods, 0.0))
+    spread = float(np.quantile(late, 0.95) - np.quantile(late, 0.05))
+    return period, spread / total

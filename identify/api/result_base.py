@@ -1,0 +1,87 @@
+"""Base class of the results of public functions."""
+
+from abc import ABC, abstractmethod
+from html import escape
+from pathlib import Path
+from typing import Any, ClassVar
+
+from pydantic import BaseModel
+
+from armident.identify.api.result_tables import Table
+from armident.identify.documents.files import to_json, write_atomically
+
+
+class Result(ABC):
+    """Result that prints itself, shows itself in a notebook, and writes its document and its report.
+
+    Parameters
+    ----------
+    document
+        Everything that the JSON file holds.
+    """
+
+    document: BaseModel
+    file: ClassVar[str]
+    """Name of the JSON file."""
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the document as JSON types."""
+        return self.document.model_dump(mode="json", by_alias=True)
+
+    def to_json(self) -> str:
+        """Return the document as JSON text, as the command line prints it with ``--json``."""
+        return to_json(self.document)
+
+    def report(self, path: str | Path) -> Path:
+        """Write the report, one HTML file that needs nothing else.
+
+        Parameters
+        ----------
+        path
+            The file to write; its folder is made.
+
+        Returns
+        -------
+        Path
+            The file.
+        """
+        file = Path(path)
+        write_atomically(file, self._html())
+        return file
+
+    def save(self, folder: str | Path) -> tuple[Path, ...]:
+        """Write the document and ``report.html``.
+
+        Parameters
+        ----------
+        folder
+            Folder of the files; made if it does not exist.
+
+        Returns
+        -------
+        tuple of Path
+            The document, the report, and further files if there are any.
+        """
+        document = Path(folder) / self.file
+        write_atomically(document, self.to_json())
+        return document, self.report(Path(folder) / "report.html")
+
+    def __repr__(self) -> str:
+        table = self._table()
+        return self._summary() if table is None else f"{self._summary()}\n{table}"
+
+    def _repr_html_(self) -> str:
+        table = self._table()
+        return f"<p>{escape(self._summary())}</p>{'' if table is None else table._repr_html_()}"
+
+    @abstractmethod
+    def _html(self) -> str:
+        """Return the report."""
+
+    @abstractmethod
+    def _summary(self) -> str:
+        """Return one line of text."""
+
+    def _table(self) -> Table | None:
+        """Return the table below the line, if there is one."""
+        return None

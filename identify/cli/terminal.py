@@ -1,0 +1,265 @@
+"""Terminal output of the commands: progress and warnings on stderr, tables on stdout."""
+
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numba.core import event
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.table import Table
+
+from armident.configs import RobotConfig
+from armident.identify.cli.print_table import print_table
+from armident.identify.documents.diagnosis import DiagnosisDocument
+from armident.identify.documents.identification import IdentificationDocument
+from armident.identify.effects.terms import arm_model
+
+if TYPE_CHECKING:
+    from armident.identify.documents.prediction import PredictionDocument, PredictionsDocument
+
+SHOW_AFTER_S = 2.0
+"""Duration after which progress is shown, s."""
+
+Report = Callable[[str, float], None]
+
+
+class _Compilation(event.Listener):
+    """Prints one line when kernels are compiled: the first run on a machine waits for the compiler."""
+
+    def __init__(self, what: str) -> None:
+        self._what, self._printed = what, False
+
+    def on_start(self, event: event.Event) -> None:
+        """Print the line before the first compilation."""
+        if not self._printed:
+            self._printed = True
+            print(f"{self._what}: compiling for this machine, once: later runs find it", file=sys.stderr)
+
+    def on_end(self, event: event.Event) -> None:
+        """Do nothing at the end of a compilation."""
+
+
+@contextmanager
+def progress(what: str) -> Iterator[Report]:
+    """Report stages after two seconds: a bar with the time left where stderr is a terminal, otherwise plain lines.
+
+    The first run on a machine also prints that it compiles kernels.
+
+    ``what``: command and its argument, the beginning of each line. The result takes a stage and the share done, 0 to 1.
+    """
+    begin = time.monotonic()
+    with event.install_listener("numba:compile", _Compilation(what)), _stages(what, begin) as report:
+        yield report
+
+
+@contextmanager
+def _stages(what: str, begin: float) -> Iterator[Report]:
+    if not sys.stderr.isatty():
+        yield _plain_lines(what, begin)
+        return
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.percentage:>3.0f} %"),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task(what, total=1.0, visible=False)
+
+        def show(stage: str, share: float) -> None:
+            visible = time.monotonic() - begin > SHOW_AFTER_S
+            bar.update(task, completed=share, description=f"{what}: {stage}", visible=visible)
+
+        yield show
+
+
+def warn(lines: list[str]) -> None:
+    """Print one line per warning on stderr."""
+    for line in lines:
+        print(f"armident: warning: {line}", file=sys.stderr)
+
+
+def design_table(robot: RobotConfig, theta: NDArray[np.float64] | None, std: NDArray[np.float64]) -> None:
+    """Print base parameters, if known, and their predicted standard deviations.
+
+    ``robot``: for the names of the parameters; ``theta``: base parameters (b,), or ``None``; ``std``: predicted
+    standard deviations (b,).
+    """
+    table = Table(title=f"{robot.name}: predicted precision, base parameters", title_justify="left")
+    names = arm_model(robot).base.names
+    for column in ("parameter", "value", "std", "std %") if theta is not None else ("parameter", "std"):
+        table.add_column(column, justify="left" if column == "parameter" else "right")
+    if theta is None:
+        for name, deviation in zip(names, std, strict=True):
+            table.add_row(name, f"{deviation:.4g}")
+    for name, value, deviation in () if theta is None else zip(names, theta, std, strict=True):
+        relative = "" if value == 0 else f"{100 * deviation / abs(value):.1f}"
+        table.add_row(name, f"{value:.4f}", f"{deviation:.4f}", relative)
+    print_table(table)
+
+
+def wanted_table(std: Mapping[str, float]) -> None:
+    """Print the predicted standard deviations of the parameters of the wanted effects, by name."""
+    table = Table(title="predicted precision, wanted effect", title_justify="left")
+    table.add_column("parameter")
+    table.add_column("std", justify="right")
+    for name, deviation in std.items():
+        table.add_row(name, f"{deviation:.4g}" if np.isfinite(deviation) else "not visible")
+    print_table(table)
+
+
+COLOURS = {"trustworthy": "green", "doubtful": "yellow", "unusable": "red"}
+"""Colours of the levels of a verdict."""
+
+
+def verdict_lines(document: IdentificationDocument) -> None:
+    """Print the verdict of an identification, its reasons, and the next step of each."""
+    level = document.verdict or "not judged"
+    console = Console()
+    console.print(f"verdict: {level}", style=f"bold {COLOURS.get(level, 'default')}", highlight=False)
+    for reason in document.reasons:
+        console.print(
+            f"- {reason.message}.", style=COLOURS[reason.level], highlight=False, soft_wrap=True, markup=False
+        )
+        console.print(f"  Next: {reason.next_step}.", highlight=False, soft_wrap=True, markup=False)
+
+
+def identification_table(document: IdentificationDocument) -> None:
+    """Print the essential parameters with their standard deviations, beside the IDIM-LS estimate."""
+    beside = {} if document.comparison is None else {p.name: p for p in document.comparison.parameters}
+    table = Table(title=f"{document.robot}: {document.method}, essential parameters", title_justify="left")
+    table.add_column("parameter")
+    table.add_column("value", justify="right")
+    table.add_column("std", justify="right")
+    table.add_column("std %", justify="right")
+    table.add_column("unit")
+    if beside:
+        table.add_column("idim-ls", justify="right")
+    for p in document.parameters:
+        if not p.essential:
+            continue
+        relative = "" if p.relative_std_pct is None else f"{p.relative_std_pct:.2f}"
+        row = [p.name, f"{p.value:.4f}", f"{p.std:.4f}", relative, p.unit]
+        table.add_row(*row, *([f"{beside[p.name].value:.4f}"] if beside else []))
+    console = Console()
+    print_table(table, console)
+    essential = sum(p.essential for p in document.parameters)
+    errors = ", ".join(f"{name} {value:.1f}" for name, value in document.relative_error_pct_by_joint.items())
+    held_out = "" if document.held_out_error_pct is None else f"; {document.held_out_error_pct:.2f} % on held-out data"
+    coloured = any(reason.kind in ("residual", "uncertainty") for reason in document.reasons)
+    tested = document.verdict in ("trustworthy", "doubtful")
+    residuals = f"; residuals are {'not ' if coloured else ''}noise" if tested else ""
+    console.print(
+        f"{essential} of {len(document.parameters)} base parameters are essential; "
+        f"relative torque error {document.relative_error_pct:.4f} % ({errors}){held_out}",
+        highlight=False,
+        soft_wrap=True,
+    )
+    console.print(
+        f"{document.iterations} iterations{residuals}",
+        highlight=False,
+        soft_wrap=True,
+    )
+
+
+def diagnosis_table(document: DiagnosisDocument) -> None:
+    """Print the verdict, the findings with their gaps on held-out data, and the unexplained residual."""
+    console = Console()
+    console.print(f"verdict: {document.verdict}", highlight=False)
+    if document.findings:
+        table = Table(title="findings", title_justify="left")
+        for heading in ("joint", "effect", "parameters", "confidence", "held-out gap"):
+            table.add_column(heading)
+        for f in document.findings:
+            std = f.evidence.get("std", {})
+            values = ", ".join(
+                f"{k} {v:.4g}" + (f" ± {std[k]:.2g}" if k in std else "") for k, v in f.parameters.items()
+            )
+            where = f.joint if f.other is None else f"{f.joint}, {f.other}"
+            closed = f"{f.gap_before:.2f} % → {f.gap_after:.2f} %"
+            table.add_row(where, f.effect, values, f"{100 * f.confidence:.0f} %", closed)
+        print_table(table, console)
+        for f in document.findings:
+            rivals = f.evidence.get("ambiguous_with", [])
+            unsure = f"; ambiguous with {', '.join(rivals)}" if rivals else ""
+            console.print(f"{f.joint}: {f.evidence['description']}{unsure}", highlight=False)
+    for u in document.unexplained:
+        console.print(
+            f"unexplained: {u.joint}, {100 * u.share_of_residual:.0f} % of its residual varies with {u.varies_with}",
+            highlight=False,
+        )
+    if document.recommended_experiment is not None:
+        console.print(f"next experiment: {document.recommended_experiment}", highlight=False)
+    gap = document.gap.validation
+    console.print(
+        f"torque error on held-out data: {gap.before.all:.2f} % before, {gap.after.all:.2f} % after", highlight=False
+    )
+
+
+def time_left(elapsed_s: float, share: float) -> str:
+    """Return the time left at a constant rate, in words.
+
+    ``elapsed_s``: time since the beginning, s; ``share``: share done, above 0 to 1.
+    """
+    seconds = round(elapsed_s * (1.0 - share) / share)
+    return f"{seconds} s" if seconds < 120 else f"{seconds // 60} min"
+
+
+def prediction_table(document: "PredictionDocument") -> None:
+    """Print the error of a model on a recording, in total and by joint."""
+    console = Console()
+    console.print(document.sentence, highlight=False, soft_wrap=True)
+    table = Table(title=f"{document.robot}: torque errors by joint", title_justify="left")
+    for heading in ("joint", "error %", "own data %", "error rms", "torque rms", "unit"):
+        table.add_column(heading, justify="left" if heading in ("joint", "unit") else "right")
+    for name, error in document.relative_error_pct_by_joint.items():
+        own = document.identification_error_pct_by_joint.get(name)
+        row = [name, f"{error:.2f}", "" if own is None else f"{own:.2f}"]
+        table.add_row(*row, f"{document.error_rms[name]:.4g}", f"{document.torque_rms[name]:.4g}", document.units[name])
+    print_table(table, console)
+
+
+def predictions_table(document: "PredictionsDocument") -> None:
+    """Print the errors of a model on several recordings, and the worst one."""
+    console = Console()
+    table = Table(title=f"{document.robot}: torque errors by recording", title_justify="left")
+    headings = ("recording", "error %", "worst joint", "its error %", "held out", "samples")
+    for heading in headings:
+        table.add_column(heading, justify="right" if "%" in heading or heading == "samples" else "left")
+    for each in document.predictions:
+        joint, error = max(each.relative_error_pct_by_joint.items(), key=lambda pair: pair[1])
+        held_out = "yes" if each.held_out else "no"
+        name = each.recording.path or "(in memory)"
+        table.add_row(name, f"{each.relative_error_pct:.2f}", joint, f"{error:.2f}", held_out, str(each.samples))
+    print_table(table, console)
+    own = document.predictions[0].identification_error_pct
+    worse = "; the model explains the torques of a recording no better than none" if document.worthless else ""
+    console.print(
+        f"Worst torque error {document.worst_error_pct:.2f} % ({document.worst_recording}); "
+        f"on its own data {own:.2f} %{worse}.",
+        highlight=False,
+        soft_wrap=True,
+        markup=False,
+    )
+
+
+def _plain_lines(what: str, begin: float) -> Report:
+    """Print lines on stderr: one per stage, and one for every further fifth of the work."""
+    last: tuple[str, int] | None = None
+
+    def show(stage: str, share: float) -> None:
+        nonlocal last
+        now = stage, int(5 * share)
+        if now != last and time.monotonic() - begin > SHOW_AFTER_S:
+            left = f", {time_left(time.monotonic() - begin, share)} left" if share > 0.0 else ""
+            print(f"{what}: {stage} ({100 * share:.0f} %{left})", file=sys.stderr, flush=True)
+            last = now
+
+    return show

@@ -1,0 +1,196 @@
+"""Comparison of the candidates of one step of the selection."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from armident.configs.schema.robot import Effect as Entry
+from armident.identify.diagnosis.candidates import Candidate, Key, Shapes
+from armident.identify.diagnosis.model_state import ModelState, acted_on
+from armident.identify.diagnosis.precision import p_value_of_effect
+from armident.identify.effects.unnamed import NAME as UNNAMED
+from armident.identify.regression.ar_noise import ArModel
+
+
+@dataclass(frozen=True, eq=False)
+class FittedCandidate:
+    """A candidate in the model, before it is compared with others.
+
+    ``candidate``, ``shapes``: the effect with its place, and its nonlinear parameters; ``entry``: entry of the effect
+    in the configuration; ``state``: model with the effect; ``allowed``: False if a linear parameter has a sign or a
+    size that physics does not allow.
+    """
+
+    candidate: Candidate
+    shapes: Shapes
+    entry: Entry
+    state: ModelState
+    allowed: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Addition:
+    """A candidate in the model, compared with the model without it.
+
+    Parameters
+    ----------
+    state
+        Model with the effect, estimated with the weights of the step.
+    gain
+        Gain of log-likelihood over the model without it, with serial correlation beyond the noise models.
+    raw_gain
+        The same if the innovations had no correlation left.
+    log_likelihood
+        Log-likelihood of the model with the effect under the noise models of the step, which all candidates share.
+    share
+        Largest share of the power of a joint's predicted errors that it removes.
+    material_pct
+        Change of that joint's torque, percent of the root mean square of its torque.
+    """
+
+    fitted: FittedCandidate
+    state: ModelState
+    gain: float
+    raw_gain: float
+    log_likelihood: float
+    share: float
+    material_pct: float
+
+    @property
+    def candidate(self) -> Candidate:
+        """The effect with its place."""
+        return self.fitted.candidate
+
+    @property
+    def shapes(self) -> Shapes:
+        """Nonlinear parameters of the effect."""
+        return self.fitted.shapes
+
+    @property
+    def entry(self) -> Entry:
+        """Entry of the effect in the configuration."""
+        return self.fitted.entry
+
+    @property
+    def allowed(self) -> bool:
+        """False if a linear parameter has a sign or a size that physics does not allow."""
+        return self.fitted.allowed
+
+    @cached_property
+    def p_value(self) -> float:
+        """Probability of its parameters if it is not there, by their own standard deviations."""
+        return p_value_of_effect(self.state, self.entry)
+
+    @property
+    def named(self) -> bool:
+        """True if the effect has a name."""
+        return self.candidate.effect.name != UNNAMED
+
+    @property
+    def family(self) -> Key:
+        """Name of the effect, whatever its law, and its place."""
+        place = self.candidate.place
+        name = self.candidate.effect.name if self.named else self.candidate.effect.key
+        return name, place.joint, place.other
+
+
+@dataclass(frozen=True, eq=False)
+class SelectionStep:
+    """Candidates that were added to one model, highest log-likelihood first.
+
+    Parameters
+    ----------
+    state
+        Model without them, estimated with the same weights.
+    noise
+        Noise models of the step: those of the model with the highest likelihood of all, one for each joint.
+    ranked
+        Candidates in the model.
+    passing
+        Those that are significant, material and physically possible.
+    tests
+        Number of candidates and nonlinear parameters from which they were selected.
+    """
+
+    state: ModelState
+    noise: tuple[ArModel, ...]
+    ranked: tuple[Addition, ...]
+    passing: tuple[Addition, ...]
+    tests: int
+
+    def rivals(self, one: Addition) -> tuple[Addition, ...]:
+        """Physically possible explanations in place of an addition: others that pass, and others of the same joint."""
+        joint = one.candidate.place.joint
+        return tuple(
+            a
+            for a in self.ranked
+            if a.allowed and a.family != one.family and (a in self.passing or a.candidate.place.joint == joint)
+        )
+
+
+def compared_candidates(
+    state: ModelState, made: Sequence[FittedCandidate], tests: int, passes: Callable[[Addition, int], bool]
+) -> SelectionStep:
+    """Compare models with candidates, all estimated and scored under the same noise models.
+
+    They are those of the most likely model that physics allows, each under noise models of its own residual without
+    smooth functions of the motion. Noise models of the model without the missing effect would take the effect for
+    noise, and so would those of a whole residual while other effects are missing.
+
+    ``state``: model without the candidates; ``made``: candidates in the model; ``tests``: number of candidates and
+    nonlinear parameters from which they were selected; ``passes``: ``(addition, tests)`` to True if an addition is
+    significant, material and physically possible.
+    """
+    noise = _noise_of_best([state, *(m.state for m in made if m.allowed)])
+    alike = state.under(noise)
+    ranked = tuple(sorted((_compared(alike, m, noise) for m in made), key=lambda a: -a.log_likelihood))
+    return SelectionStep(alike, noise, ranked, tuple(a for a in ranked if passes(a, tests)), tests)
+
+
+def advantage(one: ModelState, other: ModelState) -> float:
+    """Log-likelihood of a model less that of another one, under the noise models of the more likely of both, nats."""
+    noise = _noise_of_best([one, other])
+    first, second = (model.under(noise).score.log_likelihood_under(noise) for model in (one, other))
+    return first - second
+
+
+def _noise_of_best(models: Sequence[ModelState]) -> tuple[ArModel, ...]:
+    """Noise models that weight and score the equations of all models: of the most likely model, one for each joint."""
+    return max(models, key=lambda one: one.score.log_likelihood_under(one.weights)).weights
+
+
+def _compared(state: ModelState, made: FittedCandidate, noise: tuple[ArModel, ...]) -> Addition:
+    """Comparison of a model with an effect with the one without it."""
+    with_it = made.state.under(noise)
+    share, changed = materiality(state, with_it)
+    before, after = (one.score.log_likelihood_under(noise) for one in (state, with_it))
+    gained = with_it.score.gain_over(state.score, noise)
+    return Addition(made, with_it, gained, after - before, after, share, changed)
+
+
+def gain(with_it: ModelState, without: ModelState) -> float:
+    """Gain of log-likelihood by an effect, under the noise models of the model with it.
+
+    Both models are estimated with the same weights.
+
+    ``with_it``, ``without``: models with and without the effect.
+    """
+    return with_it.score.gain_over(without.under(with_it.fit.noise).score, with_it.score.own_noise)
+
+
+def materiality(without: ModelState, with_it: ModelState) -> tuple[float, float]:
+    """Return the largest share of a joint's error power that an effect removes, and its torque in percent there.
+
+    Errors of joints on which the effect does not act may change, too, with the other parameters. They do not count.
+
+    ``without``, ``with_it``: models without and with the effect.
+    """
+    before, after = without.score.rms, with_it.score.rms
+    removed = np.where(acted_on(with_it, without), np.maximum(before**2 - after**2, 0.0), 0.0)
+    joint = int(np.argmax(removed / np.maximum(before**2, 1e-300)))
+    torque = np.concatenate([s.y[:, joint] for s in without.study.train])
+    size = float(np.sqrt(np.mean(torque**2)))
+    share = float(removed[joint] / max(before[joint] ** 2, 1e-300))
+    return share, 100 * float(np.sqrt(removed[joint])) / max(size, 1e-300)

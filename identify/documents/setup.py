@@ -1,0 +1,83 @@
+"""The document ``check.json``: the set-up of recordings against the configuration."""
+
+from typing import Any, Literal
+
+from pydantic import Field
+
+from armident.identify.documents.base import Document, RecordingReference
+
+
+class SetupMistake(Document):
+    """One mistake of the set-up.
+
+    Parameters
+    ----------
+    kind
+        Kind of the mistake, for example ``torque_sign``.
+    joints
+        Joints concerned.
+    probability
+        Posterior share of the hypothesis among those tried, 0 to 1.
+    message
+        Mistake in one sentence with figures.
+    remedy
+        Line of the configuration, or option of a command, that corrects it.
+    decisive
+        True if results without the correction are unusable.
+    """
+
+    kind: str
+    joints: list[str]
+    probability: float
+    message: str
+    remedy: str
+    decisive: bool
+
+
+class SetupDocument(Document):
+    """Content of ``check.json``, which ``armident check --json`` prints.
+
+    Parameters
+    ----------
+    schema_
+        Name and version of the document.
+    robot
+        Name of the robot.
+    recordings
+        Recordings that were checked.
+    passed
+        True if results would be usable: no decisive mistake, and no joint that the model does not explain.
+    findings
+        Mistakes of the set-up; empty if it is right.
+    relative_error_pct_by_joint
+        Norm of the torque residual of the rigid model over that of the torque, percent; null where there is no torque.
+    corrected_error_pct_by_joint
+        The same with the corrections, percent.
+    unexplained_joints
+        Joints of which the rigid model leaves more than a third of the torque, and no hypothesis explains it.
+    tried
+        Hypotheses tried, in words.
+    corrected_configuration
+        Robot configuration with the corrections that it can express; null without any.
+    clock
+        True over recorded duration: the sampling period has to be multiplied by it.
+    torque_shift
+        Estimated common shift of the torques, samples, with its standard deviation and those of the joints; null if it
+        was not estimated.
+    versions
+        Versions of Python and of the libraries.
+    """
+
+    schema_: Literal["armident/check/1"] = Field("armident/check/1", alias="schema")
+    robot: str
+    recordings: list[RecordingReference]
+    passed: bool
+    findings: list[SetupMistake]
+    relative_error_pct_by_joint: dict[str, float | None]
+    corrected_error_pct_by_joint: dict[str, float | None]
+    unexplained_joints: list[str]
+    tried: list[str]
+    corrected_configuration: dict[str, Any] | None
+    clock: float
+    torque_shift: dict[str, Any] | None
+    versions: dict[str, str]

@@ -1,0 +1,34 @@
+"""Correction of recordings for effects on signals: wiring; torques that are scaled, delayed or saturated."""
+
+from collections.abc import Sequence
+
+from armident.configs import RobotConfig
+from armident.configs.schema.robot import Effect as Entry
+from armident.identify.effects.drive import Correction
+from armident.identify.effects.registry import of_entry
+from armident.identify.effects.wiring import rewired
+from armident.identify.signals.experiments import Experiment
+from armident.identify.signals.streamed import kept
+
+
+def of_recording(entry: Entry) -> bool:
+    """Return True if an effect entry corrects the recordings instead of being a term of the model.
+
+    Wiring errors always do. A torque correction (gain, delay, lag, saturation) does if the entry gives its value;
+    otherwise the value is a parameter of the model and estimated with the rest.
+    """
+    return of_entry(entry).corrects(entry)
+
+
+def corrected_experiments(experiments: Sequence[Experiment], robot: RobotConfig) -> Sequence[Experiment]:
+    """Return the experiments corrected for the effects on signals of a robot's configuration.
+
+    ``robot``: configuration with the effect entries. Raises ConfigError if the entry of a wiring error does not name
+    the signal or the other joint.
+    """
+    experiments = rewired(experiments, robot)
+    for entry in robot.effects:
+        effect = of_entry(entry)
+        if isinstance(effect, Correction) and effect.corrects(entry):
+            experiments = kept((effect.corrected(e, robot, entry) for e in experiments), like=experiments)
+    return experiments

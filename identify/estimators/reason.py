@@ -1,0 +1,38 @@
+"""Reasons for which a result is doubtful or unusable."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+Level = Literal["trustworthy", "doubtful", "unusable"]
+LEVELS: tuple[Level, ...] = ("trustworthy", "doubtful", "unusable")
+
+Kind = Literal[
+    "setup", "error", "physics", "excitation", "convergence", "loop", "residual", "uncertainty", "instruments", "delay"
+]
+
+DIAGNOSE = "armident diagnose RECORDING"
+
+
+@dataclass(frozen=True)
+class Reason:
+    """One defect of a result.
+
+    Parameters
+    ----------
+    level
+        Level of the verdict that the defect causes.
+    message
+        The defect in one sentence, with figures.
+    next_step
+        Action that removes it.
+    joint
+        Joint concerned; ``None``: several, or none in particular.
+    kind
+        Property that was judged.
+    """
+
+    level: Level
+    message: str
+    next_step: str
+    joint: str | None = None
+    kind: Kind = "error"

@@ -1,1 +1,0 @@
-"""Evaluation of the diagnosis on simulated recordings with known effects: ``armident diagnose-suite``."""

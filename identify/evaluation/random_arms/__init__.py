@@ -1,1 +1,0 @@
-"""Suite of random arms: ``armident diagnose-suite --arms random``."""

@@ -1,0 +1,72 @@
+"""Checks of the residuals, which must be noise, and of the instruments."""
+
+from armident.identify.estimators.methods import estimator
+from armident.identify.estimators.reason import Reason
+from armident.identify.identification.checks.judged import Judged
+from armident.identify.identification.identification_criteria import IdentificationCriteria
+from armident.identify.identification.motion_dependence import motion_dependence
+from armident.identify.identification.verdict import listed
+
+DIAGNOSE = "look for a missing effect: armident diagnose RECORDING"
+
+
+def residual(judged: Judged, criteria: IdentificationCriteria) -> list[Reason]:
+    """Return one reason for the residuals that are not noise, and one for standard deviations that are too small.
+
+    A variance that depends on speed or torque is reported by the tests, but is no defect: it biases nothing. Joints at
+    rest are not judged. An autoregressive model of the rows may absorb what depends on the motion, which finer
+    equations show.
+    """
+    if judged.unusable:
+        return []
+    method, diagnostics = judged.options.method, judged.statistics.diagnostics
+    names = [joint.joint for joint, moves in zip(diagnostics.joints, judged.support.moving, strict=True) if moves]
+    known = () if judged.solution is None else judged.solution.reasons
+    used = estimator(method)
+    finest = judged.found.blocks if used.measured and used.prefiltered else judged.ls.blocks
+    dependences = motion_dependence(judged.prepared, finest, judged.found.estimate.theta)
+    coloured = [j for j in diagnostics.joints if j.joint in names and not j.white]
+    parts, step = [], DIAGNOSE
+    if coloured:
+        parts.append(f"serially correlated at {listed([j.joint for j in coloured])}")
+    dependent = [
+        d
+        for d in dependences
+        if diagnostics.joints[d.joint].joint in names
+        and d.share > criteria.max_motion_share
+        and d.deviation >= criteria.min_motion_deviation
+    ]
+    if dependent:
+        shares = [f"{d.variable} of {diagnostics.joints[d.joint].joint} ({100 * d.share:.0f} %)" for d in dependent]
+        friction = any(d.variable == "velocity" for d in dependent)
+        cause = (
+            "friction, its smoothed sign or an effect is not as modelled" if friction else "the model misses an effect"
+        )
+        parts.append(f"they depend on {listed(shares)}, so {cause} there")
+        step = f"adjust friction.sign_smoothing, or {DIAGNOSE}" if friction else DIAGNOSE
+    parts += [reason.message for reason in known if reason.kind == "residual"]
+    reasons = []
+    if parts:
+        joints = {j.joint for j in coloured} | {diagnostics.joints[d.joint].joint for d in dependent}
+        message = f"The residuals are not noise: {'; '.join(parts)}. Standard deviations may be too small"
+        reasons.append(Reason("doubtful", message, step, joints.pop() if len(joints) == 1 else None, "residual"))
+    if estimator(method).white_covariance and diagnostics.serial_std_ratio > criteria.max_std_ratio:
+        message = (
+            f"Standard deviations are up to {diagnostics.serial_std_ratio:.1f} times too small: {method} takes the "
+            "residuals for uncorrelated, which they are not"
+        )
+        reasons.append(Reason("doubtful", message, "use --method idim-piv", kind="uncertainty"))
+    return reasons
+
+
+def instruments(judged: Judged, criteria: IdentificationCriteria) -> list[Reason]:
+    """Return a reason if instruments are weak."""
+    if judged.unusable:
+        return []
+    parameters, diagnostics = judged.found.estimate.theta.size, judged.statistics.diagnostics
+    weak = diagnostics.weak_instruments
+    if not weak:
+        return []
+    of = f"all {parameters} parameters" if len(weak) == parameters else listed(weak, criteria.max_listed)
+    message = f"The instruments of {of} are weak: the estimate may be biased like least squares"
+    return [Reason("doubtful", message, "record the reference if it is missing, or move faster", kind="instruments")]

@@ -1,0 +1,115 @@
+"""Identification of recordings: from raw samples to the result and its document."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import chain
+
+from armident.configs import DataError, RobotConfig
+from armident.daq.recording import Recording
+from armident.identify.documents.identification import IdentificationDocument
+from armident.identify.identification.document import identification_document
+from armident.identify.identification.from_recording import WHOLE, StretchRule, experiments_from_recording
+from armident.identify.identification.identification_result import IdentificationResult
+from armident.identify.identification.options import Options
+from armident.identify.identification.pipeline import identify_experiment
+from armident.identify.identification.sign_smoothing import with_numbers
+from armident.identify.setup.check import check_setup
+from armident.identify.setup.result import SetupCheck
+from armident.identify.signals.experiments import Experiment
+from armident.identify.signals.streamed import OnDisk, Streamed
+
+CHECKED_VALUES = 6_000_000
+"""Number of values (samples times joints) of a long recording by which the set-up is checked."""
+
+
+@dataclass(frozen=True)
+class IdentificationOutcome:
+    """An identification with all data of its report.
+
+    ``recordings``: identified recordings; ``robot``: configuration of the robot, with the smoothing of the sign that
+    was used; ``result``: the estimate with its curves; ``document``: contents of ``identification.json``.
+    """
+
+    recordings: tuple[Recording, ...]
+    robot: RobotConfig
+    result: IdentificationResult
+    document: IdentificationDocument
+
+
+def identify_recording(
+    recordings: Recording | Sequence[Recording],
+    robot: RobotConfig | None = None,
+    options: Options | None = None,
+    progress: Callable[[str, float], None] | None = None,
+    check: Callable[[Sequence[Experiment], RobotConfig], SetupCheck] | None = check_setup,
+    stretches: StretchRule | None = None,
+) -> IdentificationOutcome:
+    """Identification of recordings, read from files or assembled from the stream.
+
+    Raises ConfigError if the configuration cannot support the request; DataError if the data cannot support the
+    request.
+
+    Parameters
+    ----------
+    recordings
+        One or several recordings of one robot.
+    robot
+        Configuration to use; ``None``: the one inside the first recording.
+    options
+        Options of the identification; ``None``: the defaults.
+    progress
+        Called with the name of a stage and the share done, 0 to 1.
+    check
+        Check of the set-up, whose findings enter the verdict; ``None``: none.
+    stretches
+        Size from which recordings are identified in stretches; ``None``: the default.
+    """
+    recordings = (recordings,) if isinstance(recordings, Recording) else tuple(recordings)
+    robot = robot or recordings[0].robot
+    experiments, notes = experiments_of(
+        recordings, robot, name_files=len(recordings) > 1, stretches=stretches or StretchRule()
+    )
+    setup = None
+    if check is not None:
+        try:
+            setup = check(_checked(experiments), robot)
+        except DataError as error:
+            # Too short for the check: the identification itself decides if it is long enough for the parameters.
+            notes = [*notes, f"the set-up was not checked: {error}"]
+    result = identify_experiment(experiments, robot, options or Options(), progress, setup)
+    used = with_numbers(robot, result.sign_smoothing)
+    return IdentificationOutcome(recordings, used, result, identification_document(result, recordings, used, notes))
+
+
+def _checked(experiments: Sequence[Experiment]) -> Sequence[Experiment]:
+    """Experiments by which the set-up is checked: of a long recording the first ones."""
+    if not isinstance(experiments, Streamed):
+        return experiments
+    first: list[Experiment] = []
+    while len(first) < len(experiments) and sum(e.q.size for e in first) < CHECKED_VALUES:
+        first.append(experiments[len(first)])
+    return first
+
+
+def experiments_of(
+    recordings: Sequence[Recording], robot: RobotConfig, *, name_files: bool, stretches: StretchRule = WHOLE
+) -> tuple[Sequence[Experiment], list[str]]:
+    """Return the experiments of recordings, one recording after the other, and remarks on them.
+
+    ``robot``: configuration to convert them with. ``name_files``: True to begin each remark with the name of its file.
+    ``stretches``: size from which recordings are cut into stretches; all together count. Raises ConfigError if a
+    recording is of another robot; DataError if a recording holds no experiment that can be used.
+    """
+    found: list[Sequence[Experiment]] = []
+    notes: list[str] = []
+    if sum(recording.samples.sync.size for recording in recordings) * robot.n > stretches.beyond:
+        stretches = StretchRule(0, stretches.length)
+    for recording in recordings:
+        experiments, remarks = experiments_from_recording(recording, robot, stretches)
+        found.append(experiments)
+        named = name_files and recording.path is not None
+        notes += [f"{recording.path.name}: {remark}" if named and recording.path else remark for remark in remarks]
+    if len(found) == 1:
+        return found[0], notes
+    joined = chain.from_iterable(found)
+    return OnDisk(joined) if isinstance(found[0], Streamed) else list(joined), notes

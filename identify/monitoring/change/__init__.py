@@ -1,0 +1,1 @@
+"""Changes of an arm between two identifications, and their history."""

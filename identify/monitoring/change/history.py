@@ -1,0 +1,247 @@
+"""Database of identifications: a SQLite file, or any other database that SQLAlchemy supports."""
+
+import contextlib
+import datetime
+import hashlib
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import sqlalchemy as sa
+
+from armident.configs import ConfigError
+from armident.daq.recording import Recording
+from armident.identify.documents.files import from_json, to_json
+from armident.identify.documents.identification import IdentificationDocument
+from armident.identify.monitoring.change.change_test import ParameterChangeTest
+from armident.identify.monitoring.change.history_schema import (
+    comparisons,
+    engine_for,
+    parameters,
+    reason,
+    recordings,
+    repeated,
+    runs,
+    upgrade,
+    writing,
+)
+
+DEFAULT = "sqlite:///history.sqlite"
+"""SQLAlchemy URL of the default database."""
+_STAMP = re.compile(r"(\d{8}T\d{6})-\d{3}Z")
+
+
+@dataclass(frozen=True)
+class HistoryRun:
+    """Identification in the history; ``recorded`` is the time of its recording (UTC)."""
+
+    number: int
+    recorded: datetime.datetime
+    document: IdentificationDocument
+
+
+class History:
+    """Identifications in a database; missing tables are created, and those of a former version upgraded.
+
+    ``url``: SQLAlchemy URL, for example ``sqlite:///history.sqlite``, ``postgresql://USER:PASSWORD@HOST/NAME``. Raises
+    ConfigError if there is no such database, its driver is not installed, or it is locked, damaged or of a newer
+    version.
+    """
+
+    def __init__(self, url: str = DEFAULT) -> None:
+        self.url = _shown(url)
+        try:
+            self._engine = engine_for(_driven(url))
+            upgrade(self._engine)
+        except (sa.exc.SQLAlchemyError, ImportError, OSError, ConfigError) as error:
+            missing = getattr(error, "name", None) == "psycopg"
+            hint = "; install it with: pip install 'armident[postgresql]'" if missing else ""
+            raise ConfigError(f"{self.url}: cannot be used as history: {reason(error)}{hint}") from error
+
+    def add(self, document: IdentificationDocument, recorded: datetime.datetime) -> bool:
+        """Add an identification.
+
+        ``recorded``: time of its recording; see `recorded_at`. Returns False if the history has an identification of
+        this recording already, which stays. Raises ConfigError if the database cannot be written.
+        """
+        text = to_json(document)
+        digest = _digest(document)
+        source = document.recording
+        row = {
+            "digest": digest,
+            "robot": document.robot,
+            "recorded": recorded.astimezone(datetime.UTC).replace(tzinfo=None),
+            "recording": source.path,
+            "sha256": source.sha256,
+            "samples": source.samples,
+            "sample_rate_hz": source.sample_rate_hz,
+            "method": document.method,
+            "relative_error_pct": document.relative_error_pct,
+            "converged": document.converged,
+            "document": text,
+        }
+        try:
+            with writing(self._engine) as connection:
+                done = connection.execute(sa.insert(runs).values(row))
+                (number,) = done.inserted_primary_key or (None,)
+                rows = [
+                    {
+                        "identification": number,
+                        "name": p.name,
+                        "value": p.value,
+                        "std": p.std,
+                        "unit": p.unit,
+                        "essential": p.essential,
+                    }
+                    for p in document.parameters
+                ]
+                connection.execute(sa.insert(parameters), rows)
+        except sa.exc.IntegrityError:
+            return False
+        except sa.exc.SQLAlchemyError as error:
+            raise ConfigError(f"{self.url}: the history cannot be written: {reason(error)}") from error
+        return True
+
+    @staticmethod
+    def facts(recording: Recording) -> dict[str, Any]:
+        """Return the metadata of a recording, as `describe` stores them."""
+        return {
+            "sha256": recording.sha256,
+            "path": None if recording.path is None else str(recording.path),
+            "cell": recording.metadata.get("cell"),
+            "duration_s": recording.samples.sync.size / recording.sample_rate_hz,
+            "in_gaps": recording.counters.get("samples.in_gaps"),
+            "facts": dict(recording.metadata),
+            "counters": dict(recording.counters),
+        }
+
+    @staticmethod
+    def began(facts: Mapping[str, Any], document: IdentificationDocument, file: Path) -> datetime.datetime:
+        """Return the start of a recording.
+
+        ``facts``: metadata of the recording; its start is there unless it was imported. ``document``, ``file``:
+        identification and its file, otherwise see `recorded_at`.
+        """
+        started = facts["facts"].get("started_utc")
+        return recorded_at(document, file) if started is None else datetime.datetime.fromisoformat(started)
+
+    def describe(self, facts: Mapping[str, Any]) -> None:
+        """Add the metadata of a recording unless the history has them already."""
+        self._insert_once(recordings, facts)
+
+    def judge(
+        self, document: IdentificationDocument, baseline: IdentificationDocument, drift: ParameterChangeTest
+    ) -> None:
+        """Add the result of a comparison.
+
+        ``document``: identification of a recording that was added before; ``baseline``: identification that it was
+        compared with.
+        """
+        same = (runs.c.robot == document.robot) & (runs.c.sha256 == document.recording.sha256) & (repeated == 0)
+        number = sa.select(runs.c.id).where(same).scalar_subquery()
+        row = {
+            "identification": number,
+            "baseline": _digest(baseline),
+            "drifted": drift.drifted,
+            "chi_square": drift.chi_square,
+            "degrees": drift.degrees,
+            "p_joint": drift.p_joint,
+            "false_alarms": drift.false_alarms,
+            "changed": list(drift.changed),
+            "words": drift.words,
+        }
+        self._insert_once(comparisons, row)
+
+    def _insert_once(self, table: sa.Table, row: Mapping[str, Any]) -> None:
+        try:
+            with writing(self._engine) as connection:
+                connection.execute(sa.insert(table).values(row))
+        except sa.exc.IntegrityError:
+            return
+        except sa.exc.SQLAlchemyError as error:
+            raise ConfigError(f"{self.url}: the history cannot be written: {reason(error)}") from error
+
+    def first(self, robot: str, cell: str | None = None) -> HistoryRun | None:
+        """Return the oldest converged identification of an arm, or ``None``.
+
+        ``cell``: cell of the robot; ``None``: all. Runs whose cell the history does not know are included.
+        """
+        found = self._read(_of(robot, cell).where(runs.c.converged).limit(1))
+        return found[0] if found else None
+
+    def runs(self, robot: str | None = None, cell: str | None = None) -> list[HistoryRun]:
+        """Return identifications in the order of their recordings.
+
+        ``robot``: name of the robot; ``None``: all. ``cell``: cell of the robot, as arms of one type often share a
+        name; ``None``: all. Runs whose cell the history does not know are included.
+        """
+        return self._read(_of(robot, cell))
+
+    def arms(self) -> list[tuple[str, str | None]]:
+        """Return robots and their cells; ``None`` for an unknown cell."""
+        query = sa.select(runs.c.robot, recordings.c.cell).select_from(_WHERE).distinct()
+        found = [(robot, cell) for robot, cell in self._rows(query)]
+        return sorted(found, key=lambda arm: (arm[0], arm[1] or ""))
+
+    def cell(self, document: IdentificationDocument) -> str | None:
+        """Return the cell of an identification's recording, ``None`` if the history does not know it."""
+        query = sa.select(recordings.c.cell).where(recordings.c.sha256 == document.recording.sha256)
+        found = self._rows(query)
+        return found[0][0] if found else None
+
+    def _rows(self, query: sa.Select[Any]) -> list[Any]:
+        try:
+            with self._engine.connect() as connection:
+                return list(connection.execute(query).all())
+        except sa.exc.SQLAlchemyError as error:
+            raise ConfigError(f"{self.url}: the history cannot be read: {reason(error)}") from error
+
+    def _read(self, query: sa.Select[Any]) -> list[HistoryRun]:
+        return [
+            HistoryRun(
+                number, recorded.replace(tzinfo=datetime.UTC), from_json(text, IdentificationDocument, f"run {number}")
+            )
+            for number, recorded, text in self._rows(query)
+        ]
+
+
+_WHERE = runs.outerjoin(recordings, runs.c.sha256 == recordings.c.sha256)
+
+
+def _of(robot: str | None, cell: str | None) -> sa.Select[Any]:
+    """Return the query of the runs of an arm in the order of their recordings."""
+    query = sa.select(runs.c.id, runs.c.recorded, runs.c.document).select_from(_WHERE).where(repeated == 0)
+    if robot is not None:
+        query = query.where(runs.c.robot == robot)
+    if cell is not None:
+        query = query.where(sa.or_(recordings.c.cell == cell, recordings.c.cell.is_(None)))
+    return query.order_by(runs.c.recorded, runs.c.id)
+
+
+def _digest(document: IdentificationDocument) -> str:
+    return hashlib.sha256(to_json(document).encode()).hexdigest()
+
+
+def recorded_at(document: IdentificationDocument, file: Path) -> datetime.datetime:
+    """Return the time of a recording: from its name, otherwise that of the result's file.
+
+    ``file``: file of the document.
+    """
+    found = _STAMP.search(document.recording.path or "")
+    if found is not None:
+        # A name that only looks like a time is none.
+        with contextlib.suppress(ValueError):
+            return datetime.datetime.strptime(found[1] + "+0000", "%Y%m%dT%H%M%S%z")
+    return datetime.datetime.fromtimestamp(file.stat().st_mtime, datetime.UTC)
+
+
+def _driven(url: str) -> str:
+    """Return the URL with the driver of the extra ``postgresql`` unless it names one."""
+    return re.sub(r"^postgres(ql)?://", "postgresql+psycopg://", url)
+
+
+def _shown(url: str) -> str:
+    """Return the URL with its password masked."""
+    return re.sub(r"(://[^:/@]*):[^@]*@", r"\1:***@", url)

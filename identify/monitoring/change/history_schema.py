@@ -1,0 +1,244 @@
+"""Tables of the history, their versions, and their upgrade from former versions.
+
+The version is ``PRAGMA user_version`` of a SQLite file, and a row of ``armident_history_version`` in other databases.
+Databases of version 0.1 have the number 0 and all tables of version 1.
+"""
+
+import sqlite3
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import sqlalchemy as sa
+
+from armident.configs import ConfigError
+from armident.configs.reasons import reason_of
+
+BUSY_S = 15.0
+"""Longest wait for another process that writes to the database, s."""
+_LOCK = 0x61726D69
+"""Number of the advisory lock of an upgrade in PostgreSQL."""
+
+_STATES = {
+    "55P03": "locked by another process for more than {busy:g} s; try again when that has ended",
+    "40P01": "locked by another process (deadlock); try again",
+    "57P01": "the server has ended the connection; try again when it runs",
+    "25006": "it may not be written (read-only)",
+    "42501": "{text}; the user of the URL needs the rights to create, read and write tables",
+    "53100": "the disk of the server is full; free space and try again",
+}
+"""Reasons by the SQLSTATE of PostgreSQL (its manual, appendix A)."""
+
+tables = sa.MetaData()
+runs = sa.Table(
+    "identifications",
+    tables,
+    sa.Column("id", sa.Integer, primary_key=True),
+    sa.Column("digest", sa.String(64), unique=True, nullable=False),
+    sa.Column("robot", sa.String(128), index=True, nullable=False),
+    sa.Column("recorded", sa.DateTime, index=True, nullable=False),
+    sa.Column("recording", sa.Text),
+    sa.Column("sha256", sa.String(64), nullable=False),
+    sa.Column("samples", sa.Integer, nullable=False),
+    sa.Column("sample_rate_hz", sa.Float, nullable=False),
+    sa.Column("method", sa.String(32), nullable=False),
+    sa.Column("relative_error_pct", sa.Float, nullable=False),
+    sa.Column("converged", sa.Boolean, nullable=False),
+    sa.Column("document", sa.Text, nullable=False),
+)
+"""Identifications of version 1; version 2 adds ``repeated``."""
+parameters = sa.Table(
+    "parameters",
+    tables,
+    sa.Column("identification", sa.ForeignKey(runs.c.id), primary_key=True),
+    sa.Column("name", sa.String(64), primary_key=True),
+    sa.Column("value", sa.Float, nullable=False),
+    sa.Column("std", sa.Float, nullable=False),
+    sa.Column("unit", sa.String(32), nullable=False),
+    sa.Column("essential", sa.Boolean, nullable=False),
+)
+recordings = sa.Table(
+    "recordings",
+    tables,
+    sa.Column("sha256", sa.String(64), primary_key=True),
+    sa.Column("path", sa.Text),
+    sa.Column("cell", sa.String(128), index=True),
+    sa.Column("duration_s", sa.Float, nullable=False),
+    sa.Column("in_gaps", sa.Integer),
+    sa.Column("facts", sa.JSON, nullable=False),
+    sa.Column("counters", sa.JSON, nullable=False),
+)
+comparisons = sa.Table(
+    "comparisons",
+    tables,
+    sa.Column("identification", sa.ForeignKey(runs.c.id), primary_key=True),
+    sa.Column("baseline", sa.String(64), primary_key=True),
+    sa.Column("drifted", sa.Boolean, nullable=False),
+    sa.Column("chi_square", sa.Float, nullable=False),
+    sa.Column("degrees", sa.Integer, nullable=False),
+    sa.Column("p_joint", sa.Float, nullable=False),
+    sa.Column("false_alarms", sa.Float, nullable=False),
+    sa.Column("changed", sa.JSON, nullable=False),
+    sa.Column("words", sa.Text, nullable=False),
+)
+repeated: sa.ColumnClause[int] = sa.column("repeated", sa.Integer)
+"""Column of `runs`: 1 for a further identification of a recording that the history had already."""
+
+
+def _create_tables(connection: sa.Connection) -> None:
+    tables.create_all(connection)
+
+
+def _one_run_per_recording(connection: sa.Connection) -> None:
+    """Mark all but the first run of each recording as repeated, and allow one that is not."""
+    for statement in (
+        "ALTER TABLE identifications ADD COLUMN repeated INTEGER NOT NULL DEFAULT 0",
+        "UPDATE identifications SET repeated = 1 WHERE EXISTS (SELECT 1 FROM identifications AS earlier WHERE "
+        "earlier.robot = identifications.robot AND earlier.sha256 = identifications.sha256 "
+        "AND earlier.id < identifications.id)",
+        "CREATE UNIQUE INDEX one_run_per_recording ON identifications (robot, sha256) WHERE repeated = 0",
+    ):
+        connection.execute(sa.text(statement))
+
+
+MIGRATIONS: tuple[Callable[[sa.Connection], None], ...] = (_create_tables, _one_run_per_recording)
+"""Steps from version k to k + 1."""
+
+
+def engine_for(url: str) -> sa.Engine:
+    """Return the engine of a database, whose transactions on SQLite wait for other processes.
+
+    ``url``: SQLAlchemy URL.
+    """
+    if not url.startswith("sqlite"):
+        try:
+            return _server_engine(sa.make_url(url))
+        except ValueError as error:
+            raise ConfigError("the port in the URL is no number") from error
+    engine = sa.create_engine(url, connect_args={"timeout": BUSY_S})
+    # The driver begins transactions late, and none for changes of tables: they are begun here.
+    sa.event.listen(engine, "connect", _without_own_transactions)
+    sa.event.listen(engine, "begin", _begin)
+    return engine
+
+
+def _server_engine(url: sa.URL) -> sa.Engine:
+    """Return the engine of a database server; on PostgreSQL nothing is waited for longer than `BUSY_S`."""
+    if url.get_backend_name() != "postgresql":
+        return sa.create_engine(url, pool_pre_ping=True)
+    waits = {"connect_timeout": round(BUSY_S) or 1, "tcp_user_timeout": round(1000 * BUSY_S)}
+    own = {key: value for key, value in waits.items() if key not in url.query and url.get_driver_name() == "psycopg"}
+    # A connection that the server has closed since is replaced.
+    engine = sa.create_engine(url, connect_args=own, pool_pre_ping=True)
+    sa.event.listen(engine, "begin", _limit_waits)
+    return engine
+
+
+def _limit_waits(connection: sa.Connection) -> None:
+    connection.exec_driver_sql(f"SET LOCAL lock_timeout = {round(1000 * BUSY_S)}")
+
+
+def _without_own_transactions(connection: sqlite3.Connection, _record: Any) -> None:
+    connection.isolation_level = None
+
+
+def _begin(connection: sa.Connection) -> None:
+    writes = connection.get_execution_options().get("writes", False)
+    connection.exec_driver_sql("BEGIN IMMEDIATE" if writes else "BEGIN")
+
+
+@contextmanager
+def writing(engine: sa.Engine) -> Iterator[sa.Connection]:
+    """Yield a connection in a transaction that writes; it is committed at the end of the block.
+
+    ``engine``: engine of the database.
+    """
+    with engine.connect().execution_options(writes=True) as connection, connection.begin():
+        yield connection
+
+
+def upgrade(engine: sa.Engine) -> None:
+    """Create the tables, or bring those of a former version to the present one.
+
+    ``engine``: engine of the database. Any number of processes may upgrade it at once. Raises ConfigError if the
+    database is of a newer version.
+    """
+    with engine.connect() as connection:
+        if _version(connection) == len(MIGRATIONS):
+            return
+    with writing(engine) as connection:
+        if engine.dialect.name == "postgresql":
+            connection.execute(sa.text(f"SELECT pg_advisory_xact_lock({_LOCK})"))
+        version = _version(connection)
+        if version > len(MIGRATIONS):
+            raise ConfigError(f"written by a newer armident (version {version}, this one knows {len(MIGRATIONS)})")
+        for migrate in MIGRATIONS[version:]:
+            migrate(connection)
+        if version < len(MIGRATIONS):
+            _set_version(connection, len(MIGRATIONS))
+
+
+def _version(connection: sa.Connection) -> int:
+    if connection.dialect.name == "sqlite":
+        return int(connection.exec_driver_sql("PRAGMA user_version").scalar_one())
+    if not sa.inspect(connection).has_table("armident_history_version"):
+        return 0
+    version = connection.execute(sa.text("SELECT version FROM armident_history_version")).scalar()
+    if version is None:
+        raise ConfigError("damaged (armident_history_version has no row); restore a copy")
+    return int(version)
+
+
+def _set_version(connection: sa.Connection, version: int) -> None:
+    if connection.dialect.name == "sqlite":
+        connection.exec_driver_sql(f"PRAGMA user_version = {version}")
+        return
+    connection.execute(sa.text("CREATE TABLE IF NOT EXISTS armident_history_version (version INTEGER NOT NULL)"))
+    connection.execute(sa.text("DELETE FROM armident_history_version"))
+    connection.execute(sa.text("INSERT INTO armident_history_version VALUES (:version)"), {"version": version})
+
+
+def reason(error: Exception) -> str:
+    """Return one line that says why a database cannot be used, without the words of the library for known causes.
+
+    ``error``: error of SQLAlchemy or of the file system.
+    """
+    cause = getattr(error, "orig", None) or error
+    if isinstance(cause, ImportError):
+        return f"the Python package {cause.name} is not installed"
+    # libpq adds a question after the reason.
+    text = " ".join(str(cause).partition("\n\tIs the server")[0].split())[:200]
+    state = getattr(cause, "sqlstate", None)
+    if state in _STATES:
+        return _STATES[state].format(busy=BUSY_S, text=text)
+    if isinstance(error, sa.exc.OperationalError) and not isinstance(cause, sqlite3.Error):
+        text = text.removeprefix("connection failed: ")
+        return f"no connection to the server ({text}); check that it runs, and host, port, user and database of the URL"
+    if isinstance(cause, sqlite3.Error):
+        text = reason_of(cause, BUSY_S)
+        damaged = "; restore a copy, or begin a new history and add the results to it"
+        return text + damaged if text.startswith("damaged") else text
+    return text
+
+
+def wait_and_try(action: Callable[[], None], seconds: float, say: Callable[[str], None]) -> bool:
+    """Try an action again while the database refuses it; return False if the time is over.
+
+    ``action``: writes to the history; ``seconds``: time after which it is not tried again, s; ``say``: takes a line for
+    each reason of a failure.
+    """
+    until, wait, said = time.monotonic() + seconds, 1.0, ""
+    while True:
+        try:
+            action()
+        except ConfigError as error:
+            if str(error) != said:
+                say(f"warning: {error}")
+            said = str(error)
+            if time.monotonic() + wait > until:
+                return False
+            time.sleep(wait)
+            wait = min(2 * wait, 10.0)
+        else:
+            return True

@@ -1,0 +1,175 @@
+"""Test of the residuals of an identification against those of the baseline.
+
+Parameters describe what the model has; the residuals describe what it lacks. The free functions of the motion are
+tested with the difference of their coefficients, the bands of frequency with the ratio of their powers.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from armident.identify.documents.identification import IdentificationDocument, ResidualStatistics
+from armident.identify.regression.multiple_testing import holm
+
+Array = NDArray[np.float64]
+
+SAME_MOTION = 0.1
+"""Largest difference of range and speed of a joint between both runs, as share of them. The model errors of a healthy
+arm cancel in the difference only if the motion is the same.
+A shift of an eighth of the range would be one knot of the functions of position."""
+
+RANK = 1e-3
+"""Eigenvalue of the information of normalised functions, relative to the largest, below which a combination of
+functions is left out: base parameters explain it, or the motion does not show it."""
+
+NOT_COMPARED = (
+    "structure is not compared: the baseline has no statistics of the residuals; "
+    "renew it: armident identify RECORDING of the baseline, then --baseline its identification.json"
+)
+
+
+@dataclass(frozen=True)
+class ResidualChange:
+    """Test of one property of the residuals of one joint.
+
+    Parameters
+    ----------
+    kind
+        ``position`` (and direction), ``velocity``, or ``power`` in a frequency band.
+    statistic, degrees
+        Chi-square statistic and its degrees of freedom, or ratio of the powers and those of the later one.
+    p_value
+        Probability of such a statistic without a change, corrected by Holm's method for all joints and kinds.
+    band_hz
+        Frequency band of ``power``, Hz; ``None`` otherwise.
+    """
+
+    joint: str
+    kind: Literal["position", "velocity", "power"]
+    statistic: float
+    degrees: float
+    p_value: float
+    band_hz: tuple[float, float] | None = None
+
+    @property
+    def words(self) -> str:
+        """Result in one sentence, which begins with the joint."""
+        chance = f"p = {self.p_value:.1g}" if self.p_value >= 1e-12 else "p = below 1e-12"
+        if self.band_hz is not None:
+            low, high = self.band_hz
+            return (
+                f"{self.joint}: power of the residuals from {low:.3g} to {high:.3g} Hz x {self.statistic:.3g}, {chance}"
+            )
+        of = "position and direction" if self.kind == "position" else "velocity"
+        return (
+            f"{self.joint}: dependence of the residuals on {of} has changed "
+            f"(chi-square {self.statistic:.1f} of {self.degrees:.0f} degrees of freedom), {chance}"
+        )
+
+
+@dataclass(frozen=True)
+class ResidualTest:
+    """Result of the test; without tests, ``reason`` says why.
+
+    ``tests``: all joints and kinds. ``reason``: why structure is not compared, for all joints or some; empty: compared.
+    """
+
+    tests: tuple[ResidualChange, ...] = ()
+    reason: str = ""
+
+    def changed(self, level: float) -> tuple[ResidualChange, ...]:
+        """Return the significant changes, the most significant first. ``level``: False-alarm rate of the whole test."""
+        return tuple(sorted((t for t in self.tests if t.p_value < level), key=lambda t: t.p_value))
+
+
+def compare_residuals(baseline: IdentificationDocument, now: IdentificationDocument) -> ResidualTest:
+    """Test the residuals of two identifications of an arm for a change.
+
+    ``baseline``, ``now``: identifications with the same motion.
+    """
+    if baseline.residual_statistics is None:
+        return ResidualTest(reason=NOT_COMPARED)
+    if now.residual_statistics is None:
+        return ResidualTest(reason="structure is not compared: this run has no statistics of the residuals")
+    before = {each.joint: each for each in baseline.residual_statistics}
+    pairs = [(before[each.joint], each) for each in now.residual_statistics if each.joint in before]
+    same = [(old, new) for old, new in pairs if _same_motion(old, new)]
+    other = [new.joint for old, new in pairs if not _same_motion(old, new)]
+    reason = f"structure of {', '.join(other)} is not compared: the motion is not that of the baseline" if other else ""
+    tests = [test for old, new in same for test in _tests(old, new)]
+    corrected = holm(np.array([test.p_value for test in tests])) if tests else np.empty(0)
+    return ResidualTest(
+        tuple(
+            ResidualChange(t.joint, t.kind, t.statistic, t.degrees, float(p), t.band_hz)
+            for t, p in zip(tests, corrected, strict=True)
+        ),
+        reason,
+    )
+
+
+def _same_motion(old: ResidualStatistics, new: ResidualStatistics) -> bool:
+    width = old.position_range[1] - old.position_range[0]
+    moved = np.abs(np.subtract(old.position_range, new.position_range)).max()
+    return bool(
+        moved <= SAME_MOTION * width
+        and abs(old.velocity_limit - new.velocity_limit) <= SAME_MOTION * old.velocity_limit
+    )
+
+
+def _tests(old: ResidualStatistics, new: ResidualStatistics) -> list[ResidualChange]:
+    """Tests of one joint; their p-values are not corrected. Bands are left out if their limits differ."""
+    k = len(new.score)
+    split = 2 * k // 3
+    found = []
+    kinds: Sequence[tuple[Literal["position", "velocity"], slice]] = (
+        ("position", slice(0, split)),
+        ("velocity", slice(split, k)),
+    )
+    for kind, part in kinds:
+        value, degrees = _functions(old, new, part)
+        chance = float(stats.chi2.sf(value, degrees)) if degrees else 1.0
+        found.append(ResidualChange(new.joint, kind, value, degrees, chance))
+    if not np.allclose(old.band_edges_hz, new.band_edges_hz, rtol=1e-3):
+        return found
+    rows = zip(
+        old.band_power,
+        old.band_degrees,
+        new.band_power,
+        new.band_degrees,
+        new.band_edges_hz,
+        new.band_edges_hz[1:],
+        strict=False,
+    )
+    for p0, d0, p1, d1, low, high in rows:
+        if p0 <= 0.0 or p1 <= 0.0:
+            continue
+        law = stats.f(d1, d0)
+        chance = min(1.0, 2.0 * min(float(law.sf(p1 / p0)), float(law.cdf(p1 / p0))))
+        found.append(ResidualChange(new.joint, "power", p1 / p0, d1, chance, (low, high)))
+    return found
+
+
+def _functions(old: ResidualStatistics, new: ResidualStatistics, part: slice) -> tuple[float, int]:
+    """Return chi-square of the difference of the coefficients of some functions, and its degrees of freedom.
+
+    The noise of the baseline is that of both: the noise model of a changed arm absorbs a part of its model error, which
+    would hide the change.
+    """
+    information = [np.array(each.information)[part, part] for each in (old, new)]
+    score = [np.array(each.score)[part] for each in (old, new)]
+    scale = np.sqrt(np.maximum(np.diag(information[0]), 1e-300))
+    values, vectors = np.linalg.eigh(information[0] / np.outer(scale, scale))
+    kept = vectors[:, values > RANK * values[-1]] / scale[:, None]
+    if not kept.size or values[-1] <= 0.0:
+        return 0.0, 0
+    covariance, coefficients = [], []
+    for i, g in zip(information, score, strict=True):
+        covariance.append(np.linalg.pinv(kept.T @ i @ kept, hermitian=True))
+        coefficients.append(covariance[-1] @ (kept.T @ g))
+    difference = coefficients[1] - coefficients[0]
+    value = float(difference @ np.linalg.solve(2.0 * covariance[0], difference))
+    return max(value, 0.0), kept.shape[1]

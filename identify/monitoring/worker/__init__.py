@@ -1,0 +1,1 @@
+"""The identification worker of a cell."""

@@ -1,0 +1,84 @@
+"""Announcements of a worker: each result and failure in the ledger is announced once, also if workers are killed."""
+
+from armident.daq.streaming import Keys
+from armident.identify.monitoring.worker.ledger import Ledger, LedgerEntry
+from armident.identify.monitoring.worker.status_messages import failure_status, status
+from armident.identify.monitoring.worker.worker_link import LinkDown, WorkerLink
+from armident.identify.monitoring.worker.worker_receiver import content_hash
+
+COMPONENTS = ("worker", "reidentify")
+"""Programs that announce the entries of a ledger."""
+
+
+class Announcements:
+    """Announces the entries of a ledger.
+
+    An entry and its announcement are one transaction. A worker that is killed after the announcement and before the
+    end of the transaction leaves an entry that counts as not announced. Other workers have heard the announcement,
+    and enter it.
+
+    ``keys``: keys of the robot; ``link``: Zenoh session of the worker.
+    """
+
+    def __init__(self, keys: Keys, link: WorkerLink) -> None:
+        self._keys, self._link = keys, link
+        self._heard: set[bytes] = set()
+        self._sent: set[str] = set()
+
+    def make(self, ledger: Ledger, sha256: str) -> bytes | None:
+        """Announce the result or the failure of a recording, and return the document that was announced.
+
+        ``ledger``: ledger of the worker, which has a claim on the recording. Raises LinkDown if the session is missing,
+        too new, or fails. Raises LedgerError if the ledger cannot be written; the announcement is not repeated when
+        this is called again.
+        """
+        entry = ledger.entry(sha256)
+        if entry is None or entry.announced or entry.state == "waiting":
+            return None
+        if not self._link.can_announce:
+            raise LinkDown("zenoh: no session yet")
+        document, message = _outcome(entry)
+        with ledger.announcement(sha256) as mine:
+            if mine and sha256 not in self._sent:
+                if document is None:
+                    self._link.announce((self._keys.status, failure_status("worker", message, entry.name, sha256)))
+                else:
+                    done = status(
+                        "worker", "done", result=str(entry.result), verdict=message, capture=entry.name, sha256=sha256
+                    )
+                    self._link.announce((self._keys.identification, document), (self._keys.status, done))
+                self._sent.add(sha256)
+        self._sent.discard(sha256)
+        return document if mine else None
+
+    def enter_heard(self, ledger: Ledger) -> None:
+        """Enter the announcements that other workers have made, but not entered.
+
+        ``ledger``: ledger that the workers share. Raises LedgerError if the ledger cannot be read or written; what was
+        heard is kept for the next call.
+        """
+        self._heard |= self._link.receiver.take_heard()
+        if not self._heard:
+            return
+        for entry in ledger.unannounced():
+            if any(content_hash(content) in self._heard for content in _contents(entry)):
+                ledger.enter_announced(entry.sha256)
+        self._heard.clear()
+
+
+def _outcome(entry: LedgerEntry) -> tuple[bytes | None, str]:
+    """Return the document of a result and its verdict; ``None`` and the reason if there is none."""
+    if entry.result is None:
+        return None, entry.message or ""
+    try:
+        return entry.result.read_bytes(), entry.message or ""
+    except FileNotFoundError:
+        return None, f"{entry.result}: the result was removed before it was announced"
+
+
+def _contents(entry: LedgerEntry) -> list[bytes]:
+    """Return the messages that announce an entry, by whichever program."""
+    document, message = _outcome(entry)
+    if document is not None:
+        return [document]
+    return [failure_status(component, message, entry.name, entry.sha256) for component in COMPONENTS]

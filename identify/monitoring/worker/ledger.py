@@ -1,0 +1,360 @@
+"""Ledger of a worker: the recordings of its cell, who works on them, their results and announcements (SQLite).
+
+The ledger outlives the workers. A recording is known by its hash. It is claimed by one worker with a lease, which the
+worker renews; after a crash the lease ends, and another worker takes over. The result is written before it is entered,
+and entered before it is announced. The announcement and its entry are one transaction. An announcement that a
+process has made, but not entered before its end, is entered by the others, which have heard it.
+"""
+
+import json
+import os
+import secrets
+import socket
+import sqlite3
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from armident.configs import ArmidentError
+from armident.configs.reasons import reason_of
+
+FILE = "worker.sqlite"
+"""Name of the ledger in the folder of the results."""
+LEASE_S = 6.0
+"""Time after which a claim ends that is not renewed, s."""
+BUSY_S = 10.0
+"""Longest wait for another process that writes the ledger, s."""
+MOST_ATTEMPTS = 12
+"""Number of workers that may end during one identification before the recording is given up."""
+
+State = Literal["waiting", "done", "failed"]
+
+_MIGRATIONS = (
+    """
+    CREATE TABLE experiments (
+        sha256 TEXT PRIMARY KEY,
+        name TEXT NOT NULL,
+        paths TEXT NOT NULL,
+        added REAL NOT NULL,
+        state TEXT NOT NULL DEFAULT 'waiting',
+        attempts INTEGER NOT NULL DEFAULT 0,
+        owner TEXT,
+        boot TEXT,
+        lease_until REAL,
+        result TEXT,
+        message TEXT,
+        finished REAL,
+        announced INTEGER NOT NULL DEFAULT 0
+    );
+    CREATE TABLE files (
+        path TEXT PRIMARY KEY,
+        stamp TEXT NOT NULL,
+        sha256 TEXT
+    );
+    """,
+)
+"""Statements that bring a ledger from version k to k + 1; the version is ``PRAGMA user_version``."""
+
+
+class LedgerError(ArmidentError):
+    """The ledger cannot be read or written at present: locked, or the disk is full. Try again."""
+
+
+class LedgerUnusable(ArmidentError):
+    """The ledger is damaged, or of a newer version."""
+
+
+@dataclass(frozen=True)
+class LedgerEntry:
+    """Recording in the ledger.
+
+    Parameters
+    ----------
+    sha256
+        Hash of its samples.
+    name
+        Name of the recording, without suffix and number of the part.
+    paths
+        Its files in order; empty if it exists in the stream only.
+    state
+        ``waiting`` for a result, ``done`` or ``failed``.
+    attempts
+        Number of claims for its identification, this one included.
+    message
+        Verdict of the result, or reason of the failure.
+    announced
+        True if the result was announced.
+    """
+
+    sha256: str
+    name: str
+    paths: tuple[Path, ...]
+    state: State
+    attempts: int
+    result: Path | None
+    message: str | None
+    announced: bool
+
+
+_COLUMNS = "sha256, name, paths, state, attempts, result, message, announced"
+_LATER = "max(:time, coalesce((SELECT max(finished) FROM experiments), 0) + 0.001)"
+"""Time of a result: later than all others, also after a step of the clock back."""
+_FREE = "(owner IS NULL OR boot IS NOT :boot OR lease_until < :now OR owner = :owner)"
+
+
+class Ledger:
+    """Ledger in a file, shared by all processes that work on the recordings of a folder.
+
+    ``path``: the file; created if it is missing. It must be on a local disk (SQLite's write-ahead log). ``owner``: name
+    of this process in its claims. ``lease_s``: time after which a claim ends that is not renewed, s. ``clock``: clock
+    of the leases, s; the default is not set by anyone and counts from the start of the machine. Raises LedgerError if
+    the file is locked or the disk is full; LedgerUnusable if the file is damaged or of a newer version.
+    """
+
+    def __init__(
+        self, path: Path, owner: str, lease_s: float = LEASE_S, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        self.path, self.owner = path, owner
+        self._lease_s, self._clock = lease_s, clock
+        self._boot = _boot_id()
+        with self._errors():
+            path.parent.mkdir(parents=True, exist_ok=True)
+        with self._transaction() as db:
+            version = int(db.execute("PRAGMA user_version").fetchone()[0])
+            if version > len(_MIGRATIONS):
+                raise LedgerUnusable(
+                    f"{path}: ledger of version {version}, this program knows {len(_MIGRATIONS)}; "
+                    "use the newer armident"
+                )
+            for number, script in enumerate(_MIGRATIONS[version:], start=version + 1):
+                for statement in script.split(";"):
+                    db.execute(statement)
+                db.execute(f"PRAGMA user_version = {number}")
+
+    def add(self, sha256: str, name: str, paths: Sequence[Path]) -> bool:
+        """Enter a recording, and return True if the ledger did not know it.
+
+        ``sha256``: hash of its samples. ``paths``: its files; empty if it exists in the stream only. They complete an
+        entry that has none.
+        """
+        row = {"sha256": sha256, "name": name, "paths": _texts(paths), "added": time.time()}
+        with self._transaction() as db:
+            fresh = db.execute(
+                "INSERT INTO experiments (sha256, name, paths, added) VALUES (:sha256, :name, :paths, :added) "
+                "ON CONFLICT DO NOTHING",
+                row,
+            ).rowcount
+            if not fresh and paths:
+                db.execute(
+                    "UPDATE experiments SET name = :name, paths = :paths "
+                    "WHERE sha256 = :sha256 AND state = 'waiting' AND paths = '[]'",
+                    row,
+                )
+        return bool(fresh)
+
+    def adopt(self, sha256: str, name: str, paths: Sequence[Path], result: Path, message: str) -> bool:
+        """Enter a recording whose result was announced before this ledger existed; return True if it is new.
+
+        ``sha256``, ``name``, ``paths``: as of `add`; ``result``, ``message``: file of the result, and its verdict.
+        """
+        with self._transaction() as db:
+            done = db.execute(
+                "INSERT INTO experiments (sha256, name, paths, added, state, result, message, finished, announced) "
+                f"VALUES (:sha256, :name, :paths, :time, 'done', :result, :message, {_LATER}, 1) "
+                "ON CONFLICT DO NOTHING",
+                {"sha256": sha256, "name": name, "paths": _texts(paths), "time": time.time()}
+                | {"result": str(result), "message": message},
+            )
+            return bool(done.rowcount)
+
+    def claim(
+        self, sha256: str | None = None, held: Sequence[str] = (), *, announce: bool = True
+    ) -> LedgerEntry | None:
+        """Claim a recording without a result or announcement, and return it; ``None`` if there is none.
+
+        The one with the fewest attempts comes first, so that a recording that ends its workers does not hold up others.
+
+        ``sha256``: claim this one, and no other; ``held``: recordings without files whose samples this process has in
+        memory; ``announce``: claim recordings that only lack the announcement, too.
+        """
+        names = {f"h{k}": value for k, value in enumerate(held)}
+        here = ", ".join(f":{name}" for name in names)
+        query = (
+            f"SELECT {_COLUMNS} FROM experiments WHERE announced = 0 AND (:announce OR state = 'waiting') AND {_FREE} "
+            f"AND (:sha256 IS NULL OR sha256 = :sha256) "
+            f"AND (paths != '[]' OR state != 'waiting' OR sha256 IN ({here})) "
+            "ORDER BY state = 'waiting', attempts, added, name LIMIT 1"
+        )
+        with self._transaction() as db:
+            row = db.execute(query, names | self._me() | {"sha256": sha256, "announce": announce}).fetchone()
+            if row is None:
+                return None
+            db.execute(
+                "UPDATE experiments SET owner = :owner, boot = :boot, lease_until = :until, "
+                "attempts = attempts + (state = 'waiting') WHERE sha256 = :sha256",
+                self._me() | {"sha256": row[0]},
+            )
+            return _entry(db.execute(f"SELECT {_COLUMNS} FROM experiments WHERE sha256 = ?", row[:1]).fetchone())
+
+    def renew(self) -> None:
+        """Renew the leases of all claims of this process."""
+        with self._transaction() as db:
+            db.execute("UPDATE experiments SET lease_until = :until WHERE owner = :owner", self._me())
+
+    def release(self) -> None:
+        """End all claims of this process: another worker may continue at once."""
+        with self._transaction() as db:
+            db.execute("UPDATE experiments SET owner = NULL WHERE owner = :owner", self._me())
+
+    def finish(self, sha256: str, state: State, result: Path | None, message: str) -> bool:
+        """Enter a result; return False if the claim was lost to another worker, whose result counts.
+
+        ``state``: ``done`` or ``failed``; ``result``: file of the result, which is complete; ``message``: verdict of
+        the result, or reason of the failure.
+        """
+        values = {"sha256": sha256, "state": state, "result": None if result is None else str(result)}
+        with self._transaction() as db:
+            done = db.execute(
+                f"UPDATE experiments SET state = :state, result = :result, message = :message, finished = {_LATER} "
+                "WHERE sha256 = :sha256 AND owner = :owner AND state = 'waiting'",
+                values | {"message": message, "time": time.time()} | self._me(),
+            )
+            return bool(done.rowcount)
+
+    @contextmanager
+    def announcement(self, sha256: str) -> Iterator[bool]:
+        """Enter an announcement that is made inside the block; yield False if it must not be made.
+
+        The entry counts if the block ends without an exception. The claim ends with it.
+        """
+        with self._transaction() as db:
+            done = db.execute(
+                "UPDATE experiments SET announced = 1, owner = NULL "
+                "WHERE sha256 = :sha256 AND owner = :owner AND announced = 0 AND state != 'waiting'",
+                {"sha256": sha256} | self._me(),
+            )
+            yield bool(done.rowcount)
+
+    def unannounced(self) -> list[LedgerEntry]:
+        """Return the entries with a result or a failure that has not been announced."""
+        query = f"SELECT {_COLUMNS} FROM experiments WHERE announced = 0 AND state != 'waiting'"
+        with self._transaction() as db:
+            return [_entry(row) for row in db.execute(query)]
+
+    def enter_announced(self, sha256: str) -> None:
+        """Enter an announcement that another process has made, and end the claim."""
+        with self._transaction() as db:
+            db.execute(
+                "UPDATE experiments SET announced = 1, owner = NULL WHERE sha256 = ? AND state != 'waiting'", (sha256,)
+            )
+
+    def entry(self, sha256: str) -> LedgerEntry | None:
+        """Return the entry of a recording, or ``None``."""
+        with self._transaction() as db:
+            row = db.execute(f"SELECT {_COLUMNS} FROM experiments WHERE sha256 = ?", (sha256,)).fetchone()
+        return None if row is None else _entry(row)
+
+    def entries(self) -> list[LedgerEntry]:
+        """Return all entries in the order in which they were added."""
+        with self._transaction() as db:
+            return [_entry(row) for row in db.execute(f"SELECT {_COLUMNS} FROM experiments ORDER BY added, name")]
+
+    def last_result(self) -> Path | None:
+        """Return the file of the newest announced result, or ``None``."""
+        with self._transaction() as db:
+            row = db.execute(
+                "SELECT result FROM experiments WHERE announced AND result IS NOT NULL ORDER BY finished DESC LIMIT 1"
+            ).fetchone()
+        return None if row is None else Path(row[0])
+
+    def file_hash(self, path: Path, stamp: str) -> tuple[str | None] | None:
+        """Return the hash that was entered for a file with this stamp; ``None`` if it was not entered.
+
+        ``stamp``: its size and time of change.
+        """
+        with self._transaction() as db:
+            row = db.execute("SELECT sha256 FROM files WHERE path = ? AND stamp = ?", (str(path), stamp)).fetchone()
+        return None if row is None else (row[0],)
+
+    def enter_file(self, path: Path, stamp: str, sha256: str | None) -> None:
+        """Enter a file that was read.
+
+        ``path``, ``stamp``: as of `file_hash`. ``sha256``: hash of its recording; ``None`` if it is none of this cell.
+        """
+        with self._transaction() as db:
+            db.execute("INSERT OR REPLACE INTO files VALUES (?, ?, ?)", (str(path), stamp, sha256))
+
+    def _me(self) -> dict[str, object]:
+        now = self._clock()
+        return {"owner": self.owner, "boot": self._boot, "now": now, "until": now + self._lease_s}
+
+    @contextmanager
+    def _transaction(self) -> Iterator[sqlite3.Connection]:
+        """Yield a connection in a transaction that excludes other writers; it is committed at the end of the block."""
+        with self._errors():
+            db = sqlite3.connect(self.path, timeout=BUSY_S, isolation_level=None)
+            try:
+                _use_write_ahead_log(db)
+                db.execute("BEGIN IMMEDIATE")
+                try:
+                    yield db
+                    db.execute("COMMIT")
+                except BaseException:
+                    if db.in_transaction:
+                        db.execute("ROLLBACK")
+                    raise
+            finally:
+                db.close()
+
+    @contextmanager
+    def _errors(self) -> Iterator[None]:
+        try:
+            yield
+        except (sqlite3.OperationalError, OSError) as error:
+            raise LedgerError(f"{self.path}: {reason_of(error, BUSY_S, named=False)}") from error
+        except sqlite3.DatabaseError as error:
+            raise LedgerUnusable(
+                f"{self.path}: the ledger is damaged ({error}); move it away and start again, results are found"
+            ) from error
+
+
+def unique_owner() -> str:
+    """Return a name for this process in its claims."""
+    return f"{socket.gethostname()}-{os.getpid()}-{secrets.token_hex(4)}"
+
+
+def _use_write_ahead_log(db: sqlite3.Connection) -> None:
+    """Set the journal mode; SQLite does not wait by itself for other processes that do the same at first."""
+    until = time.monotonic() + BUSY_S
+    while True:
+        try:
+            db.execute("PRAGMA journal_mode = WAL")
+            # A commit then survives the end of any process, and a loss of power costs the last ones at most.
+            db.execute("PRAGMA synchronous = NORMAL")
+            return
+        except sqlite3.OperationalError as error:
+            if "locked" not in str(error) or time.monotonic() > until:
+                raise
+            time.sleep(0.02)
+
+
+def _entry(row: tuple[str, str, str, State, int, str | None, str | None, int]) -> LedgerEntry:
+    sha256, name, paths, state, attempts, result, message, announced = row
+    files = tuple(Path(path) for path in json.loads(paths))
+    found = None if result is None else Path(result)
+    return LedgerEntry(sha256, name, files, state, attempts, found, message, bool(announced))
+
+
+def _texts(paths: Sequence[Path]) -> str:
+    return json.dumps([str(path) for path in paths])
+
+
+def _boot_id() -> str:
+    """Return the number of this start of the machine: leases of an earlier one have ended."""
+    try:
+        return Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
+    except OSError:
+        return ""

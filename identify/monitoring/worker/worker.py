@@ -1,0 +1,345 @@
+"""Identification worker: identifies every recording of a cell once, and announces the results on Zenoh."""
+
+import logging
+import queue
+import signal
+import threading
+import time
+from collections.abc import Callable
+from contextlib import closing, suppress
+from pathlib import Path
+from types import FrameType
+from typing import TypeVar
+
+from pydantic import TypeAdapter, ValidationError
+
+from armident.configs import ArmidentError, ConfigError, DataError, RobotConfig, SessionConfig, load_robot, load_session
+from armident.configs.reasons import reason_of
+from armident.daq.streaming import Keys
+from armident.identify.identification.identify_recording import identify_recording
+from armident.identify.identification.options import Options
+from armident.identify.monitoring.worker.announcements import Announcements
+from armident.identify.monitoring.worker.intake import Intake
+from armident.identify.monitoring.worker.ledger import (
+    FILE,
+    MOST_ATTEMPTS,
+    Ledger,
+    LedgerEntry,
+    LedgerError,
+    State,
+    unique_owner,
+)
+from armident.identify.monitoring.worker.recorded import (
+    Captured,
+    captured_in,
+    result_of,
+)
+from armident.identify.monitoring.worker.stream_buffer import LARGEST_BLOCK, LARGEST_EVENT, StreamBuffer
+from armident.identify.monitoring.worker.worker_link import LinkDown, WorkerLink
+from armident.identify.report.robot_file import write_identification
+from armident.systemd import Notifier
+
+log = logging.getLogger(__name__)
+
+POLL_S = 1.0
+"""Interval at which the ledger is looked at, and at which leases are renewed, s."""
+SCAN_S = 5.0
+"""Interval at which folders are searched for recordings whose capture announced no end, s."""
+RETRY_S, LONGEST_RETRY_S = 1.0, 30.0
+"""First and longest wait before a write is tried again, s."""
+LONGEST_STAGE_S = 7200.0
+"""Time after which an identification that reports no further stage counts as hung, s."""
+
+T = TypeVar("T")
+
+
+class _Closing(Exception):
+    """The worker is being closed while it waits."""
+
+
+def options_of(session: SessionConfig) -> Options:
+    """Options of the worker of a cell; a ConfigError names the key that is wrong."""
+    # The filters of a published fit are for a comparison with it, not for a cell.
+    given = {"derivatives": "irwsm"} | session.identification
+    try:
+        return TypeAdapter(Options).validate_python(given)
+    except ValidationError as error:
+        problem = error.errors()[0]
+        keys = ".".join(str(key) for key in ("identification", *problem["loc"]))
+        raise ConfigError(f"session of cell {session.cell}: {keys}: {problem['msg']}") from error
+
+
+class Worker:
+    """Identifies every recording of one robot in one cell.
+
+    It finds recordings by the events on Zenoh and in the folders of the cell. A ledger in the folder of the results
+    says which have a result: a worker that was absent or killed continues there, and several workers share the work.
+
+    ``out``: folder of the results; each recording has a subfolder. The ledger is there. ``progress``: called every
+    second with the state, as long as the work advances; resets a watchdog. Raises ConfigError if Zenoh's configuration
+    is wrong.
+    """
+
+    def __init__(
+        self, session: SessionConfig, robot: RobotConfig, out: Path, progress: Callable[[str], None] | None = None
+    ) -> None:
+        self._robot, self._cell, self._out = robot, session.cell, out
+        self._folders = (session.recording.directory, out)
+        self._options = options_of(session)
+        self._keys = Keys(session.cell, robot.name)
+        self._owner = unique_owner()
+        self._results: queue.SimpleQueue[int] = queue.SimpleQueue()
+        self._buffer = StreamBuffer()
+        self._lock = threading.Lock()
+        self._intake = Intake(session.cell, robot.name, self._folder, self._buffer, self._lock, self._refuse)
+        self._last: bytes | None = None
+        self._problem: str | None = None
+        self._progress = progress
+        self._state, self._advanced = "waiting", time.monotonic()
+        self._wake, self._closing = threading.Event(), threading.Event()
+        self._ledger: Ledger | None = None
+        limits = LARGEST_EVENT, LARGEST_BLOCK
+        self._link = WorkerLink(session, self._keys, self._on_event, self._on_block, limits, lambda: self._last)
+        self._announcements = Announcements(self._keys, self._link)
+        self._threads = [
+            threading.Thread(target=self._identify_all, name="identify", daemon=True),
+            threading.Thread(target=self._keep_alive, name="lease", daemon=True),
+        ]
+
+    def __enter__(self) -> "Worker":
+        """Subscribe, answer queries, declare the liveliness token, and begin to work."""
+        self._link.check()
+        self._link.status("waiting")
+        for thread in self._threads:
+            thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Close the session; a running identification is abandoned, and free for other workers."""
+        self._closing.set()
+        self._wake.set()
+        self._threads[1].join()
+        self._threads[0].join(POLL_S)
+        self._link.close()
+        if self._ledger is not None:
+            try:
+                self._ledger.release()
+            except ArmidentError as error:
+                log.warning("%s", error)
+
+    def result(self, timeout: float | None = None) -> int | None:
+        """Wait for the exit code of the next recording; ``None`` after ``timeout``, s."""
+        try:
+            return self._results.get(timeout=timeout)
+        except queue.Empty:
+            return None
+
+    def _on_event(self, data: bytes | None, size: int) -> None:
+        with self._lock:
+            event = self._buffer.take_event(data, size)
+        if event is None:
+            return
+        if event["kind"] == "experiment_start":
+            self._link.status("recording", capture=event["capture"])
+        self._wake.set()
+
+    def _on_block(self, data: bytes | None, size: int) -> None:
+        with self._lock:
+            self._buffer.take_block(data, size)
+
+    def _keep_alive(self) -> None:
+        """Renew the leases, enter what others announced, and keep the Zenoh session open; in a thread of its own."""
+        while not self._closing.wait(POLL_S):
+            try:
+                if self._ledger is not None:
+                    self._ledger.renew()
+                    self._announcements.enter_heard(self._ledger)
+            except (ArmidentError, OSError) as error:
+                log.debug("lease not renewed: %s", error)
+            self._link.check()
+            if self._progress is not None and time.monotonic() - self._advanced < LONGEST_STAGE_S:
+                self._progress(self._state)
+
+    def _advance(self, state: str) -> None:
+        """Note that the identifying thread has advanced; a thread that hangs does not, and the watchdog ends it."""
+        self._state, self._advanced = state, time.monotonic()
+
+    def _identify_all(self) -> None:
+        scanned = -SCAN_S
+        while not self._closing.is_set():
+            self._wake.clear()
+            self._advance(self._problem or "waiting")
+            try:
+                ledger = self._opened()
+                with self._lock:
+                    ended = self._buffer.take_ended()
+                for assembly in ended:
+                    self._intake.take_stream(ledger, assembly)
+                if time.monotonic() - scanned >= SCAN_S:
+                    self._intake.add_files(ledger, captured_in(self._folders, self._robot.name))
+                    scanned = time.monotonic()
+                entry = ledger.claim(held=tuple(self._intake.streams), announce=self._link.can_announce)
+                self._problem = None
+                if entry is not None:
+                    self._process(ledger, entry)
+                    continue
+            except _Closing:
+                return
+            except (ArmidentError, OSError) as error:
+                self._say_problem(str(error) if isinstance(error, ArmidentError) else reason_of(error))
+            except Exception as error:
+                # The worker must survive any failure of one recording.
+                self._say_problem(f"internal error ({type(error).__name__})")
+                log.debug("internal error", exc_info=True)
+            self._wake.wait(POLL_S)
+
+    def _opened(self) -> Ledger:
+        if self._ledger is None:
+            self._ledger = Ledger(self._out / FILE, self._owner)
+            last = self._ledger.last_result()
+            if last is not None and last.is_file():
+                self._last = last.read_bytes()
+        return self._ledger
+
+    def _say_problem(self, text: str) -> None:
+        """Report a problem once while it lasts; the work is tried again."""
+        if text != self._problem:
+            self._problem = text
+            log.warning("%s; trying again", text)
+            self._link.status("waiting", message=text)
+
+    def _refuse(self, capture: str, message: str, code: int) -> None:
+        self._link.status("failed", capture=capture, message=message)
+        self._results.put(code)
+
+    def _folder(self, name: str) -> Path:
+        return self._out / f"{name}.identification"
+
+    def _folder_of(self, entry: LedgerEntry) -> Path:
+        """Return the folder of a result; another one if a recording of the same name has a result there."""
+        plain = self._folder(entry.name)
+        taken = (plain / "identification.json").is_file() and result_of(entry.sha256, plain) is None
+        return self._folder(f"{entry.name}.{entry.sha256[:8]}") if taken else plain
+
+    def _process(self, ledger: Ledger, entry: LedgerEntry) -> None:
+        """Identify a recording, enter and announce the result; what was done before is not repeated."""
+        code = _exit_code(entry.state, entry.message)
+        if entry.state == "waiting":
+            try:
+                if entry.attempts > MOST_ATTEMPTS:
+                    raise DataError(f"{entry.name}: {MOST_ATTEMPTS} workers have ended while they identified it")
+                path, verdict = self._identify(entry)
+            except _Closing:
+                raise
+            except ArmidentError as error:
+                self._fail(ledger, entry, str(error))
+                code = error.exit_code
+            except Exception as error:
+                self._fail(ledger, entry, f"{entry.name}: internal error ({type(error).__name__})")
+                log.debug("internal error", exc_info=True)
+                code = 1
+            else:
+                if not self._enter(ledger, entry, "done", path, verdict):
+                    return
+                code = _exit_code("done", verdict)
+        self._intake.streams.pop(entry.sha256, None)
+        # Without Zenoh the other recordings come first; the next claim is for the announcement.
+        with suppress(LinkDown):
+            self._until_possible("announcement", lambda: self._announce(ledger, entry.sha256))
+            self._results.put(code)
+
+    def _fail(self, ledger: Ledger, entry: LedgerEntry, message: str) -> None:
+        log.error("%s", message)
+        self._enter(ledger, entry, "failed", None, message)
+
+    def _enter(self, ledger: Ledger, entry: LedgerEntry, state: State, path: Path | None, message: str) -> bool:
+        mine = self._until_possible("ledger", lambda: ledger.finish(entry.sha256, state, path, message))
+        if not mine:
+            log.warning("%s: lease expired: the result of the other worker is used", entry.name)
+        return mine
+
+    def _identify(self, entry: LedgerEntry) -> tuple[Path, str]:
+        """Return the file of the result and its verdict; a result that a killed worker has written is used."""
+        folder = self._folder_of(entry)
+        found = result_of(entry.sha256, folder)
+        if found is not None:
+            return found[0], found[1].verdict or ""
+        recording = Captured(entry.name, entry.paths).read() if entry.paths else self._intake.streams[entry.sha256]
+        source = "file" if entry.paths else "stream"
+        self._advance(f"identifying {entry.name}")
+        print(f"worker: {recording.samples.sync.size} samples from the {source}, identifying", flush=True)
+
+        def progress(stage: str, share: float) -> None:
+            self._advance(f"identifying {entry.name}: {stage}")
+            self._link.status("identifying", capture=entry.name, stage=stage, share=share)
+
+        outcome = identify_recording(recording, self._robot, self._options, progress)
+        document, report = self._until_possible("result", lambda: write_identification(outcome, folder))
+        for reason in outcome.result.verdict.reasons:
+            log.warning("%s: %s. Next: %s", reason.level, reason.message, reason.next_step)
+        for warning in outcome.document.warnings:
+            log.warning("%s", warning)
+        level = outcome.result.verdict.level
+        print(
+            f"worker: {level}, relative torque error {outcome.document.relative_error_pct:.2f} %\n"
+            f"result: {document}\nreport: {report}",
+            flush=True,
+        )
+        return document, level
+
+    def _announce(self, ledger: Ledger, sha256: str) -> None:
+        document = self._announcements.make(ledger, sha256)
+        if document is not None:
+            self._last = document
+
+    def _until_possible(self, what: str, action: Callable[[], T]) -> T:
+        """Return the result of an action that is tried again while disk, ledger or Zenoh refuse it."""
+        wait, said = RETRY_S, ""
+        while True:
+            try:
+                done = action()
+            except (OSError, LedgerError) as error:
+                reason = reason_of(error) if isinstance(error, OSError) else str(error)
+            else:
+                if said:
+                    log.info("%s: done after all", what)
+                return done
+            if reason != said:
+                log.warning("%s: %s; trying again", what, reason)
+                self._link.status("waiting", message=f"{what}: {reason}")
+            said = reason
+            self._advance(f"waiting, {what}: {reason}")
+            if self._closing.wait(wait):
+                raise _Closing
+            wait = min(2 * wait, LONGEST_RETRY_S)
+
+
+def _exit_code(state: State, message: str | None) -> int:
+    return DataError.exit_code if state == "failed" or message == "unusable" else 0
+
+
+def run_worker(config: Path, *, once: bool, out: Path | None) -> int:
+    """Carry out ``armident worker`` until SIGTERM or SIGINT.
+
+    ``config``: session configuration. ``once``: end after one recording with its exit code. ``out``: folder of the
+    results; ``None``: the recording directory of the session. Returns the exit code.
+    """
+    session = load_session(config, "identify")
+    robot = load_robot(session.robot, "identify")
+    stopped = threading.Event()
+
+    def stop(_signal: int, _frame: FrameType | None) -> None:
+        stopped.set()
+
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, stop)
+    folder = out or session.recording.directory
+    with closing(Notifier()) as notifier, Worker(session, robot, folder, notifier.progress) as worker:
+        print("worker: ready", flush=True)
+        notifier.ready(f"{session.cell}: waiting")
+        while not stopped.is_set():
+            code = worker.result(timeout=0.2)
+            if once and code is not None:
+                return code
+        notifier.stopping()
+    return 0

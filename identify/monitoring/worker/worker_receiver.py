@@ -1,0 +1,101 @@
+"""Zenoh session on which a worker receives: samples and events of captures, and announcements of other workers."""
+
+import hashlib
+import logging
+from collections import deque
+from collections.abc import Callable
+from typing import Any
+
+import zenoh
+import zenoh.ext
+
+from armident.configs import ConfigError, SessionConfig
+from armident.daq.streaming import Keys, open_session
+
+log = logging.getLogger(__name__)
+
+HISTORY_BLOCKS = 100_000
+"""Number of blocks that a worker requests from the capture's cache when it starts: all of it."""
+MOST_HEARD = 1000
+"""Number of messages of other workers that are noted between two looks at the ledger."""
+
+Take = Callable[[bytes | None, int], None]
+"""Takes an encoded message (``None`` if it is larger than the limit) and its size, bytes."""
+
+
+class WorkerReceiver:
+    """Subscriptions of a worker.
+
+    They have a session of their own: the one that announces sends its messages in a single queue, and the captures
+    would have to do so, too. Blocks of samples that arrive in bursts would be lost more often.
+
+    The announcements of other workers are noted by the hash of their content.
+
+    ``keys``: keys of its robot; ``limits``: largest event and block that are passed on, bytes.
+    """
+
+    def __init__(
+        self, session: SessionConfig, keys: Keys, on_event: Take, on_block: Take, limits: tuple[int, int]
+    ) -> None:
+        self._config, self._keys = session, keys
+        self._handlers = ((keys.events, on_event, limits[0]), (keys.samples, on_block, limits[1]))
+        self._heard: deque[bytes] = deque(maxlen=MOST_HEARD)
+        self._session: zenoh.Session | None = None
+        self._problem: str | None = None
+
+    def check(self) -> None:
+        """Open the session if there is none."""
+        if self._session is not None:
+            return
+        try:
+            session = open_session(self._config, "observer", any_port=True)
+            try:
+                self._declared = self._subscribed(session)
+            except BaseException:
+                session.close()
+                raise
+        except (ConfigError, zenoh.ZError) as error:
+            if str(error) != self._problem:
+                log.warning("%s; recordings are identified from their files, trying again", error)
+            self._problem = str(error)
+        else:
+            self._session, self._problem = session, None
+
+    def take_heard(self) -> set[bytes]:
+        """Return the hashes of what was published on the keys of announcements since the last call."""
+        return {self._heard.popleft() for _ in range(len(self._heard))}
+
+    def close(self) -> None:
+        """Close the session."""
+        session, self._session = self._session, None
+        if session is not None:
+            session.close()
+
+    def _subscribed(self, session: zenoh.Session) -> list[Any]:
+        history = zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=HISTORY_BLOCKS)
+        recovery = zenoh.ext.RecoveryConfig(heartbeat=True, periodic_queries=None)
+        declared: list[Any] = [
+            zenoh.ext.declare_advanced_subscriber(
+                session, key, _limited(take, limit), history=history, recovery=recovery, subscriber_detection=True
+            )
+            for key, take, limit in self._handlers
+        ]
+        for key in (self._keys.identification, self._keys.status):
+            declared.append(session.declare_subscriber(key, self._hear))
+        return declared
+
+    def _hear(self, sample: zenoh.Sample) -> None:
+        self._heard.append(content_hash(bytes(sample.payload)))
+
+
+def content_hash(content: bytes) -> bytes:
+    """Return the hash by which an announcement is known."""
+    return hashlib.sha256(content).digest()
+
+
+def _limited(take: Take, limit: int) -> Callable[[zenoh.Sample], None]:
+    def on_sample(sample: zenoh.Sample) -> None:
+        size = len(sample.payload)
+        take(bytes(sample.payload) if size <= limit else None, size)
+
+    return on_sample

@@ -1,0 +1,28 @@
+"""HTML report of a prediction: held-out error, measured against predicted torques."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armident.identify.documents.prediction import PredictionDocument
+from armident.identify.identification.robot_model import RobotModel
+from armident.identify.report.glossary import base_entries
+from armident.identify.report.identification_report import torque_plots
+from armident.identify.report.page import render
+
+Array = NDArray[np.float64]
+
+
+def prediction_report(
+    document: PredictionDocument, model: RobotModel, t: Array, measured: Array, predicted: Array
+) -> str:
+    """Return the HTML page of a prediction, complete in one file.
+
+    ``t``: instants (M,), s; ``measured``, ``predicted``: torques (M, n), N m or N.
+    """
+    return render(
+        "prediction.html",
+        document=document,
+        robot=model.robot,
+        torques=torque_plots(t, measured, predicted, list(document.units), list(document.units.values())),
+        glossary=base_entries(p.name for p in model.document.parameters),
+    )

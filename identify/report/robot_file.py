@@ -1,0 +1,29 @@
+"""Writers of result documents and reports."""
+
+from pathlib import Path
+
+import yaml
+
+from armident.configs import RobotConfig
+from armident.identify.documents.files import to_json, write_atomically
+from armident.identify.identification.identify_recording import IdentificationOutcome
+
+
+def write_identification(outcome: IdentificationOutcome, out: Path) -> tuple[Path, Path]:
+    """Write ``identification.json`` and ``report.html`` into a folder.
+
+    ``outcome``: result with its document. ``out``: folder; created if it is missing. Returns paths of document and
+    report.
+    """
+    from armident.identify.report.identification_report import identification_report
+
+    document, report = out / "identification.json", out / "report.html"
+    # The document comes last: where there is one, the report is there, too.
+    write_atomically(report, identification_report(outcome.recordings, outcome.robot, outcome.result, outcome.document))
+    write_atomically(document, to_json(outcome.document))
+    return document, report
+
+
+def robot_yaml(robot: RobotConfig) -> str:
+    """Return the YAML text of a robot configuration."""
+    return yaml.safe_dump(robot.model_dump(mode="json", by_alias=True), sort_keys=False)

@@ -1,1 +1,0 @@
-"""Reproduction of the tables of M. Brunot's thesis (Toulouse, 2017)."""

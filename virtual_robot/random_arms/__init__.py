@@ -1,1 +1,0 @@
-"""Random arms with hidden effects: plants of the suite ``armident diagnose-suite --arms random``."""
