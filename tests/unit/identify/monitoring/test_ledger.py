@@ -11,8 +11,8 @@ from typing import cast
 import pytest
 
 from armident.configs import ArmidentError
+from armident.identify.monitoring.worker import ledger as module
 from armident.identify.monitoring.worker.ledger import FILE, LEASE_S, Ledger, LedgerError
-from armident.identify.monitoring.worker.worker import ledger as module
 
 A, B = "a" * 64, "b" * 64
 
