@@ -25,7 +25,7 @@ from tests.integration.test_several_buses_vcan import (
     wait_for_line,
 )
 
-pytestmark = [pytest.mark.vcan, pytest.mark.timeout(300)]
+pytestmark = pytest.mark.vcan
 
 
 def events_until(receiver: Receiver, kind: str) -> list[BusEvent]:

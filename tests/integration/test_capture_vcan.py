@@ -26,7 +26,7 @@ from armident.daq.recording import Recording, join_parts, read_recording
 from armident.drivers.vcan import ensure_vcan, remove_vcan
 from tests.fixtures.processes import ForkedProcess, armident
 
-pytestmark = [pytest.mark.vcan, pytest.mark.timeout(240)]
+pytestmark = pytest.mark.vcan
 
 COUNTED = ("samples.expected", "samples.rows", "samples.in_gaps", "kernel_drops")
 

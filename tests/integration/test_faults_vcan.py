@@ -7,7 +7,7 @@ import pytest
 
 from tests.faults.plan import EVERY_FAULT, FAULTS
 
-pytestmark = [pytest.mark.vcan, pytest.mark.nightly, pytest.mark.timeout(280)]
+pytestmark = [pytest.mark.vcan, pytest.mark.nightly]
 
 
 def run(*arguments: str) -> str:

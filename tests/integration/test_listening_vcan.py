@@ -19,7 +19,7 @@ from armident.drivers.canopen.objects import COB_EMCY
 from tests.fixtures.processes import armident
 from tests.integration.test_several_buses_vcan import session_file
 
-pytestmark = [pytest.mark.vcan, pytest.mark.timeout(300)]
+pytestmark = pytest.mark.vcan
 
 PERIOD_S = 0.005
 SYNC = {"role": "producer", "period_us": 5000, "counter": 240}

@@ -21,7 +21,7 @@ from armident.drivers.canopen.objects import COB_EMCY, DriveState, drive_state
 from tests.fixtures.processes import ForkedProcess, armident
 from tests.statistics.weeks import WORN, cell_file
 
-pytestmark = [pytest.mark.vcan, pytest.mark.timeout(280)]
+pytestmark = pytest.mark.vcan
 
 QUICK: dict[str, Any] = {"sync": {"period_us": 2000}}
 

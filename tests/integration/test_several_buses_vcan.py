@@ -18,7 +18,7 @@ from armident.daq.recording import Recording, read_recording
 from armident.drivers.vcan import ensure_vcan, remove_vcan
 from tests.fixtures.processes import ForkedProcess, armident
 
-pytestmark = [pytest.mark.vcan, pytest.mark.timeout(240)]
+pytestmark = pytest.mark.vcan
 
 SLOW = {"role": "producer", "period_us": 1000, "counter": 240}
 

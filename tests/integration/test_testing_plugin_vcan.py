@@ -10,7 +10,7 @@ import pytest
 REPOSITORY = Path(__file__).resolve().parents[2]
 EXAMPLE = REPOSITORY / "docs" / "examples" / "integration_test"
 
-pytestmark = [pytest.mark.vcan, pytest.mark.timeout(280)]
+pytestmark = pytest.mark.vcan
 
 FIXTURES = """
 import pytest
