@@ -60,8 +60,8 @@ def compiled(*signatures: str, kept: bool = False, nogil: bool = True, **options
     """
 
     def decorate(function: F) -> F:
-        njit: Any = numba.njit
-        kernel = njit(nogil=nogil, no_cfunc_wrapper=True, **options)(function)
+        chosen: dict[str, Any] = {"nogil": nogil, "no_cfunc_wrapper": True, **options}
+        kernel: Any = numba.njit(**chosen)(function)
         if signatures or kept:
             kernel._cache = _MachineCode(kernel)
             _KERNELS.append((kernel, signatures))
