@@ -40,10 +40,10 @@ def expand(file: Path) -> str:
 
 
 def parse_urdf(file: Path) -> ET.Element:
-    """Root element of a URDF file; xacro is refused by its name.
+    """Root element of a URDF file.
 
-    Raises ConfigError if the file cannot be read, is not XML, is xacro, has an attribute of more than ``LONGEST``
-    characters, or names that differ from those of URDF in case.
+    Raises ConfigError if it is unreadable, no XML, xacro, or has an attribute longer than ``LONGEST`` or names in
+    another case.
     """
     try:
         content = file.read_bytes().lstrip()

@@ -41,9 +41,8 @@ MOTION_ERROR, COMMUNICATION_ERROR = 0x20, 0x10
 class ServerReport:
     """Timing of the drives' answers.
 
-    ``syncs``: number of SYNCs answered; ``delay_p50_us``, ``delay_p99_us``, ``delay_max_us``: median, 99th percentile
-    and maximum of the time that a SYNC waited in the kernel, us; ``backlog_max``: largest number of SYNCs received at
-    once; ``cpu_share``: CPU time over duration; ``dropped``: number of frames dropped by the kernel.
+    Delays, us, are times that a SYNC waited in the kernel; ``backlog_max``: SYNCs received at once; ``dropped``: frames
+    dropped by the kernel.
     """
 
     syncs: int
@@ -74,7 +73,6 @@ class ServerReport:
 class Server:
     """All virtual drives of a session on its buses; use it in a ``with`` block.
 
-    ``session``, ``robot``: buses, nodes and SYNC; joints and drives. ``motion``: plant or recording behind the drives.
     ``oddities``: names of the oddities of drives, by joint. Raises ConfigError if a bus is missing or an EDS is
     unusable.
     """
@@ -146,11 +144,9 @@ class Server:
             drive_bus.close()
 
     def run(self, stopped: Callable[[], bool], duration: float | None = None) -> ServerReport:
-        """Answer every SYNC.
+        """Answer every SYNC until ``stopped`` or ``duration``, s; raises BusDown if the only bus goes down.
 
-        ``stopped``: function that returns ``True`` to end. ``duration``: longest duration, s; ``None``: unlimited.
-        Raises BusDown if the only bus goes down; with several buses the others go on, and a bus that is back is served
-        again.
+        Of several buses the others go on, and a bus that is back is served again.
         """
         begin, cpu = time.monotonic(), time.process_time()
 

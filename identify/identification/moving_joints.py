@@ -32,9 +32,6 @@ def moving_joints(experiments: Sequence[Experiment], robot: RobotConfig, criteri
     """Mask (n,) of the joints that move; the others are at rest by the limits of ``criteria``.
 
     A joint whose recorded reference rests is at rest, whatever disturbances deflect it.
-
-    ``experiments``: recordings of the robot; ``criteria``: limits in encoder counts, position noise, and ranges of
-    limits and other joints.
     """
     ranges = joint_ranges(experiments)
     limits = np.array([joint.limits.position for joint in robot.joints], dtype=np.float64)
@@ -55,11 +52,7 @@ def moving_joints(experiments: Sequence[Experiment], robot: RobotConfig, criteri
 
 
 def require_motion(experiments: Sequence[Experiment], robot: RobotConfig, moving: Mask) -> None:
-    """Raise if no joint moves.
-
-    ``experiments``: recordings of the robot; ``moving``: mask (n,) of the joints that move. Raises DataError if no
-    joint moves; the message gives the largest range.
-    """
+    """Raise DataError, with the largest range, if no joint moves."""
     if moving.any():
         return
     ranges = joint_ranges(experiments)

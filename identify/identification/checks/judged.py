@@ -14,8 +14,8 @@ from armident.identify.identification.support import Support
 class Judged:
     """Parts of an identification that its verdict depends on.
 
-    ``ls``: IDIM-LS, in whose equations errors are measured; ``found``: the estimate of the method; ``solution``:
-    ``None`` for IDIM-LS; ``reasons``: defects that the checks before have found.
+    Errors are measured in the equations of ``ls``; ``solution`` is ``None`` for IDIM-LS; ``reasons`` are of the checks
+    before.
     """
 
     prepared: Prepared

@@ -20,13 +20,9 @@ LEVEL_STD = 0.01
 class FrictionTest:
     """Two CUSUMs per joint: more friction, and less, than the slow level of the joint.
 
-    With relative change c of a window, its standard deviation s, level l, tolerated change a and sought change b, the
-    sum grows by ``(b - a) / s^2 (c - l - (a + b) / 2)``, which is the log-likelihood ratio of b against a. Growth per
-    window is limited, so that several windows are needed. The mean number of windows to a false alarm is at least
-    ``exp(h)`` for the threshold h, because the ratio has a mean of at most one while the friction is healthy
-    (Lorden 1971).
-
-    ``settings``: changes, false-alarm rate and memories.
+    With change c, its standard deviation s, level l, tolerated a and sought b, the sum grows by ``(b - a) / s^2 (c - l
+    - (a + b) / 2)``, the log-likelihood ratio. Its limit per window requires several windows. The mean number of
+    windows to a false alarm is at least ``exp(h)`` for the threshold h (Lorden 1971).
     """
 
     _saved = ("sums", "level", "spread", "spread_weight", "last", "last_std", "alarm", "alarm_change", "windows")
@@ -48,11 +44,9 @@ class FrictionTest:
         self.windows = 0
 
     def add(self, change: Array, std: Array, instant: int, valid: NDArray[np.bool_]) -> None:
-        """Add the estimate of a window.
+        """Add a window's relative change and its standard deviation (n,), 1; only ``valid`` joints (n,) raise alarms.
 
-        ``change``, ``std``: relative change of each joint's friction and its standard deviation, (n,), 1. ``instant``:
-        number of the decimated instant at its end; it dates an alarm. ``valid``: mask (n,) of the joints with enough
-        excitation; the others raise no alarm.
+        ``instant``: number of the decimated instant at its end, which dates an alarm.
         """
         self.windows += 1
         known = np.isfinite(change) & np.isfinite(std)
