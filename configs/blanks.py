@@ -16,10 +16,9 @@ LOG = "import of a bus log"
 
 @dataclass(frozen=True)
 class Need:
-    """Use of a key that may be blank.
+    """Use of a key that may be blank; ``how``: way to find the value.
 
-    ``commands`` need the value; ``how`` tells the user how to find it. ``placeholder`` gives a required key a value
-    from the position of its entry.
+    ``placeholder`` is the value of a required key, from the position of its entry in the list; else the default counts.
     """
 
     commands: tuple[str, ...]
@@ -85,7 +84,7 @@ def pattern(key: str) -> str:
 
 
 def without_marks(data: dict[str, Any]) -> tuple[dict[str, Any], tuple[str, ...]]:
-    """Content of a file without its blanks (a list with a blank is one), and their keys; placeholders if required."""
+    """Content of a file without blanks and lists with one, and their keys; required keys have placeholders."""
     blanks: list[str] = []
     content = _stripped(data, "", 0, blanks)
     return content, tuple(blanks)

@@ -27,10 +27,9 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class MdhChain:
-    """A serial chain in modified Denavit-Hartenberg parameters.
+    """A serial chain in MDH parameters; offsets of the variables are in ``theta`` (revolute) or ``r`` (prismatic).
 
-    ``base`` (4, 4) is frame 0 in the frame of the axes, z along the first one. ``frames`` (n, 4, 4) are frames 1 to n
-    in it, all variables zero. The offsets of the variables are in ``theta`` or ``r``.
+    ``base`` (4, 4): frame 0 in the frame of the axes, z along the first; ``frames`` (n, 4, 4): 1 to n in it, at zero.
     """
 
     base: Floats

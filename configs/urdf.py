@@ -1,7 +1,6 @@
 """Geometry of a robot from URDF: the chain from base to tip as modified Denavit-Hartenberg parameters.
 
-Masses are ignored, because the dynamics are identified; `armident.configs.urdf_inertials` reads them for the virtual
-arm.
+Masses are ignored, because the dynamics are identified; only the virtual arm reads them (`urdf_inertials`).
 """
 
 import re
@@ -106,10 +105,7 @@ class UrdfGeometry(FrozenModel):
 
 
 def geometry_from_urdf(given: UrdfGeometry, where: Path) -> dict[str, Any]:
-    """Convert a URDF to ``joints``, ``gravity`` and ``collision`` of a configuration, in frames of the chain.
-
-    Raises ConfigError, with file and element, if the URDF is wrong or not a serial chain.
-    """
+    """Convert a URDF to ``joints``, ``gravity`` and ``collision`` of a configuration; ConfigError if it is wrong."""
     file = urdf_file(given, where)
     joints = read_chain(file, given.urdf.base, given.urdf.tip)
     chain = mdh_of(joints, file)
@@ -188,10 +184,7 @@ def _additions(
 
 
 def joint_names(names: list[str], file: Path) -> list[str]:
-    """Names of joints in a configuration: those of the URDF, or ``joint_1``, ... by place if no Latin letter is left.
-
-    Raises ConfigError if names in Latin letters differ only in case or punctuation.
-    """
+    """Names of joints in Latin letters, else ``joint_1``, ...; ConfigError if only case or punctuation differs."""
     plain = [joint_name(name) for name in names]
     for k, name in enumerate(names):
         twins = [other for other in plain if other.lower() == plain[k].lower()]

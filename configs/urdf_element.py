@@ -13,7 +13,7 @@ LARGEST = 1e9
 
 
 def only(file: Path, element: ET.Element, tag: str, of: ET.Element | None = None) -> ET.Element | None:
-    """Return the child element of a name, or ``None``; raises ConfigError if two differ. ``of``: joint or link."""
+    """Return the child element of a name, or ``None``; ConfigError if two differ. ``of``: its joint or link."""
     found = element.findall(tag)
     contents = {tuple((part.tag, *sorted(part.items())) for part in each.iter()) for each in found}
     if len(contents) > 1:

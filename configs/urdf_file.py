@@ -40,11 +40,7 @@ def expand(file: Path) -> str:
 
 
 def parse_urdf(file: Path) -> ET.Element:
-    """Root element of a URDF file.
-
-    Raises ConfigError if it is unreadable, no XML, xacro, or has an attribute longer than ``LONGEST`` or names in
-    another case.
-    """
+    """Root element of a URDF file; raises ConfigError if it is unreadable or xacro, or has names in another case."""
     try:
         content = file.read_bytes().lstrip()
     except OSError as error:

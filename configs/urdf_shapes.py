@@ -22,10 +22,9 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class UrdfShape:
-    """One shape of a link.
+    """One shape of a link, named by its joint (or ``base``); ``placement``: in frame j of the link (4, 4).
 
-    ``link``: the joint that moves it, or ``base``. ``placement``: in frame j (4, 4). ``kind``: ``box``, ``cylinder``,
-    ``sphere``, ``mesh`` of ``size``: edges; radius, length; radius, m; scale.
+    ``size``: edges of a box, radius and length of a cylinder, or radius of a sphere, m; scale of a mesh.
     """
 
     link: str
@@ -44,10 +43,7 @@ class UrdfShapes:
 
 
 def read_shapes(file: Path, base: str | None = None, tip: str | None = None) -> UrdfShapes:
-    """Shapes of the links between two links of a URDF; links on fixed joints belong to the link that carries them.
-
-    Raises ConfigError, with file and element, if the file is wrong or a shape has no size.
-    """
+    """Shapes of the links between two links of a URDF, each with those fixed to it; ConfigError if one is wrong."""
     joints = read_chain(file, base, tip)
     given = [joint.name for joint in joints]
     names = joint_names(given, file)

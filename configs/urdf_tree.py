@@ -30,10 +30,9 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class UrdfJoint:
-    """A moving joint of a chain.
+    """A moving joint of a chain; ``limits``: ``position``, ``velocity``, ``torque``, SI.
 
-    ``placement`` (4, 4) is its frame in the base link with all variables zero, ``axis`` (3,) a unit vector in that
-    frame. ``limits``: ``position``, ``velocity``, ``torque``, SI.
+    ``placement`` (4, 4): its frame in the base link, all variables zero; ``axis`` (3,): unit vector in that frame.
     """
 
     name: str
@@ -44,10 +43,9 @@ class UrdfJoint:
 
 
 def read_chain(file: Path, base: str | None = None, tip: str | None = None) -> tuple[UrdfJoint, ...]:
-    """Moving joints between two links of a URDF, with fixed joints merged into the placements.
+    """Moving joints between two links of a URDF, with fixed joints merged into the placements; else ConfigError.
 
-    Fixed side branches belong to their link; branches at the base are ignored, and links after the tip are its load.
-    Raises ConfigError if the file is no tree, the chain branches, or a joint cannot be part of it.
+    Fixed side branches belong to their link, links after the tip are its load; branches at the base are ignored.
     """
     tree = read_tree(file)
     base, path = tree.path(base, tip)
@@ -138,7 +136,7 @@ class UrdfTree:
         return base, self.path_to(base, self.known(tip, "urdf.tip"))
 
     def path_to(self, base: str, tip: str) -> list[ET.Element]:
-        """Joints from base to tip; raises ConfigError if the base does not move the tip, or a mover branches off."""
+        """Joints from base to tip; ConfigError if the base does not move the tip or a moving joint branches off."""
         path: list[ET.Element] = []
         link = tip
         while link != base:
@@ -187,7 +185,7 @@ class UrdfTree:
         return element.get("type", "")
 
     def origin(self, element: ET.Element, found: ET.Element | None) -> Floats:
-        """Placement (4, 4) of a joint in its parent link, or of an inertia in its link; ``None``: its origin."""
+        """Placement (4, 4) of a joint in its parent link, or of an inertia in its link; ``None``: no offset."""
         frame = np.eye(4)
         if found is not None:
             frame[:3, :3] = self._orientation(element, found)

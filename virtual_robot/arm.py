@@ -163,10 +163,9 @@ def design_drives(
     scenario: Scenario | None,
     parameters: ArmParameters,
 ) -> servo.Servo:
-    """Design the drives of a virtual arm: gains of the scenario, else those of its configuration, else tuned gains.
+    """Design the drives of a virtual arm: gains of the scenario, else of its configuration, else tuned ones.
 
-    ``mass`` (n, n): mass matrix of the healthy arm at power-on, joint side, with rotors. Raises ConfigError if gains do
-    not fit.
+    ``mass`` (n, n): of the healthy arm at power-on, joint side, with rotors. Raises ConfigError if gains do not fit.
     """
     given = None if scenario is None or scenario.controller is None else scenario.controller
     known = None if given is None else given.gains

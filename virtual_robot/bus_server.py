@@ -127,7 +127,7 @@ class DriveBus:
         return self._syncs[-1] if self._syncs else None
 
     def answer(self, sequence: int) -> None:
-        """Queue the answers to the next SYNC (counter, if it carries none) and apply set points."""
+        """Queue the answers to the next SYNC and apply set points; ``sequence`` counts a SYNC without a counter."""
         self._syncs.pop()
         at = self.take(self._at, self._count, sequence)
         self._at = at + 1

@@ -96,11 +96,7 @@ log = _ElapsedTime(logging.getLogger(__name__), {})
 
 @dataclass(frozen=True)
 class DemoOptions:
-    """Options of ``armident demo``; ``config``: default the TX40; ``quick``: capture and identification only.
-
-    ``keep_going``: leave the arm running until Ctrl-C. ``scenario``: of the second part, default direction-dependent
-    friction.
-    """
+    """Options of ``armident demo``; ``quick``: first part only; ``keep_going``: leave the arm running until Ctrl-C."""
 
     out: Path
     keep_going: bool = False
@@ -136,11 +132,7 @@ class Subject:
 
 
 def demo(options: DemoOptions) -> None:
-    """Run both parts and write the report.
-
-    Raises ConfigError if a configuration or the bus is wrong, ArmidentError, with the end of its output, if a process
-    fails.
-    """
+    """Run both parts and write the report; raises ArmidentError, with the end of its output, if a process fails."""
     out = options.out.resolve()
     subject = _subject(options, out)
     subject = subject.at(_session_for_this_machine(subject.session, options))

@@ -40,8 +40,7 @@ DRY, VISCOUS = (0.05, 0.6), (0.05, 0.8)
 class TorqueScale:
     """Typical loads of the joints over postures, joint side, (n,) each, SI.
 
-    ``inertia``: mean diagonal of the mass matrix with rotors; ``gravity``: root mean square; ``torque``: acceleration
-    and gravity.
+    ``inertia``: mean diagonal of the mass matrix with rotors; ``gravity``: rms; ``torque``: with acceleration.
     """
 
     inertia: Floats

@@ -85,8 +85,8 @@ def amplitudes(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Standard deviations (n,) of both parts of the noise, N m or N.
 
-    ``white``: torque of the motors, motor side, of a mean over ``averaged`` periods. ``slow``: disturbance of the
-    joints with the corner `DISTURBANCE_HZ`.
+    White: torque of a motor, motor side, mean of ``averaged`` periods. Slow: torque of a joint, corner
+    `DISTURBANCE_HZ`.
     """
     size = SIZES[robot.name] if size is None else size
     total, low = np.array(size.sampled), np.array(size.decimated)

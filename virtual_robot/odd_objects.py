@@ -18,7 +18,7 @@ ABORT_VALUE_RANGE = 0x06090030
 
 
 class Absent(Oddity):
-    """An object, or sub-index, that the drive does not have; or, without ``guarding``, node guarding either."""
+    """An object, or sub-index, that the drive does not have; without ``guarding`` it has no node guarding either."""
 
     def __init__(self, index: int, subindex: int | None = None, guarding: bool = True) -> None:
         self._index, self._subindex, self.answers_guarding = index, subindex, guarding
@@ -56,7 +56,7 @@ class InterpolationRounds(Oddity):
 
 
 class Bit30(Oddity):
-    """Bit 30 of the COB-IDs of TPDOs: ``demanded``, and refused without it, or else set."""
+    """Bit 30 of the COB-IDs of TPDOs: it is set, or ``demanded``: COB-IDs without it are refused."""
 
     def __init__(self, demanded: bool) -> None:
         self._demanded = demanded

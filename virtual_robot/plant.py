@@ -152,7 +152,7 @@ class Plant:
     def acceleration(
         self, q: NDArray[np.float64], qd: NDArray[np.float64], tau: NDArray[np.float64], t: float = 0.0
     ) -> NDArray[np.float64]:
-        """Accelerations (N,) by direct dynamics at joint torques (n,), N m or N; exact, and bristles slide steadily."""
+        """Accelerations (N,) at torques (n,), N m or N, without `advance`'s approximations; bristles slide steadily."""
         n, total = self.q.size, self.coordinates.size
         force, slope = np.zeros(total), np.zeros((total, total))
         force[:n] = self.resistance(q[:n], qd[:n], t) - tau

@@ -39,10 +39,9 @@ MOTION_ERROR, COMMUNICATION_ERROR = 0x20, 0x10
 
 @dataclass(frozen=True)
 class ServerReport:
-    """Timing of the drives' answers.
+    """Timing of the drives' answers: time that a SYNC waited in the kernel, us, and frames that the kernel dropped.
 
-    Delays, us, are times that a SYNC waited in the kernel; ``backlog_max``: SYNCs received at once; ``dropped``: frames
-    dropped by the kernel.
+    ``backlog_max``: SYNCs received at once.
     """
 
     syncs: int
@@ -71,10 +70,9 @@ class ServerReport:
 
 
 class Server:
-    """All virtual drives of a session on its buses; use it in a ``with`` block.
+    """All virtual drives of a session on its buses (``with`` block), with the names of oddities by joint.
 
-    ``oddities``: names of the oddities of drives, by joint. Raises ConfigError if a bus is missing or an EDS is
-    unusable.
+    Raises ConfigError if a bus is missing or an EDS is unusable.
     """
 
     def __init__(

@@ -137,8 +137,7 @@ def gains(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Gains ``kp`` (1/s) and ``kv`` (A s/rad), (n,) each, motor side, for two equal poles at the given bandwidths.
 
-    ``mass`` (n, n): at the posture of tuning, joint side, with rotors. The last bandwidth counts for all further
-    joints.
+    ``mass`` (n, n): at the posture of tuning, joint side, with rotors. The last bandwidth counts for further joints.
     """
     inverse = np.linalg.inv(robot.transmission_matrix)
     inertia = np.diag(inverse.T @ mass @ inverse)

@@ -39,10 +39,7 @@ SYNC_PERIOD_US = 1000
 
 @dataclass(frozen=True)
 class Twin:
-    """Virtual arm of a configuration, completed with everything a drive needs; ``assumed``: sentences on what was open.
-
-    ``trajectory``: motion for a session without set points.
-    """
+    """Virtual arm of a configuration, and its assumptions; ``trajectory``: motion without set points in the session."""
 
     source: Path
     session: SessionConfig

@@ -43,10 +43,9 @@ Array = NDArray[np.float64]
 
 
 class ClosedLoop(NamedTuple):
-    """The simulated closed loop of an estimator, and the parameters (b,) of its first iterate.
+    """The simulated closed loop of an estimator, first theta (b,), and why a preferred controller was not used.
 
-    ``controller``: as in the document, with the error of simulated velocities, percent. ``warnings``: why none
-    preferred was used.
+    ``controller``: as in the document, with the error of the simulated velocities, percent.
     """
 
     auxiliary: AuxiliaryModel
@@ -123,8 +122,7 @@ def closed_loop(
 def _bandpassed(options: Options, bandwidth: float, dt: float) -> Callable[[Array, int], Derivatives] | None:
     """The bandpass of the measured positions, for the instruments; ``None`` where another filter was chosen.
 
-    Else instruments of IDIM-PIV hold frequencies that the measured regressor lacks, which the prefilter takes for
-    information.
+    Other instruments have frequencies that the regressor lacks; the prefilter of IDIM-PIV takes them for information.
     """
     if options.derivatives != "bandpass" or not estimator(options.method).measured:
         return None

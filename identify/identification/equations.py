@@ -75,10 +75,9 @@ def aligned_torque(tau: NDArray[np.float64], late: float = 0.0) -> NDArray[np.fl
 def equations(
     model: ArmModel, experiments: Sequence[Experiment], signals: Sequence[Derivatives], decimation: Decimation
 ) -> Sequence[ExperimentEquations]:
-    """Filtered and decimated equations of every experiment.
+    """Filtered and decimated equations of every experiment, without rows slower than a ``velocity_threshold``.
 
-    The sign of the velocity is smoothed, so all samples stay, as a linear filter requires; with a
-    ``velocity_threshold`` slower rows are left out.
+    Without one all samples stay, as a linear filter requires: the sign of the velocity is smoothed.
     """
     threshold = model.robot.friction.velocity_threshold
 

@@ -34,8 +34,7 @@ Array = NDArray[np.float64]
 class StretchRule:
     """Size from which a recording is identified in stretches, of which one is in memory at a time.
 
-    ``beyond``: values (samples times joints), each of up to 260 bytes in an identification; ``length``: values of a
-    stretch.
+    In values (samples times joints), each of up to 260 bytes in an identification; ``length`` of a stretch.
     """
 
     beyond: int = 12_000_000
@@ -52,8 +51,7 @@ def experiments_from_recording(
     """Experiments of a recording in SI units on the joint side, cut at the experiment marks and at gaps; and remarks.
 
     Joint positions are ``R^-1 q_motor`` and joint torques ``R' tau_motor`` (thesis equation 2.14 and section B.1). The
-    reference between two set points is the straight line that a CiA 402 drive interpolates (60C2h). Raises ConfigError
-    if the robot lacks a value, DataError if the recording does not suit it.
+    reference between set points is straight, as a CiA 402 drive interpolates (60C2h). Raises ConfigError or DataError.
     """
     try:
         robot.check_filled("identify")
@@ -317,8 +315,7 @@ def rest_notes(experiments: Sequence[Experiment], robot: RobotConfig) -> list[st
 def _rate_notes(recording: Recording) -> list[str]:
     """Notes on a SYNC rate that differs from the nominal one by the receive times.
 
-    A producer held up by whole periods counts them (``sync_skipped_periods``): no clock error, but the arm of a
-    physical bus moves.
+    Whole periods that the producer skipped and counted are no clock error, but matter where a real arm moves on.
     """
     samples, nominal = recording.samples, recording.sample_rate_hz
     elapsed = float(samples.t_ns[-1] - samples.t_ns[0]) * 1e-9

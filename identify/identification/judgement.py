@@ -60,8 +60,7 @@ def refusing_singular(
 ) -> Iterator[None]:
     """Turn equations without a finite solution into a `DataError` that lists what the motion supports.
 
-    Floating-point warnings are suppressed: the verdict states the defect. Scipy reports numbers not finite as
-    ``ValueError``.
+    Floating-point warnings are suppressed. Scipy reports numbers that are not finite as ``ValueError``.
     """
     try:
         with np.errstate(invalid="ignore", divide="ignore", over="ignore"), warnings.catch_warnings():

@@ -30,10 +30,9 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class MotionDependence:
-    """Dependence of the residuals of one joint on its ``position`` (and direction) or ``velocity``.
+    """Dependence of one joint's residuals on ``position`` (and direction) or ``velocity``.
 
-    ``share``: of their power, explained beyond chance, 0 to 1; ``deviation``: of it from its mean under shifts,
-    standard deviations.
+    ``share``: power explained beyond chance, 0 to 1; ``deviation``: of it from its mean under shifts, in their std.
     """
 
     joint: int

@@ -76,9 +76,8 @@ def identify_experiment(
 ) -> IdentificationResult:
     """Identify the base parameters of a robot, and judge the result.
 
-    Steps: derivatives (5.1), IDIM-LS (2.3.2), controller (5.2), closed loop, IDIM-IV (2.3.3) or IDIM-PIV (6.2.2).
-    IDIM-LS always starts the iterations. Raises ConfigError or DataError if configuration or data do not support the
-    request.
+    Derivatives (5.1), IDIM-LS (2.3.2), which starts the iterations, controller (5.2), closed loop, and IDIM-IV (2.3.3)
+    or IDIM-PIV (6.2.2). Raises ConfigError or DataError if it is impossible.
     """
     if isinstance(experiments, Experiment):
         experiments = [experiments]
@@ -295,10 +294,7 @@ def _statistics(prepared: Prepared, found: MethodResult, solution: Solution | No
 
 
 def _defect_of_loop(solution: Solution, signals: Sequence[Derivatives]) -> str:
-    """Reason why the instruments of an estimate are unsuitable; empty if they are suitable.
-
-    At the edge of stability iterates do not settle, or settle where the instruments have little to do with the motion.
-    """
+    """Reason why the instruments of an estimate are unsuitable, as at the edge of stability; empty if suitable."""
     runs = solution.runs
     if runs is None:
         defect = "diverges with"

@@ -47,12 +47,11 @@ RANK = 1e-10
 
 @dataclass(frozen=True)
 class JointResidualStatistics:
-    """Statistics of the residuals of one joint.
+    """Statistics of the residuals of one joint; knots span ``position_range`` and ``velocity_limit``.
 
-    ``score`` (k,) and ``information`` (k, k) are ``P' W e`` and ``P' W P`` of the functions P without their projection
-    on the regressor, W the inverse noise covariance. Coefficients are ``information^-1 score``, covariance
-    ``information^-1``; the first ``2 POSITION_KNOTS`` are of position. Knots span ``position_range`` and
-    ``velocity_limit``. Powers (m,), N^2 m^2 or N^2, are chi-square.
+    ``score`` (k,) is ``P' W e`` and ``information`` (k, k) is ``P' W P``, W the inverse noise covariance and P the
+    functions without their projection on the regressor, first ``2 POSITION_KNOTS`` of position. Coefficients are
+    ``information^-1 score`` with covariance ``information^-1``. Powers (m,), N^2 m^2 or N^2, are chi-square.
     """
 
     joint: str
@@ -115,10 +114,9 @@ def _hats(x: Array, knots: Array) -> Array:
 
 
 def band_powers(series: Sequence[Array], noise: ArModel) -> tuple[Array, Array]:
-    """Mean square of residuals in the frequency bands and the degrees of freedom of each.
+    """Mean square of residuals in the frequency bands and its degrees of freedom, by Satterthwaite's approximation.
 
-    Satterthwaite's approximation with the spectrum of the noise model; ordinates of a periodogram are chi-square, each
-    with 2.
+    Its spectrum is that of the noise model; ordinates of a periodogram are chi-square with two degrees each.
     """
     bands = len(BANDS) - 1
     power, sums, squares = np.zeros(bands), np.zeros(bands), np.zeros(bands)

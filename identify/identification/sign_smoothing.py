@@ -1,7 +1,6 @@
 """Smoothing of the sign of each joint's velocity, chosen from the recorded motion (thesis appendix B.2).
 
-``sign(qd)`` is ``(2/pi) atan(g qd)``. ``1/g`` is a velocity: 150 s/rad saturates on a wrist of some rad/s, not on a
-slow lift.
+The width ``1/g`` of ``(2/pi) atan(g qd)`` is a velocity: 150 s/rad saturates on a wrist, but not on a slow lift.
 """
 
 from collections.abc import Sequence
@@ -65,8 +64,7 @@ def recorded_speeds(experiments: Sequence[Experiment], bandwidth_hz: float) -> S
 def with_sign_smoothing(robot: RobotConfig, experiments: Sequence[Experiment], bandwidth_hz: float) -> RobotConfig:
     """Return the configuration with a number for each joint's ``friction.sign_smoothing``, where it gives none.
 
-    The width ``1/g`` is ``1 / SATURATION`` of the top speed, but not below the noise of the velocity, whose sign it
-    would be.
+    The width ``1/g`` is ``1 / SATURATION`` of the top speed, but not below the noise of the velocity.
     """
     if robot.friction.sign_smoothing is not None:
         return robot

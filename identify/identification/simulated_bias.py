@@ -39,8 +39,7 @@ from armident.identify.signals.streamed import kept, mapped
 SIMULATION_ERROR = 0.15
 """Standard deviation of the part of the bias that the simulation misses, over the bias.
 
-Measured on one axis of 0.02 to 0.15 m/s at 1 kHz with encoder noise of 0 to 20 um: 0.88 to 1.13 of the bias is
-simulated.
+On one axis of 0.02 to 0.15 m/s at 1 kHz, encoder noise of 0 to 20 um, 0.88 to 1.13 of the bias was measured.
 """
 
 DOMINANT = 1.0 / SIMULATION_ERROR
@@ -88,8 +87,8 @@ def simulated_bias(
 ) -> SimulatedBias | None:
     """Bias of an instrumental-variable estimate; ``None`` if its loop fails or leaves parameters undetermined.
 
-    ``weights``: noise model of each joint in the weights. ``runs``: default few where the bias is irrelevant, else
-    many. ``share``: of the experiments that are simulated.
+    ``weights``: noise models of the joints; ``share``: of experiments simulated; ``runs``: few if irrelevant, else
+    many.
     """
     auxiliary, theta = auxiliary.fresh(), estimate.theta
     clean = auxiliary.simulate(theta)
@@ -208,8 +207,7 @@ def least_squares_bias(
 ) -> SimulatedBias:
     """Return the bias of IDIM-LS, which knows no closed loop: the smoothed motion counts as the true one.
 
-    Encoder noise is added open-loop, without the part through the controller. ``smooth(positions, k)``: derivatives (N,
-    n) of experiment k.
+    Encoder noise is added open-loop. ``smooth(positions, k)``: derivatives of positions (N, n) of experiment k.
     """
     model, theta = prepared.model, estimate.theta
     weights = joint_variances(blocks, theta)

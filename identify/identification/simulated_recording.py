@@ -13,10 +13,10 @@ from armident.identify.signals.bandwidth import motion_bandwidth
 
 
 def simulate_model(model: RobotModel, trajectory: Trajectory, rate_hz: float | None = None) -> Recording:
-    """Simulate the recording of an arm that is exactly the model, with its effects, and without noise; SI, joint side.
+    """Simulate the recording of an arm that is exactly the model, with its effects, without noise; SI, joint side.
 
-    Dynamics are of the identification (thesis section B.3), the controller of the configuration, else a critically
-    damped PD. Raises ConfigError if the trajectory leaves the limits, DataError if the loop diverges.
+    Dynamics: thesis section B.3; controller: known, else a critically damped PD. Raises ConfigError or DataError if the
+    trajectory leaves the limits or the loop diverges.
     """
     robot, arm = model.robot, model.arm
     trajectory.check(robot)

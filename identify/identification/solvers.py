@@ -154,10 +154,7 @@ class IdentificationProblem:
 
 @dataclass(frozen=True)
 class Solution:
-    """Estimate with the problem that it solves, and the bias (b,), SI, that was subtracted; ``None``: irrelevant.
-
-    ``prefiltered``: noise models weighted the rows, else they only entered the covariance.
-    """
+    """Estimate with its problem and the bias (b,), SI, that was subtracted; ``prefiltered``: with weighted rows."""
 
     estimate: Estimate
     problem: IdentificationProblem

@@ -76,9 +76,8 @@ def examine_support(
 ) -> Support:
     """Find the base parameters that a motion supports, by rank-revealing QR of the weighted regressor.
 
-    Joints at rest are held still, so that noise is no excitation. In the order of pivoted QR, the largest leading
-    subset counts in which one standard deviation moves the torques by less than ``max_relative_std``. ``None``: torque
-    variances weigh.
+    Joints at rest are held still, so that noise is no excitation. The largest leading subset of pivoted QR counts in
+    which one standard deviation moves the torques by less than ``max_relative_std``.
     """
     model = prepared.model
     b, rows = model.base.b, 0

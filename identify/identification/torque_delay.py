@@ -1,10 +1,9 @@
 """Delay between torque and position, estimated with the inverse dynamic model (thesis 2.33).
 
-A torque held from sample to sample is reported half a sample early; filters and buses delay it. To first order, ``tau =
-phi theta + delta d(phi theta)/dk + e`` where ``tau(k)`` belongs to the instant ``k + delta``.
-
-In a closed loop least squares finds a delay in the noise itself, because a disturbance moves the arm before the torque.
-The instruments of IDIM-IV are independent of it: regressors along the reference or a simulated motion.
+A torque held from sample to sample is reported half a sample early; filters and buses delay it. If ``tau(k)`` belongs
+to the instant ``k + delta``, ``tau = phi theta + delta d(phi theta)/dk + e`` to first order. In a closed loop a
+disturbance moves the arm before the torque, so that least squares finds a delay in the noise itself. Instruments of
+IDIM-IV, along the reference or a simulated motion, are independent of it.
 """
 
 from collections.abc import Sequence
@@ -75,9 +74,8 @@ def torque_delay(
 ) -> TorqueDelay:
     """Delay between torque and position of every joint, in fractions of samples, beside all base parameters.
 
-    Standard deviations allow for serial correlation. Coupled motors give the mixture that acts on the joint.
-    ``instruments``: default the references, else the measured motion (least squares). ``regressors`` (M, n, b):
-    filtered, of both motions.
+    Instruments are by default the references, else the measured motion (least squares). Coupled motors give a mixture.
+    ``regressors`` (M, n, b) are filtered; standard deviations allow for serial correlation.
     """
     references = [e.q_ref for e in experiments if e.q_ref is not None]
     instrumented = instruments is not None or len(references) == len(experiments)

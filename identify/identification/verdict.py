@@ -44,8 +44,7 @@ def judge(reasons: Sequence[Reason], setup: SetupCheck | None = None) -> Verdict
 def _merged(reasons: Sequence[Reason], setup: SetupCheck | None) -> list[Reason]:
     """Reasons of the set-up and of the result, each defect once.
 
-    Rest is a matter of the excitation, a common delay of the set-up; joints not explained are in the reason with their
-    error.
+    Rest belongs to the excitation, a common delay to the set-up, and unexplained joints to the reason with their error.
     """
     if setup is None:
         return list(reasons)

@@ -12,10 +12,9 @@ from armident.identify.identification.support import Support
 
 @dataclass(frozen=True)
 class Judged:
-    """Parts of an identification that its verdict depends on.
+    """Parts of an identification that its verdict depends on; errors are measured in the equations of ``ls``.
 
-    Errors are measured in the equations of ``ls``; ``solution`` is ``None`` for IDIM-LS; ``reasons`` are of the checks
-    before.
+    ``solution`` is ``None`` for IDIM-LS; ``reasons`` are of the checks before.
     """
 
     prepared: Prepared

@@ -40,10 +40,9 @@ _NAME = re.compile(r"([a-z]+?)(m?\d+)r?(?:_\d+)?$")
 
 @dataclass(frozen=True)
 class Group:
-    """Parameters of one joint or coupling, tested together because their estimates are correlated.
+    """Parameters of one joint or coupling (``place``), tested together because their estimates are correlated.
 
-    ``place``: number of the joint or name of the coupling. ``chi_square``: with all other parameters free. ``p_value``:
-    corrected as in `ParameterChangeTest`.
+    ``chi_square`` is of their differences with all other parameters free; ``p_value`` as in `ParameterChangeTest`.
     """
 
     kind: Literal["friction", "masses"]

@@ -1,7 +1,6 @@
-"""Tables of the history, their versions (in the database), and their upgrade from former versions.
+"""Tables of the history, their versions, and their upgrade; databases of version 0.1 have the number 0.
 
-SQLite has ``PRAGMA user_version``, others a row of ``armident_history_version``. Version 0.1 has number 0 and tables of
-1.
+The version is ``PRAGMA user_version`` of SQLite, or a row of ``armident_history_version``.
 """
 
 import sqlite3

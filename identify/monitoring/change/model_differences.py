@@ -37,8 +37,7 @@ def model_differences(
 def _smoothing(baseline: IdentificationDocument, now: IdentificationDocument, std: Mapping[str, float]) -> str:
     """Line on joints whose Coulomb friction is shifted by more than one standard deviation.
 
-    At a velocity ``v`` the smoothed sign lacks ``2 / (pi g v)``, so that another ``g`` shifts Coulomb friction by that
-    share.
+    The smoothed sign lacks ``2 / (pi g v)`` at a velocity ``v``; another ``g`` shifts Coulomb friction by that share.
     """
     one, other = baseline.sign_smoothing or {}, now.sign_smoothing or {}
     values = {p.name: p.value for p in now.parameters}

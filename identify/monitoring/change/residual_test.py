@@ -33,10 +33,9 @@ NOT_COMPARED = (
 
 @dataclass(frozen=True)
 class ResidualChange:
-    """Test of one property of the residuals of one joint; ``band_hz`` only of ``power``.
+    """Test of one property of the residuals of one joint, by chi-square or, of ``power``, by a ratio of powers.
 
-    ``statistic``, ``degrees``: chi-square, or ratio of the powers and degrees of the later one. ``p_value``: without a
-    change, by Holm's method for all joints and kinds.
+    ``p_value``: probability without a change, corrected by Holm's method for all joints and kinds.
     """
 
     joint: str

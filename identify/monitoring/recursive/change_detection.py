@@ -20,9 +20,9 @@ LEVEL_STD = 0.01
 class FrictionTest:
     """Two CUSUMs per joint: more friction, and less, than the slow level of the joint.
 
-    With change c, its standard deviation s, level l, tolerated a and sought b, the sum grows by ``(b - a) / s^2 (c - l
-    - (a + b) / 2)``, the log-likelihood ratio. Its limit per window requires several windows. The mean number of
-    windows to a false alarm is at least ``exp(h)`` for the threshold h (Lorden 1971).
+    For a change c with standard deviation s, level l, tolerated a and sought b, each grows by the log-likelihood ratio
+    ``(b - a) / s^2 (c - l - (a + b) / 2)``, limited, so that an alarm needs several windows. The mean number of windows
+    to a false alarm is at least ``exp(h)`` for the threshold h (Lorden 1971).
     """
 
     _saved = ("sums", "level", "spread", "spread_weight", "last", "last_std", "alarm", "alarm_change", "windows")
@@ -44,10 +44,7 @@ class FrictionTest:
         self.windows = 0
 
     def add(self, change: Array, std: Array, instant: int, valid: NDArray[np.bool_]) -> None:
-        """Add a window's relative change and its standard deviation (n,), 1; only ``valid`` joints (n,) raise alarms.
-
-        ``instant``: number of the decimated instant at its end, which dates an alarm.
-        """
+        """Add a window, dated by ``instant``: relative change and std (n,), 1; only ``valid`` joints raise alarms."""
         self.windows += 1
         known = np.isfinite(change) & np.isfinite(std)
         self._add_spread(change, std, known)

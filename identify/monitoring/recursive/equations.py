@@ -29,10 +29,9 @@ EARLIER = 2
 
 @dataclass(frozen=True)
 class Instant:
-    """Equations of all joints at one decimated instant.
+    """Equations of all joints at one decimated instant; ``moving`` (n,): share of the low-pass window.
 
-    ``x``, ``z`` (n, b): regressor, measured and predicted by the reference; ``y`` (n,): torques, N m or N; ``moving``
-    (n,): share of the low-pass window.
+    ``x``, ``z`` (n, b): regressor, measured and predicted by the reference; ``y`` (n,): torques, N m or N.
     """
 
     x: Array
@@ -44,10 +43,9 @@ class Instant:
 class StreamEquations:
     """Turns rows of the stream into equations; a gap starts the filters anew.
 
-    Measured and reference positions pass the same live filter and have its delay; the rest is delayed alike. The
-    first-order lag behind the reference is estimated per joint. ``lead``, samples, is that of the torque, up to
-    `EARLIER`: k belongs to ``k + lead``, 0.5 if it is held. Without a reference the regressor is the instrument. Raises
-    DataError if the rate is too low.
+    Measured and reference positions pass the same live filter, whose delay all quantities get. A first-order lag behind
+    the reference is estimated per joint; without a reference the regressor is the instrument. ``lead``: torque k
+    belongs to ``k + lead`` samples, 0.5 if held. Raises DataError if the rate is too low.
     """
 
     _saved = (
@@ -236,8 +234,7 @@ def slow_velocity(model: ArmModel, settings: RecursiveSettings) -> Array:
 def acceleration_delay(nvr: float) -> float:
     """Delay of the acceleration of the live filter of order 3 at low frequencies, samples.
 
-    In steady state it follows ``k^3 / 6`` with a constant delay of the acceleration, of which velocity and position
-    have none.
+    In steady state it follows ``k^3 / 6`` with a constant delay of the acceleration, but none of velocity and position.
     """
     length = int(40 / nvr ** (1 / 6)) + 40
     k = np.arange(length, dtype=np.float64)

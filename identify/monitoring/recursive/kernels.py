@@ -51,8 +51,7 @@ def update(
 ) -> None:
     """Measurement update of the random walk with instruments, equation by equation; a Kalman filter if ``z = x``.
 
-    Young's symmetric form: gain and covariance have the instruments, the innovation the regressor. ``state`` (b,) and
-    ``covariance`` (b, b) change in place; ``x``, ``z`` are (n, b), the others (n,).
+    Young's symmetric form: gain and ``covariance`` (b, b) have the instruments, the innovation the regressor (n, b).
     """
     b = state.size
     gain = np.empty(b)
@@ -143,8 +142,7 @@ def add_residuals(
 ) -> None:
     """Add an instant's residuals (n,), N m or N, to the running autocovariances, in place; ``keep``: share that stays.
 
-    ``past``, ``known`` (L, n): last residuals and masks, latest first; ``sums``, ``counts`` (L + 1, n): of products and
-    weights.
+    ``past``, ``known`` (L, n): last residuals and masks, latest first; ``sums``, ``counts`` (L + 1, n): by lag.
     """
     lags, n = past.shape
     for j in range(n):

@@ -36,10 +36,9 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, eq=False)
 class Reference:
-    """Parameters that friction is compared with, and how far they may move; SI.
+    """Parameters that friction is compared with, and how far they may move; SI. -1 in an index: none.
 
-    ``walk`` (b,): variance added per second of motion; ``window_precision`` (b, b): prior of one window. ``friction``:
-    viscous and Coulomb, indices (n, 2); ``place``: joint (b,); -1: none.
+    ``walk`` (b,): variance per second of motion; ``window_precision`` (b, b): prior of a window; ``friction`` (n, 2).
     """
 
     model: ArmModel
@@ -66,8 +65,8 @@ class Reference:
 def torque_lead(document: IdentificationDocument) -> float:
     """Number of samples by which the torque leads the position, of all joints together.
 
-    A drive holds its torque (0.5), unless joints that know it to a quarter of a sample agree on another lead. Limits as
-    of the check of the set-up: 0.1 to 1 sample, three standard deviations.
+    Torque is held (0.5), unless joints agree, within three standard deviations, on a lead that differs by 0.1 to 1. The
+    joints that count know it to a quarter; the limits are those of the check of the set-up.
     """
     found = np.array(list((document.torque_delay_samples or {}).values())).reshape(-1, 2)
     samples, std = found[np.isfinite(found).all(axis=1) & (found[:, 1] <= KNOWN_LEAD) & (found[:, 1] > 0)].T
@@ -86,10 +85,7 @@ def torque_lead(document: IdentificationDocument) -> float:
 
 
 def reference_from(document: IdentificationDocument, robot: RobotConfig, settings: RecursiveSettings) -> Reference:
-    """Return the reference of an identification document; raises ConfigError if the configuration has effects.
-
-    Raises DataError if the document is unusable, of another robot, or has other parameters.
-    """
+    """Reference of an identification; ConfigError for effects in the configuration, DataError if it does not suit."""
     if robot.effects:
         raise ConfigError(f"robot {robot.name!r} has effects: armident watch needs a configuration without them")
     if document.robot != robot.name:

@@ -39,10 +39,10 @@ class SampleBlock(Protocol):
 
 
 class RowMatcher:
-    """Collects blocks in any cutting and hands over rows with position, torque and reference, in the order of SYNC.
+    """Hands over rows with position, torque and reference in the order of SYNC, from blocks in any cutting.
 
-    With a reference each sample waits for the report after it. ``take``: SYNC numbers (N,) and values (N, w), n columns
-    of each quantity, joint side, SI.
+    ``take``: SYNC numbers (N,) and values (N, w), n columns each, joint side, SI; a reference waits for the next
+    report.
     """
 
     _saved = (

@@ -28,8 +28,7 @@ class Baseline:
 def baseline_of(file: Path | None, history: History | None, robot: str, cell: str) -> Baseline:
     """Baseline of the robot in a cell: the file, else the first run in the history.
 
-    Raises ConfigError if the file is missing and the history has runs (a misspelt name), DataError if it is of another
-    robot.
+    Raises ConfigError if the history has runs but the file is missing (a misspelt name), DataError if it does not fit.
     """
     first = None if history is None else history.first(robot, cell)
     if file is None:

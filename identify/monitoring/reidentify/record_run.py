@@ -28,7 +28,7 @@ Say = Callable[[str], None]
 
 
 def start_process(words: Sequence[str], out: IO[bytes], err: IO[bytes]) -> Process:
-    """Start a command in its own session, so that signals of the terminal reach this process only; it ends with it."""
+    """Start a command in a session of its own, away from the terminal; it stops the arm if this process is killed."""
     return start_command(words, out, err, own_session=True, with_parent=True)
 
 
@@ -41,8 +41,7 @@ class Interrupted(ArmidentError):
 def record_run(config: Path, out: Path, say: Say, start: Start = start_process) -> Recording:
     """Play the set points of a session once under a guard and return the recording, which is always kept.
 
-    Raises ConfigError if bus or drives are not as configured, ArmidentError if guard or drive stopped, Interrupted on
-    signals.
+    Raises ConfigError if the bus is not as configured, ArmidentError if guard or drive stopped, or Interrupted.
     """
     # The guard runs from before the first motion until after the last.
     with _interruptible(), _command(["guard", "--config", str(config)], start) as guard:

@@ -107,8 +107,7 @@ def reidentify_command(asked: ReidentifyOptions, *, as_json: bool) -> int:
 def prepare(config: Path, baseline: Path | None, store: str, out: Path | None, false_alarms: float) -> Job:
     """Load and check the inputs of a job; by default the first run in the history is the baseline.
 
-    Raises ConfigError if there are no set points, or they exceed limits, DataError if the baseline is of another robot
-    or model.
+    Raises ConfigError if set points are missing or beyond limits, DataError if the baseline does not fit.
     """
     session = load_session(config)
     robot = load_robot(session.robot)

@@ -24,8 +24,7 @@ class Announcements:
     def make(self, ledger: Ledger, sha256: str) -> bytes | None:
         """Announce the result or the failure of a claimed recording, and return the document that was announced.
 
-        Raises LinkDown if the session fails; LedgerError if the ledger does: the next call does not repeat the
-        announcement.
+        Raises LinkDown, or LedgerError: then the next call does not repeat the announcement.
         """
         entry = ledger.entry(sha256)
         if entry is None or entry.announced or entry.state == "waiting":

@@ -16,11 +16,7 @@ log = logging.getLogger(__name__)
 
 
 class Intake:
-    """Enters recordings that have ended in the ledger, each once.
-
-    ``lock`` protects ``buffer``, the captures under way; ``refused`` takes capture, message and exit code of an
-    unusable stream.
-    """
+    """Enters recordings that have ended in the ledger, each once; ``refused`` takes streams that cannot be used."""
 
     def __init__(
         self,

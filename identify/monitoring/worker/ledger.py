@@ -70,8 +70,7 @@ class LedgerUnusable(ArmidentError):
 class LedgerEntry:
     """Recording in the ledger: ``waiting``, ``done`` or ``failed``; without files it exists in the stream only.
 
-    ``sha256`` is of its samples; ``attempts`` counts claims, this one included; ``message`` is verdict or reason of the
-    failure.
+    ``sha256``: of its samples; ``attempts``: claims, this one included; ``message``: verdict or reason of failure.
     """
 
     sha256: str
@@ -93,8 +92,8 @@ _FREE = "(owner IS NULL OR boot IS NOT :boot OR lease_until < :now OR owner = :o
 class Ledger:
     """Ledger in a file, shared by all processes that work on the recordings of a folder.
 
-    It is on a local disk (SQLite's write-ahead log). ``lease_s``: end of a claim that is not renewed, s. ``clock``: s,
-    set by nobody. Raises LedgerError if locked or full, LedgerUnusable if damaged or newer.
+    It is on a local disk (SQLite's write-ahead log). ``lease_s``: end of a claim that is not renewed, s. ``clock``: one
+    that nobody sets. Raises LedgerError if locked or full, LedgerUnusable if damaged or newer.
     """
 
     def __init__(
@@ -151,8 +150,7 @@ class Ledger:
     ) -> LedgerEntry | None:
         """Claim a recording without a result or announcement, and return it; ``None`` if there is none.
 
-        Fewest attempts come first, so that one that ends its workers does not hold up others. ``held``: without files,
-        in memory.
+        Fewest attempts come first, so that one that ends its workers holds up no others. ``held``: streams in memory.
         """
         names = {f"h{k}": value for k, value in enumerate(held)}
         here = ", ".join(f":{name}" for name in names)

@@ -84,10 +84,9 @@ class Assembly:
 
 
 class StreamBuffer:
-    """Collects events and blocks by the name of their capture, up to ``most_bytes``.
+    """Collects events and blocks by the name of their capture, up to ``most_bytes``; then its file is read.
 
-    Anybody may publish on the keys of a cell: foreign messages are counted and reported. A capture given up is read
-    from its file.
+    Anybody may publish on the keys of a cell: foreign messages are counted and reported.
     """
 
     def __init__(self, most_bytes: int | None = None, clock: Callable[[], float] = time.monotonic) -> None:

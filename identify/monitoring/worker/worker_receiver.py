@@ -26,8 +26,7 @@ Take = Callable[[bytes | None, int], None]
 class WorkerReceiver:
     """Subscriptions of a worker, up to ``limits`` of event and block, bytes; announcements of others by their hash.
 
-    Their session is their own: a session that announces sends in a single queue, and the captures would lose more
-    bursts of blocks.
+    Their session is their own: one that announces sends in a single queue, and more bursts of blocks would be lost.
     """
 
     def __init__(
