@@ -15,7 +15,7 @@ WITH_VCAN := $(PY) -m armident.drivers.vcan -n 2 --
 PARALLEL := -n auto --dist worksteal
 LINT := $(PY) -m ruff check $(SOURCES) && $(PY) -m ruff format --check $(SOURCES) && $(PY) -m mypy && $(VENV)/bin/lint-imports
 
-.PHONY: help install develop demo check quick test nightly off-bus on-bus coverage lint vcan suite reproduce docs bench lock clean
+.PHONY: help install develop demo check quick test nightly off-bus on-bus coverage lint vcan suite reproduce docs bench lock sbom clean
 
 help: ## what there is to do
 	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "make %-9s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -133,6 +133,12 @@ lock: install ## write both lock files anew from the ranges in pyproject.toml
 	compile --upgrade --extra dev -o .cache/all.lock pyproject.toml
 	echo "setuptools>=77" | compile --extra all -c .cache/all.lock -o requirements.lock pyproject.toml -
 	awk 'NR == FNR {have[$$1]; next} /^[^ ]/ {keep = !($$1 in have)} keep' requirements.lock .cache/all.lock >requirements-dev.lock
+
+sbom: develop ## bill of materials (CycloneDX) of the wheel with all extras, dist/armident.cdx.json
+	@mkdir -p dist
+	$(VENV)/bin/cyclonedx-py requirements --pyproject pyproject.toml --mc-type library --output-reproducible \
+		-o dist/armident.cdx.json requirements.lock
+	echo "bill of materials: dist/armident.cdx.json"
 
 clean: ## remove what make and the tools created
 	@rm -rf $(VENV) .cache src/armident/kernels .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache *.egg-info build dist out demo suite reproduction
