@@ -15,7 +15,7 @@ WITH_VCAN := $(PY) -m armident.drivers.vcan -n 2 --
 PARALLEL := -n auto --dist worksteal
 LINT := $(PY) -m ruff check $(SOURCES) && $(PY) -m ruff format --check $(SOURCES) && $(PY) -m mypy && $(VENV)/bin/lint-imports
 
-.PHONY: help install develop demo check test proof off-bus on-bus coverage lint vcan suite reproduce docs bench lock clean
+.PHONY: help install develop demo check quick test nightly off-bus on-bus coverage lint vcan suite reproduce docs bench lock clean
 
 help: ## what there is to do
 	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "make %-9s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -73,22 +73,25 @@ demo: install ## the whole story on this machine, ends with a report (DEMO="--ou
 lint: develop
 	@$(LINT)
 
-check: lint ## ruff, mypy, import-linter and the quick tests, about four minutes on two cores
-	@$(PYTEST) -q $(PARALLEL) -m "not vcan and not slow and not proof"
+check: develop ## ruff, mypy, import-linter and the quick tests, side by side
+	@$(MAKE) --no-print-directory -k -j2 lint quick
 
-test: lint ## everything but the proofs, the tests on vcan included; about twenty minutes on two cores
-	@$(MAKE) --no-print-directory -k -j2 NAME=tests SELECTED="not proof" off-bus on-bus && failed= || failed=1
+quick:
+	@$(PYTEST) -q $(PARALLEL) -m "not vcan and not slow and not nightly"
+
+test: develop ## everything but the nightly tests, those on vcan included
+	@$(MAKE) --no-print-directory -k -j3 NAME=tests SELECTED="not nightly" on-bus lint off-bus && failed= || failed=1
 	echo
 	echo "Skipped, or failing as expected:"
 	grep -hE '^(SKIPPED|XFAIL)' .cache/tests.log .cache/tests-vcan.log || echo "nothing"
 	if [ -n "$$failed" ]; then echo "FAILED: see above, .cache/tests.log and .cache/tests-vcan.log"; exit 1; fi
 
 # Hypothesis marks its own tests; the profile (tests/conftest.py) has more examples of each.
-proof: develop ## tests that prove a statistic or repeat the suite, many examples of each property (tests/README.md)
-	@export ARMIDENT_HYPOTHESIS_PROFILE=proof
-	$(MAKE) --no-print-directory -k -j2 NAME=proof SELECTED="proof or hypothesis" off-bus on-bus
+nightly: develop ## faults, kills, oddities, statistics, pages, the wheel; many examples of each property (tests/README.md)
+	@export ARMIDENT_HYPOTHESIS_PROFILE=nightly
+	$(MAKE) --no-print-directory -k -j2 NAME=nightly SELECTED="nightly or hypothesis" off-bus on-bus
 
-# The parts of test and proof, side by side. The guest has one CPU and its buses run in real time: it goes first.
+# The parts of test and nightly, side by side. The guest has one CPU and its buses run in real time: it goes first.
 off-bus:
 	@mkdir -p .cache
 	nice -n 10 $(PYTEST) $(PARALLEL) -m "not vcan and ($(SELECTED))" 2>&1 | tee .cache/$(NAME).log
@@ -104,7 +107,7 @@ on-bus:
 
 coverage: develop ## lines and branches that the tests off the bus run, by file; .cache/line-coverage/html has every line
 	@mkdir -p .cache/line-coverage
-	$(PYTEST) -q $(PARALLEL) -m "not vcan and not proof" --cov --cov-branch \
+	$(PYTEST) -q $(PARALLEL) -m "not vcan and not nightly" --cov --cov-branch \
 		--cov-report=term:skip-covered --cov-report=html:.cache/line-coverage/html --cov-report=json:.cache/line-coverage/total.json
 	$(PY) -m tests.tools.line_coverage .cache/line-coverage/total.json
 

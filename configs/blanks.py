@@ -16,11 +16,9 @@ LOG = "import of a bus log"
 
 @dataclass(frozen=True)
 class Need:
-    """Use of a key that may be blank.
+    """Use of a key that may be blank; ``how``: way to find the value.
 
-    ``commands``: commands that need its value; other commands work without it. ``how``: way to find the value, for the
-    user. ``placeholder``: value in place of a required key, from the position of its entry in the list; ``None``: the
-    default of the key.
+    ``placeholder`` is the value of a required key, from the position of its entry in the list; else the default counts.
     """
 
     commands: tuple[str, ...]
@@ -86,12 +84,7 @@ def pattern(key: str) -> str:
 
 
 def without_marks(data: dict[str, Any]) -> tuple[dict[str, Any], tuple[str, ...]]:
-    """Content of a file without its blanks, and the keys of the blanks.
-
-    A list with a blank among its elements is blank as a whole. Required keys get a placeholder (`Need.placeholder`).
-
-    ``data``: content of a configuration file.
-    """
+    """Content of a file without blanks and lists with one, and their keys; required keys have placeholders."""
     blanks: list[str] = []
     content = _stripped(data, "", 0, blanks)
     return content, tuple(blanks)
@@ -129,11 +122,7 @@ def _entry(entry: dict[str, Any], k: int) -> str:
 
 
 def needed(blanks: Sequence[str], command: str | None, *, efforts_are_torques: bool = True) -> tuple[str, ...]:
-    """Blanks whose value a command needs.
-
-    ``command``: the command; ``None``: one that needs everything. ``efforts_are_torques``: ``False`` if drives report
-    currents or voltages: the transmission is then needed to identify.
-    """
+    """Blanks whose value a command needs (``None``: any); without torques the transmission is needed to identify."""
 
     def wanted(key: str) -> bool:
         need = NEEDS.get(pattern(key))
@@ -164,11 +153,7 @@ def listed(keys: Iterable[str]) -> list[str]:
 
 
 def check_filled(where: str, blanks: Sequence[str], command: str | None) -> None:
-    """Refuse a configuration with blanks.
-
-    ``blanks``: keys whose value is needed. ``command``: the command that needs them; ``None``: not named. Raises
-    ConfigError if there are any; lists all of them, each with the way to find its value.
-    """
+    """Raise ConfigError, with the way to find each value, if a configuration has blanks that the command needs."""
     if blanks:
         who = f"armident {command} needs" if command is not None else "expected"
         raise ConfigError(f"{where}: {who} values for keys marked {MARK}: {'; '.join(listed(blanks))}")

@@ -26,11 +26,7 @@ _SHOWN = 80
 
 
 def evaluate(expression: str | float, names: Mapping[str, float], where: str = "expression") -> float:
-    """Value of an arithmetic expression.
-
-    ``expression``: a number, or text such as ``0.3 * fc``; ``names``: values of the names that the expression may use.
-    Raises ConfigError if the text is not an expression, a name is unknown, or the value is not finite.
-    """
+    """Value of an expression such as ``0.3 * fc``; raises ConfigError if it is wrong, not finite, or a name unknown."""
     shown = repr(expression) if isinstance(expression, str) else "the number"
     shown = shown if len(shown) <= _SHOWN else f"{shown[: _SHOWN - 3]}..."
     if isinstance(expression, str) and len(expression) > LONGEST:

@@ -27,11 +27,9 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class MdhChain:
-    """A serial chain in modified Denavit-Hartenberg parameters.
+    """A serial chain in MDH parameters; offsets of the variables are in ``theta`` (revolute) or ``r`` (prismatic).
 
-    ``base``: frame 0 in the frame that the axes were given in, homogeneous, shape (4, 4); its z is the first axis.
-    ``parameters``: one per joint; ``theta`` (revolute) or ``r`` (prismatic) holds the offset of the joint variable.
-    ``frames``: frames 1 to n in the frame of the axes, all joint variables zero, shape (n, 4, 4).
+    ``base`` (4, 4): frame 0 in the frame of the axes, z along the first; ``frames`` (n, 4, 4): 1 to n in it, at zero.
     """
 
     base: Floats
@@ -42,14 +40,10 @@ class MdhChain:
 def modified_dh(axes: ArrayLike, points: ArrayLike, names: Sequence[str]) -> MdhChain:
     """Modified Denavit-Hartenberg parameters of a serial chain (Khalil and Kleinfinger 1986, thesis section 2.1.1).
 
-    ``z_j`` is the axis of joint j, ``x_j`` the common normal of axes j and j+1. The remaining freedom is fixed by
-    convention. Of the two senses of ``x_j`` the one with the smaller ``|theta_j|`` is taken, and between parallel axes
-    the normal with ``r_j = 0``. The last frame has ``theta_n = r_n = 0``, and frame 0 has ``alpha_1 = d_1 = 0`` with
-    ``x_0`` towards the given x.
-
-    ``axes``: unit vectors of the joint axes in the direction of positive motion, all joint variables zero, shape
-    (n, 3); ``points``: a point on each axis, shape (n, 3), m; ``names``: joint names for messages, length n. Raises
-    ConfigError if two axes are nearly but not exactly parallel, so that their common normal is too far away.
+    ``z_j`` is the axis of joint j, ``x_j`` the common normal of axes j and j+1: with the smaller ``|theta_j|``, between
+    parallel axes that with ``r_j = 0``. Further, ``theta_n = r_n = alpha_1 = d_1 = 0``, and ``x_0`` is towards the
+    given x. ``axes``: unit vectors (n, 3); ``points``: one on each axis (n, 3), m. Raises ConfigError if two axes are
+    nearly parallel.
     """
     z = np.array(axes, dtype=np.float64)
     p = np.asarray(points, dtype=np.float64)

@@ -25,10 +25,7 @@ _OF_SQLITE = {
 
 
 def reason_of(error: OSError | sqlite3.Error, busy_s: float = 0.0, *, named: bool = True, step: bool = False) -> str:
-    """Return file (if ``named``), reason and next ``step`` of an error in one line.
-
-    ``busy_s`` is the time, s, for which a locked database was waited for.
-    """
+    """File, reason and next step of an error in one line; ``busy_s``: time a locked database was waited for, s."""
     if isinstance(error, OSError):
         where = f"{os.fspath(error.filename)!s}: " if named and error.filename else ""
         more = f"; {_STEPS[error.errno]}" if step and error.errno in _STEPS else ""

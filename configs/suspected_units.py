@@ -28,12 +28,7 @@ LONGEST_AXIS = 200.0
 
 
 def suspected_units(robot: RobotConfig, geometry: bool = True) -> list[str]:
-    """Values of a robot that look like degrees or millimetres.
-
-    ``robot``: robot configuration, of which the file claims rad and m; ``geometry``: ``True`` to include the modified
-    Denavit-Hartenberg parameters, as for a robot that is not from a URDF. Returns the key, value and the suspected unit
-    of each value.
-    """
+    """Key, value and suspected unit of values that look like degrees or mm; ``geometry``: MDH parameters, too."""
     found: list[str] = []
     if math.hypot(*robot.gravity) > STRONGEST_GRAVITY:
         metres = ", ".join(f"{g / 1000:g}" for g in robot.gravity)

@@ -8,11 +8,7 @@ from armident.configs.schema.robot import RobotConfig
 
 
 def counts_per_si(robot: RobotConfig) -> NDArray[np.float64]:
-    """Encoder counts per rad (revolute joint) or per metre (prismatic joint) of each motor.
-
-    ``robot``: robot whose drives have ``counts_per_unit``. Returns the counts per rad or m at the motor, shape (n,).
-    Raises ConfigError if a drive has no ``counts_per_unit``.
-    """
+    """Encoder counts of each motor (n,) per rad or m; raises ConfigError if a drive has no ``counts_per_unit``."""
     counts = []
     for joint in robot.joints:
         if joint.drive.counts_per_unit is None:

@@ -1,7 +1,6 @@
 """Geometry of a robot from URDF: the chain from base to tip as modified Denavit-Hartenberg parameters.
 
-Only origins, axes, types and limits of the joints are read. Meshes and transmissions are ignored, and so are masses,
-because the dynamics are identified; `armident.configs.urdf_inertials` reads them for the virtual arm.
+Masses are ignored, because the dynamics are identified; only the virtual arm reads them (`urdf_inertials`).
 """
 
 import re
@@ -106,12 +105,7 @@ class UrdfGeometry(FrozenModel):
 
 
 def geometry_from_urdf(given: UrdfGeometry, where: Path) -> dict[str, Any]:
-    """Convert the geometry of a URDF to ``joints`` and ``gravity`` of a robot configuration.
-
-    ``given``: keys of the robot configuration that are combined with the URDF. Returns plain values: ``joints`` with
-    ``mdh``; ``gravity`` and the bodies of ``collision`` in frames of the chain. Raises ConfigError if the URDF is wrong
-    or not a serial chain; names file and element.
-    """
+    """Convert a URDF to ``joints``, ``gravity`` and ``collision`` of a configuration; ConfigError if it is wrong."""
     file = urdf_file(given, where)
     joints = read_chain(file, given.urdf.base, given.urdf.tip)
     chain = mdh_of(joints, file)
@@ -133,11 +127,7 @@ def geometry_from_urdf(given: UrdfGeometry, where: Path) -> dict[str, Any]:
 
 
 def link_placements(joints: tuple[UrdfJoint, ...], names: list[str], chain: MdhChain) -> dict[str, NDArray[np.float64]]:
-    """Frames (4, 4) of the moved links of a URDF, and of its base link, in the frames of the chain, by link.
-
-    ``joints``, ``names``: moving joints, base to tip, and their names in the configuration; ``chain``: their modified
-    Denavit-Hartenberg parameters.
-    """
+    """Frames (4, 4) of the moved links of a URDF, and of its base link, in the frames of the chain, by link."""
     moved = zip(names, chain.frames, joints, strict=True)
     base: dict[str, NDArray[np.float64]] = {BASE: np.asarray(np.linalg.inv(chain.base))}
     return base | {name: np.asarray(np.linalg.solve(frame, joint.placement)) for name, frame, joint in moved}
@@ -168,10 +158,7 @@ def _triple(values: NDArray[np.float64]) -> tuple[float, float, float]:
 
 
 def urdf_file(given: UrdfGeometry, where: Path) -> Path:
-    """Path of the URDF of a robot configuration.
-
-    ``given``: keys of the configuration. Raises ConfigError if there is no such file.
-    """
+    """Path of the URDF of a robot configuration; raises ConfigError if there is no such file."""
     file = where.resolve().parent / given.urdf.file
     if not is_file(file):
         raise ConfigError(f"{where}: urdf.file: no such file {given.urdf.file} (looked for {file})")
@@ -181,10 +168,7 @@ def urdf_file(given: UrdfGeometry, where: Path) -> Path:
 def _additions(
     given: UrdfGeometry, joints: tuple[UrdfJoint, ...], names: list[str], where: Path
 ) -> dict[str, JointGiven]:
-    """Additions of the configuration by name of the joint; joints are found by either of their names.
-
-    Raises ConfigError if the chain has no such joint, or a joint is a duplicate.
-    """
+    """Additions of the configuration by name of the joint; ConfigError if a joint is unknown or a duplicate."""
     known = {joint_name(name).lower(): name for name in names}
     known |= {joint.name: name for joint, name in zip(joints, names, strict=True)}
     extra: dict[str, JointGiven] = {}
@@ -200,11 +184,7 @@ def _additions(
 
 
 def joint_names(names: list[str], file: Path) -> list[str]:
-    """Names of joints in a configuration: those of the URDF, or ``joint_1``, ... by place if no Latin letter is left.
-
-    ``names``: names in the URDF, base to tip; ``file``: path of the URDF for messages. Raises ConfigError if names in
-    Latin letters differ only in case or punctuation.
-    """
+    """Names of joints in Latin letters, else ``joint_1``, ...; ConfigError if only case or punctuation differs."""
     plain = [joint_name(name) for name in names]
     for k, name in enumerate(names):
         twins = [other for other in plain if other.lower() == plain[k].lower()]
@@ -226,11 +206,7 @@ def joint_name(name: str) -> str:
 
 
 def mdh_of(joints: tuple[UrdfJoint, ...], file: Path) -> MdhChain:
-    """Modified Denavit-Hartenberg parameters of a chain, with frames in the base link.
-
-    ``joints``: moving joints from base to tip; ``file``: path of the URDF for messages. Raises ConfigError if two axes
-    are nearly parallel; names ``file`` and joints.
-    """
+    """MDH parameters of a chain, with frames in the base link; raises ConfigError if two axes are nearly parallel."""
     axes = np.array([joint.placement[:3, :3] @ joint.axis for joint in joints])
     try:
         return modified_dh(axes, np.array([joint.placement[:3, 3] for joint in joints]), [j.name for j in joints])

@@ -13,12 +13,7 @@ LARGEST = 1e9
 
 
 def only(file: Path, element: ET.Element, tag: str, of: ET.Element | None = None) -> ET.Element | None:
-    """Return the element of a name in another one, or ``None``.
-
-    ``file``: path of the URDF, for messages. ``element``, ``tag``: element of a joint or link, or one below it, and the
-    name. ``of``: joint or link around the element, for messages; ``None``: it is one. Raises ConfigError if there are
-    two that differ.
-    """
+    """Return the child element of a name, or ``None``; ConfigError if two differ. ``of``: its joint or link."""
     found = element.findall(tag)
     contents = {tuple((part.tag, *sorted(part.items())) for part in each.iter()) for each in found}
     if len(contents) > 1:
@@ -37,12 +32,7 @@ def end_link(element: ET.Element, end: Literal["parent", "child"]) -> str:
 def words(
     file: Path, element: ET.Element, child: ET.Element, key: str, *, count: int = 3, default: str | None = "0 0 0"
 ) -> list[str]:
-    """Finite numbers of an attribute, as written.
-
-    ``file``, ``element``: path of the URDF, and element of the joint or link, for messages. ``child``, ``key``: element
-    below it, and the attribute. ``default``: text if there is no such attribute; ``None``: it is required. Raises
-    ConfigError if there are not that many finite numbers.
-    """
+    """Finite numbers of an attribute, as written; raises ConfigError if there are not ``count`` of them."""
     text = child.get(key, default)
     words = (text or "").split()
     if len(words) != count or not all(_is_finite(word) for word in words):

@@ -40,11 +40,7 @@ def expand(file: Path) -> str:
 
 
 def parse_urdf(file: Path) -> ET.Element:
-    """Root element of a URDF file; xacro is refused by its name.
-
-    Raises ConfigError if the file cannot be read, is not XML, is xacro, has an attribute of more than ``LONGEST``
-    characters, or names that differ from those of URDF in case.
-    """
+    """Root element of a URDF file; raises ConfigError if it is unreadable or xacro, or has names in another case."""
     try:
         content = file.read_bytes().lstrip()
     except OSError as error:

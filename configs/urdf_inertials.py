@@ -26,18 +26,9 @@ Floats = NDArray[np.float64]
 class UrdfInertials:
     """Masses and friction of a chain of a URDF; SI, joint side.
 
-    Parameters
-    ----------
-    standard
-        Inertial parameters by name (``xx1`` to ``m6``) in the modified Denavit-Hartenberg frames of the chain.
-    friction
-        Viscous and Coulomb friction by name (``fv1``, ``fc1``), where the URDF gives a positive one.
-    massless
-        Numbers of the joints, from 1, that move no mass before the next joint.
-    impossible
-        Links whose moments of inertia no body has: one is larger than the sum of the others.
-    held
-        Moving joints after the tip, whose links count as a rigid load at position zero.
+    ``standard`` (``xx1`` to ``m6``) is in MDH frames; ``friction`` (``fv1``, ``fc1``) has the positive values. Joints
+    ``massless``, from 1, move no mass before the next joint. No body has the moments of ``impossible`` links. Joints
+    ``held`` after the tip carry a rigid load.
     """
 
     standard: dict[str, float]
@@ -48,12 +39,9 @@ class UrdfInertials:
 
 
 def read_inertials(file: Path, base: str | None = None, tip: str | None = None) -> UrdfInertials:
-    """Masses of the links between two links of a URDF, and the friction of its joints.
+    """Masses of the links between two links of a URDF, and friction of its joints; errors name file and element.
 
     Links on fixed joints belong to the link that carries them, and everything after the tip to the last link.
-
-    ``base``, ``tip``: first and last link of the chain, as of `armident.configs.urdf_tree.read_chain`. Raises
-    ConfigError if the file is wrong, or a mass or inertia is negative or not a number; names file and element.
     """
     joints = read_chain(file, base, tip)
     frames = mdh_of(joints, file).frames
@@ -86,10 +74,7 @@ def read_inertials(file: Path, base: str | None = None, tip: str | None = None) 
 
 
 def carried_links(tree: UrdfTree, base: str, chain: list[str]) -> Iterator[tuple[str, int, Floats, str | None]]:
-    """Links below the base: name, index of the joint that moves it (-1: none), placement, joint that is held still.
-
-    ``base``: first link of the chain.
-    """
+    """Links below the base: name, index of the joint that moves it (-1: none), placement, joint that is held still."""
     todo: list[tuple[str, int, Floats]] = [(base, -1, np.eye(4))]
     while todo:
         link, owner, placement = todo.pop()
@@ -107,10 +92,7 @@ def carried_links(tree: UrdfTree, base: str, chain: list[str]) -> Iterator[tuple
 
 
 def _moments(tree: UrdfTree, link: ET.Element) -> tuple[Floats, bool]:
-    """Pseudo-inertia of a link about its frame, shape (4, 4), and False if no body has such moments of inertia.
-
-    The pseudo-inertia holds the second moments, the first moment and the mass (Wensing, Kim and Slotine 2018).
-    """
+    """Pseudo-inertia (4, 4) of a link (Wensing, Kim and Slotine 2018), and False if no body has such moments."""
     inertial = only(tree.file, link, "inertial")
     if inertial is None:
         return np.zeros((4, 4)), True

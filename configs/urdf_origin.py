@@ -20,10 +20,7 @@ Floats = NDArray[np.float64]
 
 
 def rotation(roll: float, pitch: float, yaw: float) -> Floats:
-    """Rotation matrix of URDF's fixed-axis angles, exact for right angles: ``Rot(z, y) Rot(y, p) Rot(x, r)``.
-
-    ``roll``, ``pitch``, ``yaw``: angles, rad. Returns the rotation matrix, shape (3, 3).
-    """
+    """Rotation matrix of URDF's fixed-axis angles, exact for right angles: ``Rot(z, y) Rot(y, p) Rot(x, r)``."""
     (cr, sr), (cp, sp), (cy, sy) = (_cos_sin(angle) for angle in (roll, pitch, yaw))
     about_x = np.array([[1.0, 0.0, 0.0], [0.0, cr, -sr], [0.0, sr, cr]])
     about_y = np.array([[cp, 0.0, sp], [0.0, 1.0, 0.0], [-sp, 0.0, cp]])
@@ -33,10 +30,7 @@ def rotation(roll: float, pitch: float, yaw: float) -> Floats:
 
 
 def fixed_axis_angles(matrix: Floats) -> tuple[float, float, float]:
-    """Return URDF's fixed-axis angles ``roll, pitch, yaw`` of a rotation, rad; yaw is 0 at a pitch of 90 degrees.
-
-    ``matrix``: rotation matrix, shape (3, 3).
-    """
+    """Fixed-axis angles ``roll, pitch, yaw`` of a rotation, rad; yaw is 0 at a pitch of 90 degrees."""
     pitch = math.atan2(-matrix[2, 0], math.hypot(matrix[0, 0], matrix[1, 0]))
     if math.hypot(matrix[0, 0], matrix[1, 0]) < EXACT:
         return math.atan2(-matrix[1, 2], matrix[1, 1]), pitch, 0.0
@@ -59,11 +53,7 @@ def rounded_angle(word: str) -> float:
 
 
 def rotation_of_quaternion(quaternion: Sequence[float]) -> Floats:
-    """Rotation matrix of a quaternion, exact for right angles.
-
-    ``quaternion``: ``x, y, z, w`` in the order of URDF's ``quat_xyzw``, of length 1 but for rounding. Returns the
-    rotation matrix, shape (3, 3). Raises ValueError if the length of the quaternion is not 1.
-    """
+    """Rotation matrix of a quaternion ``x, y, z, w`` of length 1 (else ValueError), exact for right angles."""
     values = np.array(quaternion, dtype=np.float64)
     length = float(np.linalg.norm(values))
     if not abs(length - 1.0) <= LENGTH_TOLERANCE:

@@ -22,18 +22,9 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class UrdfShape:
-    """One shape of a link.
+    """One shape of a link, named by its joint (or ``base``); ``placement``: in frame j of the link (4, 4).
 
-    Parameters
-    ----------
-    link
-        The joint that moves the link, by its name in the configuration, or ``base``.
-    placement
-        Frame of the shape in frame j of the link, homogeneous, (4, 4).
-    kind
-        ``box``, ``cylinder``, ``sphere`` or ``mesh``.
-    size
-        Edges of a box (3,), radius and length of a cylinder (2,), radius of a sphere (1,), scale of a mesh (3,); m.
+    ``size``: edges of a box, radius and length of a cylinder, or radius of a sphere, m; scale of a mesh.
     """
 
     link: str
@@ -45,22 +36,14 @@ class UrdfShape:
 
 @dataclass(frozen=True, eq=False)
 class UrdfShapes:
-    """Shapes of the links of a chain of a URDF.
-
-    ``shapes``: all shapes that could be read: of each link its ``collision`` shapes, or its ``visual`` ones if it has
-    no other; ``missing``: mesh files that were not found, each with the name of its link in the URDF.
-    """
+    """Shapes of the links of a chain: ``collision``, else ``visual`` ones; ``missing``: mesh files with their links."""
 
     shapes: tuple[UrdfShape, ...]
     missing: tuple[str, ...]
 
 
 def read_shapes(file: Path, base: str | None = None, tip: str | None = None) -> UrdfShapes:
-    """Shapes of the links between two links of a URDF; links on fixed joints belong to the link that carries them.
-
-    ``base``, ``tip``: first and last link of the chain, as of `armident.configs.urdf_tree.read_chain`. Raises
-    ConfigError if the file is wrong, or a shape has no size; names file and element.
-    """
+    """Shapes of the links between two links of a URDF, each with those fixed to it; ConfigError if one is wrong."""
     joints = read_chain(file, base, tip)
     given = [joint.name for joint in joints]
     names = joint_names(given, file)
@@ -107,10 +90,7 @@ def _size(tree: UrdfTree, link: ET.Element, found: ET.Element) -> tuple[float, .
 
 
 def _mesh_file(urdf: Path, name: str) -> Path:
-    """Path of a mesh: relative to the URDF, or in a package whose folder is one of those above the URDF.
-
-    A package may also be beside one of these folders. The path may not exist.
-    """
+    """Path of a mesh, which may not exist: relative to the URDF, or in a package above or beside its folders."""
     parts = urlsplit(name)
     if parts.scheme == "file":
         return Path(unquote(parts.path))

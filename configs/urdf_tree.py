@@ -30,11 +30,9 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class UrdfJoint:
-    """A moving joint of a chain.
+    """A moving joint of a chain; ``limits``: ``position``, ``velocity``, ``torque``, SI.
 
-    ``placement``: frame of the joint, and of the link it moves, in the base link with all variables zero, shape (4, 4);
-    ``axis``: unit vector in that frame, shape (3,); ``limits``: limits of the file: ``position`` (rad or m),
-    ``velocity`` (rad/s or m/s), ``torque`` (N m or N).
+    ``placement`` (4, 4): its frame in the base link, all variables zero; ``axis`` (3,): unit vector in that frame.
     """
 
     name: str
@@ -45,14 +43,9 @@ class UrdfJoint:
 
 
 def read_chain(file: Path, base: str | None = None, tip: str | None = None) -> tuple[UrdfJoint, ...]:
-    """Moving joints between two links of a URDF, with fixed joints merged into the placements.
+    """Moving joints between two links of a URDF, with fixed joints merged into the placements; else ConfigError.
 
-    Side branches that cannot move belong to the link they are fixed to. Branches at the base are ignored, and links
-    after the tip are its load.
-
-    ``base``: first link of the chain; ``None``: the root of the tree. ``tip``: last link of the chain; ``None``: the
-    chain ends with its last moving joint. Raises ConfigError if the file is not a URDF or not a tree, if the chain
-    branches, or if a joint is not of a serial chain. Names file and element.
+    Fixed side branches belong to their link, links after the tip are its load; branches at the base are ignored.
     """
     tree = read_tree(file)
     base, path = tree.path(base, tip)
@@ -69,8 +62,7 @@ def read_chain(file: Path, base: str | None = None, tip: str | None = None) -> t
 def serial_tips(file: Path, base: str | None = None) -> dict[str, tuple[str, ...]]:
     """Names of the moving joints to each link at which a serial chain can end: ends of branches, and their forks.
 
-    ``base``: first link of the chains; ``None``: the root of the tree. Raises ConfigError if the file is not a URDF or
-    not a tree. Chains that cannot be identified are left out.
+    Chains that cannot be identified are left out. Raises ConfigError if the file is no URDF or not a tree.
     """
     tree = read_tree(file)
     found: dict[str, tuple[str, ...]] = {}
@@ -86,11 +78,7 @@ def serial_tips(file: Path, base: str | None = None) -> dict[str, tuple[str, ...
 
 
 def moving_links(file: Path, base: str | None, tip: str) -> list[tuple[str, str]]:
-    """Links before and after each moving joint of a chain, base to tip.
-
-    ``base``, ``tip``: first and last link of the chain; ``base`` ``None``: the root of the tree. Raises ConfigError if
-    the file is not a URDF, or the base does not move the tip.
-    """
+    """Links before and after each moving joint, base to tip; raises ConfigError if the base does not move the tip."""
     tree = read_tree(file)
     path = tree.path_to(tree.root() if base is None else base, tree.known(tip, "urdf.tip"))
     return [
@@ -101,10 +89,7 @@ def moving_links(file: Path, base: str | None, tip: str) -> list[tuple[str, str]
 
 
 def orientation(file: Path, link: str) -> Floats:
-    """Rotation of a link in the root of a URDF with all joints at zero, shape (3, 3).
-
-    Raises ConfigError if the file is not a URDF, or has no such link.
-    """
+    """Rotation (3, 3) of a link in the root of a URDF with all joints at zero; raises ConfigError if it is missing."""
     tree = read_tree(file)
     turned = np.eye(3)
     element = tree.above.get(tree.known(link, "urdf.base"))
@@ -115,19 +100,13 @@ def orientation(file: Path, link: str) -> Floats:
 
 
 def robot_name(file: Path) -> str:
-    """Name of the robot in a URDF, as it is written there; empty if it has none.
-
-    Raises ConfigError if the file is not a URDF or not a tree.
-    """
+    """Name of the robot in a URDF, as written; empty if it has none. Raises ConfigError if the file is wrong."""
     return read_tree(file).name
 
 
 @dataclass(frozen=True)
 class UrdfTree:
-    """Links and joints of a URDF.
-
-    ``file``: path of the URDF, for messages; ``above``, ``below``: joint elements by child link, and by parent link.
-    """
+    """Links and joints of a URDF; ``above``, ``below``: joint elements by child link, and by parent link."""
 
     file: Path
     links: Mapping[str, ET.Element]
@@ -136,11 +115,7 @@ class UrdfTree:
     name: str = ""
 
     def known(self, link: str, key: str) -> str:
-        """Return the name of a link that the file contains.
-
-        ``key``: key of the configuration that names the link, for messages. Raises ConfigError if the file has no such
-        link.
-        """
+        """Return the name of a link of the file; raises ConfigError, with the key that names it, if there is none."""
         if link not in self.links:
             raise ConfigError(f"{self.file}: no link {link!r} ({key}); links are {', '.join(sorted(self.links))}")
         return link
@@ -154,22 +129,14 @@ class UrdfTree:
         return roots[0]
 
     def path(self, base: str | None, tip: str | None) -> tuple[str, list[ET.Element]]:
-        """First link of a chain, and all its joints, fixed ones included, from base to tip.
-
-        ``base``, ``tip``: first and last link, as of `read_chain`. Raises ConfigError if there is no such link, or no
-        chain between them.
-        """
+        """First link of a chain, and all its joints, fixed ones included; raises ConfigError if there is none."""
         base = self.root() if base is None else self.known(base, "urdf.base")
         if tip is None:
             return base, list(self.only_way(base))
         return base, self.path_to(base, self.known(tip, "urdf.tip"))
 
     def path_to(self, base: str, tip: str) -> list[ET.Element]:
-        """Joints from base to tip; branches that move are refused on the way.
-
-        ``base``, ``tip``: first and last link of the chain. Raises ConfigError if the base does not move the tip, or a
-        second moving joint branches off.
-        """
+        """Joints from base to tip; ConfigError if the base does not move the tip or a moving joint branches off."""
         path: list[ET.Element] = []
         link = tip
         while link != base:
@@ -218,11 +185,7 @@ class UrdfTree:
         return element.get("type", "")
 
     def origin(self, element: ET.Element, found: ET.Element | None) -> Floats:
-        """Placement of a joint in its parent link, or of an inertia in its link, homogeneous, shape (4, 4).
-
-        ``element``: element of the joint or link, for messages. ``found``: element ``origin``; ``None``: the origin of
-        the parent.
-        """
+        """Placement (4, 4) of a joint in its parent link, or of an inertia in its link; ``None``: no offset."""
         frame = np.eye(4)
         if found is not None:
             frame[:3, :3] = self._orientation(element, found)
@@ -256,11 +219,7 @@ class UrdfTree:
             raise ConfigError(f"{where}: {farthest:g} looks like millimetres; expected m")
 
     def moving_joint(self, element: ET.Element, placement: Floats) -> UrdfJoint:
-        """Return a moving joint of the chain.
-
-        ``placement``: frame of the joint in the base link with all variables zero, shape (4, 4). Raises ConfigError if
-        the joint is of another type, follows another joint, or has no usable axis.
-        """
+        """Return a moving joint with its frame (4, 4) in the base link, all variables zero; ConfigError if unusable."""
         where = f"{self.file}: {element.tag} {element.get('name')!r}"
         kind = self.type_of(element)
         if kind not in MOVING:
@@ -307,10 +266,7 @@ class UrdfTree:
 
 
 def read_tree(file: Path) -> UrdfTree:
-    """Links and joints of a URDF file, checked to be a tree.
-
-    Raises ConfigError if the file is not a URDF, or its joints are not those of a tree; names file and element.
-    """
+    """Links and joints of a URDF file; raises ConfigError, with file and element, unless they are a tree."""
     root = parse_urdf(file)
     if root.tag != "robot":
         raise ConfigError(f"{file}: expected a URDF with the root element robot, found {root.tag:.40}")

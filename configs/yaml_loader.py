@@ -70,11 +70,7 @@ class _SelfReference(Exception):
 
 
 def _expanded(value: Any, known: dict[int, int]) -> int:
-    """Return the number of values in a value, each as often as aliases repeat it.
-
-    ``value``: value of a YAML document. ``known``: numbers of the lists and mappings so far, by identity; 0 within
-    their own value.
-    """
+    """Number of values in a YAML value, each as often as aliases repeat it; ``known``: by identity, 0 inside."""
     if not isinstance(value, dict | list):
         return 1
     if id(value) not in known:

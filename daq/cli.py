@@ -1,7 +1,7 @@
 """Root of the command line: finds the registered commands and loads the one that is called.
 
-A command is an entry point of group ``armident.commands`` that names a function with typer annotations. Its module
-must import quickly: heavy imports belong into the function.
+A command is an entry point of group ``armident.commands`` that names a function with typer annotations. Its module must
+import quickly: heavy imports belong into the function.
 """
 
 import functools
@@ -34,13 +34,7 @@ EPILOG = (
 
 
 def main(arguments: Sequence[str] | None = None) -> NoReturn:
-    """Run a command and exit with its status.
-
-    Parameters
-    ----------
-    arguments
-        The command and its arguments; default: those of the process.
-    """
+    """Run a command, by default with the arguments of the process, and exit with its status."""
     if "ARMIDENT_PARENT" in os.environ:
         from armident.processes import end_with_parent
 
@@ -53,11 +47,7 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
 def application(
     words: Sequence[str], entry_points: Iterable[importlib.metadata.EntryPoint] | None = None
 ) -> typer.Typer:
-    """Return the command line with the command that is called, or with all if none is (help, completion).
-
-    ``words``: arguments of the command line. ``entry_points``: the registered commands; default: those of the installed
-    packages.
-    """
+    """Return the command line with the command that is called, or with all if none is (help, completion)."""
     app = typer.Typer(
         no_args_is_help=True,
         rich_markup_mode=None,

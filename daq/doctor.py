@@ -51,11 +51,7 @@ _CHUNKS = 20
 
 @dataclass(frozen=True)
 class Check:
-    """Result of one check.
-
-    ``verdict``: ``ok``, ``warning`` or ``failed``: a capture would not run; ``message``: findings, and the remedy if
-    there are any.
-    """
+    """Result of one check; ``failed``: a capture would not run. The message has the findings and the remedy."""
 
     name: str
     verdict: Verdict
@@ -63,11 +59,7 @@ class Check:
 
 
 def checks_for(config: str | Path, command: Command) -> list[Check]:
-    """Check everything that a command needs of a configuration.
-
-    ``config``: robot or session configuration. ``command``: the command; for ``capture`` as `run_checks`, which needs a
-    session.
-    """
+    """Check everything that a command needs of a robot or session configuration; ``capture`` needs a session."""
     if command == "capture":
         return run_checks(config)
     try:
@@ -92,13 +84,7 @@ def checks_for(config: str | Path, command: Command) -> list[Check]:
 
 
 def run_checks(config: str | Path) -> list[Check]:
-    """Check everything that a capture of a session needs.
-
-    Nothing is sent to the buses, and only a probe file is written. If the configuration is invalid, the checks are
-    that, the data sheets of the drives if the session could be read, and the clock.
-
-    ``config``: session configuration.
-    """
+    """Check everything that a capture of a session needs; nothing is sent, and only a probe file is written."""
     try:
         session = load_session(config, "")
         robot = load_robot(session.robot, "")
@@ -348,11 +334,7 @@ def _zenoh(session: SessionConfig) -> Check:
 
 
 def doctor(config: str, as_json: bool, command: Command = "capture") -> None:
-    """Run ``armident doctor``: print the checks.
-
-    ``config``: session configuration; for other commands than ``capture`` also a robot configuration. ``command``:
-    command in mind. Raises ConfigError if a check failed: the command would not run.
-    """
+    """Run ``armident doctor``: print the checks; ConfigError if one failed, as the command would not run."""
     checks = checks_for(config, command)
     if as_json:
         print(json.dumps([{"what": c.name, "verdict": c.verdict, "found": c.message} for c in checks]))

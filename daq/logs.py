@@ -1,8 +1,4 @@
-"""Log output of the commands: one line per record on stderr.
-
-Modules log to ``logging.getLogger(__name__)``. The logger ``armident`` has no output by itself, so that a program that
-imports armident chooses its own; the command line adds `StderrHandler`.
-"""
+"""Log output of the commands: a line per record on stderr; the logger ``armident`` by itself has none."""
 
 import contextlib
 import logging
@@ -44,11 +40,7 @@ class StderrHandler(logging.Handler):
 
 @contextlib.contextmanager
 def log_to(handler: logging.Handler, level: int | None = None) -> Iterator[None]:
-    """Send the records of armident to a handler while the block runs, in place of another `StderrHandler`.
-
-    ``handler``: takes the records; closed at the end. ``level``: lowest level that is logged; default: the level that
-    is set already, else INFO.
-    """
+    """Send armident's records to a handler while the block runs; ``level``: default is the one set, else INFO."""
     replaced = [other for other in LOGGER.handlers if isinstance(other, StderrHandler)]
     level_before = LOGGER.level
     for other in replaced:

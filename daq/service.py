@@ -201,10 +201,9 @@ def _system(cell: str, root: Path, executable: Path | None) -> System:
 
 
 def install(cell: str, root: Path = Path("/"), executable: Path | None = None, dry_run: bool = False) -> list[str]:
-    """Install the service of a cell, and return the lines that report what was done; nothing is enabled or started.
+    """Install the service of a cell, and return the lines of a report; nothing is enabled or started.
 
-    Parts that are there are left alone, so that a second run does nothing. ``executable`` is the command of the units;
-    by default that of this environment, in a system image (``root``) ``/opt/armident/bin/armident``.
+    By default ``executable`` is that of this environment; in a system image (``root``) it is in ``/opt/armident/bin``.
     """
     system = _system(cell, root, executable)
     with_sudo = f"sudo {system.executable} service install {cell}"
@@ -267,10 +266,9 @@ def _state(step: InstallStep) -> str:
 
 
 def uninstall(cell: str, root: Path = Path("/"), dry_run: bool = False) -> list[str]:
-    """Remove the services of a cell, and return the lines that report what was done and what was kept.
+    """Stop, disable and remove the services of a cell, and return the lines of a report.
 
-    Its units are stopped and disabled. The files that all cells share go with the last cell. Recordings, results,
-    configurations and the user that owns them are kept.
+    Shared files go with the last cell. Recordings, results, configurations and their user are kept.
     """
     system = _system(cell, root, Path(SHIPPED_EXECUTABLE))
     try:

@@ -20,14 +20,9 @@ Raw16 = NDArray[np.int16]
 
 
 class DriveBackend(Protocol):
-    """Interface of the plant or recording behind the drives: raw numbers for the coming SYNC.
+    """Plant or recording behind the drives: raw numbers (n,) for the coming SYNC, which `advance` changes in place.
 
-    Attributes
-    ----------
-    position, demand
-        Actual and demanded motor positions, counts, int32, shape (n,); changed in place by `advance`.
-    current
-        Reported signal of the drives, per mille of rated, int16, shape (n,); changed in place by `advance`.
+    Motor positions and demands in counts, int32; reported signals in per mille of rated, int16.
     """
 
     position: Raw32
@@ -38,11 +33,7 @@ class DriveBackend(Protocol):
         """Handle that a drive enters or leaves operation enabled. ``enabled``: new state."""
 
     def set_targets(self, targets: Raw32, fresh: NDArray[np.bool_]) -> None:
-        """Set new targets, which the drives reach after their interpolation time.
-
-        ``targets``: target positions, counts, int32, shape (n,); ``fresh``: ``True`` where the target is new, shape
-        (n,).
-        """
+        """Set target positions (n,), counts, int32, where ``fresh`` (n,), reached after the interpolation time."""
 
     def advance(self) -> None:
         """Advance by one SYNC period."""
@@ -51,26 +42,9 @@ class DriveBackend(Protocol):
 class Arm:
     """Virtual arm: plant, drives and noise, with the raw numbers of the bus.
 
-    Drives of arms without a control period of their own (``servo.OWN_PERIODS``) report the position and the demand of
-    the last SYNC, and the mean of their signal since then: what moved the arm from that position to the next. Raises
-    ConfigError if the SYNC period is not a multiple of the control period, or an encoder resolution is missing.
-
-    Parameters
-    ----------
-    robot
-        Joints, transmission and drives; every joint needs ``counts_per_unit``.
-    q
-        Initial posture, rad or m, shape (n,).
-    sync_period
-        SYNC period, s; ``None``: one control period. That of the EMPS is a multiple of its control period.
-    seed, noise
-        Seed of the noise, and factor on its amplitude (see ``armident.virtual_robot.noise``).
-    scenario
-        Hidden effects; controller, friction and noise.
-    velocity_feedback
-        Structure of the drives' velocity loop, see ``servo.design``.
-    parameters
-        Parameters of the arm; ``None``: `armident.virtual_robot.arm_parameters.arm_parameters` of the robot.
+    Drives without a control period of their own (``servo.OWN_PERIODS``) report position and demand of the last SYNC,
+    and the mean signal since. ``q``: initial posture (n,), rad or m. ``sync_period``: s, default one control period;
+    that of the EMPS is a multiple. Raises ConfigError if it is no multiple, or an encoder resolution is missing.
     """
 
     def __init__(
@@ -131,19 +105,12 @@ class Arm:
         self._steps[joint] = max(round(seconds / self._servo.period), 1)
 
     def enable(self, joint: int, enabled: bool) -> None:
-        """Open or close the brake of a joint; its demand starts at the measured position.
-
-        ``enabled``: ``True`` opens the brake.
-        """
+        """Open or close the brake of a joint; its demand starts at the measured position."""
         self._held[joint] = not enabled
         self.plant.brake[joint] = 0.0 if enabled else BRAKE
 
     def set_targets(self, targets: Raw32, fresh: NDArray[np.bool_]) -> None:
-        """Set new targets; interpolation starts at the last target.
-
-        ``targets``: target positions, counts, int32, shape (n,); ``fresh``: ``True`` where the target is new, shape
-        (n,).
-        """
+        """Set target positions (n,), counts, int32, where ``fresh`` (n,); interpolation starts at the last target."""
         take = fresh & ~self._held
         np.copyto(self._origin, self._target, where=take)
         np.copyto(self._target, targets, where=take)
@@ -196,11 +163,9 @@ def design_drives(
     scenario: Scenario | None,
     parameters: ArmParameters,
 ) -> servo.Servo:
-    """Design the drives of a virtual arm: gains of the scenario, else those of its configuration, else tuned gains.
+    """Design the drives of a virtual arm: gains of the scenario, else of its configuration, else tuned ones.
 
-    ``mass``: mass matrix of the healthy arm at power-on, joint side, rotors included, shape (n, n).
-    ``velocity_feedback``: as for ``servo.design``. ``scenario``: the scenario; ``None``: none. Raises ConfigError if
-    the gains are not those of n joints, or contradict ``velocity_feedback``.
+    ``mass`` (n, n): of the healthy arm at power-on, joint side, with rotors. Raises ConfigError if gains do not fit.
     """
     given = None if scenario is None or scenario.controller is None else scenario.controller
     known = None if given is None else given.gains

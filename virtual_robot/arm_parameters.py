@@ -24,22 +24,10 @@ EDGE = 0.1
 
 @dataclass(frozen=True)
 class ArmParameters:
-    """Parameters of a virtual arm; SI, joint side.
+    """Parameters of a virtual arm by standard name in the frames of the configuration; SI, joint side.
 
-    Parameters
-    ----------
-    standard
-        Standard parameters by name: ``xx1`` ... ``m6`` in the frames of the configuration, rotors, friction, couplings.
-    rest
-        Posture at power-on, rad or m, length n.
-    noise
-        Noise of the torque signals.
-    bandwidth_hz
-        Bandwidth of the position loops, Hz, length n.
-    sources
-        Where the parameters come from, one sentence each.
-    sign_smoothing
-        ``g`` of each joint's smoothed sign where an identification has it, s/rad or s/m, length n.
+    ``rest``: posture at power-on, n. ``bandwidth_hz``: of the position loops, n. ``sources``: sentences.
+    ``sign_smoothing``: ``g``, s/rad or s/m, of an identification.
     """
 
     standard: Mapping[str, float]
@@ -57,14 +45,10 @@ def arm_parameters(
     inertials: UrdfInertials | None = None,
     seed: int = 0,
 ) -> ArmParameters:
-    """Parameters of the virtual arm of a robot.
+    """Parameters of the virtual arm of a robot with limits of position, velocity and acceleration.
 
-    Masses are those of ``model``, else of the URDF, else those shipped for the robot (TX40, EMPS), else drawn.
-
-    ``robot``: robot with limits of position, velocity and acceleration (`armident.virtual_robot.twin.with_limits`);
-    ``model``: ``identification.json`` with physically consistent parameters; ``inertials``: masses of the robot's URDF;
-    ``seed``: seed of what is drawn: rotors, friction, and masses if there are no others. Raises ConfigError if the
-    document is not of this robot, or masses leave a joint without inertia.
+    Masses are those of ``model``, else of the URDF, else those shipped (TX40, EMPS), else drawn from ``seed``. Raises
+    ConfigError if the document is of another robot, or a joint has no inertia.
     """
     if model is not None:
         identified = read_identified(model, robot)
@@ -130,11 +114,7 @@ def _rest(robot: RobotConfig) -> tuple[float, ...]:
 
 
 def with_scenario(parameters: ArmParameters, robot: RobotConfig, scenario: Scenario | None) -> ArmParameters:
-    """Parameters of the arm with the friction, the noise and the bandwidth of a scenario.
-
-    ``scenario``: the scenario; ``None``: no changes. Raises ConfigError if the scenario names a joint that the robot
-    does not have, or has another number of bandwidths.
-    """
+    """Parameters with the friction, noise and bandwidth of a scenario; raises ConfigError if it does not fit."""
     if scenario is None:
         return parameters
     names = [joint.name for joint in robot.joints]

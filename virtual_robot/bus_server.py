@@ -13,7 +13,7 @@ from armident.configs import ConfigError
 from armident.configs.schema.session import Bus
 from armident.drivers.can.frames import STANDARD_ID_MASK, BusDown, frames
 from armident.drivers.can.socketcan import RECEIVE_TIMEOUT, RawSocket
-from armident.drivers.can.udp import open_bus
+from armident.drivers.can.udp import open_bus, open_python_can
 from armident.drivers.canopen.objects import COB_HEARTBEAT, COB_NMT, COB_SDO_REQUEST, COB_SYNC
 from armident.virtual_robot.arm import DriveBackend
 from armident.virtual_robot.node import Drive
@@ -45,10 +45,7 @@ class GuardingListener(can.Listener):
 
 
 class DriveBus:
-    """Virtual drives on one bus.
-
-    ``drives``, ``motion``, ``period``: as for :class:`Exchange`. Raises ConfigError if the bus does not exist.
-    """
+    """Virtual drives on one bus, as of :class:`Exchange`; raises ConfigError if the bus does not exist."""
 
     def __init__(self, bus: Bus, drives: Sequence[Drive], motion: DriveBackend, period: float) -> None:
         self.config, self.drives = bus, drives
@@ -85,7 +82,8 @@ class DriveBus:
         network.NOTIFIER_CYCLE = NOTIFIER_CYCLE_S
         network.listeners.append(GuardingListener(self.drives))
         try:
-            network.connect(interface=self.config.interface, channel=self.config.channel, can_filters=filters)
+            network.bus = open_python_can(self.config, filters)
+            network.connect()
         except (OSError, can.CanError) as error:
             raise ConfigError(f"bus {self.config.channel}: cannot be opened: {error}") from error
         return network
@@ -99,27 +97,18 @@ class DriveBus:
                 oddity.begin(self.config)
 
     def take(self, start: int, stop: int, sequence: int) -> int:
-        """Process the frames of ``batch`` up to the next SYNC, as :meth:`Exchange.take`.
-
-        ``start``, ``stop``, ``sequence``: as in :meth:`Exchange.take`.
-        """
+        """Process the frames of ``batch`` up to the next SYNC, as :meth:`Exchange.take`."""
         return self.exchange.take(*self._columns, start, stop, sequence)
 
     def receive(self, wait: bool) -> int:
-        """Receive frames into ``batch`` and return their number.
-
-        ``wait``: ``True``: wait up to ``RECEIVE_TIMEOUT`` for the first frame. Raises BusDown if the bus is down.
-        """
+        """Receive frames into ``batch``, waiting up to ``RECEIVE_TIMEOUT``; raises BusDown if the bus is down."""
         # One system call if possible, because they are slow in a guest kernel.
         if isinstance(self.bus, RawSocket):
             return self.bus.receive(self.batch, wait=wait)
         return self.bus.receive(self.batch) if not wait or self.bus.poll(RECEIVE_TIMEOUT) else 0
 
     def next_sync(self) -> tuple[int, int] | None:
-        """Counter (0: none) and time stamp (ns) of the next SYNC; ``None`` if there is none.
-
-        Reads from the bus if no SYNC is left in the batch. A bus that is down is used again when it is back.
-        """
+        """Counter (0: none) and time, ns, of the next SYNC; ``None`` if there is none. Reopens a bus that is back."""
         if not self._syncs:
             self.flush()
             if self._at < self._count:
@@ -138,10 +127,7 @@ class DriveBus:
         return self._syncs[-1] if self._syncs else None
 
     def answer(self, sequence: int) -> None:
-        """Queue the answers to the next SYNC and apply set points.
-
-        ``sequence``: counter of the SYNC if it carries none.
-        """
+        """Queue the answers to the next SYNC and apply set points; ``sequence`` counts a SYNC without a counter."""
         self._syncs.pop()
         at = self.take(self._at, self._count, sequence)
         self._at = at + 1

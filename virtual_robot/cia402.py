@@ -22,10 +22,7 @@ def statusword(state: DriveState) -> int:
 
 
 def next_state(state: DriveState, control: int, before: int) -> DriveState:
-    """State of a drive after a controlword (6040h).
-
-    ``state``: present state; ``control``, ``before``: new and previous controlword.
-    """
+    """State of a drive after a controlword (6040h) that follows another."""
     if state is DriveState.FAULT:
         rising = control & Control.FAULT_RESET and not before & Control.FAULT_RESET
         return DriveState.SWITCH_ON_DISABLED if rising else state

@@ -87,10 +87,7 @@ class _ElapsedTime(logging.LoggerAdapter[logging.Logger]):
     begin = time.monotonic()
 
     def process(self, msg: Any, kwargs: MutableMapping[str, Any]) -> tuple[Any, MutableMapping[str, Any]]:
-        """Add the elapsed time to a message.
-
-        ``kwargs``: keyword arguments of the logging call, which are returned unchanged.
-        """
+        """Add the elapsed time to a message."""
         return f"[{time.monotonic() - self.begin:5.1f} s] {msg}", kwargs
 
 
@@ -99,23 +96,7 @@ log = _ElapsedTime(logging.getLogger(__name__), {})
 
 @dataclass(frozen=True)
 class DemoOptions:
-    """Options of ``armident demo``.
-
-    Parameters
-    ----------
-    out
-        Directory of recordings, results and the report.
-    keep_going
-        Leave the virtual arm running on its bus until Ctrl-C.
-    quick
-        Only the first part: capture and identification.
-    config
-        Configuration of a session or of a robot; ``None``: the TX40.
-    scenario
-        Scenario of the second part; ``None``: direction-dependent friction in one joint.
-    choice
-        Where the parameters of the arm come from.
-    """
+    """Options of ``armident demo``; ``quick``: first part only; ``keep_going``: leave the arm running until Ctrl-C."""
 
     out: Path
     keep_going: bool = False
@@ -137,11 +118,7 @@ class DemoOptions:
 
 @dataclass(frozen=True)
 class Subject:
-    """The arm of the demo.
-
-    ``scenario``: scenario of the second part; ``robot_options``: further options of ``armident robot``; ``repeats``:
-    number of runs of the trajectory in the second part.
-    """
+    """The arm of the demo, the scenario of the second part, and the repeats of its trajectory."""
 
     session: SessionConfig
     robot: RobotConfig
@@ -155,11 +132,7 @@ class Subject:
 
 
 def demo(options: DemoOptions) -> None:
-    """Run both parts and write the report.
-
-    Raises ConfigError if a configuration is wrong, or the bus cannot be set up. Raises ArmidentError if a process
-    fails; contains its name and the end of its output.
-    """
+    """Run both parts and write the report; raises ArmidentError, with the end of its output, if a process fails."""
     out = options.out.resolve()
     subject = _subject(options, out)
     subject = subject.at(_session_for_this_machine(subject.session, options))
@@ -207,10 +180,7 @@ def _subject(options: DemoOptions, out: Path) -> Subject:
 
 
 def worn(twin: Twin) -> Scenario:
-    """Scenario of a worn bearing: viscous friction depends on the direction, in the joint where there is most of it.
-
-    ``twin``: the virtual arm.
-    """
+    """Scenario of a worn bearing: viscous friction depends on the direction, in the joint where there is most of it."""
     robot, standard = twin.robot, twin.parameters.standard
     scale = torque_scale(robot, standard).torque
     share = [standard[f"fv{j + 1}"] * joint.limits.velocity / scale[j] for j, joint in enumerate(robot.joints)]
@@ -377,11 +347,7 @@ class _DemoProcess(CommandProcess):
         super().__init__(words, name=name, log=file, merge=True, start=start)
 
     def wait(self, seconds: float, accepted: Sequence[int] = (0,)) -> None:
-        """Wait for the end and log the lines that the process prints in the meantime.
-
-        ``seconds``: longest time to wait, s; ``accepted``: exit codes of success. Raises ArmidentError if it takes
-        longer, or ends with another exit code.
-        """
+        """Wait for the end and log what the process prints; raises ArmidentError on other exit codes or time-out, s."""
         until = time.monotonic() + seconds
         while True:
             try:

@@ -18,11 +18,7 @@ _PART = re.compile(r"<!-- chapter begins -->(.*?)<!-- chapter ends -->", re.DOTA
 
 @dataclass(frozen=True)
 class Identified:
-    """Results of the first part.
-
-    ``document``: content of ``identification.json``; ``report``: report of the identification; ``truth``: true values
-    of the identified parameters by name, where they are known; ``lost``: number of lost samples.
-    """
+    """Results of the first part; ``truth``: known true values by name; ``lost``: number of lost samples."""
 
     document: dict[str, Any]
     report: Path
@@ -32,11 +28,7 @@ class Identified:
 
 @dataclass(frozen=True)
 class Diagnosed:
-    """Results of the second part.
-
-    ``document``: content of ``diagnosis.json``; ``report``: report of the diagnosis; ``hidden``: effects that were
-    hidden, each with its joint.
-    """
+    """Results of the second part; ``hidden``: effects that were hidden, each with its joint."""
 
     document: dict[str, Any]
     report: Path
@@ -44,11 +36,7 @@ class Diagnosed:
 
 
 def true_values(document: Mapping[str, Any], truth: Mapping[str, float], robot: RobotConfig) -> dict[str, float]:
-    """True values of identified parameters: of the arm, or of the formula of a regrouped parameter.
-
-    ``document``: content of ``identification.json``. ``truth``: parameters of the virtual arm by name. ``robot``: the
-    robot; its lengths ``d1``, ``r1``, ... occur in the formulas.
-    """
+    """True values of identified parameters: of the arm, or of the formula (of ``d1``, ...) of a regrouped one."""
     names = dict(truth)
     for j, joint in enumerate(robot.joints, start=1):
         names |= {f"d{j}": joint.mdh.d, f"r{j}": joint.mdh.r}
@@ -66,11 +54,7 @@ def true_values(document: Mapping[str, Any], truth: Mapping[str, float], robot: 
 
 
 def write_report(out: Path, robot: RobotConfig, first: Identified, second: Diagnosed | None) -> Path:
-    """Join the reports of both parts to one page.
-
-    ``out``: folder of the page ``report.html``. ``first``, ``second``: results of the parts; ``None``: the second was
-    left out.
-    """
+    """Join the reports of both parts to one page ``report.html``; ``None``: the second was left out."""
     page = first.report.read_text(encoding="utf-8")
     parts = [_part(page)] + ([] if second is None else [_part(second.report.read_text(encoding="utf-8"))])
     head = page[: page.index("<!-- chapter begins -->")]
@@ -149,10 +133,7 @@ def _against_truth(first: Identified) -> list[tuple[str, float, float, float, fl
 
 
 def print_table(first: Identified, second: Diagnosed | None) -> None:
-    """Print the identified parameters beside the true ones, and the findings.
-
-    ``first``, ``second``: results of the parts; ``None``: the second was left out.
-    """
+    """Print the identified parameters beside the true ones, and the findings of the second part, if any."""
     print(f"\n{'parameter':>10} {'identified':>11} {'+- std':>9} {'true':>9} {'off by':>9}")
     for name, value, std, truth, distance in _against_truth(first):
         print(f"{name:>10} {value:11.4f} {std:9.4f} {truth:9.4f} {distance:5.1f} std")

@@ -1,7 +1,6 @@
 """Plausible parameters of a robot whose masses or friction are not known, drawn from a seed.
 
-Masses follow the geometry: a body lies between its joint and the next one, and links become lighter towards the tip.
-The total is such that gravity and acceleration take a share of the torque limits.
+A body lies between its joint and the next one, lighter towards the tip; torques take a share of the limits.
 """
 
 from collections.abc import Mapping
@@ -39,11 +38,9 @@ DRY, VISCOUS = (0.05, 0.6), (0.05, 0.8)
 
 @dataclass(frozen=True, eq=False)
 class TorqueScale:
-    """Typical loads of the joints, joint side.
+    """Typical loads of the joints over postures, joint side, (n,) each, SI.
 
-    ``inertia``: diagonal of the mass matrix, rotors included, averaged over postures, kg m^2 or kg, shape (n,);
-    ``gravity``: root mean square torque of gravity over postures, N m or N, shape (n,); ``torque``: typical torque of
-    acceleration and gravity, N m or N, shape (n,).
+    ``inertia``: mean diagonal of the mass matrix with rotors; ``gravity``: rms; ``torque``: with acceleration.
     """
 
     inertia: Floats
@@ -57,21 +54,14 @@ def log_uniform(rng: np.random.Generator, limits: tuple[float, float], size: int
 
 
 def random_body(rng: np.random.Generator, size: float, mass: float) -> tuple[Floats, Floats]:
-    """Draw a body of a length, m, and a mass, kg: centre of mass, m, (3,), and second moments about it, kg m^2, (3, 3).
-
-    Second moments are positive, so that the body exists.
-    """
+    """Draw a body, m, kg, that exists: centre of mass, m, (3,), and second moments about it, kg m^2, (3, 3)."""
     com = rng.normal(size=3) * size * np.array([0.4, 0.15, 0.3])
     axes = np.linalg.qr(rng.normal(size=(3, 3)))[0]
     return com, mass * axes @ np.diag((size * rng.uniform(0.08, 0.4, 3)) ** 2) @ axes.T
 
 
 def draw_bodies(robot: RobotConfig, seed: int) -> dict[str, float]:
-    """Draw the inertial parameters of all links.
-
-    ``robot``: robot with limits of position, velocity and acceleration. Returns parameters by name (``xx1`` ...
-    ``m6``), SI.
-    """
+    """Draw the inertial parameters of all links, by name (``xx1`` ... ``m6``), SI, for the limits of a robot."""
     rng, n = np.random.default_rng([seed, 1]), robot.n
     mass = log_uniform(rng, MASS) * np.cumprod(np.concatenate([[1.0], rng.uniform(*DECAY, n - 1)]))
     ends = [_next_origin(robot, j) for j in range(n)]
@@ -89,11 +79,7 @@ def draw_bodies(robot: RobotConfig, seed: int) -> dict[str, float]:
 
 
 def needed_torque(robot: RobotConfig, standard: Mapping[str, float]) -> Floats:
-    """Torque for gravity and a large acceleration, N m or N, shape (n,).
-
-    ``robot``: robot with limits of position, velocity and acceleration. ``standard``: inertial parameters of the links
-    by name; others do not count.
-    """
+    """Torque (n,) for gravity and a large acceleration, N m or N; of ``standard`` only the links count."""
     load = torque_scale(robot, {name: value for name, value in standard.items() if not name.startswith("ia")})
     rise = np.array([min(j.limits.acceleration, RISE_PER_S * j.limits.velocity) for j in robot.joints])
     # Rotors add to the inertia about as much as the links do.
@@ -117,11 +103,7 @@ def _standard(link: int, mass: float, com: Floats, second: Floats) -> dict[str, 
 
 
 def torque_scale(robot: RobotConfig, standard: Mapping[str, float]) -> TorqueScale:
-    """Typical loads of the joints over postures within their limits.
-
-    ``robot``: robot with limits of position and velocity; ``standard``: inertial parameters by name, and rotor inertias
-    where there are any. Raises ConfigError if a joint moves no inertia.
-    """
+    """Typical loads of the joints over postures within their limits; raises ConfigError if a joint moves no inertia."""
     n = robot.n
     model = build_model(robot, standard)
     data = model.createData()
@@ -145,10 +127,7 @@ def torque_scale(robot: RobotConfig, standard: Mapping[str, float]) -> TorqueSca
 
 
 def draw_rotors(robot: RobotConfig, standard: Mapping[str, float], seed: int) -> dict[str, float]:
-    """Draw the rotor inertias, joint side; zero at joints without ``rotor_inertia``.
-
-    ``robot``: robot with limits of position and velocity; ``standard``: inertial parameters of the links by name.
-    """
+    """Draw the rotor inertias, joint side; zero at joints without ``rotor_inertia``."""
     factors = log_uniform(np.random.default_rng([seed, 2]), ROTOR, robot.n)
     links = torque_scale(robot, standard).inertia
     return {
@@ -158,10 +137,7 @@ def draw_rotors(robot: RobotConfig, standard: Mapping[str, float], seed: int) ->
 
 
 def draw_friction(robot: RobotConfig, scale: TorqueScale, seed: int) -> dict[str, float]:
-    """Draw viscous and Coulomb friction and offset of each joint, and the parameters of couplings.
-
-    ``scale``: typical loads of its joints.
-    """
+    """Draw viscous and Coulomb friction and offset of each joint, and the parameters of couplings."""
     rng, n = np.random.default_rng([seed, 3]), robot.n
     speed = np.array([joint.limits.velocity for joint in robot.joints])
     viscous = log_uniform(rng, VISCOUS, n) * scale.torque / speed

@@ -1,7 +1,6 @@
 """Compiled integration of the arm over one control period, with constant torque and stiff friction.
 
-Coordinates ``y`` (N,): motors, joint side (n,), then links behind elastic gears, then swinging masses. Without such
-effects N = n.
+Coordinates ``y`` (N,): motors, joint side (n,), then links behind elastic gears, then swinging masses.
 """
 
 import math
@@ -27,26 +26,11 @@ M2, M3 = 6.1697947043828245592553615689730, -0.42772256543218573326238373806514
     **PLAIN,
 )
 def friction_torques(q, qd, t, friction, smoothing, pairs, ratio, table, load, out, slope):  # type: ignore[no-untyped-def]
-    """Torques of friction, couplings (equation B.1), brakes and hidden effects, and their slopes over the velocities.
+    """Torques (N,) of friction, couplings (equation B.1), brakes and hidden effects, and slopes (N, N) over velocities.
 
-    Parameters
-    ----------
-    q, qd
-        Coordinates and velocities, shape (N,).
-    friction
-        fv, fc, offset and viscous coefficient of the brake by joint, shape (n, 4).
-    smoothing
-        ``g`` in ``sign(qd) -> (2/pi) atan(g qd)`` of each joint, s/rad or s/m, shape (n,).
-    pairs
-        The two joints, fv and fc of the couplings, shape (C, 4).
-    ratio
-        Transmission matrix, shape (n, n).
-    table
-        Hidden torques (`force_table`), shape (E, 9).
-    load
-        Torques that the gears transmit to the links, shape (n,).
-    out, slope
-        Resulting torques, shape (N,), and slopes, shape (N, N); written in place.
+    Written to ``out`` and ``slope``. ``friction`` (n, 4): fv, fc, offset, viscous brake. ``smoothing`` (n,): ``g`` in
+    ``sign(qd) -> (2/pi) atan(g qd)``, s/rad or s/m. ``pairs`` (C, 4): two joints, fv and fc. ``table`` (E, 9):
+    `force_table`. ``load`` (n,): of the gears on the links.
     """
     n = friction.shape[0]
     slope[:, :] = 0.0
@@ -83,11 +67,9 @@ def friction_torques(q, qd, t, friction, smoothing, pairs, ratio, table, load, o
 
 @compiled("f8[::1], f8[::1], f8[:, ::1], f8[::1], f8[:, ::1], f8[:, ::1]", **PLAIN)
 def gear_torques(q, qd, gears, out, slope, stiff):  # type: ignore[no-untyped-def]
-    """Add the torques of elastic gears and their slopes.
+    """Add the torques (N,) of elastic gears and their slopes (N, N) over velocities and coordinates, in place.
 
-    ``q``, ``qd``: coordinates and velocities, shape (N,); ``gears``: elastic gears (`gear_rows`), shape (G, 6);
-    ``out``: torques, shape (N,), changed in place; ``slope``, ``stiff``: slopes over velocities and coordinates, shape
-    (N, N), changed in place.
+    ``q``, ``qd`` (N,): coordinates and velocities; ``gears`` (G, 6): `gear_rows`.
     """
     for e in range(gears.shape[0]):
         a, b = int(gears[e, 0]), int(gears[e, 1])
@@ -151,32 +133,12 @@ def advance(  # type: ignore[no-untyped-def]
     period, substeps, t, state, z, tau, mass, bias, rotor, link,
     friction, smoothing, pairs, ratio, table, load, gears, bristles,
 ):  # fmt: skip
-    """Integrate the state over one period with constant torque (ROS3).
+    """Integrate the state over one period, s, with constant joint torque (n,) (ROS3), in place.
 
-    Parameters
-    ----------
-    period, substeps
-        Period, s, and number of inner steps.
-    t
-        Time at the beginning, s.
-    state
-        Position, velocity, and both as predicted for the middle of the next period, shape (4, N); changed in place.
-    z
-        Deflection of the bristles, shape (B,); changed in place.
-    tau
-        Joint torques, shape (n,).
-    mass, bias
-        Pinocchio's mass matrix (upper triangle) and nonlinear effects at the predicted middle of the period.
-    rotor
-        Additional inertias, shape (N, N).
-    link
-        Coordinates of ``mass`` and ``bias``.
-    friction, smoothing, pairs, ratio, table, load
-        As in `friction_torques`.
-    gears
-        As in `gear_torques`.
-    bristles
-        Bristles (`bristle_table`), shape (B, 7).
+    ``state`` (4, N): position, velocity, and both as predicted for the middle of the next period; ``z`` (B,):
+    deflection of the bristles. ``mass`` (upper triangle) and ``bias`` are Pinocchio's at the predicted middle, of the
+    coordinates ``link``; ``rotor`` (N, N) are further inertias. ``bristles`` (B, 7): `bristle_table`; the others as in
+    `friction_torques` and `gear_torques`.
     """
     q, qd, middle, speed = state[0], state[1], state[2], state[3]
     n, count, total = tau.size, bristles.shape[0], q.size

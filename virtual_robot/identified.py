@@ -12,11 +12,7 @@ from armident.configs.urdf_inertials import INERTIAL
 
 @dataclass(frozen=True)
 class Identified:
-    """Parameters of an identified arm.
-
-    ``sources``: remarks for the user. ``sign_smoothing``: ``g`` of each joint's smoothed sign, s/rad or s/m; ``None``
-    in documents without it.
-    """
+    """Parameters of an identified arm, remarks, and ``g`` of each joint's smoothed sign, s/rad or s/m, if known."""
 
     standard: dict[str, float]
     sources: tuple[str, ...]
@@ -24,11 +20,7 @@ class Identified:
 
 
 def read_identified(path: Path, robot: RobotConfig) -> Identified:
-    """Read the physically consistent parameters of an identification.
-
-    ``path``: ``identification.json`` of an identification with ``--physical``. Raises ConfigError if the document
-    cannot be read, is of another robot, or has no physically consistent parameters.
-    """
+    """Read the physically consistent parameters of an identification (``--physical``), else raise ConfigError."""
     document = _read(path)
     if document.get("robot") != robot.name:
         raise ConfigError(f"{path}: is of robot {document.get('robot')!r:.80}, the configuration is of {robot.name!r}")

@@ -1,9 +1,8 @@
 """Link parameters of the virtual arms; those of the TX40 are physically consistent and agree with table B.4.
 
-Table B.4 of the thesis gives fourteen essential base inertial values; the links need sixty standard ones. A
-semidefinite programme determines them: every pseudo-inertia is positive definite (Wensing, Kim, Slotine 2018), rotor
-inertias are positive, the essential values are met, and all other values are small. Regenerate the data file with
-``python -m armident.virtual_robot.inertias``.
+Table B.4 has fourteen essential base values; the links need sixty. A semidefinite programme keeps pseudo-inertias
+positive definite (Wensing, Kim, Slotine 2018), meets the values, and keeps others small. Regenerate: ``python -m
+armident.virtual_robot.inertias``.
 """
 
 from collections.abc import Mapping
@@ -62,11 +61,7 @@ MASS_MARGIN = 0.02
 
 
 def base_parameters(standard: Mapping[str, float]) -> dict[str, float]:
-    """Base inertial parameters of the TX40 from its standard ones (thesis tables B.2 and B.3).
-
-    ``standard``: standard parameters by name, SI; for an arm of fewer links only the groups with known parameters
-    result.
-    """
+    """Base inertial parameters of the TX40 from standard ones (thesis tables B.2 and B.3), SI; known groups only."""
     groups = {name: terms for name, terms in regrouping().items() if terms.keys() <= standard.keys()}
     return {name: sum(c * standard[k] for k, c in terms.items()) for name, terms in groups.items()}
 
@@ -102,10 +97,7 @@ def regrouping() -> dict[str, dict[str, float]]:
 
 
 def pseudo_inertia(standard: Mapping[str, float], link: int) -> NDArray[np.float64]:
-    """Pseudo-inertia matrix of a link, shape (4, 4): positive definite for a real body (Wensing, Kim, Slotine 2018).
-
-    ``standard``: standard parameters by name, SI; ``link``: number of the link, from 1.
-    """
+    """Pseudo-inertia (4, 4) of link 1, ...: positive definite for a real body (Wensing, Kim, Slotine 2018)."""
     xx, xy, xz, yy, yz, zz, mx, my, mz, m = (standard[f"{k}{link}"] for k in INERTIAL)
     inertia = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
     out = np.empty((4, 4))
@@ -116,10 +108,7 @@ def pseudo_inertia(standard: Mapping[str, float], link: int) -> NDArray[np.float
 
 
 def solve() -> dict[str, float]:
-    """Standard parameters of the six links that meet table B.4 (kg, kg m, kg m^2).
-
-    Raises ArmidentError if the programme has no solution.
-    """
+    """Standard parameters that meet table B.4 (kg, kg m, kg m^2); raises ArmidentError without a solution."""
     names = [f"{k}{j}" for j in range(1, JOINTS + 1) for k in INERTIAL] + [f"ia{j}" for j in range(1, JOINTS + 1)]
     at = {name: k for k, name in enumerate(names)}
 
@@ -202,10 +191,7 @@ def has_stored_parameters(robot: RobotConfig) -> bool:
 
 
 def plant_parameters(robot: RobotConfig) -> dict[str, float]:
-    """All standard parameters of the virtual TX40 or EMPS, by name, SI.
-
-    ``robot``: robot with stored parameters. Raises ConfigError if there are no stored parameters of that robot.
-    """
+    """All standard parameters of the virtual TX40 or EMPS, SI; raises ConfigError for other robots."""
     if not has_stored_parameters(robot):
         known = ", ".join(sorted(p.name.removesuffix("_inertias.yaml") for p in HERE.glob("*_inertias.yaml")))
         raise ConfigError(f"robot {robot.name!r}: no stored parameters for these joints (there is: {known})")

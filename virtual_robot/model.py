@@ -12,13 +12,10 @@ pin: Any = pinocchio
 
 
 def build_model(robot: RobotConfig, standard: Mapping[str, float]) -> Any:
-    """Build a Pinocchio model whose joint frames are the MDH frames (thesis section 2.1.1).
+    """Build a Pinocchio model of n joints whose joint frames are the MDH frames (thesis section 2.1.1).
 
-    ``Rot(z, theta)`` and ``Trans(z, r)`` commute, so offset and ``r`` precede the joint. The frame that moves with the
-    joint is then frame j itself, and the standard parameters apply unchanged.
-
-    ``robot``: geometry and gravity. ``standard``: standard parameters by name (``xx1`` ... ``m6``), inertias about the
-    frame origins, SI. Returns the model with n joints.
+    ``Rot(z, theta)`` and ``Trans(z, r)`` commute, so offset and ``r`` precede the joint; the moving frame is frame j
+    itself, for which the standard parameters (about origins, SI) apply.
     """
     model = pin.Model()
     model.name = robot.name

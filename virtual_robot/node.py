@@ -76,26 +76,10 @@ NEEDED = (
 
 
 class Drive(canopen.LocalNode):
-    """One virtual CiA 402 drive.
+    """One virtual CiA 402 drive; raises ConfigError if the EDS cannot be read or lacks an object.
 
-    Raises ConfigError if the EDS cannot be read or lacks an object that the drive needs.
-
-    Parameters
-    ----------
-    node_id, eds
-        Node id, and EDS of the object dictionary.
-    index
-        Number of its joint.
-    joint
-        Source of encoder resolution (608Fh) and rated current (6075h).
-    motion
-        Plant or recording behind the drive.
-    changed
-        Called when PDO configuration, NMT state or a mapped constant may have changed.
-    status_changed
-        Called when the statusword has changed.
-    fd
-        ``True`` if its TPDOs are CAN FD frames.
+    ``joint`` gives encoder resolution (608Fh) and rated current (6075h). ``changed``: PDO configuration, NMT state or a
+    mapped constant may have changed. ``fd``: TPDOs are CAN FD frames.
     """
 
     def __init__(
@@ -150,10 +134,7 @@ class Drive(canopen.LocalNode):
             self.data_store.setdefault(index, {})[subindex] = entry.encode_raw(value)
 
     def reset(self, communication_only: bool) -> None:
-        """Restore the power-on values of the object dictionary.
-
-        ``communication_only``: ``True``: only the communication profile (1000h to 1FFFh).
-        """
+        """Restore the power-on values of the object dictionary, or of the communication profile (1000h to 1FFFh)."""
         for index in list(self.data_store):
             if not communication_only or index < 0x2000:
                 del self.data_store[index]
@@ -163,10 +144,7 @@ class Drive(canopen.LocalNode):
             self._enter(DriveState.SWITCH_ON_DISABLED)
 
     def get_data(self, index: int, subindex: int, check_readable: bool = False) -> bytes:
-        """Read an object.
-
-        ``check_readable``: refuse write-only objects: a request over SDO, which oddities may answer.
-        """
+        """Read an object; a request over SDO refuses write-only ones, and oddities may answer it."""
         if check_readable:
             for oddity in self.oddities:
                 answer = oddity.read(index, subindex)
@@ -206,10 +184,7 @@ class Drive(canopen.LocalNode):
         self._enter(state)
 
     def fault(self, code: int, register: int) -> None:
-        """Enter the fault state and report it (EMCY, 1001h, 1003h).
-
-        ``code``, ``register``: emergency error code, and error register.
-        """
+        """Enter the fault state and report error code and register (EMCY, 1001h, 1003h)."""
         if self.state is DriveState.FAULT:
             return
         self._enter(DriveState.FAULT)
@@ -310,10 +285,7 @@ class Drive(canopen.LocalNode):
             raise SdoAbortedError(ABORT_NOT_MAPPABLE)
 
     def pdos(self, base: int) -> list[tuple[int, int, list[tuple[int, int, int]]]]:
-        """Enabled PDOs: COB-ID, transmission type, and mapped objects (index, subindex, bytes) in order.
-
-        ``base``: first communication record: 1400h (RPDO) or 1800h (TPDO).
-        """
+        """Enabled PDOs from record 1400h or 1800h on: COB-ID, type, objects (index, subindex, bytes) in order."""
         out = []
         for index in range(base, base + MAPPING):
             if index not in self.object_dictionary:

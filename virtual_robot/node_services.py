@@ -38,10 +38,7 @@ class Nmt(NmtSlave):
     _toggle = 0
 
     def on_command(self, can_id: int, data: bytes, timestamp: float) -> None:
-        """Execute a command addressed to this node or to all; malformed commands are ignored.
-
-        ``can_id``, ``data``, ``timestamp``: identifier, data bytes and receive time of the frame.
-        """
+        """Execute a command addressed to this node or to all; malformed commands are ignored."""
         if len(data) != 2 or data[1] not in (0, self.id):
             return
         drive: Drive = self._local_node
@@ -109,10 +106,7 @@ class Sdo(SdoServer):
         self._index = self._subindex = 0
 
     def on_request(self, can_id: int, data: bytes, timestamp: float) -> None:
-        """Serve one request.
-
-        ``can_id``, ``data``, ``timestamp``: identifier, data bytes and receive time of the frame.
-        """
+        """Serve one request."""
         if len(data) != 8 or self._node.nmt.stopped:
             return
         if all([oddity.request(bytes(data)) for oddity in self._node.oddities]):

@@ -11,10 +11,7 @@ from armident.configs import RobotConfig
 
 @dataclass(frozen=True)
 class NoiseSize:
-    """Variances of the joint torque's noise, (N m)^2 or N^2.
-
-    ``decimated``: variance of the part below 20 Hz, by joint.
-    """
+    """Variances of the joint torque's noise, (N m)^2 or N^2; ``decimated``: of the part below 20 Hz."""
 
     sampled: tuple[float, ...]
     decimated: tuple[float, ...]
@@ -42,12 +39,8 @@ BLOCK = 1024
 class Noise:
     """Reproducible noise of one arm, by control period.
 
-    A white part and a slow part together have the variance as sampled; their parts below the cut-off have the
-    decimated variance.
-
-    ``robot``: transmission and drive gains. ``seed``: seed of the random numbers. ``level``: factor on the amplitudes;
-    0: no noise. ``size``: variances of the noise; ``None``: those of the TX40 or the EMPS. ``averaged``: number of
-    control periods over which a reported signal is averaged; its mean has the variance as sampled.
+    A white and a slow part together have the sampled variance, their parts below the cut-off the decimated one.
+    ``level``: factor on amplitudes. The mean of a signal over ``averaged`` periods has the sampled variance.
     """
 
     def __init__(
@@ -90,12 +83,10 @@ class Noise:
 def amplitudes(
     robot: RobotConfig, period: float, size: NoiseSize | None = None, averaged: int = 1
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return standard deviations of both parts of the noise.
+    """Standard deviations (n,) of both parts of the noise, N m or N.
 
-    ``robot``: robot with the name of a virtual arm, n joints. ``size``: variances of the noise; ``None``: those of the
-    TX40 or the EMPS. ``averaged``: number of control periods over which a reported signal is averaged; its mean has the
-    variance as sampled. Returns ``white``: white torque noise of the motors, motor side, (n,), N m or N. ``slow``:
-    disturbance torque of the joints, (n,), N m or N; its spectrum has the corner `DISTURBANCE_HZ`.
+    White: torque of a motor, motor side, mean of ``averaged`` periods. Slow: torque of a joint, corner
+    `DISTURBANCE_HZ`.
     """
     size = SIZES[robot.name] if size is None else size
     total, low = np.array(size.sampled), np.array(size.decimated)

@@ -18,11 +18,7 @@ ABORT_VALUE_RANGE = 0x06090030
 
 
 class Absent(Oddity):
-    """An object that the drive does not have.
-
-    ``subindex``: its sub-index; ``None``: all. ``guarding``: ``False`` if the drive does not answer node guarding
-    either.
-    """
+    """An object, or sub-index, that the drive does not have; without ``guarding`` it has no node guarding either."""
 
     def __init__(self, index: int, subindex: int | None = None, guarding: bool = True) -> None:
         self._index, self._subindex, self.answers_guarding = index, subindex, guarding
@@ -60,10 +56,7 @@ class InterpolationRounds(Oddity):
 
 
 class Bit30(Oddity):
-    """Bit 30 of the COB-IDs of TPDOs.
-
-    ``demanded``: ``True``: COB-IDs without the bit are refused; ``False``: the bit is set.
-    """
+    """Bit 30 of the COB-IDs of TPDOs: it is set, or ``demanded``: COB-IDs without it are refused."""
 
     def __init__(self, demanded: bool) -> None:
         self._demanded = demanded
@@ -79,10 +72,7 @@ class Bit30(Oddity):
 
 
 class PdoFixed(Oddity):
-    """Read-only PDO mapping.
-
-    ``session``: session whose streams and set points are mapped; ``None``: the mapping of the EDS.
-    """
+    """Read-only PDO mapping: of the streams and set points of a session, or of the EDS."""
 
     def __init__(self, drive: Drive, session: SessionConfig | None) -> None:
         self._drive = drive
@@ -152,10 +142,7 @@ class WriteLate(Oddity):
 
 
 class ModeLate(Oddity):
-    """Mode of operation that is reported only some time after enabling.
-
-    ``before``: mode reported until then; ``delay_s``: time after enabling, s.
-    """
+    """Mode of operation that is reported some time, s, after enabling; ``before``: reported until then."""
 
     def __init__(self, drive: Drive, before: int, delay_s: float) -> None:
         self._drive, self._before, self._delay = drive, before.to_bytes(1, "little", signed=True), delay_s

@@ -8,6 +8,7 @@ from contextlib import suppress
 import can
 
 from armident.configs.schema.session import Bus
+from armident.drivers.can.udp import open_python_can
 from armident.drivers.canopen import objects as od
 from armident.drivers.canopen.objects import NmtCommand, NmtState
 from armident.virtual_robot.node import ABORT_DEVICE_STATE, Drive
@@ -97,7 +98,7 @@ class OtherClient(Oddity):
 
     def _run(self, bus: Bus) -> None:
         answers = [{"can_id": od.COB_SDO_RESPONSE + self._node, "can_mask": 0x7FF, "extended": False}]
-        with can.Bus(bus.channel, interface=bus.interface, can_filters=answers) as client:
+        with open_python_can(bus, answers) as client:
             while not self._over.wait(0.005):
                 with suppress(can.CanError, OSError):
                     client.send(self._request)

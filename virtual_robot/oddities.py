@@ -1,7 +1,4 @@
-"""Oddities of real drives: what CiA 301 and CiA 402 leave optional, masked, rounded, delayed or temporary.
-
-A scenario gives oddities to drives by the names of `ODDITIES`; ``odd_behaviours`` implements them.
-"""
+"""Oddities of drives: what CiA 301 and CiA 402 leave optional, masked, rounded, delayed or temporary (`ODDITIES`)."""
 
 from collections.abc import Mapping
 
@@ -52,18 +49,11 @@ class Oddity:
         """Set objects to other power-on values."""
 
     def read(self, index: int, subindex: int) -> bytes | None:
-        """Return the bytes that an SDO request reads; ``None``: those of the object.
-
-        Raises SdoAbortedError if the drive refuses.
-        """
+        """Bytes that an SDO request reads; ``None``: those of the object. SdoAbortedError if the drive refuses."""
         return None
 
     def write(self, index: int, subindex: int, data: bytes) -> bytes:
-        """Return the bytes that are stored when an SDO request writes.
-
-        ``index``, ``subindex``, ``data``: the object, and the bytes written. Raises SdoAbortedError if the drive
-        refuses.
-        """
+        """Bytes that are stored when an SDO request writes; raises SdoAbortedError if the drive refuses."""
         return data
 
     def request(self, data: bytes) -> bool:
@@ -94,10 +84,7 @@ def describe_oddities() -> str:
 def drive_oddities(
     scenario: Scenario | None, robot: RobotConfig, where: str = "scenario"
 ) -> dict[str, tuple[str, ...]]:
-    """Names of the oddities of each drive, by joint.
-
-    ``scenario``: the scenario; ``None``: no oddities. Raises ConfigError if a joint or an oddity is unknown.
-    """
+    """Names of the oddities of each drive, by joint; raises ConfigError if a joint or an oddity is unknown."""
     joints = [joint.name for joint in robot.joints]
     found: dict[str, tuple[str, ...]] = {}
     for name, drive in ({} if scenario is None else scenario.drives).items():

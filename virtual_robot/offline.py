@@ -36,25 +36,9 @@ def simulate_recording(
 ) -> Recording:
     """Simulate a recording of the virtual arm on a trajectory, as ``armident capture`` would write it.
 
-    Returns streams ``samples`` (position, effort, status) and ``demand``, and the marks of the experiment. Raises
-    ConfigError if the trajectory exceeds the robot's limits.
-
-    Parameters
-    ----------
-    robot
-        Robot with everything that a drive needs (`armident.virtual_robot.twin.complete`).
-    trajectory
-        Reference trajectory, joint side; the arm is at its start when the recording begins.
-    seed, noise, scenario, velocity_feedback, parameters
-        As for ``Arm``.
-    period
-        SYNC period, s; ``None``: the control period of the drives.
-    setpoint_every
-        Number of SYNCs between two set points, and between two recorded demands.
-    settle
-        Time at rest recorded before and after the trajectory, s.
-    start_ns
-        Time stamp of SYNC 0, ns.
+    Streams are ``samples`` (position, effort, status) and ``demand``, with marks of the experiment. ``settle``: rest
+    before and after it, s; ``setpoint_every``: SYNCs; ``start_ns``: stamp of SYNC 0. Raises ConfigError if the
+    trajectory exceeds limits.
     """
     trajectory.check(robot)
     every, period = setpoint_every, servo.control_period(robot) if period is None else period
@@ -110,10 +94,7 @@ def with_encoder_counts(robot: RobotConfig, counts: float) -> RobotConfig:
 
 
 def effort_of(robot: RobotConfig) -> Effort:
-    """Quantity that the robot's drives report as effort.
-
-    Raises ConfigError if the drives report different quantities.
-    """
+    """Quantity that the robot's drives report as effort; raises ConfigError if they report different ones."""
     efforts: list[Effort] = sorted({joint.drive.signal for joint in robot.joints})
     if len(efforts) > 1:
         raise ConfigError(f"robot {robot.name!r}: its drives report {' and '.join(efforts)}; a stream holds only one")

@@ -64,10 +64,9 @@ def _exchange(  # type: ignore[no-untyped-def]
 ):  # fmt: skip
     """Process frames from ``start`` on up to the next SYNC and answer it; return its index, or ``stop``.
 
-    ``sequence`` is the counter of a SYNC that carries none. ``result`` (3,) receives three numbers: frames to send,
-    bits for set points (1) and controlwords (2) that take effect at this SYNC, and SYNCs. These set points and
-    controlwords are in ``targets`` and ``control``. ``history`` keeps the live values; an entry sends those of
-    ``tx_back`` SYNCs ago.
+    ``sequence``: counter of a SYNC without one. ``result`` (3,): frames to send, bits for set points (1) and
+    controlwords (2) that take effect now, and SYNCs. ``history`` keeps live values; an entry sends those of ``tx_back``
+    SYNCs ago.
     """
     at = stop
     for k in range(start, stop):
@@ -133,11 +132,7 @@ def _exchange(  # type: ignore[no-untyped-def]
 
 
 class Exchange:
-    """PDO exchange at every SYNC by the present mapping of the drives.
-
-    ``drives``: in any order. ``motion``: plant or recording behind the drives. ``period``: SYNC period, s; velocity
-    actual (606Ch) is the difference of positions over it.
-    """
+    """PDO exchange at every SYNC by the present mapping of drives; velocity (606Ch): difference over the period, s."""
 
     def __init__(self, drives: Sequence[Drive], motion: DriveBackend, period: float) -> None:
         n = motion.position.size
@@ -226,11 +221,9 @@ class Exchange:
         )  # fmt: skip
 
     def take(self, ids: Any, lengths: Any, data: Any, start: int, stop: int, sequence: int) -> int:
-        """Process frames up to the next SYNC; afterwards `out` holds its answers, and `act` applies its set points.
+        """Process frames up to the next SYNC, and return its index, or ``stop`` if there is none.
 
-        ``ids``, ``lengths``, ``data``: fields of an array of frames, shape (N,), (N,) and (N, 8) or (N, 64); ``start``,
-        ``stop``: range of the frames to process; ``sequence``: counter of a SYNC that carries none. Returns the index
-        of the SYNC, or ``stop`` if there is none.
+        Then `out` holds its answers, and `act` applies its set points. Frames: fields (N,), (N,) and (N, 8) or (N, 64).
         """
         at = int(_exchange(ids, lengths, data, start, stop, sequence, *self._arguments))
         self.out = self._out[: self._result[0]]

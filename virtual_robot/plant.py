@@ -37,29 +37,9 @@ SETTLING = 20
 class Plant:
     """State and equations of motion of the arm; SI, joint side.
 
-    Mass matrix and nonlinear effects are evaluated once per period, at the predicted middle; friction is integrated in
-    finer steps. The error of the positions against a reference with a relative tolerance of 1e-9 is far below an
-    encoder count.
-
-    Parameters
-    ----------
-    robot
-        Geometry, gravity, couplings and smoothing of Coulomb friction.
-    q
-        Initial position, rad or m, shape (n,); the initial velocity is zero.
-    scenario
-        Hidden effects, and friction in place of the arm's own.
-    parameters
-        Parameters of the arm; ``None``: `armident.virtual_robot.arm_parameters.arm_parameters` of the robot.
-
-    Attributes
-    ----------
-    q, qd
-        Position and velocity of the motors, joint side, shape (n,).
-    coordinates, velocities
-        Position and velocity of motors, links behind elastic gears, and swinging masses, shape (N,).
-    bristles
-        Deflection of the bristles, rad, shape (B,).
+    Mass matrix and nonlinear effects are evaluated once per period, at the predicted middle, friction in finer steps;
+    the error is far below an encoder count. ``q``, ``qd`` (n,): of the motors; ``coordinates``, ``velocities`` (N,):
+    with links behind elastic gears and swinging masses; ``bristles`` (B,): deflection, rad.
     """
 
     def __init__(
@@ -159,11 +139,7 @@ class Plant:
         return mass
 
     def resistance(self, q: NDArray[np.float64], qd: NDArray[np.float64], t: float = 0.0) -> NDArray[np.float64]:
-        """Torques of friction, brakes and hidden effects against the motors; bristles slide steadily.
-
-        ``q``, ``qd``: positions and velocities of the motors, joint side, shape (n,). Returns torques, N m or N, shape
-        (n,).
-        """
+        """Torques (n,) of friction, brakes and hidden effects against the motors, N m or N; bristles slide steadily."""
         n = q.size
         out, slope = np.empty(n), np.empty((n, n))
         arguments = (q, qd, t, *self._resisting, out, slope)
@@ -176,11 +152,7 @@ class Plant:
     def acceleration(
         self, q: NDArray[np.float64], qd: NDArray[np.float64], tau: NDArray[np.float64], t: float = 0.0
     ) -> NDArray[np.float64]:
-        """Accelerations by direct dynamics, without the approximations of `advance`; bristles slide steadily.
-
-        ``q``, ``qd``: coordinates and velocities, shape (N,); ``tau``: joint torques, N m or N, shape (n,). Returns
-        accelerations of the coordinates, shape (N,).
-        """
+        """Accelerations (N,) at torques (n,), N m or N, without `advance`'s approximations; bristles slide steadily."""
         n, total = self.q.size, self.coordinates.size
         force, slope = np.zeros(total), np.zeros((total, total))
         force[:n] = self.resistance(q[:n], qd[:n], t) - tau

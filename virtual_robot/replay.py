@@ -15,13 +15,9 @@ RATE_TOLERANCE = 1e-3
 class Replay:
     """Drive backend that replays positions and currents of a recording, one sample per SYNC.
 
-    The first sample is sent until all drives of ``joints`` are enabled. Sample k is sent on the k-th SYNC after that,
-    and the last sample is repeated at the end. Set points are ignored.
-
-    ``recording``: the recording; gaps repeat the sample before them. ``robot``: encoder resolutions, transmission and
-    rated currents of the virtual drives. ``joints``: numbers of the joints whose drives must be enabled. Raises
-    ConfigError if the recording is of another robot, or its sample rate is not the SYNC rate; DataError if the
-    recording has no positions or no efforts, or if they exceed the range of the drives' numbers.
+    The first sample is repeated until all drives of ``joints`` are enabled, the last one at the end, and in a gap the
+    one before. Set points are ignored. Raises ConfigError if it is of another robot or rate, DataError if it lacks
+    values or exceeds ranges.
     """
 
     def __init__(self, recording: Recording, robot: RobotConfig, sync_period: float, joints: tuple[int, ...]) -> None:

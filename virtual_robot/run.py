@@ -47,33 +47,11 @@ def run_robot(
     choice: ParameterChoice = STANDARD,
     write_config: Path | None = None,
 ) -> None:
-    """Serve the drives of a session until SIGINT or SIGTERM, or for a given time.
+    """Serve the drives of a session, or of a robot, until SIGINT or SIGTERM, or for a given time, s.
 
-    Raises ConfigError if a file is wrong, the bus is missing, or the recording is of another robot; DataError if the
-    recording cannot be replayed; BusDown if the bus goes down.
-
-    Parameters
-    ----------
-    config
-        Configuration of a session, or of a robot (`armident.virtual_robot.twin.load_twin`).
-    scenario
-        Scenario with hidden effects, and oddities of drives.
-    replay
-        Recording to replay in place of the plant.
-    seed, noise
-        Seed of the noise, and factor on its amplitude.
-    duration
-        Time to run, s; ``None``: unlimited.
-    truth
-        File for the true parameters of the arm (JSON): standard and base parameters, and those of the drives. These
-        are ``kp`` (1/s), ``kv`` (units of the signal per rad/s or m/s at the motor), ``velocity_samples``,
-        ``velocity_filter_hz`` if there is a filter, and ``velocity_feedback`` (0 or 1).
-    velocity_feedback
-        Structure of the drives' velocity loop, see ``servo.design``.
-    choice
-        Where the parameters of the arm come from.
-    write_config
-        Folder for the completed robot and session.
+    ``truth``: JSON file of true parameters (standard, base, of the drives): ``kp`` (1/s), ``kv`` (units of the signal
+    per rad/s or m/s at the motor), ``velocity_samples``, ``velocity_filter_hz`` if any, ``velocity_feedback`` (0 or 1).
+    ``write_config``: folder for the completed robot and session. Raises ConfigError, DataError (replay) or BusDown.
     """
     hidden = load_scenario(scenario) if scenario is not None else None
     if replay is not None:
@@ -113,23 +91,10 @@ def record_robot(
     velocity_feedback: bool | None = None,
     choice: ParameterChoice = STANDARD,
 ) -> None:
-    """Write a simulated recording of one trajectory of the virtual arm, without a bus.
+    """Write a simulated recording of one trajectory of the virtual arm, without a bus; options as for ``run_robot``.
 
-    Raises ConfigError if a file is wrong, no trajectory is given, the scenario has oddities of drives, or ``out``
-    exists already.
-
-    Parameters
-    ----------
-    config
-        Configuration of a session (robot, SYNC period, set points), or of a robot.
-    out
-        The recording to write.
-    scenario, seed, noise, truth, velocity_feedback, choice
-        As for ``run_robot``.
-    trajectory
-        Trajectory; ``None``: that of the session.
-    encoder_counts
-        Counts per motor turn in place of the robot's, also for the control loops.
+    ``encoder_counts``: per motor turn in place of the robot's, also for the control loops. Raises ConfigError if a file
+    is wrong or exists, no trajectory is given, or the scenario has oddities.
     """
     if out.exists():
         raise ConfigError(f"{out}: the file exists already")

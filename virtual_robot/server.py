@@ -39,11 +39,9 @@ MOTION_ERROR, COMMUNICATION_ERROR = 0x20, 0x10
 
 @dataclass(frozen=True)
 class ServerReport:
-    """Timing of the drives' answers.
+    """Timing of the drives' answers: time that a SYNC waited in the kernel, us, and frames that the kernel dropped.
 
-    ``syncs``: number of SYNCs answered; ``delay_p50_us``, ``delay_p99_us``, ``delay_max_us``: median, 99th percentile
-    and maximum of the time that a SYNC waited in the kernel, us; ``backlog_max``: largest number of SYNCs received at
-    once; ``cpu_share``: CPU time over duration; ``dropped``: number of frames dropped by the kernel.
+    ``backlog_max``: SYNCs received at once.
     """
 
     syncs: int
@@ -72,11 +70,9 @@ class ServerReport:
 
 
 class Server:
-    """All virtual drives of a session on its buses; use it in a ``with`` block.
+    """All virtual drives of a session on its buses (``with`` block), with the names of oddities by joint.
 
-    ``session``, ``robot``: buses, nodes and SYNC; joints and drives. ``motion``: plant or recording behind the drives.
-    ``oddities``: names of the oddities of drives, by joint. Raises ConfigError if a bus is missing or an EDS is
-    unusable.
+    Raises ConfigError if a bus is missing or an EDS is unusable.
     """
 
     def __init__(
@@ -146,11 +142,9 @@ class Server:
             drive_bus.close()
 
     def run(self, stopped: Callable[[], bool], duration: float | None = None) -> ServerReport:
-        """Answer every SYNC.
+        """Answer every SYNC until ``stopped`` or ``duration``, s; raises BusDown if the only bus goes down.
 
-        ``stopped``: function that returns ``True`` to end. ``duration``: longest duration, s; ``None``: unlimited.
-        Raises BusDown if the only bus goes down; with several buses the others go on, and a bus that is back is served
-        again.
+        Of several buses the others go on, and a bus that is back is served again.
         """
         begin, cpu = time.monotonic(), time.process_time()
 

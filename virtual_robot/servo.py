@@ -31,17 +31,9 @@ SHARE_OF_POLE = 0.6436
 class Servo:
     """Cascade controllers of all drives, motor side (thesis figure B.1): a velocity loop inside a position loop.
 
-    Parameters
-    ----------
-    kp, kv
-        Gains, 1/s and units of the drives' signal per rad/s or m/s, shape (n,).
-    velocity_feedback
-        ``True``: ``signal = kv (kp e - qd)`` with ``e = demand - position``. ``False``: ``signal = kv (kp e + de/dt)``,
-        with the velocity of the demand, as in cyclic synchronous position mode.
-    velocity_samples
-        Number of periods over which the velocity is averaged.
-    filter_hz
-        Corner of the first-order low-pass on the velocity, Hz; infinite: none.
+    ``kp``, ``kv`` (n,): 1/s and units of the signal per rad/s or m/s. With feedback ``signal = kv (kp e - qd)``, ``e =
+    demand - position``; without, ``kv (kp e + de/dt)``, as in cyclic synchronous position mode. Velocity is averaged
+    over ``velocity_samples`` periods, low-pass ``filter_hz``.
     """
 
     period: float
@@ -67,39 +59,14 @@ def control(  # type: ignore[no-untyped-def]
     period, feedback, q, ratio, counts_per_rad, origin, target, age, steps, held, kp, kv, smooth, limit, noise,
     permille, past, rate, current, position, reported, demand, torque, disturbance, tau,
 ):  # fmt: skip
-    """Compute one control period of all drives (`Servo`), motor side; state and outputs are changed in place.
+    """Compute one control period of all drives (`Servo`), motor side; state and outputs (n,) change in place.
 
-    Parameters
-    ----------
-    period, feedback, kp, kv, smooth
-        Control period, velocity feedback, gains, and weight of the velocity filter, as in `Servo`.
-    q
-        Measured joint positions, rad or m, shape (n,).
-    ratio
-        Transmission matrix, shape (n, n).
-    counts_per_rad
-        Encoder counts per rad or m, shape (n,).
-    origin, target, age, steps
-        Previous and present target (counts), and passed and total periods of the interpolation, shape (n,).
-    held
-        ``True`` for drives that are not enabled: no current, and their demand follows the position, shape (n,).
-    limit
-        Saturation of the signal, shape (n,).
-    noise
-        Noise of the measured signal, shape (n,).
-    permille
-        Reported numbers per unit of the signal, shape (n,).
-    past, rate
-        Input of the velocity loop in the last periods, newest first, shape (n, velocity samples), and its filtered
-        change per period, shape (n,).
-    current, position, reported, demand
-        Signal, position (counts), reported signal (per mille of rated) and demand (counts), shape (n,).
-    torque
-        Joint torque per unit of the signal, N m or N, shape (n, n).
-    disturbance
-        Disturbance torques, joint side, shape (n,).
-    tau
-        Joint torques until the next period, shape (n,).
+    ``q``: measured, joint side. ``ratio`` (n, n): transmission. ``origin``, ``target``, ``age``, ``steps``: previous
+    and present target, counts, passed and total periods of the interpolation. ``held``: drives not enabled, without
+    current, their demand follows the position. ``smooth``: weight of the velocity filter; ``past`` (n, samples) its
+    inputs, newest first, ``rate`` the change per period. ``permille``: reported numbers per unit of the signal.
+    ``torque`` (n, n): joint torque per unit of the signal. ``tau``: joint torques until the next period, with
+    ``disturbance``.
     """
     n, samples = past.shape
     for j in range(n):
@@ -136,10 +103,7 @@ def control(  # type: ignore[no-untyped-def]
 
 
 def control_period(robot: RobotConfig, sync_period: float | None = None) -> float:
-    """Control period of the robot's drives, s; a SYNC period has a whole number of them.
-
-    ``sync_period``: SYNC period, s; ``None``: any.
-    """
+    """Control period of the robot's drives, s; a SYNC period, s, has a whole number of them."""
     if robot.name in OWN_PERIODS or sync_period is None:
         return OWN_PERIODS.get(robot.name, CONTROL_PERIOD)
     return sync_period / math.ceil(sync_period / CONTROL_PERIOD - 1e-6)
@@ -154,24 +118,10 @@ def design(
     bandwidth_hz: Sequence[float] = BANDWIDTH_HZ,
     known: Controller | None = None,
 ) -> Servo:
-    """Design the drives of a virtual arm: a known controller, else tuned gains.
+    """Design the drives of a virtual arm: a ``known`` controller (with velocity feedback), else tuned gains.
 
-    Raises ConfigError if ``velocity_feedback`` is ``False`` with a known controller.
-
-    Parameters
-    ----------
-    robot
-        Transmission and drive gains.
-    mass
-        Mass matrix at the posture for which the gains are tuned, joint side, rotors included, shape (n, n).
-    velocity_feedback
-        As for ``Servo``; ``None``: ``True`` with a known controller, else ``False``.
-    period
-        Control period, s; ``None``: that of `control_period`.
-    bandwidth_hz
-        Bandwidths of the position loops for tuned gains, Hz; the last one counts for all further joints.
-    known
-        Known controller, which has velocity feedback; ``None``: that of the robot's configuration, if it has one.
+    ``mass`` (n, n): at the posture of tuning, joint side, with rotors. The last of ``bandwidth_hz`` counts for all
+    further joints. Raises ConfigError if ``velocity_feedback`` contradicts a known controller.
     """
     period = control_period(robot) if period is None else period
     known = robot.controller if known is None else known
@@ -185,11 +135,9 @@ def design(
 def gains(
     robot: RobotConfig, mass: NDArray[np.float64], bandwidth_hz: Sequence[float] = BANDWIDTH_HZ
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Gains ``kp`` (1/s) and ``kv`` (A s/rad), motor side, for two equal poles at the given bandwidths.
+    """Gains ``kp`` (1/s) and ``kv`` (A s/rad), (n,) each, motor side, for two equal poles at the given bandwidths.
 
-    ``robot``: transmission and drive gains. ``mass``: mass matrix at the posture for which the gains are tuned, joint
-    side, rotors included, shape (n, n). ``bandwidth_hz``: bandwidths of the position loops, Hz; the last one counts for
-    all further joints. Returns ``kp``, ``kv``: gains, shape (n,) each.
+    ``mass`` (n, n): at the posture of tuning, joint side, with rotors. The last bandwidth counts for further joints.
     """
     inverse = np.linalg.inv(robot.transmission_matrix)
     inertia = np.diag(inverse.T @ mass @ inverse)

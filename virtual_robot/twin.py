@@ -39,21 +39,7 @@ SYNC_PERIOD_US = 1000
 
 @dataclass(frozen=True)
 class Twin:
-    """Virtual arm of a configuration.
-
-    Parameters
-    ----------
-    source
-        Configuration of the robot.
-    session, robot
-        The session, and the robot with everything that a drive needs.
-    parameters
-        Masses, friction, noise and bandwidths.
-    assumed
-        What the configuration left open and what was assumed, one sentence each.
-    trajectory
-        Motion for a session without set points; ``None``: the session has its own.
-    """
+    """Virtual arm of a configuration, and its assumptions; ``trajectory``: motion without set points in the session."""
 
     source: Path
     session: SessionConfig
@@ -69,11 +55,7 @@ class Twin:
 
 @dataclass(frozen=True)
 class ParameterChoice:
-    """Source of the parameters of a virtual arm.
-
-    ``model``: ``identification.json`` with physically consistent parameters; ``None``: not from an identification.
-    ``seed``: seed of what is drawn. ``draw_masses``: ``True``: masses are drawn even if the URDF has some.
-    """
+    """Source of the parameters: a physically consistent identification, else drawn; ``draw_masses``: not the URDF's."""
 
     model: Path | None = None
     seed: int = 0
@@ -85,11 +67,7 @@ STANDARD = ParameterChoice()
 
 
 def load_twin(config: Path, choice: ParameterChoice = STANDARD) -> Twin:
-    """Load the virtual arm of a session, or of a robot with a session made for it.
-
-    ``config``: configuration of a session or of a robot; ``choice``: where the parameters of the arm come from. Raises
-    ConfigError if a file is wrong, or is not of this robot.
-    """
+    """Virtual arm of a session, or of a robot with a session made for it; raises ConfigError if a file is wrong."""
     path = config_path(config)
     session = load_session(path, "robot") if is_session(path) else None
     path = path if session is None else session.robot
@@ -118,10 +96,9 @@ def at_period(session: SessionConfig, period_us: int) -> SessionConfig:
 
 
 def on_virtual_bus(session: SessionConfig, channel: str, cell: str) -> SessionConfig:
-    """Session on one virtual bus, without the cell's Zenoh, metrics and triggers: real drives and services stay apart.
+    """Session on one vcan bus, without the cell's Zenoh, metrics and triggers: real drives and services stay apart.
 
-    ``channel``: name of the vcan interface; ``cell``: name of the cell in its place. Raises ConfigError if drives of
-    several buses share a node id.
+    Raises ConfigError if drives of several buses share a node id.
     """
     nodes = [drive.node_id for drive in session.drives]
     if len(set(nodes)) < len(nodes):
@@ -145,12 +122,7 @@ def on_virtual_bus(session: SessionConfig, channel: str, cell: str) -> SessionCo
 
 
 def complete(robot: RobotConfig, **choice: Any) -> tuple[RobotConfig, ArmParameters, tuple[str, ...]]:
-    """Complete a robot for its virtual arm.
-
-    ``choice``: keyword arguments of `armident.virtual_robot.arm_parameters.arm_parameters`. Returns ``robot``,
-    ``parameters``, ``assumed``: the robot with limits, transmission and drives, the parameters of the arm, and what was
-    assumed.
-    """
+    """Robot with limits, transmission and drives, parameters of its virtual arm (`arm_parameters`), and assumptions."""
     robot, limits = with_limits(robot)
     parameters = arm_parameters(robot, **choice)
     robot, drives = _with_drives(robot, parameters)
@@ -263,10 +235,9 @@ def _session_for(path: Path, robot: RobotConfig) -> SessionConfig:
 
 
 def write_twin(twin: Twin, folder: Path) -> Path:
-    """Write the configuration of a virtual arm for ``armident capture``: robot, session and motion.
+    """Write ``robot.yaml``, ``cell.yaml`` and, without set points, ``trajectory.yaml`` for ``armident capture``.
 
-    ``twin``: the virtual arm; ``folder``: folder of the files ``robot.yaml``, ``cell.yaml`` and, for a session without
-    set points, ``trajectory.yaml``. Returns the session file. Raises ConfigError if the files cannot be written.
+    Returns the session file; raises ConfigError if the files cannot be written.
     """
     try:
         return _write_files(twin, folder)

@@ -14,9 +14,8 @@ PIECE_NS = 200_000_000
 class SamplesFirst:
     """Holds rows and gaps of other streams until the samples of their SYNC are certain.
 
-    The answers of a stream may be certain seconds before those of another: drives that lag answer the few SYNCs of a
-    slow stream in time, and none of the samples. The samples decide when a file begins. Without this class, the next
-    file would begin before the samples of the current one, and a file would have streams of different times.
+    Drives that lag may answer a slow stream in time and none of the samples, which decide when a file begins. Without
+    this class, streams of one file would have different times.
     """
 
     def __init__(self) -> None:
@@ -46,8 +45,8 @@ class SamplesFirst:
 class FileBoundaries:
     """Tells where a file may begin: before samples to which the other streams are certain.
 
-    A file without answers of its last SYNCs would not list them as a gap: they come with the next file. After
-    ``LATE_S`` without such a place, the next file begins anyway, so that a silent drive does not stop the files.
+    Else unanswered last SYNCs would not be listed as a gap: they come with the next file. After ``LATE_S`` the next
+    file begins anyway, so that a silent drive does not stop the files.
     """
 
     def __init__(self) -> None:
@@ -55,10 +54,7 @@ class FileBoundaries:
         """Time of the first samples refused since the last that were allowed, ns UTC."""
 
     def allow(self, samples: Rows, certain: Mapping[str, int]) -> bool:
-        """Return True if a file may begin before these samples.
-
-        ``samples``: at least one; ``certain``: number of the SYNC, by stream, before which all rows are known.
-        """
+        """Return True if a file may begin here; ``certain``: SYNC before which all rows of a stream are known."""
         t_ns = int(samples.t_ns[0])
         if all(until >= samples.sync[0] for until in certain.values()):
             self._refused_ns = None
@@ -73,13 +69,7 @@ class FileBoundaries:
 
 
 def pieces(batch: Batch) -> Iterator[Batch]:
-    """Yield a batch in pieces of at most `PIECE_NS`, by the time of its samples.
-
-    A batch is long if drives lagged and answered all at once. The pieces give blocks the usual size, and let files end
-    at their limits. Rows of a stream are in the piece of their SYNC, a gap is in the piece of its first SYNC.
-
-    ``batch``: rows and gaps.
-    """
+    """Yield a batch in pieces of at most `PIECE_NS`, by time of its samples: drives that lagged answer all at once."""
     samples = batch.rows["samples"]
     if samples.sync.size == 0 or samples.t_ns[-1] - samples.t_ns[0] < PIECE_NS:
         yield batch

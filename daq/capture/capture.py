@@ -45,11 +45,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class CaptureResult:
-    """Result of a capture.
-
-    ``paths``: the finished files, in their order in time; ``marks``: marks of the recording, such as begin and end of
-    the experiment; ``failure``: error of a bus or a drive that ended the capture early.
-    """
+    """Result of a capture; ``failure`` is the error of a bus or drive that ended it early."""
 
     paths: tuple[Path, ...]
     counters: dict[str, int]
@@ -63,13 +59,10 @@ def capture(
     save: threading.Event | None = None,
     reload: threading.Event | None = None,
 ) -> CaptureResult:
-    """Run one capture from the first SDO to the finished file.
+    """Run one capture from the first SDO to the finished file; set ``stop`` to end it.
 
-    ``plan``: session, robot, trajectory and options of the capture. ``stop``: set it to end the capture; the file is
-    finished nevertheless. ``save``: set it to write the last seconds, in a capture with triggers. ``reload``: set it to
-    read the configuration again, if the plan was read from a file. Result: with ``failure`` if a bus or a drive failed
-    during the capture; the recording is finished in that case, too. Raises ConfigError if the capture could not start:
-    bus, drives, mapping, disk, another capture. No file is left behind in that case.
+    ``save`` writes the last seconds, in a capture with triggers; ``reload`` reads the configuration again. Raises
+    ConfigError if the capture could not start; then no file is left behind.
     """
     session, robot = plan.session, plan.robot
     now = next_time(plan.directory, robot.name, datetime.datetime.now(datetime.UTC))
@@ -164,14 +157,7 @@ def run_capture(
     as_json: bool,
     sniff_s: float | None = None,
 ) -> None:
-    """Run ``armident capture`` until its end, SIGINT or SIGTERM, and print the paths of the files.
-
-    ``config``: session configuration. ``out``: directory of recordings; default: that of the session. ``duration``:
-    time after which the capture ends, s. ``listen_only``: send nothing to the buses. ``as_json``: print paths and
-    counters as JSON. ``sniff_s``: with ``listen_only``: time to discover the TPDOs of the drives, s. Raises ConfigError
-    if the capture could not start. Raises ArmidentError if a bus or a drive failed during the capture; the file is
-    finished in that case, too.
-    """
+    """Run ``armident capture`` until its end, SIGINT or SIGTERM, and print the paths; times in s."""
     handler = JournalHandler()
     with log_to(handler):
         plan = load_plan(config, out, duration, listen_only, sniff_s)

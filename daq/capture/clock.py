@@ -26,12 +26,7 @@ class _Timex(ctypes.Structure):
 
 @dataclass(frozen=True)
 class ClockState:
-    """State of the system clock.
-
-    ``offset_us``: offset that is still to be corrected, us; ``error_us``, ``largest_error_us``: estimated and largest
-    error, as the process that sets the clock states them, us; ``synchronised``: True if a process such as chrony or
-    ntpd sets the clock.
-    """
+    """State of the system clock, as chrony or ntpd states it; ``offset_us`` is still to be corrected."""
 
     offset_us: float
     error_us: float

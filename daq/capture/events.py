@@ -20,11 +20,7 @@ log = logging.getLogger(__name__)
 
 
 class EventHandler:
-    """Handles events in the order in which they are detected.
-
-    ``plan``: plan of the capture; its session names the events that trigger a recording. ``assembler``: gives the SYNC
-    at which an event happened, and is notified of buses that are down. ``sink``: takes the marks.
-    """
+    """Handles events in the order in which they are detected; some of them trigger a recording."""
 
     def __init__(self, plan: CapturePlan, assembler: Assembler, sink: Sink) -> None:
         self.counts = dict.fromkeys(COUNTED, 0)
@@ -58,10 +54,7 @@ class EventHandler:
             self._stop_moving(event.text)
 
     def on_bus_event(self, event: BusEvent) -> None:
-        """Handle the event of a bus; samples of its axes are gaps while it is down.
-
-        Raises ArmidentError if the bus was lost while the capture moves the arm.
-        """
+        """Handle the event of a bus, whose samples are gaps while it is down; ArmidentError if the arm moves."""
         if event.kind in self.counts:
             self.counts[event.kind] += 1
         if event.kind in ("bus_down", "bus_up"):
@@ -77,10 +70,7 @@ class EventHandler:
             self._stop_moving(event.text)
 
     def on_frames_dropped_at_end(self, dropped: int, syncs: int) -> None:
-        """Note that the kernel dropped frames after the last received one.
-
-        ``syncs``: largest number of SYNCs among them.
-        """
+        """Note that the kernel dropped frames after the last received one, at most ``syncs`` SYNCs among them."""
         self._note(f"{dropped} frames were dropped by the kernel at the end: up to {syncs} SYNCs may be missing there")
 
     def check_sync(self, now: float) -> None:

@@ -19,10 +19,9 @@ from armident.daq.matching.assembler import Assembler
 from armident.drivers.can.receiver import Receiver
 
 WARNED_SHARE = 0.1
-"""Share of the memory for waiting rows from which a warning is logged.
+"""Share of the memory for waiting rows from which a warning is logged; nothing is lost before the memory is full.
 
-Waiting rows lose nothing before the memory is full. At 0.1 of the default memory, a disk that writes nothing has
-stalled for half a minute, and five minutes remain to act.
+At 0.1 of the default memory, a disk that writes nothing has stalled for half a minute; five minutes remain to act.
 """
 
 log = logging.getLogger(__name__)
@@ -74,11 +73,7 @@ class DiskCheck:
 
 
 class Health:
-    """Reports on one capture.
-
-    ``assembler``, ``receiver``, ``jitters``: sources of the counters; ``sink``: gives the state of the files;
-    ``publisher``: takes the messages.
-    """
+    """Reports on one capture: counters of its parts and the state of its files."""
 
     def __init__(
         self,
@@ -104,10 +99,7 @@ class Health:
         self._exchange(self._opened(self._options))
 
     def change(self, session: SessionConfig) -> None:
-        """Apply the ``metrics`` options of a reloaded session.
-
-        Raises ConfigError if the port cannot be opened; the metrics stay at the former port in that case.
-        """
+        """Apply the ``metrics`` options of a reloaded session; if the port cannot be opened, the former one stays."""
         if session.metrics != self._options:
             fresh = self._opened(session.metrics)
             # Not here: closing the former server waits for its thread.
@@ -128,10 +120,7 @@ class Health:
             old.close()
 
     def report(self, seconds: float, events: dict[str, int]) -> None:
-        """Publish the state of the capture.
-
-        ``seconds``: time since the last report, s; ``events``: counts of events since the start.
-        """
+        """Publish the state of the capture, with rates over the ``seconds`` since the last report."""
         counters = self._assembler.counters
         rate = (counters["frames"] - self._frames_before) / seconds
         self._frames_before = counters["frames"]

@@ -11,10 +11,7 @@ _GIT_TIMEOUT_S = 2.0
 
 
 def host_metadata(now: datetime.datetime) -> dict[str, str]:
-    """Return host, kernel, clock source, program version and git revision, as far as they are known.
-
-    ``now``: start of the recording.
-    """
+    """Return host, kernel, clock source, program version and git revision, as far as they are known."""
     metadata = {
         "started_utc": now.astimezone(datetime.UTC).isoformat(timespec="microseconds"),
         "host": platform.node(),

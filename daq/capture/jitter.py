@@ -16,11 +16,7 @@ PERCENTILES = (50.0, 99.0, 99.9)
 
 
 class SyncJitter:
-    """Statistics of the jitter over all SYNCs of one bus.
-
-    ``overflow``: overflow of the SYNC counter (CiA 301, 1019h), by which missing SYNCs are detected; 0: SYNC has no
-    counter. ``sync_id``: COB-ID of SYNC.
-    """
+    """Jitter over all SYNCs of one bus; ``overflow`` of the counter (CiA 301, 1019h; 0: none) shows missing SYNCs."""
 
     def __init__(self, period_ns: int, overflow: int, sync_id: int = 0x80) -> None:
         self._period, self._overflow, self._sync_id = period_ns, overflow, sync_id

@@ -1,7 +1,4 @@
-"""A logging handler for the journal of systemd, with a field per attribute of a record.
-
-It uses the native protocol (systemd.io/JOURNAL_NATIVE_PROTOCOL): one datagram of fields per entry.
-"""
+"""Logging to the journal of systemd, with a field per attribute of a record (systemd.io/JOURNAL_NATIVE_PROTOCOL)."""
 
 import logging
 import os
@@ -25,11 +22,8 @@ _STANDARD = frozenset(vars(logging.makeLogRecord({}))) | {"message", "asctime", 
 class JournalHandler(StderrHandler):
     """Sends records to the journal where stderr is a stream of it, and writes lines to stderr elsewhere.
 
-    ``log.info("no heartbeat", extra={"event": "heartbeat_lost", "axis": "joint_2"})`` becomes an entry with the fields
-    ``ARMIDENT_EVENT`` and ``ARMIDENT_AXIS``.
-
-    ``fields``: fields of every entry, such as cell and robot; may be exchanged at any time. ``address``: socket of the
-    journal.
+    ``log.info("no heartbeat", extra={"event": "heartbeat_lost", "axis": "joint_2"})`` gets the fields
+    ``ARMIDENT_EVENT`` and ``ARMIDENT_AXIS``. ``fields`` are those of every entry; they may be exchanged at any time.
     """
 
     def __init__(self, fields: Mapping[str, object] | None = None, address: Path = SOCKET) -> None:
@@ -71,11 +65,7 @@ def in_journal() -> bool:
 
 
 def entry(record: logging.LogRecord, message: str, fields: Mapping[str, object]) -> bytes:
-    """Return the datagram of one entry.
-
-    ``record``: the record; its ``extra`` attributes become fields, except those that are ``None``. ``message``: the
-    formatted record. ``fields``: more fields; those of the record take precedence.
-    """
+    """Return the datagram of one entry; ``extra`` attributes that are not ``None`` take precedence over ``fields``."""
     own = {key: value for key, value in vars(record).items() if key not in _STANDARD}
     entries: dict[str, object] = {
         "MESSAGE": message,

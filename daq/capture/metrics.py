@@ -31,11 +31,7 @@ COUNTERS = {
 
 
 class Metrics:
-    """Serves the last health message over HTTP.
-
-    ``address``, ``port``: address and port of the server; port 0 takes a free one. ``labels``: labels of every metric:
-    cell and robot. Raises ConfigError if the port cannot be opened.
-    """
+    """Serves the last health message over HTTP, each metric with ``labels``; port 0 takes a free one."""
 
     def __init__(self, address: str, port: int, labels: dict[str, str]) -> None:
         collected = _Collected(labels)

@@ -1,8 +1,7 @@
 """Discovery of the TPDOs that drives send, by listening alone.
 
-Frames that come on every n-th SYNC, always with the same length, are TPDOs of the drives whose EDS gives them their
-COB-ID. Frames do not describe their contents. The mapping is that of the session if its length and interval agree, else
-the default of the EDS if its length agrees. Anything else is refused.
+Frames of one length on every n-th SYNC are TPDOs of the drives whose EDS gives them their COB-ID. Their mapping is that
+of the session if length and interval agree, else the EDS default if its length agrees; else they are refused.
 """
 
 import logging
@@ -37,10 +36,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class IdentifierStatistics:
-    """Statistics of the frames of one identifier.
-
-    ``every``: interval in SYNCs; ``None`` if the frames do not follow SYNC. ``lengths``: lengths that occurred, bytes.
-    """
+    """Statistics of one identifier: interval in SYNCs (``None``: frames do not follow SYNC) and lengths, bytes."""
 
     can_id: int
     frames: int
@@ -55,11 +51,7 @@ class IdentifierStatistics:
 
 @dataclass(frozen=True)
 class BusStatistics:
-    """Statistics of the frames of one bus.
-
-    ``period_us``: median SYNC period, us; ``identifiers``: statistics of every received identifier of the range of PDOs
-    (180h to 57Fh).
-    """
+    """Statistics of one bus: median SYNC period, us, and every received identifier of PDOs (180h to 57Fh)."""
 
     channel: str
     period_us: float
@@ -67,11 +59,7 @@ class BusStatistics:
 
 
 def bus_statistics(channel: str, frames: Frames) -> BusStatistics:
-    """Return the statistics of the frames of one bus.
-
-    ``frames``: its frames (N,) in the order of reception. Raises ConfigError if there are fewer than `FEWEST_FRAMES`
-    SYNCs among them.
-    """
+    """Return the statistics of frames (N,) in the order of reception; ConfigError below `FEWEST_FRAMES` SYNCs."""
     is_sync = frames["can_id"] == COB_SYNC
     if np.count_nonzero(is_sync) < FEWEST_FRAMES:
         raise ConfigError(f"bus {channel}: no SYNC received; start its SYNC producer")
@@ -100,10 +88,7 @@ def _interval(number: NDArray[np.int64]) -> int | None:
 
 
 def with_sent_streams(session: SessionConfig, buses: list[BusStatistics]) -> SessionConfig:
-    """Return the session with the streams that the drives send.
-
-    Raises ConfigError if SYNC has another period, drives send different TPDOs, or the mapping of a TPDO is unknown.
-    """
+    """Return the session with the streams that the drives send; ConfigError if SYNC or a TPDO does not agree."""
     for bus in buses:
         if abs(bus.period_us / session.sync.period_us - 1) > PERIOD_TOLERANCE:
             raise ConfigError(
@@ -171,11 +156,7 @@ def _stream(session: SessionConfig, drive: DriveNode, tpdo: int, bus: BusStatist
 
 
 def default_mapping(drive: DriveNode, tpdo: int) -> tuple[int, tuple[str, ...] | str]:
-    """Return COB-ID and objects of a TPDO by the defaults of the drive's EDS.
-
-    ``tpdo``: number of the TPDO, 1 to 4. Returns the COB-ID, and the names of the objects; instead of names a message
-    if one of the objects is unknown. Raises ConfigError if the EDS cannot be read.
-    """
+    """Return COB-ID and object names of TPDO 1 to 4 by the EDS; a message in place of names if an object is unknown."""
     known = read_objects(drive.eds, drive.node_id)
     cob_id = _default(known, od.TPDO_COMMUNICATION + tpdo - 1, 1)
     cob_id = od.tpdo_cob(tpdo, drive.node_id) if cob_id is None else cob_id & STANDARD_ID_MASK
@@ -194,10 +175,7 @@ def _default(known: Any, index: int, subindex: int) -> int | None:
 
 
 def receive_frames(buses: tuple[Bus, ...], seconds: float) -> list[Frames]:
-    """Return the frames of each bus in a time that begins when all have had a SYNC; nothing is sent.
-
-    ``seconds``: length of the time, s. Raises ConfigError if a bus does not exist, or has no SYNC within `SYNC_WAIT_S`.
-    """
+    """Return each bus's frames in ``seconds`` after all had a SYNC (ConfigError after `SYNC_WAIT_S`); sends nothing."""
     parts: list[list[Frames]] = [[] for _ in buses]
     openers = [lambda bus=bus: open_bus(bus) for bus in buses]
     with closing(Receiver(openers)) as receiver:
@@ -217,11 +195,7 @@ def receive_frames(buses: tuple[Bus, ...], seconds: float) -> list[Frames]:
 
 
 def discover_pdos(session: SessionConfig, seconds: float) -> SessionConfig:
-    """Return the session with the streams that its drives send; nothing is sent to them.
-
-    ``session``: the session; its drives send already. ``seconds``: time to listen, s. Raises ConfigError if the drives
-    send TPDOs whose mapping is unknown.
-    """
+    """Return the session with the streams that its drives send already, from listening for some seconds."""
     log.info("listening for %g s on %s", seconds, ", ".join(bus.channel for bus in session.all_buses))
     received = receive_frames(session.all_buses, seconds)
     buses = [bus_statistics(bus.channel, frames) for bus, frames in zip(session.all_buses, received, strict=True)]

@@ -23,9 +23,8 @@ from armident.drivers.canopen.objects import COB_SDO_REQUEST, COB_SYNC
 class CapturePlan:
     """Configuration and options of one capture.
 
-    ``trajectory``: trajectory that the arm follows, if it moves. ``directory``: directory of the recordings.
-    ``duration``: time after which the capture ends, s; default: with the trajectory, or when it is stopped.
-    ``listen_only``: send nothing to the buses. ``config``: file of the session, if it may be reloaded.
+    ``duration``: s; ``None``: until the trajectory ends, or it is stopped. ``listen_only``: send nothing to the buses.
+    ``config``: file of the session, if it may be reloaded.
     """
 
     session: SessionConfig
@@ -53,10 +52,7 @@ class CapturePlan:
         return () if self.listen_only else node_ids(self.session, self.robot)
 
     def filters(self, bus: int) -> list[Filter]:
-        """Return the filters of a bus: SYNC, the TPDOs of its drives, and SDO requests to them.
-
-        ``bus``: number of the bus, in the order of the session.
-        """
+        """Return the filters of bus number ``bus``: SYNC, the TPDOs of its drives, and SDO requests to them."""
         wanted = [
             COB_SYNC,
             *(COB_SDO_REQUEST + n for n, b in zip(self.sdo_nodes, self.bus_of, strict=False) if b == bus),
@@ -73,12 +69,10 @@ def load_plan(
     listen_only: bool,
     sniff_s: float | None = None,
 ) -> CapturePlan:
-    """Return the checked plan of a capture.
+    """Return the checked plan of a capture; ConfigError if the trajectory exceeds limits, or a bus is overloaded.
 
-    ``config``: session configuration. ``out``: directory of the recordings; default: that of the session. ``duration``:
-    time after which the capture ends, s. ``listen_only``: send nothing to the buses. ``sniff_s``: with ``listen_only``:
-    time to discover the TPDOs of the drives, s. Raises ConfigError if the configuration is invalid, the trajectory
-    exceeds the limits of the robot, or a bus is overloaded.
+    ``out``: default is the session's directory. ``duration``: s. ``sniff_s``: with ``listen_only``, time to discover
+    the TPDOs of the drives, s.
     """
     session = load_session(config, "capture")
     robot = load_robot(session.robot, "capture")

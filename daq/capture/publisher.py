@@ -35,17 +35,11 @@ log = logging.getLogger(__name__)
 
 
 class Publisher:
-    """Publishes blocks, events, health and status of a capture.
+    """Publishes blocks, events, health and status of a capture, which does not depend on it: its thread tries again.
 
-    Blocks wait in a queue of ``session.zenoh.queue_blocks``. If it is full they are dropped and counted; the file
-    remains complete. Subscribers detect missing blocks by sequence numbers, and can query the last
-    ``cache_blocks``. Events are dropped only if thousands wait. Of health and status only the latest waits.
-
-    A capture does not depend on Zenoh: if no session can be opened, or it fails, the reason is logged and in
-    :attr:`problem`, and the publisher tries again in its thread.
-
-    ``keys``: the key expressions of the robot; ``exclusive``: refuse to run beside another capture of the robot, whose
-    master would command the same drives. Raises ConfigError if Zenoh's configuration is wrong, or another capture runs.
+    If the queue of blocks (``session.zenoh.queue_blocks``) is full, they are dropped and counted; the file remains
+    complete. Sequence numbers show missing blocks; the last ``cache_blocks`` can be queried. Of health and status only
+    the latest waits. ``exclusive``: refuse to run beside another capture, whose master would command the same drives.
     """
 
     def __init__(self, session: SessionConfig, keys: Keys, *, exclusive: bool = True) -> None:

@@ -53,11 +53,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Outputs:
-    """Destinations of a capture.
-
-    ``sink``: takes the matched rows; ``publisher``: takes health and status, and gives the commands of others;
-    ``notifier``: takes the progress for the watchdog of systemd.
-    """
+    """Destinations of a capture: files, messages with the commands of others, and progress for systemd's watchdog."""
 
     sink: Sink
     publisher: Publisher
@@ -65,12 +61,7 @@ class Outputs:
 
 
 class Recorder:
-    """Main loop of one capture.
-
-    ``receiver``: frames of the buses. ``listener``: emergency messages where the capture only listens; a drive master
-    is created otherwise. ``outputs``: destinations of rows and messages. ``stop``: event that ends the capture.
-    ``save``: event that triggers a recording.
-    """
+    """Main loop of one capture; ``listener`` has emergency messages where it only listens, without a drive master."""
 
     def __init__(
         self,
@@ -374,7 +365,7 @@ class Recorder:
         """Record until no answer is outstanding, or none has come for ``LATE_S``.
 
         If all drives lag, the host is too busy: the limit is ``STARVED_S`` then, unless a heartbeat is missing or no
-        bus works. Another master continues to send SYNC: then the limit is ``LATE_S`` in total.
+        bus works. With another master, which continues to send SYNC, it is ``LATE_S`` in total.
         """
         reported = False
         begin = time.monotonic()

@@ -28,13 +28,7 @@ def open_series(
     name: str,
     metadata: dict[str, str],
 ) -> QueuedSeries:
-    """Return the writer of a capture's files, which a thread of its own writes.
-
-    With a trigger it keeps the last seconds in memory, and writes a file at each event.
-
-    ``session``, ``robot``: configuration that the files hold; ``name``: name of the first file, without suffix. Raises
-    ConfigError if the first file cannot be created.
-    """
+    """Return the queued writer of a capture's files; with a trigger it writes the last seconds at each event."""
     options = session.recording
     layouts = [stream.layout for stream in streams]
     every = {layout.name: layout.every for layout in layouts}
@@ -58,10 +52,7 @@ def open_series(
 
 
 def chunk_duration_ns(options: RecordingOptions) -> int:
-    """Return the time span of a chunk, ns.
-
-    A crash loses the current chunk and the frames in the kernel, together ``recording.chunk_ms``.
-    """
+    """Return the time span of a chunk, ns: a crash loses it and the frames in the kernel, together ``chunk_ms``."""
     return round(max(options.chunk_ms - 2.5 * options.drain_ms, options.chunk_ms / 4) * 1e6)
 
 
@@ -92,12 +83,7 @@ def capture_stamp(now: datetime.datetime) -> str:
 
 
 def next_time(directory: Path, robot: str, now: datetime.datetime) -> datetime.datetime:
-    """Return the time for the name of a new recording: later than that of every recording of the robot.
-
-    After a step of the clock back, names would otherwise collide or come before those of earlier recordings.
-
-    ``now``: time of the clock (UTC).
-    """
+    """Return a time (UTC) for a new recording's name, later than all of the robot: the clock may have stepped back."""
     newest = max((made for _, made in recordings_of(directory, robot)), default=None)
     if newest is None or now - newest >= _STAMP_STEP:
         return now
@@ -112,10 +98,7 @@ def next_time(directory: Path, robot: str, now: datetime.datetime) -> datetime.d
 
 
 class RecordingRetention:
-    """Deletes old recordings of a robot during a capture; use it in a ``with`` block.
-
-    ``options``: ``keep_days`` and ``min_free_gb``; may be exchanged at any time.
-    """
+    """Deletes old recordings of a robot in a ``with`` block; ``options`` may be exchanged at any time."""
 
     def __init__(self, options: RecordingOptions, directory: Path, robot: str) -> None:
         self.options = options

@@ -1,8 +1,4 @@
-"""Reload of the configuration during a capture.
-
-A thread of its own reads and checks the new configuration; the capture applies it between two reads of the buses, so
-that no sample is delayed. A change of any key outside of `CHANGEABLE` is refused with one log record.
-"""
+"""Reload of the configuration by a thread; the capture applies keys of `CHANGEABLE` between two reads of the buses."""
 
 import logging
 import threading
@@ -37,11 +33,7 @@ log = logging.getLogger(__name__)
 
 
 class Reloader:
-    """Reads the configuration again on request.
-
-    ``config``: file of the session. ``plan``: plan of the running capture. ``changes``: called by :meth:`apply`, in
-    this order. The first that raises ConfigError ends the sequence.
-    """
+    """Reads the session's file again on request; :meth:`apply` calls ``changes`` up to the first ConfigError."""
 
     def __init__(self, config: str | Path, plan: CapturePlan, changes: Sequence[Change]) -> None:
         self._config, self._plan, self._changes = config, plan, changes
@@ -85,10 +77,7 @@ class Reloader:
                 self._refuse(str(error))
 
     def _checked(self) -> SessionConfig:
-        """Return the session as it is in the file now.
-
-        Raises ConfigError if it cannot be read, or a key has changed that may not change during a capture.
-        """
+        """Return the session as it is in the file now; ConfigError if a key has changed that may not."""
         session = load_session(self._config, "capture")
         fixed = [key for key in differences(self._session, session) if not key.startswith(CHANGEABLE)]
         if fixed:

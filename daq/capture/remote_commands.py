@@ -22,20 +22,14 @@ ANSWER_S = 5.0
 
 @dataclass(frozen=True)
 class Command:
-    """A command to a capture.
-
-    ``name``: ``save``, ``mark``, ``reload`` or ``stop``; ``text``: text of a mark, or of the note that a save leaves.
-    """
+    """A command to a capture: ``save``, ``mark``, ``reload`` or ``stop``, and the text of a mark or a save's note."""
 
     name: CommandName
     text: str = ""
 
 
 class Commands:
-    """Receives the commands for a capture.
-
-    ``keys``: key expressions of the robot; ``allowed``: accept commands (``zenoh.commands`` of the session).
-    """
+    """Receives the commands for a capture, if ``allowed`` (``zenoh.commands`` of the session)."""
 
     def __init__(self, keys: Keys, allowed: bool) -> None:
         self._waiting: queue.SimpleQueue[Command] = queue.SimpleQueue()
@@ -74,11 +68,7 @@ class Commands:
 
 
 def send_command(session: SessionConfig, robot: str, command: Command, answer_s: float = ANSWER_S) -> None:
-    """Send a command to a running capture and wait until it is accepted.
-
-    ``answer_s``: longest wait for the capture, and for its answer, s. Raises ConfigError if no capture of the cell
-    answers. Raises DataError if the capture refuses; the message gives the reason. Raises ArmidentError if Zenoh fails.
-    """
+    """Send a command and wait until a capture accepts it; ConfigError if none answers, DataError if it refuses."""
     with open_session(session, "observer") as zenoh_session:
         key = Keys(session.cell, robot).command(command.name)
         replies: queue.SimpleQueue[zenoh.Reply] = queue.SimpleQueue()

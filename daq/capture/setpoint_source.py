@@ -31,11 +31,8 @@ _START_TOLERANCE = 1e-4
 class StandstillDetector:
     """Detects from the newest positions that an arm has come to rest.
 
-    An arm is at standstill if no joint exceeds 0.2 % of its velocity limit, averaged over any 10 ms of the last 50 ms.
-    The turning point of an oscillation is thus no standstill. Two encoder counts are no motion.
-
-    ``session``: gives the SYNC period; ``robot``: gives transmission, scales and limits. Raises ConfigError if a drive
-    has no ``counts_per_unit``.
+    No joint may exceed 0.2 % of its velocity limit, averaged over any 10 ms of the last 50 ms: the turning point of an
+    oscillation is no standstill. Two encoder counts are no motion.
     """
 
     def __init__(self, session: SessionConfig, robot: RobotConfig) -> None:
@@ -48,10 +45,7 @@ class StandstillDetector:
         self._since = 0
 
     def update(self, sync: int, counts: NDArray[np.integer]) -> bool:
-        """Take positions and return True if the arm stands still; ``False`` during the first 50 ms.
-
-        ``counts``: motor positions (n,), counts.
-        """
+        """Take motor positions (n,), counts; return True if the arm stands still, False during the first 50 ms."""
         now = self._per_count @ counts
         if self._last is None:
             self._last, self._since = (sync, now), sync
@@ -65,21 +59,16 @@ class StandstillDetector:
 
 @dataclass(frozen=True)
 class SetpointSchedule:
-    """Set points of a capture.
-
-    ``plan``: the set points; ``first``, ``last``: rows of the start and of the end of the experiment.
-    """
+    """Set points of a capture, and the rows of the start and of the end of the experiment."""
 
     plan: SetpointPlan
     first: int
     last: int
 
     def span(self, played_from: int) -> tuple[int, int]:
-        """Return the SYNC numbers of start and end of the experiment.
+        """Return the SYNCs of start and end of the experiment; row 0 becomes the target at ``played_from``.
 
         The demand reaches a row one interpolation period (60C2h) after the row has become the target.
-
-        ``played_from``: number of the SYNC at which row 0 becomes the target.
         """
         every = self.plan.every
         return played_from + (self.first + 1) * every, played_from + (self.last + 1) * every
@@ -88,11 +77,7 @@ class SetpointSchedule:
 def plan_setpoints(
     session: SessionConfig, robot: RobotConfig, trajectory: Trajectory, actual_counts: NDArray[np.int64]
 ) -> SetpointSchedule:
-    """Return the set points of a trajectory, with an approach from the actual position and rest at both ends.
-
-    ``session``: session with ``setpoints``; ``trajectory``: trajectory within the robot's limits; ``actual_counts``:
-    motor positions (6064h), (n,), counts.
-    """
+    """Return a trajectory's set points, with an approach from motor positions (6064h) (n,), counts, and rests."""
     assert session.setpoints is not None
     options = session.setpoints
     period = session.sync_period * options.every
@@ -115,11 +100,7 @@ def plan_setpoints(
 def approach(
     actual: NDArray[np.float64], start: NDArray[np.float64], robot: RobotConfig, period: float
 ) -> NDArray[np.float64]:
-    """Return the joint positions (N, n) of a smooth move within `APPROACH_SHARE` of the limits.
-
-    ``actual``, ``start``: joint positions (n,) at both ends, rad or m; ``robot``: gives the limits; ``period``: time
-    between two rows, s.
-    """
+    """Return positions (N, n), rad or m, of a smooth move within `APPROACH_SHARE` of the limits; ``period`` in s."""
     distance = np.abs(start - actual)
     velocity = np.array([joint.limits.velocity for joint in robot.joints]) * APPROACH_SHARE
     acceleration = np.array([joint.limits.acceleration for joint in robot.joints]) * APPROACH_SHARE

@@ -20,11 +20,7 @@ from armident.daq.streaming.codec import end_content, start_content
 
 
 class Sink:
-    """Writes batches to the recording, publishes them on Zenoh, and places marks at their SYNC.
-
-    ``writer``: files of the recording; ``publisher``: publisher of the blocks and events; ``capture``: name of the
-    capture in all of its events.
-    """
+    """Writes batches to the recording, publishes them on Zenoh, and places marks at their SYNC."""
 
     def __init__(
         self,
@@ -128,10 +124,7 @@ class Sink:
             self._publisher.event(encode_event("gaps", {"capture": self._capture, "gaps": found}))
 
     def finish(self, counters: dict[str, int]) -> None:
-        """Place the last marks, close the recording, and publish the end of the capture.
-
-        ``counters``: counters of the capture; those of writer and publisher are added.
-        """
+        """Place the last marks, close the recording, and publish the end with the counters of all parts."""
         if (rest := self._samples_first.rest()) is not None:
             self._take(rest)
         self._place_marks(True)

@@ -41,10 +41,7 @@ log = logging.getLogger(__name__)
 def stop_frames(session: SessionConfig, robot: RobotConfig) -> list[Frames]:
     """Return the frames of a quick stop (CiA 402 part 2, controlword 02h) of every drive, for each bus of a session.
 
-    The RPDOs of the controlwords come first, since they act at once; SDO requests follow for drives that map no
-    controlword.
-
-    ``session``: session with ``setpoints``.
+    RPDOs of the controlwords come first, since they act at once; SDO requests follow for drives that map none.
     """
     assert session.setpoints is not None
     word = int(Control.QUICK_STOP).to_bytes(2, "little")
@@ -65,10 +62,7 @@ def stop_frames(session: SessionConfig, robot: RobotConfig) -> list[Frames]:
 
 
 class Guard:
-    """Monitors the buses of one session and stops the drives.
-
-    ``buses``: with filters for the identifiers of the monitor; ``monitor``: checks their frames.
-    """
+    """Monitors the buses of one session, by sockets with the monitor's filters, and stops the drives."""
 
     def __init__(
         self, buses: Sequence[FrameBus], monitor: MotionMonitor, stops: Sequence[Frames], period: float
@@ -93,10 +87,7 @@ class Guard:
         self._over = True
 
     def run(self) -> Alarm | None:
-        """Monitor until an alarm, `stop` or `leave`; return the alarm, after which the drives are stopped.
-
-        Raises BusDown if a bus went down while the arm did not move.
-        """
+        """Monitor until an alarm, `stop` or `leave`; return the alarm, after which the drives are stopped."""
         while not self._over:
             alarm, received = None, 0
             for number, batch in enumerate(self._batches):
@@ -132,13 +123,10 @@ class Guard:
 
 
 def guard(config: str, following_s: float = FOLLOWING_S) -> None:
-    """Run ``armident guard`` until a signal or an alarm.
+    """Run ``armident guard`` until a signal or an alarm; ``following_s``: time of motion at the velocity limit, s.
 
-    An alarm, SIGINT and SIGTERM stop the drives. SIGUSR1 ends the guard after the motion, without a quick stop.
-
-    ``config``: session configuration; ``following_s``: largest following error, as the time of motion at the velocity
-    limit, s. Raises ConfigError if the session has no set points, or a bus does not exist. Raises ArmidentError if the
-    guard stopped the drives on an alarm; the message gives the reason.
+    An alarm, SIGINT and SIGTERM stop the drives; an alarm raises ArmidentError with its reason. SIGUSR1 ends the guard
+    after the motion, without a quick stop.
     """
     session = load_session(config)
     robot = load_robot(session.robot)

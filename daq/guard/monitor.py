@@ -50,23 +50,14 @@ ARMED_STATE = int(NmtState.OPERATIONAL)
 
 @dataclass(frozen=True)
 class Alarm:
-    """Reason to stop the drives.
-
-    ``text``: joint, measured value and limit. ``frame``: index of the frame in its batch; -1 for missing frames.
-    """
+    """Reason to stop the drives; ``frame`` is an index in its batch, -1 for missing frames."""
 
     text: str
     frame: int
 
 
 class MotionMonitor:
-    """Checks all frames on the buses of a moving arm.
-
-    The first set point arms it; the NMT command that ends the motion disarms it.
-
-    ``session``: gives nodes, streams and set points; ``robot``: gives transmission, scales and drive gains; ``limits``:
-    limits of the joints. Raises ConfigError if the session plays no set points, or its streams carry no position.
-    """
+    """Checks all frames on a moving arm's buses, from the first set point to the NMT command that ends the motion."""
 
     def __init__(self, session: SessionConfig, robot: RobotConfig, limits: MotionLimits) -> None:
         if session.setpoints is None:
@@ -135,11 +126,7 @@ class MotionMonitor:
         return bool(self._state[ARMED])
 
     def check(self, frames: Frames, now_ns: int, bus: int = 0) -> Alarm | None:
-        """Check the next frames of a bus, and return the first reason to stop.
-
-        ``frames``: frames (N,) since the last call, in the order of the bus; N may be 0. ``now_ns``: monotonic time
-        before they were received, ns. ``bus``: number of the bus, in the order of the session.
-        """
+        """Check frames (N,), N >= 0, received after ``now_ns`` (monotonic); return the first reason to stop."""
         limits = self._limits
         code = check_batch(
             frames["can_id"], frames["length"], frames["data"], now_ns, bus,
@@ -204,32 +191,11 @@ def check_limits(  # type: ignore[no-untyped-def]
 ):  # fmt: skip
     """Check the joints that motor ``moved`` drives; return the cause of an alarm or ``NO_ALARM``.
 
-    Parameters
-    ----------
-    moved
-        Number of the motor with a new value.
-    raw
-        Newest position (counts), effort (per mille of rated) and demand (counts) of each motor, int64, shape (3, n).
-    seen, demanded
-        True for motors with a position, and with a demand, shape (n,).
-    per_count
-        Joint positions per count of the motors, rad or m, shape (n, n).
-    per_mille
-        Joint torques per per mille of rated effort of the motors, N m or N, shape (n, n).
-    positions
-        Ring of the last positions, counts, int64, shape (P, n).
-    efforts
-        Ring of the last efforts over which the torque is averaged, per mille of rated, shape (E, n).
-    samples
-        Number of samples of each motor since the motion began, int64, shape (n,).
-    velocity_s
-        Time between the oldest and the newest of ``positions``, s.
-    low, high, velocity, torque, following
-        Limits of the joints, as in `armident.daq.guard.motion_limits.Limits`, shape (n,) each.
-    state
-        State of the monitor, int64, shape (3,); its element ``JOINT`` is set on an alarm.
-    value
-        Output on an alarm: measured value and limit, in the unit of the limit, shape (2,).
+    ``raw`` int64 (3, n): newest position (counts), effort (per mille of rated) and demand (counts) of each motor.
+    ``seen``, ``demanded`` (n,): motors with a position, and a demand. ``per_count``, ``per_mille`` (n, n): joint
+    position and torque per count and per mille of the motors. ``positions`` (P, n), ``efforts`` (E, n): rings of the
+    last ones, of which ``positions`` span ``velocity_s``. ``samples`` (n,): since the motion began. Limits (n,) as in
+    `MotionLimits`. On an alarm, ``state[JOINT]`` is set, and ``value`` (2,) is measured value and limit.
     """
     n, ring = low.size, positions.shape[0]
     for j in range(n):
@@ -281,36 +247,13 @@ def check_batch(  # type: ignore[no-untyped-def]
 ):  # fmt: skip
     """Check all frames of a batch, then for missing heartbeats and SYNC; return the cause of an alarm.
 
-    Parameters
-    ----------
-    ids, lengths, data
-        Fields of an array of N frames: identifiers (N,), numbers of data bytes (N,), and data bytes (N, 8) or (N, 64).
-    now
-        Monotonic time before the frames were received, ns.
-    kinds, joints
-        Kind and joint of the frames of each identifier of this bus, int64, shape (IDENTIFIERS,); kind -1: not checked.
-    at
-        First byte of position and effort in the TPDO of the samples, and of the demand in its TPDO, shape (3,); -1:
-        absent.
-    own_demand
-        True if the drives send their demand; else the set points are the demand.
-    every
-        Number of SYNCs between two set points.
-    raw, seen, demanded, positions, efforts, samples
-        Newest values and rings as in `check_limits`; changed in place.
-    beat
-        Monotonic time of the last heartbeat of each drive, ns, int64, shape (n,); changed in place.
-    silence
-        Time without heartbeat or SYNC after which they are lost, ns.
-    per_count, per_mille, velocity_s, low, high, velocity, torque, following
-        Scales and limits as in `check_limits`.
-    state
-        1 while set points are played, joint and frame of an alarm (-1: none), int64, shape (3,); changed in place.
-    sync
-        Monotonic time (ns) of the last SYNC, and number of SYNCs since a set point, by bus, int64, shape (2, B);
-        changed in place.
-    value
-        Output on an alarm: measured value and limit, shape (2,).
+    ``ids``, ``lengths`` (N,), ``data`` (N, 8) or (N, 64): fields of the frames. ``now``: monotonic ns before they were
+    received. ``kinds``, ``joints`` (IDENTIFIERS,): of the frames of each identifier on this bus; kind -1: not checked.
+    ``at`` (3,): first byte of position, effort and demand in their TPDOs; -1: absent. ``own_demand``: the drives send
+    their demand; else the set points are it. ``every``: SYNCs between set points. ``beat`` (n,): monotonic ns of the
+    last heartbeats; lost after ``silence`` ns. ``state`` (3,): 1 while set points are played, joint and frame of an
+    alarm (-1: none). ``sync`` (2, B): monotonic ns of the last SYNC, and SYNCs since a set point. Others as in
+    `check_limits`.
     """
     for k in range(ids.size):
         if ids[k] >= IDENTIFIERS or kinds[ids[k]] < 0:

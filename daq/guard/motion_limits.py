@@ -28,11 +28,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class MotionLimits:
-    """Limits of the joints.
-
-    ``low``, ``high``: range of position (n,), rad or m; ``velocity``: largest speed (n,), rad/s or m/s; ``torque``:
-    largest effort (n,), N m or N; ``following``: largest distance between demand and position (n,), rad or m.
-    """
+    """Limits of the joints, (n,), SI units; ``following``: largest distance between demand and position."""
 
     low: Floats
     high: Floats
@@ -42,11 +38,7 @@ class MotionLimits:
 
 
 def motion_limits_of(robot: RobotConfig, following_s: float = FOLLOWING_S) -> MotionLimits:
-    """Return the limits of a robot.
-
-    ``robot``: robot whose joints have limits; ``following_s``: largest following error, as the time of motion at the
-    velocity limit, s. Raises ConfigError if the robot lacks a limit.
-    """
+    """Return the limits of a robot; ``following_s``: following error as time of motion at the velocity limit, s."""
     robot.check_movable()
     limits = [joint.limits for joint in robot.joints]
     velocity = np.array([limit.velocity for limit in limits])

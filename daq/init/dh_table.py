@@ -35,11 +35,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class DhRow:
-    """One row of a table.
-
-    ``name``, ``type``: name of the joint, and ``revolute`` or ``prismatic``. ``theta``, ``d``, ``a``, ``alpha``:
-    parameters, rad and m; the joint variable is added to ``theta`` or ``d``.
-    """
+    """One row of a table; angles in rad, lengths in m. The joint variable is added to ``theta`` or ``d``."""
 
     name: str
     type: str
@@ -50,18 +46,10 @@ class DhRow:
 
 
 def from_dh_table(file: Path, convention: Convention | None) -> Geometry:
-    """Geometry of a table of Denavit-Hartenberg parameters.
+    """Geometry of a table of Denavit-Hartenberg parameters; a ConfigError has line and column.
 
-    Raises ConfigError if the file is no such table; names line and column.
-
-    Parameters
-    ----------
-    file
-        Text file with a header line: ``theta, d, a, alpha`` in any order, or ``alpha, d, theta, r``; optionally
-        ``name`` and ``type``. Units may follow in brackets, such as ``a [mm]``; angles may be written as ``-pi/2``.
-    convention
-        ``classical`` (x to the next axis) or ``modified``; ``None``: modified if there is a column ``r``, else
-        classical.
+    The header is ``theta, d, a, alpha`` or ``alpha, d, theta, r``, perhaps with ``name``, ``type`` and units (``a
+    [mm]``). ``classical`` (x to the next axis) or ``modified``; ``None``: modified if there is a column ``r``.
     """
     rows, khalil, notes = _read(file)
     if khalil and convention == "classical":
@@ -78,9 +66,9 @@ def modified(rows: Sequence[DhRow]) -> list[Mdh]:
 
 
 def of_classical(rows: Sequence[DhRow]) -> list[Mdh]:
-    """Modified parameters of a classical table: ``Rot(z, theta) Trans(z, d) Trans(x, a) Rot(x, alpha)``.
+    """Modified parameters of a classical table, base to tip: ``Rot(z, theta) Trans(z, d) Trans(x, a) Rot(x, alpha)``.
 
-    ``rows``: base to tip; axis j is the z of frame j-1. Raises ConfigError if two axes are nearly parallel.
+    Axis j is the z of frame j-1. Raises ConfigError if two axes are nearly parallel.
     """
     frame, axes, points = np.eye(4), [], []
     for row in rows:

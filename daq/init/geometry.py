@@ -27,12 +27,7 @@ URDF_SUFFIXES = (".urdf", ".xml", ".xacro")
 
 @dataclass(frozen=True)
 class Geometry:
-    """Geometry of an arm.
-
-    ``source``: name of the source, for the user. ``content``: keys of the robot configuration; ``joints`` has an entry
-    for every joint, with its ``name``. ``robot``: the robot that these keys make. ``notes``: sentences on what was
-    assumed.
-    """
+    """Geometry of an arm: keys of the robot configuration, ``joints`` with names, and the robot they make."""
 
     source: str
     content: dict[str, Any]
@@ -41,10 +36,7 @@ class Geometry:
 
 
 def from_library(name: str) -> Geometry:
-    """Geometry of a robot of the library, or of another configuration.
-
-    ``name``: name of a robot in ``configs/robots``, or a path. Raises ConfigError if there is no such robot.
-    """
+    """Geometry of a robot in ``configs/robots`` by its name, or of another configuration by its path."""
     path = config_path(name, listed=("robots",))
     robot = load_robot(path, "import")
     content = read_yaml(path.read_text(encoding="utf-8"), str(path))
@@ -60,12 +52,10 @@ def from_urdf(
     tip: str | None = None,
     fits: Callable[[RobotConfig], object] | None = None,
 ) -> Geometry:
-    """Geometry of a URDF.
+    """Geometry of a URDF, to which the robot configuration in ``out`` refers.
 
-    ``out``: folder of the robot configuration, which refers to the URDF. ``base``, ``tip``: first and last link of the
-    chain. ``None``: the root; the end of the only chain, or of the one that ``fits``. ``fits``: function that raises if
-    a robot is not the recorded one; decides between several chains. Raises ConfigError if the URDF is wrong, or several
-    chains remain; lists them.
+    ``base``, ``tip``: ``None`` is the root, and the end of the only chain or of the one that ``fits``: it raises if a
+    robot is not the recorded one. A ConfigError lists the chains that remain.
     """
     if not is_file(file):
         raise ConfigError(f"{file}: no such file")
@@ -152,10 +142,7 @@ def _of_chain(file: Path, out: Path, base: str | None, tip: str | None) -> Geome
 
 
 def of_rows(source: str, name: str, rows: list[tuple[str, str, Mdh]]) -> Geometry:
-    """Geometry of modified Denavit-Hartenberg rows.
-
-    ``source``: name of the source, for the user; ``rows``: name, type and parameters of each joint, base to tip.
-    """
+    """Geometry of modified Denavit-Hartenberg rows (name, type, parameters) of the joints, base to tip."""
     names = joint_names([joint for joint, _, _ in rows], Path(source))
     content = {
         "schema": "armident/robot/1",

@@ -22,33 +22,11 @@ from armident.daq.recording import is_recording
 
 @dataclass(frozen=True)
 class InitOptions:
-    """Options of ``armident init``.
+    """Options of ``armident init``; the geometry is that of ``urdf``, ``robot``, ``dh``, or only a number of ``axes``.
 
-    Parameters
-    ----------
-    urdf, robot, dh, axes
-        Source of the geometry: a URDF, a robot of the library, a table of Denavit-Hartenberg parameters, or only the
-        number of joints.
-    convention
-        Convention of the table; ``None``: by its columns.
-    base, tip
-        First and last link of the chain in the URDF.
-    recording
-        Recording of the arm; ``None``: none.
-    stated
-        Options of `armident.daq.interchange.importing.import_recording` for it.
-    name
-        Name of the robot; ``None``: that of the source.
-    signal
-        Kind of effort that the drives report; ``None``: that of the recording.
-    link_torques
-        True if efforts are measured behind the gears.
-    gravity
-        Acceleration of gravity in the frame of the base, m/s^2; ``None``: that of an upright base.
-    cell
-        Facts of the cell, such as ``channel``.
-    overwrite
-        True to replace files that exist.
+    ``convention``: of the table ``dh``; ``None``: by its columns. ``base``, ``tip``: links of the chain in the URDF.
+    ``stated``: options of `import_recording`. ``link_torques``: efforts are measured behind the gears. ``gravity``:
+    m/s^2 in the frame of the base; ``None``: upright.
     """
 
     out: Path
@@ -70,11 +48,7 @@ class InitOptions:
 
 
 def run_init(options: InitOptions) -> str:
-    """Write ``robot.yaml`` and ``session.yaml``, and return the summary for the user.
-
-    Raises ConfigError if no source is given, a source is wrong, or a file exists already; DataError if the recording
-    cannot be imported, or is of another arm.
-    """
+    """Write ``robot.yaml`` and ``session.yaml``, return the summary; DataError if the recording is of another arm."""
     robot_file, session_file = options.out / "robot.yaml", options.out / "session.yaml"
     taken = [str(file) for file in (robot_file, session_file) if file.exists()]
     if taken and not options.overwrite:
@@ -143,10 +117,7 @@ def _sources(geometry: Geometry, facts: RecordedFacts | None) -> str:
 
 
 def summary(robot_file: Path, session_file: Path, geometry: Geometry, facts: RecordedFacts | None) -> str:
-    """Return what was written, found and assumed, all blanks, and the next commands.
-
-    ``geometry``: source of the geometry. ``facts``: facts of the recording; ``None``: there is none.
-    """
+    """Return what was written, found and assumed, all blanks, and the next commands."""
     robot, session = load_robot(robot_file, ""), load_session(session_file, "")
     joints = ", ".join(joint.name for joint in robot.joints)
     lines = [f"{robot_file}: {robot.n} joints ({joints})", f"{session_file}: cell {session.cell}"]

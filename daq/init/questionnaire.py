@@ -21,11 +21,7 @@ _POSTURES = {
 
 
 def questionnaire(options: InitOptions, ask: Ask, tell: Callable[[str], None]) -> InitOptions:
-    """Options completed by the answers to questions.
-
-    ``options``: options of the command line; what they state is not asked. ``ask``: function that asks: question and
-    default to answer. ``tell``: function that shows a line.
-    """
+    """Options completed by answers of ``ask`` (question, default) where they state nothing; ``tell`` shows a line."""
     tell("Enter takes the value in brackets. What you do not know stays a blank that is listed at the end.")
     source = ask("URDF, table of DH parameters, or robot of the library (ur5e, panda, ...); empty: none", "")
     options = replace(options, **_source(source, ask))

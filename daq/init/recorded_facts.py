@@ -33,28 +33,10 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class RecordedFacts:
-    """Facts of a recording.
+    """Facts of a recording, in SI units and the unit of the effort.
 
-    Parameters
-    ----------
-    rate_hz
-        Sampling rate, 1/s.
-    duration_s
-        Time from the first to the last sample, s.
-    signal
-        Kind of effort: ``torque``, ``current`` or ``voltage``.
-    has_demand
-        True if the recording has a demand (reference positions).
-    position
-        Lowest and highest position, (n, 2), rad or m.
-    velocity, acceleration
-        Largest magnitudes, (n,), SI units.
-    effort
-        Largest magnitudes, (n,), in the unit of the effort.
-    options
-        Options of `armident import` for this file, such as ``{"--time-unit": "ms"}``.
-    notes
-        Sentences on what was assumed or converted.
+    ``position`` (n, 2): lowest and highest; ``velocity``, ``acceleration``, ``effort`` (n,): largest magnitudes.
+    ``options``: those of `armident import` for this file, such as ``{"--time-unit": "ms"}``. ``notes``: assumptions.
     """
 
     path: Path
@@ -71,15 +53,7 @@ class RecordedFacts:
 
 
 def examine(path: Path, robot: RobotConfig, stated: Mapping[str, Any]) -> RecordedFacts:
-    """Facts of a recording of a robot.
-
-    Units of positions, torques and times, and times that jitter, are recognized, and the options of `armident import`
-    that correct them are returned.
-
-    ``path``: a file that `armident import` reads, or a recording; ``robot``: the robot that was measured, with the
-    limits that are known; ``stated``: options of `import_recording` that the user has stated. Raises ConfigError or
-    DataError if the file cannot be imported.
-    """
+    """Facts of a recording of a robot, with options that correct units and jitter; ``stated``: options of the user."""
     if is_recording(path):
         return _facts(path, read_recording(path), robot, {})
     options: dict[str, Any] = dict(given(stated))

@@ -16,11 +16,7 @@ SYNC_US = (100, 1_000_000)
 
 @dataclass(frozen=True)
 class CellFacts:
-    """Facts of a cell with CANopen drives; what is ``None`` is left blank.
-
-    ``channel``, ``bitrate``: CAN interface and bit rate; a bit rate of 0 is that of a virtual bus. ``node_ids``:
-    CANopen node of each joint, base to tip. ``eds``: electronic data sheet of the drives.
-    """
+    """Facts of a cell with CANopen drives, base to tip; ``None`` is left blank, bit rate 0 is a virtual bus."""
 
     cell: str
     channel: str | None = None
@@ -36,19 +32,10 @@ def robot_content(
     gravity: tuple[float, float, float] | None = None,
     link_torques: bool = False,
 ) -> dict[str, Any]:
-    """Return the content of ``robot.yaml``.
+    """Return the content of ``robot.yaml``; arguments that are ``None`` are taken from recording and geometry.
 
-    Parameters
-    ----------
-    facts
-        Facts of a recording; ``None``: there is none.
-    signal
-        Kind of effort that the drives report; ``None``: that of the recording, else of the geometry, else ``torque``.
-    gravity
-        Acceleration of gravity in the frame of the base, m/s^2; ``None``: that of the geometry, else that of an upright
-        base.
-    link_torques
-        ``True`` if efforts are measured behind the gears, by torque sensors: rotors are then no part of the model.
+    ``gravity``: m/s^2 in the frame of the base, upright if nothing states it. ``link_torques``: torque sensors behind
+    the gears, so that rotors are no part of the model.
     """
     robot = geometry.robot
     content = dict(geometry.content)
@@ -125,10 +112,7 @@ def _moved(facts: RecordedFacts, kind: str, k: int) -> str:
 
 
 def session_content(robot: RobotConfig, signal: str, facts: RecordedFacts | None, cell: CellFacts) -> dict[str, Any]:
-    """Return the content of ``session.yaml``.
-
-    ``signal``: kind of effort that the drives report. ``facts``: facts of a recording; ``None``: there is none.
-    """
+    """Return the content of ``session.yaml``; ``signal``: kind of effort that the drives report."""
     hinted: set[str] = set()
     ids = cell.node_ids
     period = round(1e6 / facts.rate_hz) if facts is not None else 0

@@ -19,10 +19,7 @@ class Noted:
 
 
 def yaml_text(content: dict[str, Any], depth: int = 0) -> str:
-    """Return a mapping as YAML: nested mappings and lists of mappings as blocks, other values on one line.
-
-    ``content``: keys and values; each may be `Noted`. ``depth``: number of spaces of indentation.
-    """
+    """Return a mapping as YAML: nested mappings and lists of them as blocks, other values (or `Noted`) on one line."""
     return "".join(_entry(key, value, depth) for key, value in content.items())
 
 

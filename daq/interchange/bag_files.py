@@ -1,7 +1,4 @@
-"""Messages in the files of rosbag2: MCAP, SQLite (.db3), either compressed, and folders of several files.
-
-Damaged parts are passed over and described, so that a torn bag gives what is whole.
-"""
+"""Messages in the files of rosbag2: MCAP, SQLite (.db3), either compressed, and folders, without damaged parts."""
 
 import mmap
 import re
@@ -51,10 +48,7 @@ _DAMAGED = (sqlite3.Error, UnicodeDecodeError)
 
 
 class BagMessage(NamedTuple):
-    """Message of a bag.
-
-    ``logged_ns``: time at which it was recorded, ns UTC; ``data``: content in CDR, uncompressed.
-    """
+    """Message of a bag, recorded at ``logged_ns``, ns UTC; ``data`` is its content in CDR, uncompressed."""
 
     topic: str
     logged_ns: int
@@ -64,9 +58,8 @@ class BagMessage(NamedTuple):
 def bag_files(path: Path) -> tuple[list[Path], list[str]]:
     """Return the files of a bag in the order of recording, and the names of those that its metadata lists in vain.
 
-    ``path``: a file, or a folder with ``metadata.yaml``; without it, the folder's bag files in the order of their
-    numbers. Raises ConfigError if there is no such file or folder, or the folder has no bag file, those of several
-    bags, or bags of ROS 1.
+    ``path``: a file, or a folder with ``metadata.yaml``; without it, the order is that of the files' numbers. Raises
+    ConfigError for the files of several bags, or bags of ROS 1.
     """
     if not path.is_dir():
         if not path.is_file():
@@ -112,18 +105,10 @@ def _of_ros_1(file: Path) -> str:
 
 
 class BagReader:
-    """Iterates over the messages of one type in a bag, in the order of its files.
+    """Iterates over the messages of one type, such as ``sensor_msgs/msg/JointState``, in the order of a bag's files.
 
-    ``message_type``: type of the messages, such as ``sensor_msgs/msg/JointState``. Raises ConfigError if there is no
-    such bag, or it cannot be read. The iteration raises it. Raises DataError if no file is a bag file. The iteration
-    raises it.
-
-    Attributes
-    ----------
-    topics
-        Type by topic, of all topics so far.
-    losses
-        Descriptions of what is missing or damaged, after the iteration.
+    ``topics``: type by topic so far; ``losses``: descriptions of what is missing or damaged, after the iteration. It
+    raises ConfigError if a file cannot be read, DataError if none is a bag file.
     """
 
     def __init__(self, path: Path, message_type: str) -> None:

@@ -1,7 +1,7 @@
-"""Frames of Vector BLF logs, without damaged blocks.
+"""Frames of Vector BLF logs, without damaged blocks; the layout is that of the reader of python-can.
 
-A BLF file is a header and a sequence of objects; containers hold further objects, compressed or not, and an object may
-continue in the next container. The layout of header and objects is that of the reader of python-can.
+A BLF file is a header and a sequence of objects. Containers hold further objects, compressed or not, and an object may
+continue in the next container.
 """
 
 import struct
@@ -36,10 +36,7 @@ _LARGEST_CONTAINER = 256 * 2**20
 
 
 def read_blf(path: Path, into: FrameCollector) -> None:
-    """Add the frames of a BLF log, and a note for everything that is damaged or cut off.
-
-    ``into``: takes the frames. Raises DataError if it is not a BLF file.
-    """
+    """Add the frames of a BLF log, and a note for what is damaged or cut off; DataError if it is no BLF file."""
     with path.open("rb") as file:
         head = file.read(_HEADER.size)
         if len(head) < _HEADER.size or head[:4] != b"LOGG":

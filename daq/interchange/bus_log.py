@@ -1,8 +1,4 @@
-"""Conversion between recordings and logs of CAN tools: candump, Vector ASC and BLF, PEAK TRC.
-
-The session configuration defines the frames that hold samples. They are processed like captured frames: matched to
-their SYNC, with every SYNC accounted for.
-"""
+"""Conversion of recordings and logs of CAN tools (candump, Vector ASC and BLF, PEAK TRC) by a session's mapping."""
 
 import hashlib
 import logging
@@ -34,10 +30,8 @@ NOTES = "source_remarks"
 def recording_from_log(path: Path, session: SessionConfig, robot: RobotConfig) -> Recording:
     """Return the recording of a log: its frames, matched by the mapping of a session.
 
-    ``path``: log of one bus, or of several that have the names of the session's buses; ``session``, ``robot``: mapping
-    of the TPDOs, and scales of their objects. Raises ConfigError if there is no such file, it lacks a bus of the
-    session, or the session's buses carry CAN FD; DataError if it cannot be read as such a log, holds no SYNC, its SYNC
-    period differs from that of the session, or a drive sends no TPDO of the length that the session maps.
+    With several buses the log has the names of the session's. Raises ConfigError if it lacks one, or they carry CAN FD;
+    DataError if it holds no SYNC, or its SYNC period or TPDO lengths are not those of the session.
     """
     _check_classic(session, str(path))
     streams = captured_streams(session, robot)
@@ -149,14 +143,10 @@ def _in_turn(read: Sequence[Frames]) -> Iterator[tuple[int, Frames]]:
 
 
 def write_log(recording: Recording, path: Path) -> None:
-    """Write the SYNCs and TPDOs of a recording as a log.
+    """Write the SYNCs and TPDOs of a recording as a log, in the format of its suffix.
 
-    A recording has the time of every SYNC; its answers follow at intervals of 20 us. SYNCs that were not received or
-    not answered by all drives are not in the log, which its SYNC counter shows.
-
-    ``recording``: a recording that comes from a bus. ``path``: the file; its suffix selects the format. Raises
-    ConfigError if the session's buses carry CAN FD; DataError if the recording does not
-    come from a bus.
+    Answers follow their SYNC at intervals of 20 us. SYNCs that were not received or not answered by all drives are left
+    out, which the SYNC counter shows. Raises DataError if the recording does not come from a bus.
     """
     session = recording.session
     if session is None:

@@ -44,10 +44,7 @@ AMBIGUOUS = 0.25
 """Distance, periods, of a step between stamps from a whole number above which missing samples cannot be counted."""
 
 PERIOD_TOLERANCE = 0.02
-"""Largest difference of the SYNC periods of log and session, relative.
-
-Clocks of computers and adapters agree to 0.1 %; the next period that a session can mean differs by far more.
-"""
+"""Largest relative difference of log's and session's SYNC periods: clocks agree to 0.1 %, periods differ by more."""
 _FEWEST = 10
 """SYNCs below which a log tells no period."""
 _CLOCK_STEP_NS = 20_000_000
@@ -132,8 +129,7 @@ def repeated_share(values: Floats) -> float:
 def clock_of(times: Floats, rate_hz: float | None, repeated: float = 0.0) -> Clock:
     """Return the clock of samples by their times (N,), s; missing samples are missing numbers.
 
-    Raises `JitterError` if the steps are too uneven to tell how many samples are missing, and DataError if the times
-    contradict ``rate_hz``.
+    Raises `JitterError` if steps are too uneven for that, and DataError if the times contradict ``rate_hz``.
     """
     steps = np.diff(times)
     if steps.size == 0:
@@ -170,8 +166,6 @@ def clock_of(times: Floats, rate_hz: float | None, repeated: float = 0.0) -> Clo
             f"--rate {rate_hz:g} contradicts the time column: steps of {median:.6g} s, {measured:.6g} Hz; "
             f"omit --rate, or give the rate of a conversion with --resample {rate_hz:g}"
         )
-    if not missing:
-        measured = steps.size / float(times[-1] - times[0])
     return Clock(rate_hz or measured, np.append(0, np.cumsum(advance)).astype(np.int64))
 
 
@@ -294,9 +288,9 @@ def check_sync_period(path: Path, frames: Frames, session: SessionConfig) -> Non
 
 
 def sync_period_ns(t_ns: Ints, steps: Ints | None) -> tuple[float, float] | None:
-    """Return the mean SYNC period and its uncertainty, ns; ``None`` if there are too few SYNCs.
+    """Return the mean SYNC period and its uncertainty, ns, from receive times (N,); ``None`` if there are too few.
 
-    ``t_ns`` are the times of the SYNCs (N,), ``steps`` the periods between them by their counter (N - 1,), or one each.
+    ``steps`` are the periods between them by their counter (N - 1,), or one each.
     """
     if t_ns.size < _FEWEST:
         return None

@@ -57,29 +57,19 @@ _SHOWN: Mapping[str, str] = {
 
 
 def plain_unit(text: str) -> str:
-    """Return a unit in lower case without spaces and signs of multiplication; empty if the text is no unit.
-
-    ``text``: text in brackets after a name, or a cell of a line of units.
-    """
+    """Return a unit in lower case without spaces and signs of multiplication; empty if the text is no unit."""
     word = unicodedata.normalize("NFKC", text.replace("º", "°")).casefold().replace("μ", "u")
     word = _SIGNS.sub("", word.strip("[]() "))
     return "" if word in _NO_UNITS else word
 
 
 def time_unit(text: str) -> str:
-    """Return ``s``, ``ms``, ``us`` or ``ns`` for a unit of times in any spelling, and other units as they are.
-
-    ``text``: the unit, or nothing.
-    """
+    """Return ``s``, ``ms``, ``us`` or ``ns`` for a unit of times in any spelling, and other units as they are."""
     return _TIMES.get(plain_unit(text), plain_unit(text))
 
 
 def check_unit(column: str, quantity: str, unit: str) -> None:
-    """Refuse a column whose unit is not one of its quantity.
-
-    ``quantity``: ``position``, ``demand``, ``torque``, ``current`` or ``voltage``. ``unit``: unit that the file states
-    for it; empty if it states none. Raises DataError if the unit is not known, or is one of another quantity.
-    """
+    """Refuse a column whose unit in the file (empty: none) is not one of its quantity, such as ``position``."""
     if plain_unit(unit) not in ("", *OF_QUANTITY[quantity]):
         raise DataError(
             f"column {column} states the unit {shortened(unit)!r}, expected one of {_SHOWN[quantity]}: "

@@ -31,11 +31,9 @@ _UNIT = re.compile(
 
 @dataclass(frozen=True)
 class CsvTable:
-    """Values of a table in a text file.
+    """Values (N, columns) of a table in a text file; NaN where a cell is empty, and in the whole row of a damaged line.
 
-    ``header``: name of each column; ``None`` if there is no header line. ``units``: text of the line of units below the
-    header, one per column; empty if there is none. ``values`` (N, columns); NaN where a cell is empty, and in the whole
-    row of a damaged line. ``lines``: line number of each row, (N,). ``notes``: sentences on lines that were left out.
+    ``header``: ``None`` if there is none. ``units``: from the line below it, or empty. ``lines`` (N,): of each row.
     """
 
     header: list[str] | None
@@ -59,13 +57,11 @@ class _Head:
 
 
 def read_csv(path: Path) -> CsvTable:
-    """Return the table of a text file.
+    """Return the table of a text file; DataError if it is no table of numbers, or too many of its lines are damaged.
 
-    Lines of comments are passed over. Lines with another number of columns, or with a cell that is no number, are
-    damaged: their rows are NaN. Columns of text are NaN. Columns are separated by commas, semicolons, tabs or spaces;
-    decimal commas are read where they are not the separator. The first column, and those named after time, may hold
-    dates (ISO 8601). Raises ConfigError if it cannot be opened; DataError if it is no table of numbers, or too many of
-    its lines are damaged.
+    Columns are separated by commas, semicolons, tabs or spaces; decimal commas are read where they are not the
+    separator. Lines with another number of columns, or a cell that is no number, are damaged; columns of text are NaN.
+    The first column, and those named after time, may hold dates (ISO 8601).
     """
     try:
         encoding = encoding_of(path)
@@ -81,10 +77,7 @@ def read_csv(path: Path) -> CsvTable:
 
 
 def cells_of(line: str, delimiter: str | None) -> list[str]:
-    """Return the cells of a line without quotes and spaces around them.
-
-    ``delimiter``: separator of the cells; ``None``: spaces.
-    """
+    """Return the cells of a line without quotes and spaces around them; delimiter ``None``: spaces."""
     text = line.strip("\r\n\0")
     if delimiter is None:
         words = text.replace('"', "").split()
@@ -99,10 +92,7 @@ def cells_of(line: str, delimiter: str | None) -> list[str]:
 
 
 def seconds_of_date(text: str) -> float | None:
-    """Return the seconds since 1970 of a date with time of day (ISO 8601), or ``None``.
-
-    ``text``: the date; UTC if it has no zone.
-    """
+    """Return the seconds since 1970 of a date with time of day (ISO 8601; UTC if it has no zone), or ``None``."""
     if len(text) < 10 or text[4:5] != "-":
         return None
     # Python reads six digits of a second; the others are added.

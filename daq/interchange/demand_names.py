@@ -23,10 +23,6 @@ _NO_POSITION = re.compile(
 def without_demand(name: str) -> str | None:
     """Return the rest of the name of a demand; ``None`` if no word in it names a demand.
 
-    ``name``: name of a column, such as ``q1_ref``, ``targetPosition1`` or ``elbow/desired/position``.
-
-    Examples
-    --------
     >>> [without_demand(name) for name in ("q1_ref", "elbow/desired/position", "reference2", "q1")]
     ['q1', 'elbow/position', '2', None]
     """

@@ -15,8 +15,7 @@ from armident.extras import install_line
 def columns(recording: Recording) -> dict[str, NDArray[np.float64]]:
     """Return time ``t`` (s), joint positions ``q1..``, torques ``tau1..`` and references ``qr1..``, (N,) each.
 
-    References are given where recorded, linear between set points, as drives interpolate (CiA 402, 60C0h = 0). Rows
-    outside the recorded set points are NaN. Raises DataError if the recording has no samples.
+    References are linear between recorded set points, as drives interpolate (CiA 402, 60C0h = 0), and NaN outside them.
     """
     robot, samples = recording.robot, recording.samples
     if samples.sync.size == 0:
@@ -102,10 +101,7 @@ def export_mat(recording: Recording, path: Path) -> None:
 
 
 def export_rosbag(recording: Recording, path: Path) -> None:
-    """Write the `columns` of a recording as joint states.
-
-    Stamps are those of the sampling clock: times of reception jitter, and other tools take stamps for sampling times.
-    """
+    """Write the `columns` of a recording as joint states, stamped by the sampling clock: times of reception jitter."""
     from armident.daq.interchange.rosbag import write_joint_states
 
     table, samples = columns(recording), recording.samples

@@ -107,7 +107,8 @@ def with_import_options(*without: str) -> Callable[[Function], Function]:
                 inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=_HINTS[name])
             )
         function.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
-        function.__annotations__ = {key: hint for key, hint in function.__annotations__.items() if key != "options"}
+        kept = {each.name for each in parameters} | {"return"}
+        function.__annotations__ = {key: hint for key, hint in function.__annotations__.items() if key in kept}
         function.__annotations__ |= {name: _HINTS[name] for name in names}
         texts = "\n".join(f"    {name}\n        {_HINTS[name].__metadata__[0].help}" for name in names)
         function.__doc__ = (function.__doc__ or "").replace("    options\n        Options of an import.", texts)

@@ -39,8 +39,8 @@ def import_recording(
 ) -> Recording:
     """Return measured motion and effort as a recording, after checks of content, units and clock.
 
-    ``config`` is the robot that was measured, the session of a bus log, or ``None`` for a recording: the robot inside
-    it. Raises ConfigError if a file or option is wrong, DataError if the content is.
+    ``config`` is the robot that was measured, the session of a bus log, or ``None`` for a recording, which has its
+    robot.
     """
     reader = reader_of(path)
     check_options(path, reader, options)

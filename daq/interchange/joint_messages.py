@@ -37,10 +37,9 @@ _MOST_NS = 2**63 - 1
 
 @dataclass(frozen=True, eq=False)
 class MessageTable:
-    """Messages with one list of names, and with the same quantities, M of them.
+    """M messages with one list of names and the same quantities: positions and efforts (M, m), or ``None``.
 
-    ``number``: number of each message on its topic, from 1, (M,). ``stamp``, ``logged``: stamp in the header and time
-    of recording, ns, (M,). ``q``, ``tau``: positions and efforts, (M, m); ``None`` if the messages have none.
+    ``number`` (M,): on the topic, from 1. ``stamp``, ``logged`` (M,): stamp in the header and time of recording, ns.
     """
 
     names: tuple[str, ...]
@@ -61,13 +60,7 @@ class _Rows:
 
 
 class TopicMessages:
-    """Collects the messages of a topic.
-
-    Attributes
-    ----------
-    count
-        Number of messages so far, unusable ones included.
-    """
+    """Collects the messages of a topic; ``count`` includes unusable ones."""
 
     def __init__(self, topic: str) -> None:
         self.topic = topic
@@ -78,10 +71,7 @@ class TopicMessages:
         self._first_odd: dict[str, int] = {}
 
     def add(self, logged_ns: int, data: bytes) -> None:
-        """Add a message; one that cannot be used is counted.
-
-        ``logged_ns``: time of recording, ns; ``data``: its content in CDR.
-        """
+        """Add a message in CDR, recorded at ``logged_ns``; one that cannot be used is counted."""
         self.count += 1
         try:
             message = self._decode(data)

@@ -18,12 +18,7 @@ Words = tuple[str, ...]
 
 @dataclass(frozen=True)
 class JointMatch:
-    """Joints of a robot in a file.
-
-    ``index``: index of each joint among the names of the file, n numbers in the robot's order. ``names``: name of each
-    joint in the file, in the robot's order. ``remarks``: sentences on what was assumed, for the user; empty if all
-    names are equal.
-    """
+    """Index and name of each joint of a robot in a file, in the robot's order; remarks if names are not equal."""
 
     index: tuple[int, ...]
     names: tuple[str, ...]
@@ -37,16 +32,11 @@ def match_joints(
     by_position: bool = False,
     joints: Sequence[str] | None = None,
 ) -> JointMatch:
-    """Return the index of each joint of a robot among the names of a file.
+    """Return the index of each of a robot's n joints among the names of a file; order is no evidence.
 
-    Names are compared in this order: the names of the source (``Joint.source_name``, those of a URDF), the names of
-    the configuration, either without regard to case and separators, and either with one prefix common to all joints,
-    in the file or in the configuration. A match that is not exact has a remark. Order is no evidence.
-
-    ``found``: names in the file; those of other devices among them are passed over. ``wanted``: joints of the robot
-    from base to tip, n of them. ``by_position``: True to take n names in their order where they do not match.
-    ``joints``: names of the file in the robot's order, n of them: replaces all comparison. Raises DataError if a joint
-    is not found, several names fit, or ``by_position`` contradicts the names; has both lists of names.
+    Compared in this order: names of the source (``Joint.source_name``, those of a URDF), names of the configuration,
+    both without case and separators, both with one common prefix. ``by_position`` takes n names in order where they do
+    not match; ``joints`` (n) replaces all comparison. A DataError has both lists of names.
     """
     twice = sorted({name for name in found if list(found).count(name) > 1})
     if twice:

@@ -31,10 +31,7 @@ def is_lerobot(arrays: Mapping[str, Any]) -> bool:
 
 
 def data_files(folder: Path) -> list[Path]:
-    """Return the Parquet files of a data set in order; none if the folder is neither a data set nor a part of one.
-
-    ``folder``: a folder with ``data``, or one of the folders in it.
-    """
+    """Return the Parquet files of a data set (a folder with ``data``, or one in it) in order; else none."""
     if not folder.is_dir() or any(file.name.endswith((METADATA, *SUFFIXES)) for file in folder.iterdir()):
         return []
     parts = ("data/*/*.parquet", "data/*.parquet", "chunk-*/*.parquet", "*.parquet")
@@ -42,10 +39,7 @@ def data_files(folder: Path) -> list[Path]:
 
 
 def joined(parts: Mapping[Path, Mapping[str, Any]]) -> dict[str, Any]:
-    """Return the columns of the files of a data set, one after the other.
-
-    Raises DataError if a file lacks a column of another one.
-    """
+    """Return the columns of the files of a data set, one after the other; DataError if a file lacks a column."""
     every = dict.fromkeys(name for part in parts.values() for name in part)
     for file, part in parts.items():
         if absent := [
@@ -57,11 +51,7 @@ def joined(parts: Mapping[Path, Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def lerobot_table(path: Path, arrays: Mapping[str, Any]) -> tuple[dict[str, NDArray[np.float64]], list[str]]:
-    """Return times, positions, demand and effort of a data set, and notes.
-
-    ``path``: file or folder of the data set, for the names of the joints in ``meta/info.json``; ``arrays``: columns by
-    name. Raises DataError if it has no effort, or columns of unequal length.
-    """
+    """Return times, positions, demand and effort of a data set, and notes; ``meta/info.json`` names its joints."""
     features = _features(path)
     table: dict[str, NDArray[np.float64]] = {}
     notes: list[str] = []

@@ -21,11 +21,7 @@ _LONGEST_LINE = 4096
 
 
 def read_log(path: Path) -> LogFrames:
-    """Return the frames of a bus log.
-
-    ``path``: the log; its suffix tells the format. Raises ConfigError if there is no such file, or it cannot be opened;
-    DataError if it is not such a log, or holds no frames.
-    """
+    """Return the frames of a bus log, by its suffix; DataError if it is no such log or has no frames."""
     if not is_file(path):
         raise ConfigError(f"{path}: no such file")
     parsers: dict[str, type[CandumpLines] | type[AscLines] | type[TrcLines]] = {

@@ -20,11 +20,9 @@ LATEST_NS = 9_000_000_000 * 1_000_000_000
 
 @dataclass(frozen=True)
 class LogFrames:
-    """Classic data frames with 11-bit identifiers, in the order of the log.
+    """Classic data frames (N,) with 11-bit identifiers, times in ns, in the order of the log, and their buses (N,).
 
-    ``frames``: the frames, (N,), with times in ns; ``bus``: number of the bus of each frame, (N,); ``foreign``: number
-    of other frames: CAN FD, extended identifiers, remote and error frames; ``notes``: one sentence for everything that
-    was left out or interpreted; ``skipped``: number of lines or objects that were left out.
+    ``foreign``: number of CAN FD, extended, remote and error frames; ``skipped``: number of lines or objects left out.
     """
 
     frames: Frames
@@ -35,11 +33,7 @@ class LogFrames:
     skipped: int = 0
 
     def of(self, path: Path, bus: str, several: bool) -> Frames:
-        """Return the frames of one bus.
-
-        ``path``: the log, for messages. ``several``: the session has several buses; otherwise the frames of the only
-        bus in the log are returned.
-        """
+        """Return the frames of one bus; if the session has only one, those of the only bus in the log."""
         if len(self.buses) < 2 and not (self.buses and several):
             return self.frames
         if bus not in self.buses:
@@ -75,10 +69,7 @@ class FrameCollector:
         return self._done + len(self._rows)
 
     def add(self, t_ns: int, can_id: int, data: bytes, channel: str) -> None:
-        """Add a classic data frame with an 11-bit identifier.
-
-        ``data``: at most eight bytes; ``channel``: name of its bus.
-        """
+        """Add a classic data frame with an 11-bit identifier and at most eight bytes."""
         number = self._numbers.setdefault(channel, len(self._numbers))
         self._rows.append((t_ns, can_id, data, number))
         if len(self._rows) >= _BATCH:
@@ -103,11 +94,7 @@ class FrameCollector:
         self._parts[-1] = (frames[:-1], bus[:-1])
 
     def finish(self, path: Path, added_up: bool | None = None) -> LogFrames:
-        """Return the frames.
-
-        ``path``: the log, for messages. ``added_up``: add up the times, as each is the time since the frame before;
-        ``None``: do so if they say it. Raises DataError if there are none.
-        """
+        """Return the frames; DataError without any. ``added_up``: each time is the time since the frame before."""
         self._flush()
         if not self._parts or not sum(part[0].size for part in self._parts):
             others = f", only {self.foreign} CAN FD, extended, remote or error frames" if self.foreign else ""
@@ -143,10 +130,7 @@ class FrameCollector:
 _LATEST_DIFFERENCE_NS = 1_000_000 * 1_000_000_000
 """Times above 11 days are those of a clock, not differences."""
 _DESCENDING_SHARE = 0.05
-"""Share of frames that are earlier than the one before above which times are differences.
-
-A clock that is set back, or two buses in one log, make far fewer of them; of differences, about half are.
-"""
+"""Share of frames earlier than the one before above which times are differences, of which about half are earlier."""
 
 
 def _are_differences(t_ns: NDArray[np.int64]) -> bool:
@@ -169,9 +153,6 @@ def _odd_times(t_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
 
 
 def nanoseconds(seconds: str, fraction: str | None) -> int | None:
-    """Return a time in ns from its decimal digits, or ``None`` if it is no possible time.
-
-    ``seconds``, ``fraction``: digits before and after the decimal point.
-    """
+    """Return a time in ns from its digits before and after the decimal point; ``None`` if it is impossible."""
     t_ns = int(seconds[:11]) * 1_000_000_000 + int((fraction or "0")[:9].ljust(9, "0"))
     return t_ns if t_ns < LATEST_NS else None

@@ -155,10 +155,7 @@ def _month(word: str) -> int | None:
 
 
 def asc_date_ns(text: str) -> int | None:
-    """Return the time of a date line of an ASC log in ns, in the zone of this computer; ``None`` if it is not known.
-
-    ``text``: the line, in the language of the computer that wrote it.
-    """
+    """Return the time of a date line of an ASC log, ns, in this computer's zone, any language; ``None`` if unknown."""
     clock = _ASC_CLOCK.search(text)
     if clock is None:
         return None
@@ -257,10 +254,9 @@ class AscLines:
         return t_ns, can_id, data, str(int(channel[:9]) - 1)
 
     def _of_fd_channel(self, t_ns: int, words: list[str]) -> FrameLine | LineKind:
-        """Return a classic frame of a CAN FD channel; another frame if it is CAN FD, extended, remote or an error.
+        """Return a classic frame of a CAN FD channel, or the kind of another line.
 
-        The words are channel, direction, identifier, perhaps a name, BRS, ESI, DLC, length, data, duration, bits and
-        flags, among others.
+        Words: channel, direction, identifier, perhaps a name, BRS, ESI, DLC, length, data, duration, bits and flags.
         """
         if len(words) > 3 and not words[3].isdecimal():
             del words[3]

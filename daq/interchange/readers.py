@@ -1,6 +1,6 @@
 """Formats of other tools: one class for each. Help texts, messages, docs and fuzz targets derive from `READERS`.
 
-The module is imported for the help of the command line: what is slow to import is imported where a file is read.
+It is imported for the help of the command line: what is slow to import is imported where a file is read.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _OF_TABLES = frozenset(FLAGS) - {"topic", "effort"}
 class Reader(Protocol):
     """Reader of a format, and writer if ``writer`` names one.
 
-    ``reader`` and ``writer`` are ``module:function`` in this package: (path, config, options) and (recording, path).
+    Both are ``module:function`` in this package: (path, config, options) and (recording, path).
     """
 
     name: ClassVar[str]

@@ -82,10 +82,7 @@ def sampled(
     resample_hz: float | None = None,
     time_unit: str | None = None,
 ) -> Sampled:
-    """Return the rows of a table as samples of one clock; options as those of `import_recording`.
-
-    Raises DataError if times, rate and motion contradict each other, or there is neither a time nor a rate.
-    """
+    """Return the rows of a table as samples of one clock; options as those of `import_recording`."""
     everything = np.concatenate([values for name, values in rows.values.items() if name != "demand"], axis=1)
     repeated = repeated_share(everything) if len(everything) > 1 else 0.0
     note = (
@@ -140,9 +137,8 @@ def _interpolated(name: str, at: Floats | Ints, known: Floats | Ints, values: Fl
 def _from_polled(rows: TableRows, times: Floats | None, rate_hz: float, polled: bool, notes: list[str]) -> Sampled:
     """Put polled rows on the clock of the controller: repeated ones are dropped, missed ones interpolated.
 
-    A program that polls an arm gets some samples twice and misses others, and its own times tell nothing. The motion
-    does: from one sample to the next the joints advance by a whole multiple of their usual increments at that time.
-    During standstill every row counts as one sample.
+    The times of a polling program tell nothing. The motion does: between samples, joints advance by a whole multiple of
+    their usual increments at that time. During standstill every row counts as one sample.
     """
     longest = float(np.diff(times).max(initial=0.0)) if times is not None else 0.0
     if longest * rate_hz > _LONGEST_POLLED:
@@ -259,10 +255,9 @@ def _from_jitter(rows: TableRows, times: Floats, rate_hz: float, notes: list[str
 def at_rate(recording: Recording, rate_hz: float) -> Recording:
     """Return a recording at another sampling rate, 1/s.
 
-    Positions, velocities and efforts go through a linear-phase low-pass filter (windowed sinc) below the lower of both
-    Nyquist frequencies. Demands are interpolated linearly, as a CiA 402 drive does (60C2h), and status words are held.
-    Gaps, marks and pieces between gaps keep their times. So does the time from a position to the torque that belongs
-    to it, as in a capture of the same drives at the new rate; in sampling periods it is another number.
+    Positions, velocities and efforts pass a linear-phase low-pass filter (windowed sinc) below the lower Nyquist
+    frequency. Demands are linear, as in a CiA 402 drive (60C2h); status words are held. Gaps, marks and pieces keep
+    their times, and so does the time from a position to its torque.
     """
     if not (np.isfinite(rate_hz) and rate_hz > 0):
         raise ConfigError(f"--rate: expected a sampling rate greater than 0 Hz, found {rate_hz:g}")
@@ -330,8 +325,7 @@ def _values(quantity: str, raw: NDArray[Any], at: Floats, ratio: float) -> NDArr
 def low_passed(values: Floats, at: Floats, share: float) -> Floats:
     """Return a signal (N, n) after a low-pass filter of linear phase, at any instants (M,), in samples.
 
-    The signal is attenuated from ``share`` of the Nyquist frequency on; beyond its ends it continues by point
-    reflection.
+    It is attenuated from ``share`` of the Nyquist frequency on, and continues beyond its ends by point reflection.
     """
     stop, begin = 0.5 * share, 0.5 * share * PASS_SHARE
     cutoff = (stop + begin) / 2

@@ -35,11 +35,7 @@ SIMULATED_S = 1e8
 
 @dataclass(frozen=True)
 class JointStates:
-    """Joint states of a robot.
-
-    ``t_ns``: times, ns, (N,), increasing; ``q``, ``tau``: positions and efforts, SI units, (N, n), in the robot's
-    order; ``remarks``: sentences on what was assumed, passed over or is missing, for the user.
-    """
+    """Positions and efforts of a robot, SI units, (N, n), in the robot's order, at increasing times (N,), ns."""
 
     t_ns: NDArray[np.int64]
     q: NDArray[np.float64]
@@ -55,26 +51,10 @@ def read_joint_states(
     joints: Sequence[str] | None = None,
     by_position: bool = False,
 ) -> JointStates:
-    """Return positions and efforts of a robot's joints from a bag.
+    """Return positions and efforts of a robot's joints from a bag, by their names in every message.
 
-    Joints are found by their names in every message (`armident.daq.interchange.joint_names`). Other joints are passed
-    over. Messages of one stamp with parts of the robot's joints are one sample. Times are the stamps, or the times of
-    recording if no stamp is set. What is damaged is left out, with a remark. Raises ConfigError if there is no such
-    bag; DataError if it is no bag, has no joint states, those of several robots, no joint of a name, or contradictory
-    times.
-
-    Parameters
-    ----------
-    path
-        MCAP or SQLite file, either compressed with zstd, or folder of a bag.
-    robot
-        The robot, for the names of its joints.
-    topic
-        Topic to read; ``None``: the only one with the robot's joints.
-    joints
-        Names in the bag of the robot's joints, in the robot's order; ``None``: those of the robot.
-    by_position
-        True to take joints of other names in the order of the messages.
+    ``topic``: ``None`` is the only one with these joints; ``joints``: their names in the bag. Messages of one stamp are
+    one sample. Times are the stamps, or those of recording if none is set. What is damaged is left out, with a remark.
     """
     reader = BagReader(path, MESSAGE_TYPE)
     found: dict[str, TopicMessages] = {}
@@ -279,11 +259,7 @@ def write_joint_states(
     t_ns: NDArray[np.int64],
     columns: dict[str, NDArray[np.float64]],
 ) -> None:
-    """Write positions and efforts as joint states.
-
-    ``path``: the rosbag2 file. ``joints``: names of the n joints. ``t_ns``: times, ns UTC, (N,). ``columns``: positions
-    ``q1..qn`` and efforts ``tau1..taun``, (N,) each; either may be absent.
-    """
+    """Write positions ``q1..qn`` and efforts ``tau1..taun``, (N,) each, as joint states at times (N,), ns UTC."""
     q, tau = (
         np.stack([columns[f"{base}{j + 1}"] for j in range(len(joints))], axis=1) if f"{base}1" in columns else None
         for base in ("q", "tau")
@@ -300,4 +276,4 @@ def write_joint_states(
                 "effort": [] if tau is None else tau[k].tolist(),
             }
             writer.write_message(TOPIC, schema, message, at, at, k)
-        writer.finish()  # type: ignore[no-untyped-call]
+        writer.finish()

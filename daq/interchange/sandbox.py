@@ -24,10 +24,7 @@ def error_line(error: Exception) -> str:
 
 
 def read_in_subprocess(read: Callable[[], Mapping[str, Any]], longest_s: float = LONGEST_S) -> dict[str, NDArray[Any]]:
-    """Return the arrays of real numbers of a reader that runs in a subprocess, which may crash.
-
-    ``longest_s``: time limit, s. Raises ValueError with the reader's error, or the way its process ended.
-    """
+    """Return the arrays of a reader in a subprocess; ValueError if it fails, crashes or exceeds ``longest_s``."""
     with tempfile.TemporaryFile() as file:
         process = os.fork()
         if process == 0:

@@ -30,11 +30,7 @@ _UNEXPLAINED_SHARE = 0.5
 
 
 def si_unit_of(quantity: str, robot: RobotConfig) -> str:
-    """Return the SI unit of a quantity of a robot's joints.
-
-    ``quantity``: ``position``, ``demand``, ``torque``, ``current`` or ``voltage``; ``robot``: for the types of its
-    joints.
-    """
+    """Return the SI unit of a quantity (``position``, ``torque``, ...) of a robot's joints, by their types."""
     kinds = {joint.type for joint in robot.joints}
     if quantity in ("position", "demand"):
         return "rad" if kinds == {"revolute"} else "m" if kinds == {"prismatic"} else "rad|m"
@@ -50,12 +46,7 @@ def check_units(
     raw: Mapping[str, NDArray[np.float64]],
     known: slice,
 ) -> None:
-    """Refuse values far outside the limits in SI units on the stated side.
-
-    ``path``: the file, for messages; ``robot``: for its limits and gears; ``fields``: side of each quantity; ``raw``:
-    values of each quantity, (N, n); ``known``: rows with a demand. Raises DataError if positions or torques are far
-    beyond their limits, or no joint followed its demand.
-    """
+    """Refuse positions and torques (N, n) far beyond SI limits, or a demand (``known`` rows) that none followed."""
     transmission = robot.transmission_matrix
     for name, values in raw.items():
         values = values[known] if name == "demand" else values
@@ -94,10 +85,7 @@ def _other_unit(name: str, kind: str, shares: NDArray[np.float64]) -> str:
 
 
 def fast_note(robot: RobotConfig, position: NDArray[np.float64], rate_hz: float) -> tuple[str, ...]:
-    """Return a sentence on joints that move far beyond their velocity limits; joints without one tell nothing.
-
-    ``position``: positions on the joint side, (N, n); ``rate_hz``: sampling rate, 1/s.
-    """
+    """Return a sentence on joints whose positions (N, n) move far beyond their velocity limits, if they have one."""
     # An odd number of rows, so that the values of two sources in turn show.
     apart = len(position) // _WINDOWS | 1
     if len(position) <= apart:

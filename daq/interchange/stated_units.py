@@ -33,12 +33,7 @@ Floats = NDArray[np.float64]
 
 
 def in_si(rows: TableRows, robot: RobotConfig, units: Mapping[str, str]) -> TableRows:
-    """Rows in SI units.
-
-    ``rows``: rows of a table in the units of the file. ``robot``: for the types of its joints: ``deg`` is that of
-    revolute joints, ``mm`` that of prismatic ones. ``units``: unit of a quantity (`CHOICES`); quantities that are left
-    out are in SI units. Raises ConfigError if a quantity has no such unit.
-    """
+    """Rows in SI units, from those by quantity (`CHOICES`); ``deg`` is of revolute, ``mm`` of prismatic joints."""
     values = dict(rows.values)
     notes = list(rows.notes)
     for quantity, unit in units.items():
@@ -71,11 +66,7 @@ def _factors(robot: RobotConfig, unit: str) -> Floats:
 
 
 def suspected(rows: TableRows, robot: RobotConfig) -> dict[str, str]:
-    """Units by magnitude: those in which values beyond the limits of the joints are within them.
-
-    ``rows``: rows in the units of the file. ``robot``: the robot with its limits; joints without limits do not tell a
-    unit.
-    """
+    """Units by magnitude: those in which values beyond the limits of the joints are within them."""
     found: dict[str, str] = {}
     limits = np.array([max(abs(end) for end in joint.limits.position) for joint in robot.joints])
     revolute = np.array([joint.type == "revolute" for joint in robot.joints])

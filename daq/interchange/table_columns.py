@@ -44,11 +44,7 @@ Table = Mapping[str, NDArray[np.float64]]
 
 @dataclass(frozen=True)
 class TableColumns:
-    """Values of one quantity.
-
-    ``values`` (N, n). ``labels``: name of each column in the file. ``notes``: sentences on what was assumed.
-    ``joints``: name of the joint of each column; empty if the columns are numbered.
-    """
+    """Values (N, n) of one quantity, labels of the columns, and joint of each column (empty: they are numbered)."""
 
     values: NDArray[np.float64]
     labels: tuple[str, ...]
@@ -59,12 +55,9 @@ class TableColumns:
 def without_units(
     table: Table, units: Sequence[str] = ()
 ) -> tuple[dict[str, NDArray[np.float64]], dict[str, str], list[str]]:
-    """Return the table without units in its names and in SI, the units by name, and notes on conversions.
+    """Return the table in SI without units in its names (``q1 [deg]``, ``time_ms``), the units by name, and notes.
 
-    Units that are not known are kept, for `armident.daq.interchange.column_units.check_unit`.
-
-    ``table``: columns by name, such as ``q1 [deg]`` or ``time_ms``. ``units``: a unit for each column, from a line of
-    units; may be empty. Raises DataError if two names are equal without their units.
+    Units that are not known are kept, for `check_unit`. ``units``: from a line of units, one per column, or empty.
     """
     made: dict[str, NDArray[np.float64]] = {}
     stated: dict[str, str] = {}
@@ -88,10 +81,7 @@ def without_units(
 
 
 def find_time(table: Table, name: str | None = None) -> tuple[str, NDArray[np.float64]] | None:
-    """Return name and values (N,) of the column of times, or ``None``.
-
-    ``table``: columns by name; ``name``: name that the user has given.
-    """
+    """Return name and values (N,) of the column of times, or ``None``; ``name``: stated by the user."""
     if name is not None and name not in table:
         raise DataError(f"no array named {name!r}; found {listed(list(table))}")
     lower = {each.lower(): each for each in reversed(list(table))}
@@ -114,13 +104,7 @@ def find_columns(
     by_position: bool = False,
     joints: Sequence[str] | None = None,
 ) -> TableColumns | None:
-    """Return the columns of a quantity in the robot's order, or ``None`` if there are none.
-
-    ``table``: columns (N,), or arrays (N, n), by name; ``quantity``: a key of `NAMES`; ``robot``: for number and names
-    of its joints; ``name``: name that the user has given for this quantity; ``by_position``, ``joints``: choice of the
-    joints by the user (`armident.daq.interchange.joint_names`). Raises DataError if joints are missing, or there are
-    too many.
-    """
+    """Return the columns of a quantity in the robot's order, or ``None``; ``name``: stated by the user."""
     for base in (name,) if name is not None else NAMES[quantity]:
         found = _numbered(table, base, robot.n)
         if found is not None:
@@ -133,10 +117,7 @@ def find_columns(
 
 
 def unused_demand(table: Table) -> str:
-    """Return a sentence on columns that name a demand, for a table in which no demand was found; empty without any.
-
-    ``table``: columns by name.
-    """
+    """Return a sentence on columns that name a demand, for a table in which no demand was found; empty without any."""
     named = [name for name in table if without_demand(name) is not None]
     if not named:
         return ""

@@ -24,11 +24,9 @@ _LATER_MAT = b"MATLAB 7.3"
 
 @dataclass(frozen=True)
 class Source:
-    """Named arrays of a file.
+    """Named arrays of a file, (N,) or (N, n), with the units that it states for them.
 
-    ``table``: arrays by name, (N,) or (N, n). ``lines``: line number of each row in a text file, (N,); ``None`` for
-    other formats. ``units``: units that the file states, by name of the array. ``notes``: sentences on what was left
-    out or assumed. ``t_ns``: stamps of the messages of a bag, ns, (N,).
+    ``lines`` (N,): line of each row in a text file, else ``None``. ``t_ns`` (N,): stamps of the messages of a bag, ns.
     """
 
     path: Path
@@ -39,10 +37,7 @@ class Source:
     t_ns: NDArray[np.int64] | None = None
 
     def place(self, row: int, name: str) -> str:
-        """Return the position of a value in the file, for messages.
-
-        ``row``: row, from 0; ``name``: name of the column.
-        """
+        """Return the position of a value in the file, for messages; rows count from 0."""
         where = f"row {row}" if self.lines is None else f"line {self.lines[row]}"
         return f"{self.path}: {where}, column {name}"
 

@@ -23,24 +23,10 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class TableRows:
-    """Complete rows of a table.
+    """Complete rows of a table: position, effort and, if there is one, demand, (N, n) each.
 
-    Parameters
-    ----------
-    values
-        Position, effort and, if there is one, demand, (N, n) each.
-    labels
-        Names of the columns of each quantity in the file.
-    row
-        Number of each row in the file, from 0, (N,).
-    times
-        Times (N,), in the unit of the file; ``None`` if there is no column of times.
-    time_name
-        Name of that column.
-    time_unit
-        Unit that the file states for them; empty if it states none.
-    notes
-        Sentences on what was left out or assumed.
+    ``labels``: column names by quantity. ``row`` (N,): number in the file, from 0. ``times`` (N,) in the unit of the
+    file (``time_unit``, empty if it states none), ``None`` without a column ``time_name``.
     """
 
     values: dict[Quantity, Floats]
@@ -66,14 +52,10 @@ def complete_rows(
     by_position: bool = False,
     joints: Sequence[str] | None = None,
 ) -> TableRows:
-    """Return the rows of a table that have time, all positions and all efforts.
+    """Return the rows of a table that have time, all positions and all efforts; DataError if too many are incomplete.
 
-    Rows without any of them belong to something else and are passed over. Rows of one time are joined, where one has
-    what the other lacks. Others are left out and named.
-
-    ``robot``: for its joints. ``names``: names of the file by quantity; ``-`` leaves one out. ``by_position``,
-    ``joints``: choice of the joints by the user. Raises DataError if a quantity is missing, or too many rows are
-    incomplete.
+    Rows without any of them are passed over. Rows of one time are joined where one has what the other lacks. Others are
+    left out and named. ``names``: names of the file by quantity; ``-`` leaves one out.
     """
     try:
         found: dict[Quantity, TableColumns] = {}

@@ -15,10 +15,7 @@ _LISTED = 40
 
 
 def encoding_of(path: Path) -> str:
-    """Return the encoding of a text file: UTF-8, UTF-16 by its mark or its zeros, or Windows-1252.
-
-    Raises OSError if it cannot be read.
-    """
+    """Return the encoding of a text file: UTF-8, UTF-16 by its mark or its zeros, or Windows-1252."""
     with path.open("rb") as file:
         head = file.read(_HEAD)
     if head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):

@@ -52,13 +52,7 @@ _MISALIGNED = 20
 
 @dataclass(frozen=True)
 class TpdoStream:
-    """TPDOs of a stream on the bus.
-
-    A frame of ``length`` bytes holds ``pack`` samples of ``size`` bytes, one of every SYNC.
-
-    ``every``: number of SYNCs from one sample to the next. ``cob_ids``: COB-ID of each joint's TPDO. ``length``: bytes
-    of a frame. ``pack``: samples in a frame. ``size``: bytes of a sample; 0: all of the frame.
-    """
+    """TPDOs of a stream, a sample per ``every`` SYNCs; frames hold ``pack`` samples of ``size`` bytes (0: all)."""
 
     name: str
     every: int
@@ -75,11 +69,7 @@ class TpdoStream:
 
 @dataclass(frozen=True)
 class Rows:
-    """Complete rows.
-
-    ``sync``: SYNC numbers, (N,); ``t_ns``: receive times of the SYNCs, ns UTC, (N,); ``data``: bytes of each joint's
-    sample, (N, n, 8) or wider.
-    """
+    """Complete rows: SYNC numbers (N,), their receive times (N,), ns UTC, bytes by joint (N, n, 8) or wider."""
 
     sync: NDArray[np.int64]
     t_ns: NDArray[np.int64]
@@ -88,11 +78,7 @@ class Rows:
 
 @dataclass(frozen=True)
 class Batch:
-    """Result of a batch of frames.
-
-    ``rows``: complete rows by stream; ``gaps``: gaps that have ended; ``certain``: number of the SYNC, by stream,
-    before which all rows are known: they are complete, or in a gap.
-    """
+    """Complete rows and ended gaps; ``certain``: SYNC by stream before which all rows are complete or in a gap."""
 
     rows: dict[str, Rows]
     gaps: tuple[Gap, ...]
@@ -100,29 +86,12 @@ class Batch:
 
 
 class Assembler:
-    """Matches SYNC and TPDO frames.
+    """Matches SYNC and TPDO frames; the division of a bus's frames into batches does not matter.
 
-    The result does not depend on the division of the frames of a single bus into batches. Drives on several buses are
-    compared with each other as far as their buses have been read. Thus late answers of a drive may be assigned, or
-    become a gap with the reason ``ambiguous order``, as the time decides at which its bus is read.
-
-    Parameters
-    ----------
-    streams
-        TPDOs to match, all with the same joints.
-    joints
-        Names of the joints, in the order of the COB-IDs.
-    overflow
-        Synchronous counter overflow value (CiA 301, 1019h); 0: SYNC has no counter.
-    first_counter
-        Counter of SYNC 0 if it is known (own producer); ``None``: the first SYNC received is SYNC 0.
-    sync_id
-        COB-ID of SYNC.
-    bus_of
-        Number of the bus of each joint's drive; empty: all on one bus.
-    nodes
-        Node ID of each joint's drive, if SDO requests are watched: a write to TPDO parameters makes the TPDOs
-        unverified until :meth:`mark_unverified` gives the time span.
+    Drives on several buses are compared as far as these have been read: the time of reading decides if late answers are
+    assigned, or a gap ``ambiguous order``. ``overflow``: of the SYNC counter (CiA 301, 1019h; 0: none).
+    ``first_counter``: of SYNC 0; ``None``: the first received. ``bus_of`` empty: all on one. ``nodes``: if SDO requests
+    are watched: a write to TPDO parameters makes TPDOs unverified until :meth:`mark_unverified`.
     """
 
     def __init__(
@@ -210,27 +179,15 @@ class Assembler:
 
     @property
     def counters(self) -> dict[str, int]:
-        """Counters of frames, SYNCs and samples.
-
-        Per stream, ``expected`` rows are ``rows`` (complete) or ``in_gaps``. ``discarded`` is the number of samples of
-        single joints that were received for rows in gaps.
-        """
+        """Counters of frames, SYNCs and samples; ``discarded``: samples of single joints received for rows in gaps."""
         counts = dict(zip(COUNT_NAMES, (int(c) for c in self._state.counts), strict=True))
         return counts | self._totals
 
     def push(self, frames: NDArray[Any], sent: int | None = None, dropped: bool = False, bus: int = 0) -> Batch:
-        """Match frames of one bus, in the order of reception.
+        """Match frames (N,) of one bus in the order of reception; return rows and gaps that are certain now.
 
-        Returns rows and gaps that are certain now. Raises DataError if the SYNC counters of two buses do not agree.
-
-        Parameters
-        ----------
-        frames
-            Structured array (N,) with ``t_ns``, ``can_id``, ``length`` and ``data`` (8 or 64 bytes), as received.
-        sent
-            Number of SYNCs sent so far by the own producer, an upper limit for gaps; ``None``: another producer.
-        dropped
-            Frames of this bus were lost between the last call and the end of these, according to the kernel.
+        ``sent``: SYNCs sent so far by the own producer, or ``None``. ``dropped``: frames of this bus were lost since
+        the last call. Raises DataError if the SYNC counters of two buses do not agree.
         """
         arguments = (*_columns(frames), *self._timing, bus)
         self._lossy[bus] |= dropped
@@ -270,10 +227,7 @@ class Assembler:
             sent[0] = self._sends_loaded = first + times.size
 
     def set_bus_down(self, bus: int, down: bool) -> None:
-        """Mark a bus as down or up.
-
-        While a bus is down, its drives have nothing to answer, and other buses do not wait for it.
-        """
+        """Mark a bus as down or up; while it is down, its drives have nothing to answer and no bus waits for it."""
         self._state.slack[bus] = 0 if down else self._slack
         self._lossy[bus] |= down
         self.mark_incomplete(bus)
@@ -283,21 +237,14 @@ class Assembler:
         self._state.bus_state[bus, INCOMPLETE] = 1
 
     def mark_unverified(self, joint: str, since_ns: int, until_ns: int) -> None:
-        """Set the time span in which TPDOs of a joint may have another mapping than the session.
-
-        ``since_ns``, ``until_ns``: begin and end, ns UTC.
-        """
+        """Set the time span, ns UTC, in which TPDOs of a joint may have another mapping than the session."""
         span = self._state.unverified[self._joints.index(joint)]
         if span[0] < span[1] and span[1] == OPEN_END:
             since_ns = min(since_ns, int(span[0]))
         span[:] = since_ns, until_ns
 
     def most_unreceived(self, dropped: Sequence[int], now_ns: int) -> int:
-        """Return the largest number of SYNCs that may have been sent after the last one received.
-
-        ``dropped``: frames of each bus lost after the last one received, according to the kernel; ``now_ns``: present
-        time of the kernel's clock, ns UTC.
-        """
+        """Return the most SYNCs that may follow the last one received, by each bus's ``dropped`` frames and ns UTC."""
         numbers, times = self._state.bus_state[:, SYNC], self._state.bus_state[:, TIME]
         known = times != NEVER
         periods = np.maximum(0, now_ns - times[known]) // self._timing[1]
@@ -305,10 +252,7 @@ class Assembler:
         return int(max(0, last.max(initial=self.last_sync) - self.last_sync))
 
     def finish(self, sent: int | None = None) -> Batch:
-        """Return the remaining rows and gaps after the last frame.
-
-        ``sent``: total number of SYNCs sent; ``None`` if unknown.
-        """
+        """Return the remaining rows and gaps after the last frame; ``sent``: number of SYNCs, if it is known."""
         total = self.last_sync + 1 if sent is None else max(sent, self.last_sync + 1)
         out = output_buffers(self._state, total - self.last_sync)
         _finish(total, self._state, out)

@@ -19,21 +19,14 @@ REASONS = {
 
 
 class OpenGaps:
-    """Gaps that may still continue, by stream, joint (``None``: all joints) and reason.
-
-    ``joints``: names of the joints, in the order of the columns.
-    """
+    """Gaps that may still continue, by stream, joint (``None``: all joints) and reason."""
 
     def __init__(self, joints: Sequence[str]) -> None:
         self._joints = tuple(joints)
         self._open: dict[tuple[str, str | None, str], tuple[int, int]] = {}
 
     def add(self, stream: str, every: int, sync: NDArray[np.int64], code: NDArray[np.uint8]) -> list[Gap]:
-        """Add incomplete rows and return the gaps that have ended.
-
-        ``every``: number of SYNCs from one row to the next; ``sync``: SYNC numbers of the rows, (N,), increasing;
-        ``code``: state of each joint's sample (`state.LOST` and so on), (N, n).
-        """
+        """Add incomplete rows, SYNCs (N,) and states (N, n) such as `state.LOST`; return the gaps that have ended."""
         found: list[tuple[str | None, str, NDArray[np.int64]]] = []
         for value, reason in REASONS.items():
             hit = code == value
@@ -58,11 +51,7 @@ class OpenGaps:
         return gaps
 
     def ended(self, stream: str, last: int | None, final: bool) -> list[Gap]:
-        """Return the gaps of a stream that have ended.
-
-        ``last``: last SYNC number known; a gap that ends before it has ended. ``None``: none. ``final``: return all
-        gaps of the stream: no more rows follow.
-        """
+        """Return a stream's gaps that end before the SYNC ``last``, or all of them if no rows follow (``final``)."""
         gaps = []
         for key, (begin, end) in list(self._open.items()):
             if key[0] == stream and (final or (last is not None and last > end)):

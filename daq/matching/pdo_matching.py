@@ -1,25 +1,22 @@
 """Compiled matching of TPDOs to the SYNCs that they answer.
 
-A TPDO has no number, only an order: each drive answers its SYNCs one after the other. So per drive and TPDO, SYNCs and
-answers are matched first to first. The match is evaluated at the next SYNC of the bus. If the drive has then answered
-all SYNCs, the match is certain, however late the answers were. An answer is lost if a drive
+A TPDO has no number, only an order: per drive and TPDO, SYNCs and answers are matched first to first. If the drive has
+answered all SYNCs by the next SYNC, the match is certain, however late the answers were. An answer is lost if a drive
 
 - answers every SYNC again and still lacks answers while another drive on its bus lacks none,
 - is silent beside such a drive, or
 - lacks answers for longer than a window of SYNCs.
 
-Then every answer is taken as prompt (the latest SYNC that it can belong to). If answers also came in bursts, the match
-is ambiguous and the samples in question are discarded as ``AMBIGUOUS``, never guessed. While all drives lack answers
-at every SYNC and no frame is known to be missing, the buses are delayed and nothing is lost: then the window is
-``LONG_WINDOW`` SYNCs.
+Then every answer is taken as prompt (the latest SYNC that it can belong to). If answers also came in bursts, the
+samples in question are discarded as ``AMBIGUOUS``, never guessed. While all drives lack answers at every SYNC and no
+frame is known to be missing, the buses are delayed: then the window is ``LONG_WINDOW`` SYNCs.
 
-Answers to discarded rows, of a drive that was silent or a bus that was off, may still arrive. Until such a drive has
-answered each of some consecutive SYNCs, or has kept its largest surplus of answers at as many SYNCs of a longer time,
-equal numbers of answers and SYNCs prove nothing; the first surplus answers belong to discarded rows.
+Answers to discarded rows, of a drive that was silent or a bus that was off, may still arrive: the first surplus answers
+belong to them, and equal numbers of answers and SYNCs prove nothing. They do once the drive has answered each of some
+consecutive SYNCs, or has kept its largest surplus of answers at as many SYNCs of a longer time.
 
-Several buses carry the same SYNC numbers: a row is one SYNC of all axes. If SYNC comes from another master, buses are
-aligned by its counter and receive time. A bus without SYNC while others receive SYNCs is silent: its SYNCs are
-missing, and its drives have nothing to answer.
+A row is one SYNC of all axes on all buses. With another master, buses are aligned by counter and receive time; a bus
+without SYNC while others receive it is silent, and its drives have nothing to answer.
 """
 
 from typing import Any
@@ -153,21 +150,7 @@ def count_sync(
     count: int, can_id: Any, length: Any, t_ns: Any, data: Any, sync_id: int, period_ns: int, overflow: int,
     bus: int, longest: int, m: MatcherState,
 ) -> int:  # fmt: skip
-    """Return the number of SYNC numbers that the frames may cover, without a change of the state.
-
-    Parameters
-    ----------
-    can_id, length, t_ns
-        COB-IDs, data lengths and receive times (ns UTC) of the frames, (count,) or longer.
-    data
-        Data of the frames as 64-bit words, (count, words).
-    sync_id
-        COB-ID of SYNC.
-    overflow
-        Synchronous counter overflow value (CiA 301, 1019h); 0: SYNC has no counter.
-    longest
-        Largest advance with whole counter turns, SYNCs.
-    """
+    """Return the number of SYNCs that the frames may cover, without a change of the state; arguments as in `match`."""
     total, bus_state = 0, m.bus_state.copy()
     for i in range(count):
         if can_id[i] == sync_id:
@@ -183,20 +166,8 @@ def match(
 ) -> None:  # fmt: skip
     """Match frames of one bus, in the order of reception, and append the decided samples to ``out``.
 
-    Parameters
-    ----------
-    can_id, length, t_ns
-        COB-IDs, data lengths and receive times (ns UTC) of the frames, (count,) or longer.
-    data
-        Data of the frames as 64-bit words, (count, words).
-    sync_id
-        COB-ID of SYNC.
-    overflow
-        Synchronous counter overflow value (CiA 301, 1019h); 0: SYNC has no counter.
-    longest
-        Largest advance with whole counter turns, SYNCs.
-    out
-        Output of decided samples.
+    ``can_id``, ``length``, ``t_ns`` (ns UTC): (count,) or longer; ``data``: 64-bit words, (count, words). ``overflow``:
+    of the SYNC counter (CiA 301, 1019h; 0: none). ``longest``: largest advance with whole counter turns, SYNCs.
     """
     n = m.settled.shape[1]
     words = min(data.shape[1], m.answer.shape[3])
@@ -254,10 +225,7 @@ def match(
 
 @compiled("i8, MatcherState, MatchedSamples")
 def finish(total: int, m: MatcherState, out: MatchedSamples) -> None:
-    """Settle all rows after the last frame: unanswered SYNCs are lost.
-
-    ``total``: number of SYNCs that were sent; ``out``: output of decided samples.
-    """
+    """Settle all rows after the last frame, of ``total`` SYNCs that were sent: unanswered SYNCs are lost."""
     for bus in range(m.bus_state.shape[0]):
         last = m.bus_state[bus, SYNC]
         for other in range(m.bus_state.shape[0] if last < 0 else 0):

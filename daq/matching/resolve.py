@@ -127,10 +127,7 @@ def _update_progress(m: MatcherState, s: int, j: int) -> None:
 
 @compiled()
 def _is_aligned(m: MatcherState, s: int, j: int, head: int) -> bool:
-    """Return True if the surplus of answers is the number of those to discarded rows: a drive never answers early.
-
-    The surplus is then the largest one, which the drive reaches whenever it is prompt.
-    """
+    """Return True if the surplus is that of answers to discarded rows, the largest one: drives never answer early."""
     if m.progress[s, j, BALANCE_RUN] >= ALIGNED_SYNCS:
         return True
     lasting = head - m.progress[s, j, BALANCE_AT] >= m.config[s, SHORT_WINDOW] // 2
@@ -336,10 +333,7 @@ def _emit(m: MatcherState, s: int, end: int, out: MatchedSamples) -> None:
 
 @compiled()
 def settle_all(m: MatcherState, bus: int, s: int, final: bool, out: MatchedSamples) -> None:
-    """Decide the open rows of the drives on one bus, and output the rows that all drives have settled.
-
-    ``s``: number of the stream; ``final``: no more answers follow.
-    """
+    """Decide the open rows of a bus's drives in stream ``s``, and output the settled; ``final``: no answers follow."""
     n = m.settled.shape[1]
     head = m.head[bus, s]
     slot = (head - 1 - m.watermark[s, BASE]) % m.row_sync.shape[1]

@@ -83,60 +83,18 @@ class MatcherState(NamedTuple):
     Row ``u`` of stream ``s`` is in ring slot ``(u - watermark[s, BASE]) % C`` until every joint has settled it. When no
     row is open the ring restarts, so that memory is only touched if answers are late.
 
-    Parameters
-    ----------
-    bus_state
-        State of each bus (`SYNC` and following), (B, 7).
-    slack
-        SYNCs by which a bus may be behind another one before it counts as silent, (B,).
-    sync_times
-        Ring of receive times by SYNC number, ns UTC, (B, R).
-    send_times
-        Ring of send times of the own producer, ns UTC, (`SEND_TIMES`,); used where SYNCs are lost.
-    sends_known
-        Number of SYNCs before which ``send_times`` is valid, (1,); -1: none.
-    counts
-        Counters (`COUNT_NAMES`).
-    config
-        Shape and windows of each stream (`EVERY` and following), (S, 7).
-    watermark
-        Row ordinals of each stream (`TOP` and following), (S, 4).
-    bus_of
-        Bus of each joint's drive, (n,).
-    channel_of
-        ``s n + j`` by bus and COB-ID of a TPDO, or -1, (B, 2048).
-    writes_to
-        Joint by bus and COB-ID of an SDO request, or -1, (B, 2048).
-    head
-        Rows to be answered by the SYNCs of each bus, (B, S).
-    gap_end
-        Row before which a frame is known to be missing, (B, S).
-    progress
-        Progress of each drive (`BALANCE` and following), (S, n, 9).
-    settled
-        Rows settled, (S, n).
-    pending
-        Answers received for later rows, (S, n).
-    since_sync
-        Those received since the last SYNC, (S, n).
-    wrong_length
-        TPDOs of the wrong length, (S, n).
-    lag, lag_at
-        Largest recent number of outstanding answers, and its row, (S, n).
-    ambiguous_before
-        Row before which a match is ambiguous, (S, n).
-    unverified
-        Time span in which TPDOs may have another mapping, ns UTC, (n, 2).
-    newest_row
-        Newest row of the bus when each pending answer was received, (S, n, A).
-    answer, answer_code
-        Data as 64-bit words, (S, n, A, words), and state of each pending answer, (S, n, A).
-    row_sync
-        SYNC number of each row, (S, C).
-    row_t
-        Receive times of the SYNCs of each row, (S, C, pack, B); `NEVER` if not received.
-    row_code, row_data
-        State, (S, C, n), and data as 64-bit words, (S, C, n, words), of each row.
+    ``bus_state`` (B, 7): `SYNC` and following; ``config`` (S, 7): `EVERY` ...; ``watermark`` (S, 4): `TOP` ...
+    ``progress`` (S, n, 9): `BALANCE` ... of each drive; ``counts``: `COUNT_NAMES`; ``bus_of`` (n,).
+    ``slack`` (B,): SYNCs behind another bus before a bus counts as silent; ``sync_times`` (B, R): ring, ns UTC.
+    ``send_times`` (`SEND_TIMES`,): used where SYNCs are lost; valid before SYNC ``sends_known``, -1: none.
+    ``channel_of`` (B, 2048): ``s n + j`` by COB-ID of a TPDO; ``writes_to``: joint by COB-ID of an SDO request; or -1.
+    ``head``, ``gap_end`` (B, S): number of rows to be answered, and row before which a frame is known to be missing.
+    ``settled``, ``pending``, ``since_sync`` (S, n): rows settled, answers to later rows, and answers since SYNC.
+    ``lag``, ``lag_at`` (S, n): largest recent number of outstanding answers, and its row.
+    ``ambiguous_before``, ``wrong_length`` (S, n): row before which a match is ambiguous, and TPDOs of wrong length.
+    ``unverified`` (n, 2): span of another mapping, ns UTC; ``newest_row`` (S, n, A): of the bus at each answer.
+    ``answer`` (S, n, A, words), ``answer_code`` (S, n, A): 64-bit words, and states, of the pending answers.
+    ``row_sync`` (S, C), ``row_t`` (S, C, pack, B) or `NEVER`, ``row_code`` (S, C, n), ``row_data`` (S, C, n, words).
     """
 
     bus_state: NDArray[np.int64]
@@ -172,11 +130,10 @@ class MatcherState(NamedTuple):
 
 @structure("i8[::1], i8[:, ::1], i8[:, ::1], u1[:, :, ::1], u8[:, :, :, ::1]")
 class MatchedSamples(NamedTuple):
-    """Decided samples; S streams, n joints, space for N rows.
+    """Decided samples of S streams and n joints, ``rows`` (S,) of the N that have space.
 
-    ``rows``: number of rows of each stream, (S,); ``sync``: SYNC numbers, (S, N); ``t_ns``: receive time on the first
-    bus that received the SYNC, ns UTC, (S, N); ``code``: state of each sample, (S, N, n); ``data``: data as 64-bit
-    words, (S, N, n, words).
+    ``sync`` (S, N); ``t_ns`` (S, N): receive time on the first bus that received the SYNC, ns UTC; ``code`` (S, N, n):
+    state; ``data`` (S, N, n, words): 64-bit words.
     """
 
     rows: NDArray[np.int64]
@@ -187,11 +144,7 @@ class MatchedSamples(NamedTuple):
 
 
 class StreamShape(NamedTuple):
-    """Frames of a stream.
-
-    ``every``: number of SYNCs from one frame to the next; ``pack``: samples in a frame; ``size``: bytes of a sample;
-    ``length``: bytes of a frame.
-    """
+    """Frames of a stream: one per ``every`` SYNCs, of ``length`` bytes, with ``pack`` samples of ``size`` bytes."""
 
     every: int
     pack: int
@@ -208,19 +161,10 @@ def new_state(
     channel_of: NDArray[np.int64],
     writes_to: NDArray[np.int64],
 ) -> MatcherState:
-    """Return the state before the first frame.
+    """Return the state before the first frame; ``bus_of``, ``channel_of`` and ``writes_to`` as in `MatcherState`.
 
-    Parameters
-    ----------
-    window, long_window, short_window
-        Of each stream, the rows by which an answer may be late: in general, if all drives are late, and if the drive is
-        in step again beside others.
-    bus_of
-        Number of the bus of each joint's drive, (n,).
-    channel_of
-        ``s n + j`` by bus and COB-ID of a TPDO, or -1, (B, 2048).
-    writes_to
-        Joint by bus and COB-ID of an SDO request, or -1, (B, 2048).
+    Windows of each stream are rows by which an answer may be late: in general, if all drives are late
+    (``long_window``), and if the drive is in step again beside others (``short_window``).
     """
     buses, streams, n = len(channel_of), len(shapes), len(bus_of)
     rows = 2 * max(long_window) + 8
@@ -269,10 +213,7 @@ def new_state(
 
 
 def output_buffers(matcher: MatcherState, syncs: int) -> MatchedSamples:
-    """Return buffers for all samples that can be decided after more SYNCs.
-
-    ``syncs``: largest number of SYNCs to come.
-    """
+    """Return buffers for all samples that can be decided after at most ``syncs`` more SYNCs."""
     streams, _, n = matcher.row_code.shape
     rows = (
         int(((matcher.watermark[:, TOP] - matcher.watermark[:, EMITTED] + 1) * matcher.config[:, PACK]).max()) + syncs

@@ -22,10 +22,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class CapturedStream:
-    """One stream on the bus and in the recording.
-
-    ``tpdo``: layout of the objects in a TPDO; ``bus``: COB-IDs and frame lengths for the matcher.
-    """
+    """One stream: layout of its objects in a TPDO and the recording; COB-IDs and frame lengths for the matcher."""
 
     tpdo: TpdoLayout
     bus: TpdoStream
@@ -38,11 +35,7 @@ class CapturedStream:
 
 
 def captured_streams(session: SessionConfig, robot: RobotConfig) -> tuple[CapturedStream, ...]:
-    """Return the streams of a session, with the joints in the robot's order.
-
-    ``robot``: for joints, transmission and encoder scales. Raises ConfigError if a joint has no drive, a stream does
-    not fit into its TPDO, or a position has no scale.
-    """
+    """Return the streams of a session, joints in robot order; ConfigError without drive, room in a TPDO, or scale."""
     nodes = node_ids(session, robot)
     fd = all(bus.fd for bus in session.all_buses)
     if robot.transmission is None:
@@ -60,12 +53,9 @@ def captured_streams(session: SessionConfig, robot: RobotConfig) -> tuple[Captur
 
 
 def unknown_phase(session: SessionConfig) -> str | None:
-    """Return a message about streams that are not sent on every SYNC, for SYNC without a counter.
+    """Return a message about streams that are not sent on every SYNC, if SYNC has no counter; ``None`` without any.
 
-    In a log, or with another master, drives send these streams by their own count then, which is unknown. ``None`` if
-    there is no such stream.
-
-    ``session``: configuration of the capture.
+    In a log, or with another master, drives send these streams by their own count then, which is unknown.
     """
     slow = [name for name, stream in session.streams.items() if max(stream.every, stream.pack) > 1]
     if not slow:
@@ -77,10 +67,7 @@ def unknown_phase(session: SessionConfig) -> str | None:
 
 
 def node_ids(session: SessionConfig, robot: RobotConfig) -> tuple[int, ...]:
-    """Return the node ID of each joint's drive, in the robot's order.
-
-    ``session``: configuration of the capture, with its drives. Raises ConfigError if a joint has no drive.
-    """
+    """Return the node ID of each joint's drive, in the robot's order; ConfigError if a joint has no drive."""
     by_joint: Mapping[str, int] = {drive.joint: drive.node_id for drive in session.drives}
     for joint in robot.joints:
         if joint.name not in by_joint:
@@ -89,20 +76,14 @@ def node_ids(session: SessionConfig, robot: RobotConfig) -> tuple[int, ...]:
 
 
 def bus_numbers(session: SessionConfig, robot: RobotConfig) -> tuple[int, ...]:
-    """Return the number of the bus of each joint's drive, in the robot's order.
-
-    ``session``: configuration of the capture, with its buses and drives.
-    """
+    """Return the number of the bus of each joint's drive, in the robot's order."""
     buses = session.all_buses
     by_joint = {drive.joint: buses.index(session.bus_of(drive)) for drive in session.drives}
     return tuple(by_joint[joint.name] for joint in robot.joints)
 
 
 def field_of(name: ObjectName, robot: RobotConfig) -> Field:
-    """Return quantity, unit and scale of an object (CiA 402 part 2; 6078h and 6077h in per mille of rated).
-
-    ``robot``: for rated values and encoder scales.
-    """
+    """Return quantity, unit and scale of an object (CiA 402 part 2; 6078h and 6077h in per mille of rated)."""
     one = (1.0,) * robot.n
     if name == "status":
         return Field(name, "status", "", "motor", one)

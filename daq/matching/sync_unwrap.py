@@ -33,21 +33,13 @@ _MISALIGNED = 2.0
 
 @compiled()
 def turns_in(periods: float, overflow: int) -> int:
-    """Return the number of whole counter turns in a time.
-
-    SYNCs may be late, when their master was delayed, but at most a quarter of a turn early.
-
-    ``overflow``: synchronous counter overflow value (CiA 301, 1019h).
-    """
+    """Return the number of whole counter turns in SYNC periods; SYNCs may be late, but at most a quarter turn early."""
     return int(np.floor(periods / overflow + _EARLY))
 
 
 @compiled()
 def _is_delayed(counter: int, previous: int, elapsed: float, irregular: bool, overflow: int) -> bool:
-    """Return True if the master was delayed between consecutive counters: the time is no multiple of counter turns.
-
-    The time of an ``irregular`` master is no evidence for missing turns.
-    """
+    """Return True if the time between counters is no multiple of turns; an ``irregular`` master's tells nothing."""
     step = (counter - previous) % overflow
     deviation = elapsed - step - turns_in(elapsed - step, overflow) * overflow
     return bool(step == 1 and (irregular or abs(deviation) > _ON_TIME + _DRIFT * elapsed))
@@ -57,11 +49,7 @@ def _is_delayed(counter: int, previous: int, elapsed: float, irregular: bool, ov
 def sync_step(counter: int, previous: int, elapsed: float, overflow: int, longest: int) -> int:
     """Return the number of SYNCs by which the counter advanced; zero or less for a repeated SYNC.
 
-    The counter gives it modulo ``overflow``, the time the whole turns.
-
-    ``counter``, ``previous``: counters of this SYNC and the last one; ``elapsed``: time between them, SYNC periods;
-    ``overflow``: synchronous counter overflow value (CiA 301, 1019h); ``longest``: largest advance with whole turns,
-    SYNCs.
+    The counter gives it modulo ``overflow``, ``elapsed`` (SYNC periods) the whole turns, at most ``longest`` SYNCs.
     """
     step = (counter - previous) % overflow
     turns = turns_in(elapsed - step, overflow)
@@ -74,10 +62,7 @@ def sync_step(counter: int, previous: int, elapsed: float, overflow: int, longes
 
 @compiled()
 def _first_step(buses: Any, sync_times: Any, bus: int, counter: int, t_ns: int, period_ns: int, overflow: int) -> int:
-    """Number the first SYNC of a bus: 0, or by the numbers of another bus.
-
-    Return the step to it, 0 for a SYNC before number 0, less than 0 if the counters of the buses do not agree.
-    """
+    """Number a bus's first SYNC, 0 or by another bus; return the step: 0 before SYNC 0, < 0 if counters disagree."""
     for other in range(buses.shape[0]):
         if buses[other, SYNC] < 0:
             continue
@@ -108,7 +93,7 @@ def _step_by_other_bus(
     """Return the advance of a bus, ``step`` and whole turns, to the SYNC that another bus received at this time.
 
     A delayed master keeps no period, but all buses receive its SYNC at the same time. If the delay is between buses,
-    this SYNC lies between two that another bus received. ``UNKNOWN_STEP`` if no bus received one.
+    this SYNC lies between two of another bus. ``UNKNOWN_STEP`` if no bus received one.
     """
     best, nearest, kept = UNKNOWN_STEP, _MISALIGNED * period_ns, sync_times.shape[1]
     for other in range(buses.shape[0]):
@@ -156,9 +141,8 @@ def _step_by_send_time(
 ) -> int:
     """Return the advance of a bus, ``step`` and whole turns, to the SYNC sent by this program at this time.
 
-    It is the first SYNC sent no earlier than half a turn before it was received; the one a turn earlier is much older.
-    ``UNKNOWN_STEP`` if there is none, or if the SYNC before it was sent later: then the received SYNC is older than the
-    last number of this bus, which was taken from other buses.
+    It is the first SYNC sent no earlier than half a turn before it was received. ``UNKNOWN_STEP`` if there is none, or
+    the SYNC before it was sent later: then it is older than the bus's last number, which came from other buses.
     """
     k, kept = last + step, send_times.size
     # The SYNC being sent has no time yet.
@@ -202,13 +186,10 @@ def _step_by_counter(
 
 @compiled()
 def advance(buses: Any, m: Any, bus: int, counter: int, t_ns: int, period_ns: int, overflow: int, longest: int) -> int:
-    """Number a received SYNC and update ``buses``; return the number of SYNCs by which its bus advances.
+    """Number a received SYNC, update ``buses``, and return the advance of its bus; nothing changes at zero or less.
 
-    With zero or less, nothing changes: the SYNC is repeated, or the buses do not agree.
-
-    ``buses``: ``MatcherState.bus_state`` of ``m``, or a copy. ``m``: state of the matcher. ``counter``: counter of the
-    SYNC; -1 if it has none. ``t_ns``: receive time, ns UTC. ``overflow``: synchronous counter overflow value
-    (CiA 301, 1019h). ``longest``: largest advance with whole counter turns, SYNCs.
+    ``buses``: ``bus_state`` of ``m``, or a copy. ``counter``: -1 if it has none. ``t_ns``: receive time, ns UTC.
+    ``longest``: largest advance with whole counter turns, SYNCs.
     """
     if buses[bus, SYNC] < 0 and buses[bus, COUNTER] < 0:
         step = _first_step(buses, m.sync_times, bus, counter, t_ns, period_ns, overflow)

@@ -11,11 +11,7 @@ _FEWEST = 4096
 
 
 class GrowingRows:
-    """Rows of one stream read so far.
-
-    ``layout``: layout of the stream's messages. ``expected``: expected number of rows, for which memory is reserved; 0
-    if unknown.
-    """
+    """Rows of one stream read so far; memory is reserved for the ``expected`` number (0: unknown)."""
 
     def __init__(self, layout: StreamLayout, expected: int = 0) -> None:
         self.size = 0
@@ -28,10 +24,7 @@ class GrowingRows:
         }
 
     def append(self, records: NDArray[Any]) -> None:
-        """Add message records of the stream, (N,) in the dtype of the layout.
-
-        Raises DataError if a record does not have the layout of the stream's channel.
-        """
+        """Add message records (N,) in the dtype of the layout; DataError if one does not have that layout."""
         end = self.size + len(records)
         if end > self._sync.size:
             self._resize(max(end, 2 * self._sync.size))

@@ -20,10 +20,7 @@ Event = tuple[str, int, dict[str, Any]]
 
 
 class RowRanges:
-    """Ranges of rows by stream, as first and last SYNC number; adjacent ranges are merged.
-
-    ``every``: by stream, the number of SYNCs from one row to the next.
-    """
+    """Ranges of rows, by stream of one row per ``every`` SYNCs: first and last SYNC; adjacent ranges are merged."""
 
     def __init__(self, every: Mapping[str, int]) -> None:
         self._every = dict(every)
@@ -73,10 +70,7 @@ class RowRanges:
 
 
 class LostRows:
-    """Rows and events of chunks that could not be written, and rows of the chunk that is being gathered.
-
-    ``every``: by stream, the number of SYNCs from one row to the next.
-    """
+    """Rows and events of chunks that could not be written, and rows of the chunk that is being gathered."""
 
     def __init__(self, every: Mapping[str, int]) -> None:
         self._gathered, self._lost = RowRanges(every), RowRanges(every)

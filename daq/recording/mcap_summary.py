@@ -14,9 +14,8 @@ from armident.daq.recording import mcap_records as mcap
 class Summary:
     """The summary of a file that grows chunk by chunk.
 
-    ``schemas``, ``channels``: bytes of their records, as in the file. ``chunks``, ``metadata``: index records of the
-    chunks and metadata. ``messages``: number of messages by channel. ``span_ns``: earliest and latest log time of all
-    messages, ns; ``None`` if there are none.
+    ``schemas``, ``channels``: bytes of their records. ``chunks``, ``metadata``: index records. ``messages``: number by
+    channel. ``span_ns``: earliest and latest log time, ns; ``None`` without messages.
     """
 
     schemas: list[bytes] = field(default_factory=list)

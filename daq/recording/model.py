@@ -124,10 +124,7 @@ class Mark:
 
 
 def gap_from(entries: object) -> Gap:
-    """Return the gap from its JSON entries in a file or an event.
-
-    Raises DataError if the entries are not those of a gap.
-    """
+    """Return the gap from its JSON entries in a file or an event; DataError if they are not those of a gap."""
     if not isinstance(entries, dict) or not {"stream", "first", "last"} <= entries.keys() <= _GAP_ENTRIES:
         raise DataError(f"no gap: {entries!r:.100}")
     gap = Gap(**entries)
@@ -139,10 +136,7 @@ def gap_from(entries: object) -> Gap:
 
 
 def mark_from(entries: object) -> Mark:
-    """Return the mark from its JSON entries in a file or an event.
-
-    Raises DataError if the entries are not those of a mark.
-    """
+    """Return the mark from its JSON entries in a file or an event; DataError if they are not those of a mark."""
     if not isinstance(entries, dict) or not {"kind", "sync", "t_ns"} <= entries.keys() <= _MARK_ENTRIES:
         raise DataError(f"no mark: {entries!r:.100}")
     mark = Mark(**entries)

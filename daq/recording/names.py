@@ -19,10 +19,7 @@ COUNTERS = "armident.counters"
 """Metadata: the counters of the capture, written at its end."""
 
 CHECK = "armident.check"
-"""Metadata: number of bytes before the record and their CRC-32.
-
-The first one covers the head of the file. Those at the end continue the head's CRC, so that they fit this file alone.
-"""
+"""Metadata: number of bytes before the record and their CRC-32, which at the end continues that of the head."""
 
 ROWS_OF = "rows "
 """Key of `CHECK` at the end of a file, followed by a topic: the number of its messages."""

@@ -1,7 +1,4 @@
-"""Preview channels: a part of every stream's samples in SI units at the joints, for viewers of MCAP files.
-
-armident does not read them: the streams contain the measured values as received from the bus.
-"""
+"""Preview channels: a part of each stream's samples in SI units at the joints, for viewers of MCAP files only."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -23,12 +20,7 @@ JOINT_TORQUE = "joint_torque"
 
 @dataclass(frozen=True)
 class PreviewChannel:
-    """Preview of one stream.
-
-    ``layout``: layout of the preview; ``layout.every`` is the number of SYNCs between two samples. ``matrices``: of
-    each field, the matrix (n, n) that maps raw values to SI units. ``sources``: of each field, the name of the raw
-    field of the stream.
-    """
+    """Preview of one stream every ``layout.every`` SYNCs; each field has its raw one and a matrix (n, n) to SI."""
 
     layout: StreamLayout
     matrices: tuple[NDArray[np.float64], ...]
@@ -38,11 +30,7 @@ class PreviewChannel:
     def of_stream(
         cls, stream: StreamLayout, robot: RobotConfig, sample_rate_hz: float, rate_hz: float
     ) -> "PreviewChannel | None":
-        """Return the preview of a stream, ``None`` if it has nothing but status words.
-
-        ``robot``: for its transmission; ``sample_rate_hz``: rate of SYNC, 1/s; ``rate_hz``: highest rate of the
-        preview, 1/s.
-        """
+        """Return the preview of a stream, at most at ``rate_hz``; ``None`` if it has nothing but status words."""
         every = stream.every * max(1, -(-round(sample_rate_hz) // round(max(rate_hz, 1.0) * stream.every)))
         fields: list[Field] = []
         matrices: list[NDArray[np.float64]] = []
@@ -79,11 +67,7 @@ class PreviewChannel:
     def select(
         self, sync: NDArray[np.int64], t_ns: NDArray[np.int64], raw: Mapping[str, NDArray[Any]]
     ) -> tuple[NDArray[np.int64], NDArray[np.int64], dict[str, NDArray[np.float64]]]:
-        """Return the rows of the preview.
-
-        ``sync``: SYNC numbers, (N,); ``t_ns``: times, ns UTC, (N,); ``raw``: raw values of every field of the stream,
-        (N, n) each. Returns SYNC numbers and times (M,), and values in SI units, (M, n) by field.
-        """
+        """Return SYNC numbers, times (M,), ns UTC, and SI values (M, n) of the preview, from raw (N, n) by field."""
         shown = np.flatnonzero((sync + 1) % self.layout.every == 0)
         values = {
             field.name: raw[source][shown].astype(np.float64) @ matrix.T
@@ -93,9 +77,9 @@ class PreviewChannel:
 
 
 def _joint_torque(stream: StreamLayout, robot: RobotConfig) -> tuple[str, NDArray[np.float64]] | None:
-    """Return the field with the drives' effort, and the matrix (n, n) from its raw values to torques at the joints.
+    """Return the field of the drives' effort and its matrix (n, n) to joint torques; ``None`` without such a field.
 
-    ``tau_joint = R' diag(gain) signal`` (thesis equation 2.14); ``None`` if the stream has a torque or no such field.
+    ``tau_joint = R' diag(gain) signal`` (thesis equation 2.14); ``None`` also if the stream has a torque.
     """
     signals = {joint.drive.signal for joint in robot.joints}
     if len(signals) != 1 or any(field.quantity == "torque" for field in stream.fields):

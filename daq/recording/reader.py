@@ -100,10 +100,7 @@ def _is_listed(file: BinaryIO) -> bool:
 
 
 def recovered_words(metadata: dict[str, dict[str, str]]) -> list[str]:
-    """Return a description of the parts that a recovered file lacks; empty if it was not recovered.
-
-    ``metadata``: entries of the file's metadata records, by name.
-    """
+    """Return a description of what a recovered file lacks, by its metadata records; empty if it was not recovered."""
     entries = metadata.get(RECOVERED) or {}
     return [entries["missing"]] if "missing" in entries else []
 
@@ -120,10 +117,7 @@ class _Content:
     marks: list[Mark] = field(default_factory=list)
 
     def rows_of(self, channel: int) -> GrowingRows:
-        """Return the rows of a channel with a layout; channels of one stream share them.
-
-        Raises DataError if another channel of the same stream has another layout.
-        """
+        """Return the rows of a channel; those of one stream share them. DataError if their layouts differ."""
         layout = self.scan.layouts[channel]
         if layout.name not in self.rows:
             expected = min((self.scan.expected or {}).get(channel, 0), self.most_rows)

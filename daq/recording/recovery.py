@@ -122,11 +122,7 @@ class _Cut:
 
 @dataclass
 class _Chunk:
-    """A valid chunk and its message indexes so far.
-
-    ``index``: its index record; ``raw``: its records, uncompressed; ``messages``: number of its messages by channel;
-    ``end``: end of its last message index, bytes; ``indexed``: number of entries in its message indexes, by channel.
-    """
+    """A valid chunk with its index record, records ``raw``, messages and index entries by channel, and end in bytes."""
 
     index: ChunkIndex
     raw: bytes
@@ -141,10 +137,7 @@ class _Chunk:
         return self.index.chunk_start_offset + self.index.chunk_length
 
     def add_index(self, content: MessageIndexContent, start: int, end: int) -> None:
-        """Add a message index of the chunk.
-
-        ``content``: channel and number of entries; ``start``, ``end``: position of the record in the file, bytes.
-        """
+        """Add a message index of the chunk; ``start``, ``end``: position of the record in the file, bytes."""
         self.index.message_index_offsets[content.channel_id] = start
         self.index.message_index_length += end - start
         self.indexed[content.channel_id], self.end = content.number, end
@@ -160,22 +153,10 @@ class _Chunk:
 
 
 class _Contents:
-    """Summary, damaged byte ranges and end of the valid records of a file.
+    """Summary, damaged byte ranges (``cuts``) and end of a file's valid records; MalformedRecord at a damaged head.
 
-    Raises DataError if the file is not a recording of armident; MalformedRecord if its head is damaged.
-
-    Attributes
-    ----------
-    summary
-        Summary of the valid records.
-    cuts
-        Byte ranges of damaged records.
-    end
-        End of the last valid record before the data end, bytes.
-    tail
-        Message indexes of the last chunk, if those in the file may be incomplete.
-    missing
-        Description of the missing parts, ``None`` for a complete file.
+    ``end`` precedes the data end, bytes; ``tail``: message indexes of the last chunk, if those in the file may lack
+    some; ``missing``: ``None`` for a complete file.
     """
 
     def __init__(self, data: memoryview) -> None:
@@ -224,10 +205,7 @@ class _Contents:
             self.cuts.append(_Cut(self._damage_start(item), item.end))
 
     def _damage_start(self, item: DamageItem) -> int:
-        """Return the start of the cut for a damaged record.
-
-        Either the counters or their checksum may be damaged: both are left out.
-        """
+        """Return the start of the cut for a damaged record: counters and their checksum are both left out."""
         counters = [index.offset for index in self.summary.metadata if index.name == COUNTERS]
         if item.opcode != Opcode.METADATA or not counters:
             return item.start

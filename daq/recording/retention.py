@@ -27,27 +27,11 @@ def prune(
     min_free_bytes: float | None,
     free: Callable[[Path], int] = lambda path: shutil.disk_usage(path).free,
 ) -> list[Path]:
-    """Delete recordings that are too old, then the oldest ones until there is enough free space.
+    """Delete recordings that are too old, then the oldest ones until there is enough space; return them, oldest first.
 
-    Only finished captures of this robot are deleted, recognised by the names that ``capture`` gives them. A file being
-    written is never deleted. Returns deleted files, the oldest first.
-
-    Parameters
-    ----------
-    directory
-        Directory of the recordings; its subdirectories are not searched.
-    robot
-        Name of the robot, with which the file names begin.
-    now
-        Current time, with its zone.
-    keep_days
-        Age, by the times in the names, at which a recording is deleted, days; ``None``: no limit. It counts to the
-        newest finished recording that is not in the future, without pauses of more than a year: a clock that is ahead
-        deletes nothing younger.
-    min_free_bytes
-        Free space to keep on the file system, bytes; ``None``: no limit.
-    free
-        Returns the free space, bytes.
+    Only finished captures of this robot are deleted, recognised by their names; subdirectories are not searched.
+    ``keep_days`` counts to the newest finished recording not in the future, without pauses of more than a year: a clock
+    that is ahead deletes nothing younger. ``min_free_bytes``, ``free``: wanted and present space, bytes.
     """
     deleted = []
     found = [(path, made, is_being_written(path)) for path, made in recordings_of(directory, robot)]
@@ -68,8 +52,8 @@ def prune(
 def _ages(times: list[datetime.datetime], keep: datetime.timedelta) -> dict[datetime.datetime, datetime.timedelta]:
     """Ages of recordings against the newest one, by the time of each, without steps of the clock.
 
-    A pause longer than `LONGEST_PAUSE` is taken for a clock that is ahead. Time that certainly passed is the time
-    between recordings on the same side of it: after a real pause old recordings stay for ``keep`` longer.
+    A pause longer than `LONGEST_PAUSE` is taken for a clock that is ahead: only time between recordings on one side of
+    it counts. After a real pause old recordings stay for ``keep`` longer.
     """
     ages: dict[datetime.datetime, datetime.timedelta] = {}
     age, later = datetime.timedelta(0), max(times, default=None)
@@ -81,11 +65,7 @@ def _ages(times: list[datetime.datetime], keep: datetime.timedelta) -> dict[date
 
 
 def recordings_of(directory: Path, robot: str) -> Iterator[tuple[Path, datetime.datetime]]:
-    """Yield the recordings of a robot with the times in their names, the oldest first.
-
-    ``directory``: directory of the recordings; its subdirectories are not searched. ``robot``: name of the robot, with
-    which the file names begin.
-    """
+    """Yield the recordings of a robot in a directory with the times in their names, the oldest first."""
     found = []
     for path in directory.glob(f"{robot}-*.mcap*"):
         match = _NAME.search(path.name)
@@ -110,12 +90,7 @@ def is_being_written(path: Path) -> bool:
 
 
 class RetentionThread:
-    """Deletes old recordings at regular intervals in a separate thread, so that a capture does not wait for the disk.
-
-    Every deleted file is logged, and every error once.
-
-    ``delete``: deletes old recordings and returns their paths; ``every_s``: interval between two calls of it, s.
-    """
+    """Calls ``delete`` every ``every_s`` in a thread, so that a capture does not wait for the disk; logs results."""
 
     def __init__(self, delete: Callable[[], list[Path]], every_s: float = EVERY_S) -> None:
         self.deleted = 0

@@ -61,11 +61,7 @@ class MessageIndexContent(NamedTuple):
 
 @dataclass(frozen=True)
 class RecordItem:
-    """Valid record other than a chunk.
-
-    ``opcode``: MCAP opcode. ``start``, ``end``: position in the file, bytes. ``content``: the decoded record; ``None``
-    if it was not decoded.
-    """
+    """Valid record other than a chunk, with its position in bytes; ``content`` is ``None`` if it was not decoded."""
 
     opcode: int
     start: int
@@ -75,11 +71,7 @@ class RecordItem:
 
 @dataclass(frozen=True)
 class ChunkItem:
-    """A valid chunk, in bytes ``start`` to ``end`` of the file.
-
-    ``start``, ``end``: position in the file, bytes; ``body``: content of the chunk record; ``raw``: its records,
-    uncompressed; ``runs``: its messages in order.
-    """
+    """A valid chunk, in bytes ``start`` to ``end``; ``raw`` has its records, ``runs`` its messages in order."""
 
     start: int
     end: int
@@ -116,31 +108,11 @@ _Pending = tuple[int, int, memoryview, "Future[bytes | None] | None"]
 class RecordingScan:
     """Iterates over the records up to the end of the data, and collects the content of those other than chunks.
 
-    A damaged record behind the head is skipped and described in ``damage``. Other threads decompress chunks ahead of
-    the iteration. In a file that another MCAP tool has written from a recording, the checksums of bytes say nothing; it
-    is judged by the checksums of its chunks, by the numbers of its messages, and by what its metadata states. Raises
-    DataError if the file is not MCAP. The iteration raises it if the file is no recording of armident, too.
+    A damaged record behind the head is skipped and described in ``damage``; other threads decompress chunks ahead. A
+    file of another MCAP tool (``rewritten``) is judged by its chunks' checksums, numbers of messages and metadata.
 
-    Attributes
-    ----------
-    channels, layouts
-        Channels and stream layouts so far, by channel id.
-    metadata
-        Entries of the metadata records so far, by name.
-    messages
-        Number of messages in valid chunks so far, by channel id.
-    expected
-        Number of messages by channel id that the summary states; ``None`` without a valid summary.
-    damage
-        Descriptions of damaged records.
-    head_crc
-        CRC-32 of the head; ``None`` before its checksum record.
-    finished
-        True if the file has its data end and closing magic.
-    rewritten
-        True if another tool has written the file: its checksum records are not where they were made.
-    end
-        End of the last complete record, bytes.
+    By channel id: ``channels``, ``layouts``, ``messages`` so far, ``expected`` (``None``: the summary is invalid).
+    ``finished``: data end and closing magic are there. ``end``: end of the last complete record, bytes.
     """
 
     def __init__(self, data: memoryview) -> None:
@@ -158,10 +130,7 @@ class RecordingScan:
         self._data = data
 
     def __iter__(self) -> Iterator[Item]:
-        """Yield the records in file order, the data end last.
-
-        Raises MalformedRecord if the head is damaged; DataError if messages do not have their channel's layout.
-        """
+        """Yield the records in file order, the data end last; MalformedRecord at a damaged head."""
         with ThreadPoolExecutor(_WORKERS, "zstd") as pool:
             for opcode, start, body, chunk in self._read_ahead(pool):
                 end = start + mcap.RECORD_HEAD.size + len(body)
@@ -193,10 +162,7 @@ class RecordingScan:
         self.finished = self.finished and bytes(self._data[-len(mcap.MAGIC) :]) == mcap.MAGIC
 
     def missing(self, last_sync: int | None) -> list[str]:
-        """Return descriptions of the missing parts, after the iteration; empty for a complete file.
-
-        ``last_sync``: SYNC number of the last sample; ``None`` if there is none.
-        """
+        """Return descriptions of missing parts after the iteration, by the SYNC of the last sample (``None``: none)."""
         words = list(self.damage)
         if self.finished and not self.damage:
             words += [
@@ -248,11 +214,7 @@ class RecordingScan:
         yield from waiting
 
     def _decoded(self, opcode: int, at: int, body: memoryview) -> Channel | Metadata | MessageIndexContent | None:
-        """Check a record at byte ``at``, register its content and return it.
-
-        Raises MalformedRecord if it may not precede the summary, is malformed, or states another checksum than that of
-        the bytes before.
-        """
+        """Check a record at byte ``at``, register its content and return it; MalformedRecord if it is wrong."""
         if opcode not in _IN_DATA:
             raise mcap.MalformedRecord(f"a record of kind {opcode:02X}h before the end of the data")
         if opcode == Opcode.MESSAGE_INDEX:
@@ -333,10 +295,7 @@ class RecordingScan:
 
 
 def expected_messages(data: memoryview) -> dict[int, int] | None:
-    """Return the number of messages by channel id that a file's summary states.
-
-    Returns ``None`` if the file has no summary, or its checksum is wrong.
-    """
+    """Return the number of messages by channel id of a file's summary; ``None`` without a valid one."""
     footer_start = len(data) - len(mcap.MAGIC) - mcap.FOOTER_SIZE
     footer_end = footer_start + mcap.FOOTER_SIZE
     if footer_start < len(mcap.MAGIC) or bytes(data[footer_end:]) != mcap.MAGIC:

@@ -410,12 +410,7 @@ def write_recording(recording: Recording, path: Path) -> None:
 
 
 def checksum_record(data: bytes, start: int = 0) -> Metadata:
-    """Return the metadata record with the checksum of ``data``, the bytes right before it.
-
-    Chunks have checksums of their own, other records have none.
-
-    ``start``: CRC-32 that the checksum continues.
-    """
+    """Return the metadata record with the CRC-32 of ``data``, the bytes right before it, continued from ``start``."""
     return Metadata(CHECK, {"bytes": str(len(data)), "crc32": str(zlib.crc32(data, start))})
 
 

@@ -17,17 +17,11 @@ CONNECTING_S = 1.0
 
 
 class Announcer:
-    """Publishes messages that are not repeated, such as results.
+    """Publishes messages that are not repeated, such as results; ``session`` has the settings `SENT_IN_ORDER`.
 
-    ``put`` of Zenoh returns before the message is sent: another thread writes it to the network. A process that is
-    killed at once loses the message. Here a declaration follows each message in the same queue. The queue takes it
-    when the operating system has taken the message, which then arrives whatever becomes of this process.
-
-    Zenoh also forgets a message at once if nobody listens. Listeners that have lost a session try again after the
-    longest interval of their configuration, which is taken to be that of this session.
-
-    ``session``: Zenoh session with the settings `SENT_IN_ORDER`, which has just been opened; ``keys``: keys of the
-    robot; ``retry_s``: longest interval between two attempts to connect, s.
+    ``put`` of Zenoh returns before the message is sent, so that a killed process loses it. Here a declaration follows
+    each message in the same queue; it is taken when the operating system has taken the message. Zenoh also forgets
+    messages if nobody listens: lost listeners get ``retry_s``, the longest interval between attempts to connect, s.
     """
 
     def __init__(self, session: zenoh.Session, keys: Keys, retry_s: float) -> None:
@@ -40,10 +34,7 @@ class Announcer:
         return max(0.0, self._ready - time.monotonic())
 
     def announce(self, *messages: tuple[str, bytes]) -> None:
-        """Publish messages, and return when the operating system has taken them.
-
-        ``messages``: key expressions and contents. Raises zenoh.ZError if the session fails.
-        """
+        """Publish messages (key expression, content), and return when the operating system has taken them."""
         for key, content in messages:
             # Express: not batched with later messages. Block: not dropped if the queue is full.
             self._session.put(key, content, express=True, congestion_control=zenoh.CongestionControl.BLOCK)

@@ -1,8 +1,8 @@
 """Binary format of published blocks and events, and their assembly to a recording.
 
-A block is ``ARMB``, version (u16), length of the head (u32), CRC-32 of all that follows it, the head (JSON: name of
-the capture, sequence number, rows, stream layout), then ``sync`` and ``t_ns`` as int64 and every field's raw values,
-little endian, row by row. Version 2 added the name of the capture.
+A block is ``ARMB``, version (u16), length of the head (u32), CRC-32 of all that follows it, the head (JSON: capture,
+sequence number, rows, stream layout), then ``sync`` and ``t_ns`` as int64 and every field's raw values, little endian,
+row by row. Version 2 added the name of the capture.
 """
 
 import json
@@ -44,11 +44,9 @@ _MOST_ROWS = 1 << 20
 
 @dataclass(frozen=True)
 class Block:
-    """Consecutive rows of one stream.
+    """Consecutive rows of one stream: SYNC numbers and times (N,), ns UTC, and raw values (N, n) by field.
 
-    ``sequence``: number of the block in its capture, counted over all streams. ``sync``: SYNC numbers, (N,). ``t_ns``:
-    receive times of the SYNCs, ns UTC, (N,). ``raw``: raw values of every field, (N, n) each. ``capture``: name of the
-    capture, as in its events; empty for a block of none.
+    ``sequence``: number in the capture, over all streams. ``capture``: its name, as in events; empty without capture.
     """
 
     layout: StreamLayout
@@ -76,10 +74,7 @@ def encode_block(block: Block) -> bytes:
 
 
 def decode_block(data: bytes) -> Block:
-    """Return the block in these bytes; every length is checked before use.
-
-    Raises DataError if the bytes are not a block of this version.
-    """
+    """Return the block in these bytes; every length is checked, and a DataError refuses what is no block."""
     if len(data) < _HEAD.size:
         raise DataError(f"a block of {len(data)} bytes is too short")
     magic, version, head_size, crc = _HEAD.unpack_from(data)
@@ -123,10 +118,7 @@ def encode_event(kind: str, content: Mapping[str, Any]) -> bytes:
 
 
 def decode_event(data: bytes) -> dict[str, Any]:
-    """Return the entries of the event in these bytes.
-
-    Raises DataError if the bytes are not an event of this version.
-    """
+    """Return the entries of the event in these bytes; DataError if they are no event of this version."""
     try:
         event = json.loads(data)
     except (ValueError, RecursionError) as error:
@@ -151,10 +143,7 @@ def start_content(
     layouts: Iterable[StreamLayout],
     metadata: Mapping[str, str],
 ) -> dict[str, Any]:
-    """Return the content of an ``experiment_start`` event: all that a listener needs to decode the following blocks.
-
-    ``sample_rate_hz``: rate of SYNC, 1/s; ``metadata``: facts about the capture.
-    """
+    """Return the content of an ``experiment_start`` event: all that a listener needs to decode the following blocks."""
     return {
         "capture": capture,
         "sample_rate_hz": sample_rate_hz,
@@ -173,11 +162,7 @@ def end_content(
     marks: Iterable[Mark],
     paths: Sequence[Path],
 ) -> dict[str, Any]:
-    """Return the content of an ``experiment_end`` event: the required blocks, and the files.
-
-    ``blocks``: number of blocks of the capture; ``counters``: counters of the capture; ``gaps``: missing samples;
-    ``marks``: marks of the capture; ``paths``: files of the capture.
-    """
+    """Return the content of an ``experiment_end`` event: the required blocks, and the files."""
     return {
         "capture": capture,
         "blocks": blocks,
@@ -189,11 +174,9 @@ def end_content(
 
 
 def assemble(start: Mapping[str, Any], blocks: Iterable[Block], end: Mapping[str, Any]) -> Recording:
-    """Return the recording of a published capture, with the same samples as its file.
+    """Return the recording of a published capture from its events and its blocks, in any order, with duplicates.
 
-    ``start``, ``end``: the ``experiment_start`` and ``experiment_end`` events of the capture; ``blocks``: in any order,
-    duplicates allowed. Result: ``path`` is that of the file; ``missing`` describes the blocks that did not arrive.
-    Raises DataError if the events or blocks do not belong together or are malformed.
+    ``missing`` describes the blocks that did not arrive. DataError if events and blocks do not belong together.
     """
     if start.get("capture") != end.get("capture"):
         raise DataError("the start and the end are of different captures")

@@ -33,9 +33,7 @@ def endpoints(session: SessionConfig) -> dict[Role, str]:
 def configuration(session: SessionConfig, role: Role, *, any_port: bool = False) -> zenoh.Config:
     """Return the Zenoh configuration of a role: the session's file, or peers on the loopback interface.
 
-    ``role``: ``capture`` or ``worker`` (listen), or ``observer``; ``any_port``: listen on a free loopback port in place
-    of that of the role, which other peers learn from those they know. Raises ConfigError if the configuration file is
-    not one of Zenoh's.
+    ``any_port``: listen on a free loopback port in place of the role's, which other peers learn from those they know.
     """
     options = session.zenoh
     if options.config is not None:
@@ -72,11 +70,9 @@ def configuration(session: SessionConfig, role: Role, *, any_port: bool = False)
 
 
 def open_session(session: SessionConfig, role: Role, *, any_port: bool = False) -> zenoh.Session:
-    """Open a Zenoh session; capture and worker may start in any order and restart.
+    """Open a Zenoh session; capture and worker, one each per cell, start in any order; an observer only connects.
 
-    ``role``: ``capture`` and ``worker`` listen, one each per cell; an ``observer`` only connects to both. ``any_port``:
-    listen on a free loopback port in place of that of the role: for a second worker. Raises ConfigError if Zenoh
-    refuses the configuration or cannot listen (another process of that role runs).
+    ``any_port``: as in `configuration`, for a second worker. ConfigError if another process of that role runs.
     """
     config = configuration(session, role, any_port=any_port)
     try:
@@ -90,10 +86,7 @@ def open_session(session: SessionConfig, role: Role, *, any_port: bool = False) 
 
 
 def unreadable_files(config: zenoh.Config) -> list[str]:
-    """Files named in a Zenoh configuration that cannot be opened: certificates, private keys, lists of users.
-
-    Returns the key and path of each file, with the reason.
-    """
+    """Key, path and reason of each file in a Zenoh configuration that cannot be opened: certificates, keys, users."""
     found: list[str] = []
     for section in ("transport/link/tls", "transport/auth/usrpwd", "transport/auth/pubkey"):
         for key, value in (json.loads(config.get_json(section)) or {}).items():

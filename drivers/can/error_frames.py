@@ -23,11 +23,7 @@ _CLASSES = {
 
 
 def describe(error: Any) -> tuple[BusState | None, str]:
-    """Interpret one error frame.
-
-    ``error``: an element of an array of ``FRAME``. Returns ``state``: state that the controller enters; ``None`` if the
-    frame reports no change of state. ``text``: description of the error.
-    """
+    """Return the state that the controller enters by one error frame (``None``: no change), and a description."""
     classes = int(error["can_id"]) & 0x1FFFFFFF
     detail = int(error["data"][1]) if classes & CONTROLLER else 0
     if classes & BUS_OFF:
@@ -47,10 +43,7 @@ def describe(error: Any) -> tuple[BusState | None, str]:
 
 
 def summarise(errors: Frames) -> list[tuple[BusState | None, str]]:
-    """Summarise error frames: every change of state in order, then each kind of other errors with its count.
-
-    ``errors``: error frames, shape (N,). Returns pairs of state and text, as `describe` returns them.
-    """
+    """Return state and text of error frames (N,): each change of state in order, then other errors with counts."""
     changes: list[tuple[BusState | None, str]] = []
     counts: dict[str, int] = {}
     for error in errors:

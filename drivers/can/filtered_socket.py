@@ -13,10 +13,7 @@ BATCH = 256
 
 
 class FilteredSocket:
-    """Socket that receives a few identifiers and reopens a bus whose interface was removed and is back.
-
-    ``cob_ids``: identifiers to receive. Raises ConfigError if the bus does not exist; BusDown if the bus is down.
-    """
+    """Socket for the identifiers ``cob_ids``; reopens a bus whose interface was removed and is back."""
 
     def __init__(self, bus: Bus, cob_ids: Sequence[int]) -> None:
         self._config, self._cob_ids = bus, tuple(cob_ids)

@@ -64,10 +64,7 @@ class FrameBus(Protocol):
         ...
 
     def receive(self, batch: Frames) -> int:
-        """Write received frames to the beginning of ``batch``; return their number, 0 if none.
-
-        ``batch``: array of ``FRAME`` or ``FD_FRAME``, shape (N,), written in place.
-        """
+        """Write received frames to the beginning of ``batch`` (N,); return their number, 0 if none."""
         ...
 
     def poll(self, timeout: float) -> bool:
@@ -101,10 +98,7 @@ def frames(n: int, fd: bool = False) -> Frames:
 
 
 def fd_length(size: int) -> int:
-    """Number of data bytes of the smallest CAN FD frame that carries a payload; the rest is padding.
-
-    Raises ValueError if the payload exceeds the largest frame.
-    """
+    """Number of data bytes of the smallest CAN FD frame that carries a payload; ValueError if none does."""
     if size > FD_LENGTHS[-1]:
         raise ValueError(f"{size} bytes do not fit into the {FD_LENGTHS[-1]} of a CAN FD frame")
     return next(length for length in FD_LENGTHS if length >= size)

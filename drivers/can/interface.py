@@ -28,10 +28,7 @@ def is_can(channel: str) -> bool:
 
 
 def check_fd(channel: str) -> None:
-    """Refuse an interface that carries classic frames only.
-
-    Raises ConfigError if the interface has no CAN FD; contains the command that enables it.
-    """
+    """Refuse an interface that carries classic frames only; the ConfigError has the command that enables CAN FD."""
     try:
         mtu = int((SYSFS / channel / "mtu").read_text())
     except (OSError, ValueError):
@@ -56,9 +53,6 @@ def missing(channel: str, reason: str | None) -> ConfigError:
 
 
 def down(channel: str, what: str) -> BusDown:
-    """Error for an interface that is down, went down or was removed.
-
-    ``what``: predicate of the message, such as ``is down``.
-    """
+    """Error for an interface that is down, went down or was removed; ``what`` is the predicate of its message."""
     command = f"sudo ip link set dev {channel} up"
     return BusDown(f"bus {channel}: the interface {what}; an administrator may run: {command}")

@@ -40,17 +40,9 @@ CLASSIC_MTU, FD_MTU = FRAME.itemsize - 8, FD_FRAME.itemsize - 8
 
 
 class Messages:
-    """Preallocated ``struct mmsghdr`` for a batch of frames.
+    """Preallocated ``struct mmsghdr`` for at most ``n`` frames; ``body`` (n, 16) or (n, 72) has their bytes.
 
-    ``n``: maximum number of frames; ``control``: ``True`` with space for time stamps and drop counters; ``fd``:
-    ``True`` for ``struct canfd_frame``; ``hardware``: ``True`` with space for hardware time stamps.
-
-    Attributes
-    ----------
-    body
-        Bytes of ``struct can_frame`` or ``struct canfd_frame``, uint8, shape (n, 16) or (n, 72).
-    control
-        Time stamps and drop counters, shape (n,).
+    ``control`` adds space for software time stamps and drop counters, ``hardware`` for hardware time stamps.
     """
 
     def __init__(self, n: int, control: bool = True, fd: bool = False, hardware: bool = False) -> None:
@@ -70,10 +62,7 @@ class Messages:
         self.address: int = self.header.ctypes.data
 
     def load(self, frames: Frames) -> None:
-        """Copy frames to send; frames with ``FD_FLAG`` are sent as CAN FD, the others as classic frames.
-
-        ``frames``: array of ``FRAME`` or ``FD_FRAME``, shape (N,), N <= n.
-        """
+        """Copy at most ``n`` frames to send; those with ``FD_FLAG`` go as CAN FD, others as classic frames."""
         octets = frame_bytes(frames)[:, 8:]
         width = min(octets.shape[1], self.body.shape[1])
         self.body[: frames.size, :width] = octets[:, :width]
@@ -82,10 +71,7 @@ class Messages:
             self.iovec["length"][: frames.size] = np.where(fd, FD_MTU, CLASSIC_MTU)
 
     def unload(self, batch: Frames) -> None:
-        """Copy the bodies of received frames into ``batch``.
-
-        ``batch``: array of ``FRAME`` or ``FD_FRAME``, shape (N,), written in place except for the times.
-        """
+        """Copy the bodies of received frames into ``batch`` (N,), all but the times."""
         got = batch.size
         frame_bytes(batch)[:, 8:] = self.body[:got]
         if self.body.shape[1] == FD_MTU:
@@ -93,10 +79,7 @@ class Messages:
 
 
 def frame_bytes(batch: Frames) -> "np.ndarray[tuple[int, ...], np.dtype[np.uint8]]":
-    """View of a contiguous array of frames as bytes, shape (N, 24) or (N, 80).
-
-    ``batch``: array of ``FRAME`` or ``FD_FRAME``, shape (N,). Raises ValueError if the array is not contiguous.
-    """
+    """View of a contiguous array of frames (N,) as bytes, (N, 24) or (N, 80); ValueError if it is not contiguous."""
     if not batch.flags.c_contiguous:
         raise ValueError("frames must lie contiguously in memory")
     return batch.view(np.uint8).reshape(batch.size, batch.dtype.itemsize)

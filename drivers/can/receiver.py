@@ -51,9 +51,8 @@ class _BusState:
 class Receiver:
     """Reads several buses in turn, each in whole batches.
 
-    A bus that goes down or comes back is an event. Its socket is kept, or reopened if the interface was removed. Error
-    frames are removed from the batches, counted, and reported as events. Raises ConfigError if a bus does not exist;
-    BusDown if a bus is down.
+    A bus that goes down or comes back is an event; it is reopened if its interface was removed. Error frames are taken
+    out of the batches, counted, and reported as events.
     """
 
     def __init__(self, openers: Sequence[Callable[[], FrameBus]]) -> None:
@@ -108,11 +107,7 @@ class Receiver:
         return self._buses[0].batch[:2]
 
     def drain(self) -> Iterator[tuple[int, Frames, bool]]:
-        """Yield received frames until none are left.
-
-        Yields ``bus``: number of the bus; ``frames``: shape (N,), valid until the next iteration; ``lost``: ``True`` if
-        the kernel dropped frames before these.
-        """
+        """Yield bus number, frames (N,) valid until the next iteration, and whether the kernel dropped any before."""
         # Bounded, so that a bus faster than this loop cannot keep a capture from ending.
         for _ in range(DRAINS):
             more = False
@@ -128,10 +123,7 @@ class Receiver:
                 return
 
     def events(self, *, last: bool = False) -> list[BusEvent]:
-        """Events since the last call; errors are reported once per second.
-
-        ``last``: ``True`` for the last call, which reports all remaining errors.
-        """
+        """Events since the last call; errors are reported once per second, all remaining ones by the ``last`` call."""
         now = time.monotonic()
         for k, entry in enumerate(self._buses):
             if entry.down_since is not None and now - entry.checked >= RETRY_S:

@@ -12,10 +12,7 @@ HIGHEST = -20
 
 
 def set_realtime_priority(priority: int) -> bool:
-    """Request exact timers and a real-time priority for the calling thread.
-
-    ``priority``: priority of ``SCHED_FIFO``, 1 to 99. Returns ``True`` if the priority was granted.
-    """
+    """Request exact timers and ``SCHED_FIFO`` of ``priority`` 1 to 99 for the calling thread; True if granted."""
     ctypes.CDLL(None).prctl(PR_SET_TIMERSLACK, 1, 0, 0, 0)
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
@@ -26,10 +23,7 @@ def set_realtime_priority(priority: int) -> bool:
 
 @contextmanager
 def raised_priority(steps: int) -> Iterator[None]:
-    """Raise the priority of the calling thread in a ``with`` block.
-
-    ``steps``: steps of the nice value; threads that are started in the block inherit them.
-    """
+    """Lower the nice value by ``steps`` in a ``with`` block; threads started in the block inherit the priority."""
     thread = threading.get_native_id()
     before = os.getpriority(os.PRIO_PROCESS, thread)
     with suppress(OSError):

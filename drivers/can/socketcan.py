@@ -1,7 +1,6 @@
 """Fast access to a SocketCAN bus: batches of frames in one system call, in arrays.
 
-The kernel writes a batch into preallocated arrays (``recvmmsg``), stamps every frame in nanoseconds and counts dropped
-frames. There is no Python object per frame.
+The kernel writes batches into preallocated arrays (``recvmmsg``), stamps each frame in ns and counts dropped frames.
 """
 
 import ctypes
@@ -60,29 +59,11 @@ _sendmmsg.argtypes = [ctypes.c_int, ctypes.c_void_p, ctypes.c_uint, ctypes.c_int
 
 
 class RawSocket:
-    """Raw socket on one CAN interface that moves batches of frames.
+    """Raw socket on one CAN interface that moves batches of frames; a ConfigError has the command for an administrator.
 
-    Raises ConfigError if the kernel has no SocketCAN, or the interface does not exist or has no CAN FD; contains the
-    command for an administrator. Raises BusDown if the interface is down.
-
-    Parameters
-    ----------
-    channel
-        Name of the interface, ``vcan0``.
-    filters
-        Frames to receive; ``None``: all, empty: none (a socket that only sends).
-    errors
-        Receive error frames of the controller (``can_id & ERROR_FLAG``).
-    own
-        Receive frames that are sent through this socket.
-    loopback
-        Deliver sent frames to other sockets of this machine.
-    receive_buffer
-        Size of the kernel's receive buffer, bytes; beyond the system's limit with the right to it.
-    fd
-        Move CAN FD frames too; batches are then arrays of ``FD_FRAME``.
-    hardware
-        Use the interface's time stamps, if it has any, converted to the machine's time.
+    ``filters``: frames to receive (``None``: all; empty: none, to send only). ``errors``: receive error frames too.
+    ``own``, ``loopback``: give sent frames to this socket, and to others. ``receive_buffer``: bytes. ``fd``: batches
+    are arrays of ``FD_FRAME``. ``hardware``: use the interface's time stamps, converted to the machine's time.
     """
 
     def __init__(
@@ -178,11 +159,9 @@ class RawSocket:
         return self._socket.fileno()
 
     def receive(self, batch: Frames, wait: bool = False) -> int:
-        """Write received frames to the beginning of ``batch``.
+        """Write received frames to the beginning of ``batch`` (N,); return their number, at most ``min(N, BATCH)``.
 
-        ``batch``: array of ``FRAME`` (``FD_FRAME`` with ``fd``), shape (N,), written in place; ``wait``: wait up to
-        ``RECEIVE_TIMEOUT`` for the first frame, in the same system call. Returns the number of frames, 0 if none had
-        arrived; at most ``min(N, BATCH)``. Raises BusDown if the interface went down or was removed.
+        With ``wait`` it waits up to ``RECEIVE_TIMEOUT`` for the first frame, in the same system call.
         """
         if self._in is None:
             self._in = Messages(BATCH, fd=self.fd, hardware=self._clock is not None)
@@ -215,10 +194,7 @@ class RawSocket:
         return self.dropped + ((int(now) - self.dropped) & 0xFFFFFFFF)
 
     def poll(self, timeout: float) -> bool:
-        """Return True if a frame arrives within the timeout.
-
-        ``timeout``: longest wait, s. Raises BusDown if the interface went down or was removed.
-        """
+        """Return True if a frame arrives within the timeout, s; raises BusDown if the interface is down."""
         for _, event in self._poll.poll(max(0.0, timeout) * 1000):
             if event & (select.POLLERR | select.POLLHUP | select.POLLNVAL):
                 self._failed(self._socket.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR), (0,))
@@ -226,11 +202,10 @@ class RawSocket:
         return False
 
     def send(self, frames: Frames) -> int:
-        """Send frames in order and wait for space in the transmit queue.
+        """Send frames (N,) in order, wait for space in the transmit queue, and return N.
 
-        ``frames``: array of ``FRAME`` or ``FD_FRAME``, shape (N,); ``t_ns`` is ignored. Returns the number of frames
-        sent: N. Raises BusDown if the interface went down or was removed, or if nothing could be sent for half a
-        second. A physical bus without another node acknowledges nothing.
+        Raises BusDown if the interface is down, or nothing could be sent for half a second: a physical bus without
+        another node acknowledges nothing.
         """
         if self._out is None:
             self._out = Messages(BATCH, control=False, fd=self.fd)

@@ -22,10 +22,7 @@ _CLOCK_STEP_NS = 50_000_000
 
 
 def has_hardware_timestamps(channel: str) -> bool:
-    """Return True if the interface stamps received frames with its own clock.
-
-    ``channel``: name of the interface; the result is ``False`` if it does not support the query.
-    """
+    """Return True if the interface stamps received frames with its own clock; False if the query is not supported."""
     request = array.array("B", struct.pack("=I", _ETHTOOL_GET_TS_INFO).ljust(_TS_INFO_BYTES, b"\0"))
     address, _ = request.buffer_info()
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as any_socket:
@@ -40,9 +37,8 @@ def has_hardware_timestamps(channel: str) -> bool:
 class InterfaceClock:
     """Conversion of one interface's clock to the machine's clock.
 
-    The software stamp of a frame is its hardware stamp plus the offset of the clocks plus the interrupt latency. The
-    latency is never negative, so the offset is the smallest difference, which may grow at the rate of the clocks'
-    drift. Converted times keep the even spacing of the hardware stamps and the common time base of the software ones.
+    Software stamp = hardware stamp + offset of the clocks + interrupt latency, which is never negative: the offset is
+    the smallest difference, which may grow at the drift rate. The even spacing of the hardware stamps is kept.
     """
 
     def __init__(self) -> None:
@@ -50,11 +46,7 @@ class InterfaceClock:
         self._least = 0
 
     def to_utc(self, software_ns: NDArray[np.int64], hardware_ns: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Convert hardware stamps to the machine's time.
-
-        ``software_ns``: software stamps, ns UTC, shape (N,). ``hardware_ns``: hardware stamps, ns, shape (N,); 0: none.
-        Returns times, ns UTC, shape (N,); a frame without hardware stamp keeps its software stamp.
-        """
+        """Convert hardware stamps (N,), ns, to ns UTC; where it is 0 (none), the software stamp (N,), ns UTC, stays."""
         times = software_ns.copy()
         stamped = hardware_ns != 0
         software, hardware = software_ns[stamped], hardware_ns[stamped]

@@ -1,11 +1,10 @@
-"""Bus for machines without SocketCAN: python-can's ``udp_multicast``, for low rates.
+"""Bus without SocketCAN by ``udp_multicast`` of python-can; loses frames above some thousand per second: for trials."""
 
-UDP may lose frames, and does so above some thousand per second. It is suitable for trials, not for measurements.
-"""
-
+import os
+import socket
 import time
 from collections.abc import Sequence
-from typing import Self
+from typing import Any, Self
 
 import can
 import numpy as np
@@ -21,15 +20,15 @@ UDP_WARNING = "udp_multicast carries the bus over UDP and may lose frames: use i
 EXTENDED_FLAG = 0x8000_0000
 """Bit of ``can_id`` that marks a 29-bit identifier (linux/can.h)."""
 
+RECEIVE_BUFFER = 4 << 20
+"""Receive buffer that the kernel is asked for, bytes; it gives ``net.core.rmem_max`` at most."""
+
+MULTICAST_ALL = {socket.AF_INET: (socket.IPPROTO_IP, 49), socket.AF_INET6: (socket.IPPROTO_IPV6, 29)}
+"""Option ``MULTICAST_ALL`` by address family (linux/in.h, linux/in6.h): receive also the groups of other sockets."""
+
 
 class UdpBus:
-    """Bus over UDP multicast with the interface of :class:`RawSocket`.
-
-    It receives the frames that it sends itself.
-
-    ``channel``: multicast address, ``239.74.163.2``. ``filters``: frames to receive; ``None``: all, empty: none. Raises
-    ConfigError if the address is not a multicast address or the network has no route for it.
-    """
+    """Bus over UDP multicast (``239.74.163.2``) like :class:`RawSocket`; receives the frames that it sends itself."""
 
     fd = False
     timestamp_source = "software"
@@ -41,17 +40,14 @@ class UdpBus:
         """Always 0: UDP does not count lost frames."""
         self._filters = filters
         try:
-            self._bus = can.Bus(channel, interface="udp_multicast")
+            self._bus = open_python_can(Bus(interface="udp_multicast", channel=channel))
         except (can.CanError, OSError, ValueError) as error:
             cause = error.__cause__ or error
             raise ConfigError(f"bus {channel}: cannot join the multicast group: {cause}") from error
         self._ahead: can.Message | None = None
 
     def receive(self, batch: Frames) -> int:
-        """Write received frames to the beginning of ``batch`` without waiting; return their number.
-
-        ``batch``: array of ``FRAME``, shape (N,), written in place. Raises BusDown if the network went down.
-        """
+        """Write received frames to the beginning of ``batch`` (N,) without waiting; return their number."""
         n = 0
         while n < batch.size and (message := self._next(0.0)) is not None:
             if not self._passes(message.arbitration_id):
@@ -70,10 +66,7 @@ class UdpBus:
         return n
 
     def poll(self, timeout: float) -> bool:
-        """Return True if a frame arrives within the timeout.
-
-        ``timeout``: longest wait, s. Raises BusDown if the network went down.
-        """
+        """Return True if a frame arrives within the timeout, s; raises BusDown if the network went down."""
         deadline = time.monotonic() + timeout
         while self._ahead is None:
             message = self._next(max(0.0, deadline - time.monotonic()))
@@ -84,10 +77,7 @@ class UdpBus:
         return True
 
     def send(self, frames: Frames) -> int:
-        """Send all frames in order; return their number.
-
-        ``frames``: array of ``FRAME``, shape (N,). Raises BusDown if the network refuses a frame.
-        """
+        """Send all frames (N,) in order and return N; raises BusDown if the network refuses one."""
         for one in frames:
             can_id = int(one["can_id"])
             message = can.Message(
@@ -130,15 +120,20 @@ class UdpBus:
         self.close()
 
 
+def open_python_can(bus: Bus, filters: Sequence[dict[str, Any]] | None = None) -> can.BusABC:
+    """Open a bus of a session with python-can; a multicast group receives the frames of no other group."""
+    opened = can.Bus(bus.channel, interface=bus.interface, can_filters=filters)
+    if bus.interface == "udp_multicast":
+        with socket.socket(fileno=os.dup(opened.fileno())) as same:
+            same.setsockopt(*MULTICAST_ALL[same.family], 0)
+            same.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER)
+    return opened
+
+
 def open_bus(
     bus: Bus, *, filters: Sequence[Filter] | None = None, errors: bool = False, hardware: bool = False
 ) -> FrameBus:
-    """Open a bus of a session.
-
-    ``filters``: frames to receive; ``None``: all, empty: none. ``errors``: receive error frames, if the bus has them.
-    ``hardware``: use hardware time stamps, if the interface has them. Raises ConfigError if the bus does not exist;
-    BusDown if the bus is down.
-    """
+    """Open a bus of a session; ``errors`` and ``hardware`` (time stamps) have an effect where the bus has them."""
     if bus.interface == "udp_multicast":
         return UdpBus(bus.channel, filters=filters)
     return RawSocket(bus.channel, filters=filters, errors=errors, fd=bus.fd, hardware=hardware)

@@ -1,7 +1,7 @@
-"""Load of CAN buses: bits of classic and FD frames, load of a session by bus, and alternatives that fit.
+"""Load of CAN buses: bits of frames, load of a session by bus, and alternatives that fit.
 
-Classic frames: Davis, Burns, Bril and Lukkien (2007). CAN FD: ISO 11898-1:2015, with arbitration at the nominal bit
-rate and the part between bit rate switch and CRC delimiter at the data bit rate. The CRC field has fixed stuff bits.
+Classic frames: Davis, Burns, Bril and Lukkien (2007). CAN FD: ISO 11898-1:2015, nominal bit rate in arbitration, data
+bit rate from bit rate switch to CRC delimiter.
 """
 
 from collections.abc import Iterator
@@ -31,23 +31,19 @@ DATA_BITRATES = (2_000_000, 5_000_000, 8_000_000)
 
 
 def frame_bits(data_bytes: int) -> tuple[int, int]:
-    """Minimum and maximum number of bits of a classic frame with an 11-bit identifier, interframe space included.
+    """Minimum and maximum number of bits of a classic frame of n data bytes with an 11-bit identifier.
 
-    ``47 + 8 n`` bits without stuff bits, ``55 + 10 n`` with all possible ones (Davis, Burns, Bril, Lukkien 2007).
-
-    ``data_bytes``: number of data bytes n, 0 to 8.
+    ``47 + 8 n`` bits without stuff bits, ``55 + 10 n`` with all possible ones, interframe space included (Davis, Burns,
+    Bril, Lukkien 2007).
     """
     return 47 + 8 * data_bytes, 55 + 10 * data_bytes
 
 
 def fd_frame_bits(data_bytes: int) -> tuple[tuple[int, int], tuple[int, int]]:
-    """Minimum and maximum number of bits of a CAN FD frame with an 11-bit identifier (ISO 11898-1:2015).
+    """Minimum and maximum number of bits of a CAN FD frame at the nominal and at the data bit rate (ISO 11898-1:2015).
 
-    The bits from start of frame to the last data bit have dynamic stuff bits (none to one in four). The stuff count and
-    the CRC, of 17 bits up to 16 bytes and 21 above, have 6 and 7 fixed ones.
-
-    ``data_bytes``: number of data bytes of the frame, 0 to 64. Returns ``fewest``, ``most``: bits at the nominal and at
-    the data bit rate.
+    From start of frame to the last data bit, stuff bits are dynamic: none to one in four. Stuff count and CRC (17 bits
+    up to 16 bytes, 21 above) have 6 and 7 fixed ones.
     """
     crc, fixed = (17, 6) if data_bytes <= 16 else (21, 7)
     payload = 1 + 4 + 8 * data_bytes
@@ -58,10 +54,7 @@ def fd_frame_bits(data_bytes: int) -> tuple[tuple[int, int], tuple[int, int]]:
 
 
 def exact_bits(identifier: int, data: bytes) -> int:
-    """Number of bits of a classic frame with known content, stuff bits and interframe space included (ISO 11898-1).
-
-    ``identifier``: 11-bit identifier; ``data``: data bytes, at most 8.
-    """
+    """Number of bits of a classic frame of known content, stuff bits and interframe space included (ISO 11898-1)."""
     fields = [(0, 1), (identifier, 11), (0, 3), (len(data), 4), *((byte, 8) for byte in data)]
     bits = [value >> k & 1 for value, width in fields for k in reversed(range(width))]
     crc = 0
@@ -80,11 +73,7 @@ def exact_bits(identifier: int, data: bytes) -> int:
 
 @dataclass(frozen=True)
 class Load:
-    """Load of one kind of message on one bus.
-
-    ``frames_per_s``: frames per second; ``typical``, ``worst``: fraction of the bus time without and with all stuff
-    bits; ``bus``: channel of the bus.
-    """
+    """Load of one kind of message on one bus: ``typical`` without, ``worst`` with all stuff bits, of the bus time."""
 
     message: str
     frames_per_s: float
@@ -94,19 +83,12 @@ class Load:
 
 
 def loads(session: SessionConfig, period_us: int | None = None) -> list[Load]:
-    """Load of a session by bus and kind of message; ``nan`` on a bus without bit rate.
-
-    ``session``: buses, drives, streams and set points. ``period_us``: SYNC period, us; ``None``: that of the session.
-    """
+    """Load of a session by bus and kind of message; ``nan`` on a bus without bit rate."""
     return [row for bus in session.all_buses for row in bus_loads(session, bus, period_us)]
 
 
 def bus_loads(session: SessionConfig, bus: Bus, period_us: int | None = None) -> list[Load]:
-    """Load of one bus by kind of message; ``nan`` on a bus without bit rate.
-
-    ``session``: drives, streams and set points. ``bus``: a bus of the session. ``period_us``: SYNC period, us;
-    ``None``: that of the session.
-    """
+    """Load of one bus by kind of message; ``nan`` on a bus without bit rate."""
     period = (session.sync.period_us if period_us is None else period_us) * 1e-6
     bitrate, data_bitrate = bus.bitrate or float("nan"), bus.data_bitrate or float("nan")
     nodes = len(session.drives_on(bus))
@@ -136,26 +118,17 @@ def bus_loads(session: SessionConfig, bus: Bus, period_us: int | None = None) ->
 
 
 def worst_load(session: SessionConfig, bus: Bus, period_us: int | None = None) -> float:
-    """Worst-case load of one bus as a fraction of its time; ``nan`` without bit rate.
-
-    ``session``, ``bus``, ``period_us``: as in `bus_loads`.
-    """
+    """Worst-case load of one bus as a fraction of its time; ``nan`` without bit rate."""
     return sum(row.worst for row in bus_loads(session, bus, period_us))
 
 
 def fits(session: SessionConfig, period_us: int | None = None) -> bool:
-    """Return True if every bus with a bit rate carries the session in the worst case.
-
-    ``session``, ``period_us``: as in `loads`.
-    """
+    """Return True if every bus with a bit rate carries the session in the worst case."""
     return all(worst_load(session, bus, period_us) <= 1.0 for bus in session.all_buses if bus.bitrate is not None)
 
 
 def fitting_period(session: SessionConfig) -> int | None:
-    """Shortest standard SYNC period (us), at least the configured one, whose worst-case load fits all buses.
-
-    ``session``: the session; the result is ``None`` if no standard period fits.
-    """
+    """Shortest standard SYNC period (us), at least the configured one, whose load fits all buses, or ``None``."""
     for period in STANDARD_PERIODS_US:
         if period >= session.sync.period_us and fits(session, period):
             return period
@@ -163,10 +136,7 @@ def fitting_period(session: SessionConfig) -> int | None:
 
 
 def check_fits(session: SessionConfig, where: str = "session") -> None:
-    """Refuse a session whose worst-case load exceeds a bus; a virtual bus has no bit rate and always fits.
-
-    Raises ConfigError if the load exceeds a bus; contains the load and the nearest configurations that fit.
-    """
+    """Refuse a session that overloads a bus; the ConfigError has the nearest that fit. Virtual buses always fit."""
     for bus in session.all_buses:
         if bus.bitrate is None or worst_load(session, bus) <= 1.0:
             continue
@@ -181,10 +151,7 @@ def check_fits(session: SessionConfig, where: str = "session") -> None:
 
 @dataclass(frozen=True)
 class Option:
-    """Change of a session that makes it fit its buses.
-
-    ``text``: description of the change; ``size``: factor of the largest change.
-    """
+    """Change of a session that makes it fit its buses; ``size`` is the factor of the largest change."""
 
     text: str
     session: SessionConfig
@@ -195,8 +162,7 @@ class Option:
 def alternatives(session: SessionConfig) -> list[Option]:
     """Changes that make a session fit, nearest first: fewest kinds of change, then smallest change.
 
-    Of each combination of kinds (rate, buses, FD, packing) only the smallest change is listed. A change that only adds
-    to another one is left out.
+    Each combination of kinds (rate, buses, FD, packing) gives its smallest change, unless that only adds to another.
     """
     found = sorted(_all_options(session), key=lambda option: (option.kinds, option.size))
     chosen: list[Option] = []

@@ -33,21 +33,16 @@ def read_drive_state(sdo: DriveSdo) -> DriveState | None:
 
 
 def hold_position(sdo: DriveSdo) -> None:
-    """Command cyclic synchronous position mode and the present position as target.
+    """Command cyclic synchronous position mode and the present position as target, before the drive is enabled.
 
     The target is not read back: in some drives it follows the position until they are enabled.
-
-    ``sdo``: the drive, before it is enabled.
     """
     sdo.write(od.MODE_OF_OPERATION, 0, od.CYCLIC_SYNCHRONOUS_POSITION, "b")
     sdo.command(od.TARGET_POSITION, 0, sdo.read(od.POSITION_ACTUAL, 0, "i"), "i")
 
 
 def enable_drive(sdo: DriveSdo) -> None:
-    """Bring one drive from any state of CiA 402 to operation enabled.
-
-    Raises ArmidentError if the drive stays in another state; names the state.
-    """
+    """Bring one drive from any state of CiA 402 to operation enabled; an ArmidentError names a state that it keeps."""
     state = read_drive_state(sdo)
     while state != DriveState.ENABLED:
         if state not in TO_ENABLED:

@@ -13,11 +13,7 @@ MODE_TIMEOUT = 10.0
 
 
 def check_drive(sdo: DriveSdo, robot: RobotConfig) -> None:
-    """Refuse a node that is not the drive of the robot configuration.
-
-    ``robot``: expected encoder resolution and rated current. Raises ConfigError if the node is not a CiA 402 drive, or
-    if product, encoder resolution or rated current differ.
-    """
+    """Refuse a node that is no CiA 402 drive, or another one by product, encoder resolution or rated current."""
     device = sdo.read(od.DEVICE_TYPE, 0, "I")
     if device & 0xFFFF != od.DEVICE_PROFILE_CIA402:
         raise ConfigError(
@@ -61,11 +57,7 @@ def _check_scales(sdo: DriveSdo, robot: str, joint: Joint) -> None:
 
 
 def set_heartbeat(sdo: DriveSdo, period_ms: int) -> None:
-    """Set the heartbeat (1017h) and store in ``sdo.heartbeat_ms`` the period that the drive reads back.
-
-    ``period_ms``: wanted period, ms. A drive may round it; without heartbeat, ``sdo.heartbeat_ms`` is ``None``. Raises
-    ConfigError if the drive does not answer; BusDown if the bus is down.
-    """
+    """Set the heartbeat (1017h) and store the period read back in ``sdo.heartbeat_ms``, ``None`` without heartbeat."""
     try:
         found = sdo.write_rounded(od.HEARTBEAT_PRODUCER, 0, period_ms, "H")
     except SdoRefusedError:
@@ -76,12 +68,7 @@ def set_heartbeat(sdo: DriveSdo, period_ms: int) -> None:
 
 
 def set_sync_counter(sdo: DriveSdo, overflow: int) -> str | None:
-    """Set the overflow of the SYNC counter (1019h).
-
-    ``overflow``: overflow of the counter; 0: SYNC without a counter. Returns the reason why SYNC with a counter does
-    not suit the drive; ``None`` if it does. Raises ConfigError if the drive does not answer, or holds another value
-    afterwards; BusDown if the bus is down.
-    """
+    """Set the overflow of the SYNC counter (1019h; 0: none); return why it does not suit the drive, or ``None``."""
     try:
         sdo.write(od.SYNC_COUNTER_OVERFLOW, 0, overflow, "B")
     except SdoRefusedError as error:
@@ -92,8 +79,8 @@ def set_sync_counter(sdo: DriveSdo, overflow: int) -> str | None:
 def await_mode(drives: list[DriveSdo]) -> None:
     """Wait until enabled drives report cyclic synchronous position mode (6061h).
 
-    Some drives report a mode only some time after they have been enabled, and no mode or -1 before. Raises ConfigError
-    if a drive reports another mode for `MODE_TIMEOUT`; BusDown if the bus is down.
+    Some report a mode only some time after they have been enabled, and none or -1 before. ConfigError if a drive
+    reports another mode for `MODE_TIMEOUT`.
     """
     until = time.monotonic() + MODE_TIMEOUT
     for sdo in drives:

@@ -1,7 +1,7 @@
 """Object dictionary of a drive from its electronic data sheet (EDS or DCF, CiA 306).
 
-canopen reads files that follow CiA 306 to the letter. This module puts the files of many makers into that form: byte
-order marks, Windows-1252, key words in capitals, numbers with leading zeros, missing key words, compact arrays.
+canopen reads files that follow CiA 306 to the letter. Here files of many makers get that form: byte order marks,
+Windows-1252, capitals, leading zeros, missing key words, compact arrays.
 """
 
 import io
@@ -78,22 +78,14 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class DataSheet:
-    """Contents of an EDS.
-
-    ``objects``: object dictionary, with the values that depend on the node id; ``remarks``: deviations from CiA 306
-    that leave something out or undecided, one line each.
-    """
+    """Objects of an EDS for one node id; remarks on deviations from CiA 306 that leave something out or open."""
 
     objects: canopen.ObjectDictionary
     remarks: tuple[str, ...]
 
 
 def read_eds(file: Path, node_id: int) -> DataSheet:
-    """Read the electronic data sheet of a drive.
-
-    ``file``: path of an EDS or DCF (or an EPF, which canopen reads as it is); ``node_id``: node id for values that
-    depend on it. Raises ConfigError if the file cannot be read or describes no object.
-    """
+    """Read the EDS or DCF of a drive, with the values for its node id; an EPF is read by canopen as it is."""
     if file.suffix.lower() == ".epf":
         return DataSheet(_imported(file, str(file), node_id), ())
     remarks = Remarks()
@@ -110,11 +102,7 @@ def read_eds(file: Path, node_id: int) -> DataSheet:
 
 
 def read_objects(file: Path, node_id: int) -> canopen.ObjectDictionary:
-    """Read the object dictionary of a drive, and log what its data sheet leaves out or undecided, once per file.
-
-    ``file``: path of an EDS or DCF; ``node_id``: node id for values that depend on it. Raises ConfigError if the file
-    cannot be read or describes no object.
-    """
+    """Read the object dictionary of a drive; what its data sheet leaves out or undecided is logged once per file."""
     sheet = read_eds(file, node_id)
     for remark in sheet.remarks:
         _warn_once(f"{file}: {remark}")
@@ -167,10 +155,9 @@ def _flag(text: str | None) -> int | None:
 
 @dataclass(frozen=True)
 class _Cleaner:
-    """Sections of a file, from which those that canopen reads are made.
+    """Makes sections that canopen reads from those of a file, which have canonical names.
 
-    ``sections``: sections of the file by canonical name; ``remarks``: receives what is left out; ``configured``:
-    ``True`` for a DCF, whose values are those of one drive.
+    ``remarks`` receives what is left out; ``configured`` is True for a DCF, whose values are those of one drive.
     """
 
     sections: dict[str, Section]
@@ -197,10 +184,7 @@ class _Cleaner:
                 yield from self._members(index, parent | {"ObjectType": str(kind)}, subs)
 
     def _members(self, index: int, parent: Section, subs: dict[int, Section]) -> Iterator[tuple[str, Section]]:
-        """Section of an array or record, and those of its entries.
-
-        ``parent``, ``subs``: its section, and those of its entries by subindex.
-        """
+        """Section of an array or record (``parent``), and those of its entries, of which ``subs`` are in the file."""
         name = parent.get("ParameterName") or label(index)
         count = parse_number(parent.get("CompactSubObj")) or 0
         if count > 0 and parse_number(parent.get("DataType")) is not None:
@@ -248,18 +232,12 @@ class _Cleaner:
         yield section_of(index, subindex), clean
 
     def _standard_type(self, kind: int) -> int:
-        """Data type of CiA 301 behind one that the file defines in a section of its own; without one DOMAIN.
-
-        ``kind``: data type, larger than `LARGEST_STANDARD_TYPE`.
-        """
+        """Data type of CiA 301 behind one that the file defines in a section of its own; without one DOMAIN."""
         found = parse_number(self.sections.get(section_of(kind, 1), {}).get("DefaultValue"))
         return found if found is not None and 0 < found <= LARGEST_STANDARD_TYPE else DOMAIN_TYPE
 
     def _integer(self, text: str, place: str) -> str | None:
-        """Integer value as canopen reads it, ``$NODEID`` included; ``None`` if it is no integer.
-
-        ``text``: value as in the file; empty: none. ``place``: object and key word.
-        """
+        """Integer value as canopen reads it, ``$NODEID`` included; ``None`` if it is none."""
         if not text:
             return None
         word = _NODE_ID.sub("", text).replace(" ", "").strip("(){}\"'")

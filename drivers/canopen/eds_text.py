@@ -48,10 +48,7 @@ class Remarks:
     places: dict[str, list[str]] = field(default_factory=dict)
 
     def add(self, kind: str, place: str) -> None:
-        """Note a deviation.
-
-        ``kind``: text that says what was found and what was done; ``place``: line, section or object.
-        """
+        """Note a deviation: ``kind`` says what was found and done, ``place`` is line, section or object."""
         self.places.setdefault(kind, []).append(place)
 
     def lines(self) -> tuple[str, ...]:
@@ -65,10 +62,7 @@ def _listed(places: list[str]) -> str:
 
 
 def read_text(file: Path) -> str:
-    """Return the text of a file in UTF-8, UTF-16 with byte order mark, or Windows-1252.
-
-    Raises ConfigError if the file cannot be opened, is too large, or is binary.
-    """
+    """Return the text of a file in UTF-8, UTF-16 with byte order mark, or Windows-1252; ConfigError if it is binary."""
     try:
         with file.open("rb") as opened:
             content = opened.read(LARGEST_FILE + 1)
@@ -91,13 +85,10 @@ def read_text(file: Path) -> str:
 
 
 def sections_of(text: str, remarks: Remarks) -> dict[str, Section]:
-    """Return the sections of an EDS with canonical names and key words.
+    """Return the values of an EDS by section (``DeviceInfo``, ``1018``, ``1018sub1``, ``1003Name``) and key word.
 
-    Key words and section names are matched without regard to case. The first value of a key counts.
-
-    ``text``: text of the file; ``remarks``: receives lines that are neither section, key nor comment, and sections
-    whose second copy differs. Returns values by key word, by section: ``DeviceInfo``, ``1018``, ``1018sub1``,
-    ``1003Name``, .
+    Both are matched without regard to case; the first value of a key counts. ``remarks`` receives other lines, and
+    sections whose second copy differs.
     """
     found: dict[str, Section] = {}
     section: Section = {}
@@ -156,10 +147,7 @@ def section_of(index: int, subindex: int | None = None) -> str:
 
 
 def object_of(section: str) -> tuple[int, int | None] | None:
-    """Index and subindex of the object of a section; ``None`` if it describes no object.
-
-    ``section``: canonical name of the section.
-    """
+    """Index and subindex of the object of a section with this canonical name; ``None`` if it describes no object."""
     match = _OBJECT.fullmatch(section)
     if match is None or match[3] is not None:
         return None
@@ -172,10 +160,7 @@ def label(index: int, subindex: int | None = None) -> str:
 
 
 def parse_number(text: str | None) -> int | None:
-    """Integer of an EDS: decimal, also with leading zeros, or hexadecimal with 0x; ``None`` if it is none.
-
-    ``text``: value of a key; ``None`` if the key is missing.
-    """
+    """Integer of an EDS: decimal, also with leading zeros, or hexadecimal with 0x; ``None`` if it is none."""
     word = (text or "").strip()
     if re.fullmatch(r"[-+]?0[xX][0-9a-fA-F]{1,16}", word):
         return int(word, 16)

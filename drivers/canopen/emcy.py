@@ -87,10 +87,7 @@ EMCY_TEXTS: dict[int, str] = {
 
 
 def emcy_text(code: int, vendor: Mapping[int, str] | None = None) -> str:
-    """Text of an emergency error code: the vendor's, else that of the code, else that of its narrowest group.
-
-    ``vendor``: vendor-specific texts by code.
-    """
+    """Text of an emergency error code: the vendor's, else that of the code, else that of its narrowest group."""
     if vendor and code in vendor:
         return vendor[code]
     for mask in (0xFFFF, 0xFFF0, 0xFF00, 0xF000):
@@ -101,11 +98,7 @@ def emcy_text(code: int, vendor: Mapping[int, str] | None = None) -> str:
 
 @dataclass(frozen=True)
 class Emergency:
-    """Emergency message (CiA 301 section 7.2.7.1).
-
-    ``node``: node id of the sender; ``t_ns``: receive time, ns UTC; ``code``, ``register``: error code, and error
-    register (1001h); ``manufacturer``: five manufacturer-specific bytes.
-    """
+    """Emergency message (CiA 301 section 7.2.7.1) received at ``t_ns``, ns UTC, with the error register (1001h)."""
 
     node: int
     t_ns: int
@@ -120,10 +113,7 @@ class Emergency:
 
 
 def read_emergencies(batch: Frames) -> Iterator[Emergency]:
-    """Yield the emergency messages of a batch; missing bytes are zero, and frames without error code are ignored.
-
-    ``batch``: frames with EMCY identifiers, shape (N,).
-    """
+    """Yield the emergency messages of frames (N,); missing bytes are zero, frames without error code ignored."""
     for one in batch[batch["length"] >= 2]:
         data = bytes(one["data"][: int(one["length"])]).ljust(8, b"\0")
         code = int.from_bytes(data[:2], "little")

@@ -10,10 +10,7 @@ from armident.drivers.canopen.objects import COB_EMCY
 
 
 class EmcyListener:
-    """Receives the emergency messages of a session's drives and sends nothing; use it in a ``with`` block.
-
-    ``session``: buses and drives. Raises ConfigError if a bus does not exist; BusDown if a bus is down.
-    """
+    """Receives the emergency messages of a session's drives and sends nothing; use it in a ``with`` block."""
 
     def __init__(self, session: SessionConfig) -> None:
         self._texts = session.emcy_texts

@@ -15,10 +15,7 @@ DELAYED_S = 0.1
 
 
 class HeartbeatSocket:
-    """Socket for the heartbeats and boot-up messages on one bus.
-
-    ``nodes``: node ids of its drives. Raises ConfigError if the bus does not exist; BusDown if the bus is down.
-    """
+    """Socket for the heartbeats and boot-up messages on one bus."""
 
     def __init__(self, bus: Bus, nodes: Sequence[int]) -> None:
         self._socket = FilteredSocket(bus, [COB_HEARTBEAT + node for node in nodes])
@@ -41,12 +38,10 @@ class HeartbeatSocket:
 
 
 class HeartbeatMonitor:
-    """Time without heartbeat of each drive.
+    """Time without heartbeat of each drive, s of the monotonic clock.
 
     A delayed machine stamps frames late or loses them. If the consumer was delayed, the longest pause of all drives in
-    that time does not count as silence of any drive. Each silence is shortened in this way only once.
-
-    ``now``: start time, s, monotonic clock.
+    that time does not count as silence. Each silence is shortened in this way only once.
     """
 
     def __init__(self, drives: Iterable[str], now: float) -> None:
@@ -57,10 +52,7 @@ class HeartbeatMonitor:
         """Time of the last update, s, monotonic clock."""
 
     def update(self, heartbeats: Iterable[tuple[str, float]], now: float) -> None:
-        """Process the heartbeats since the last update.
-
-        ``heartbeats``: pairs of drive and time, s; ``now``: present time, s.
-        """
+        """Process the heartbeats (drive, time in s) since the last update."""
         self._ended = dict.fromkeys(self._last, 0.0)
         before, self.updated = self.updated, now
         ordered = sorted(heartbeats, key=lambda beat: beat[1])

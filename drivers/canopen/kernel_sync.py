@@ -18,10 +18,7 @@ _FRAME = "=IBBBB8s"
 
 
 def setup_message(period_us: int, counter: int) -> bytes:
-    """Message that makes the kernel send SYNC cyclically, with counter 1 to its overflow if there is one.
-
-    ``counter``: overflow of the SYNC counter (1019h); 0: none.
-    """
+    """Message that makes the kernel send SYNC cyclically, with counter 1 to ``counter`` (1019h) unless that is 0."""
     contents = [bytes([k]) for k in range(1, counter + 1)] or [b""]
     head = struct.pack(
         _HEAD, TX_SETUP, SETTIMER | STARTTIMER, 0, 0, 0, *divmod(period_us, 1_000_000), COB_SYNC, len(contents)
@@ -32,11 +29,8 @@ def setup_message(period_us: int, counter: int) -> bytes:
 class KernelSync:
     """SYNC producer in the kernel: sends SYNC k = 0, 1, 2, ... with counter ``k % counter + 1`` on one bus.
 
-    The kernel's timer needs no wake-up of a process, so SYNC is punctual on a busy machine too. It starts each period
-    at the end of the last one, so the period is longer by the timer's latency. Therefore the clocks of several buses
-    would drift apart. Set points cannot be sent directly after SYNC.
-
-    ``counter``: overflow of the SYNC counter (1019h); 0: none.
+    Its timer is punctual on a busy machine too. Each period starts at the end of the last, lengthened by the timer's
+    latency: clocks of several buses would drift apart. Set points cannot follow SYNC directly.
     """
 
     sent: int | None = None
@@ -47,10 +41,7 @@ class KernelSync:
         self._socket: socket.socket | None = None
 
     def start(self) -> None:
-        """Send the first SYNC one period from now.
-
-        Raises ConfigError if the bus does not exist, or the kernel has no CAN_BCM; BusDown if the bus is down.
-        """
+        """Send the first SYNC one period from now; ConfigError if the kernel has no CAN_BCM."""
         # Raises an error that names the administrator's command if the interface is not usable.
         RawSocket(self._channel, filters=(), receive_buffer=4096).close()
         try:

@@ -1,8 +1,4 @@
-"""CANopen master: checks, configures, enables and supervises the drives of a session.
-
-The canopen library handles SDO and NMT. Kernel filters keep TPDO and SYNC away from its socket, because it takes tens
-of microseconds per frame.
-"""
+"""CANopen master: checks, configures, enables and supervises the drives of a session, with SDO and NMT of canopen."""
 
 import logging
 import queue
@@ -44,11 +40,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class DriveEvent:
-    """Event of a drive.
-
-    ``t_ns``: time of the frame, or of the detection of a loss, ns UTC; ``text``: message that names the drive;
-    ``code``: EMCY error code, or NMT state.
-    """
+    """Event of a drive: time of the frame, or of detection of a loss, ns UTC; EMCY error code or NMT state."""
 
     kind: EventKind
     joint: str
@@ -61,12 +53,8 @@ class DriveEvent:
 class DriveMaster:
     """CANopen master of the drives of one session; use it in a ``with`` block.
 
-    Call `configure`, then `start`, then `supervise` regularly, and `stop` at the end. After `start` a drive that boots
-    again, or whose PDO mapping another master changes, is configured, started and enabled again automatically. Until
-    then its TPDOs may differ from the session; `unverified_mapping` holds these times.
-
-    ``session``: buses, nodes and streams; ``robot``: expected encoder resolutions and rated currents. Raises
-    ConfigError if a bus does not exist; BusDown if a bus is down.
+    Call `configure`, `start`, `supervise` regularly, and `stop`. A drive that boots again, or whose mapping another
+    master changes, is configured and enabled again; `unverified_mapping` holds the times until then.
     """
 
     def __init__(self, session: SessionConfig, robot: RobotConfig) -> None:
@@ -106,11 +94,9 @@ class DriveMaster:
         return self._networks[self._session.bus_of(drive).channel]
 
     def configure(self) -> None:
-        """Check every drive against the robot, then map and enable the TPDOs of the session.
+        """Check every drive against the robot, then map and enable the session's TPDOs; ConfigError if one refuses.
 
-        Drives that do not answer yet are waited for (``boot_timeout_s``). What is unusual about a drive, but does not
-        prevent its use, becomes an event ``remark``. Raises ConfigError if a drive is missing, is not the expected one,
-        or refuses a mapping; BusDown if a bus went down.
+        Late drives are waited for (``boot_timeout_s``). What is unusual but harmless becomes an event ``remark``.
         """
         for sdo in self._drives:
             self._command(NmtCommand.PRE_OPERATIONAL, sdo)
@@ -125,11 +111,7 @@ class DriveMaster:
             map_drive(sdo, self._session)
 
     def start(self, enable: bool = True) -> None:
-        """Start the nodes (NMT) and bring the drives to operation enabled.
-
-        ``enable``: ``False``: start the nodes only. Raises ArmidentError if a drive does not follow; names its state.
-        Raises BusDown if a bus went down.
-        """
+        """Start the nodes (NMT) and, unless ``enable`` is False, bring the drives to operation enabled."""
         for sdo in self._drives:
             self._command(NmtCommand.START, sdo)
         for sdo in self._drives:
@@ -149,8 +131,8 @@ class DriveMaster:
     def supervise(self) -> list[DriveEvent]:
         """Events since the last call: EMCY, lost and returned heartbeats, NMT states, reboots, changed mappings.
 
-        Never waits. A bus that went down is reopened when it is back. While other buses are up, the drives of a bus
-        that is down count as lost. Raises BusDown if all buses are down.
+        Never waits. A bus that went down is reopened when it is back; until then its drives count as lost. Raises
+        BusDown if all buses are down.
         """
         alive = {channel: network.reopen() for channel, network in self._networks.items()}
         if not any(alive.values()):
@@ -165,10 +147,10 @@ class DriveMaster:
         return events
 
     def collect_reports(self) -> None:
-        """Process received emergency messages and SDO writes of other masters; never waits.
+        """Process emergency messages and SDO writes of other masters into `unverified_mapping`; never waits.
 
-        Updates `unverified_mapping`. `supervise` includes this. After dropped TPDOs, call it before the TPDOs that
-        follow are used: a foreign SDO write may have come before them.
+        `supervise` includes this. After dropped TPDOs, call it before the following ones are used: a foreign SDO write
+        may have come before them.
         """
         by_joint = {sdo.drive.joint: sdo for sdo in self._drives}
         for channel, network in self._networks.items():
@@ -356,10 +338,7 @@ class DriveMaster:
             self._start_thread(self._reconfigure, sdo)
 
     def _try_configure(self, sdo: DriveSdo) -> bool:
-        """Configure and start a drive once; ``False`` if its bus went down or another master wrote meanwhile.
-
-        Raises ArmidentError if the drive does not follow.
-        """
+        """Configure and start a drive once; ``False`` if its bus went down or another master wrote meanwhile."""
         joint = sdo.drive.joint
         while self._started and time.monotonic() - self._written.get(joint, 0.0) < QUIET_S:
             time.sleep(POLL_INTERVAL)

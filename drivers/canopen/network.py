@@ -17,6 +17,7 @@ from armident.configs.schema.session import Bus, DriveNode
 from armident.drivers.can.filtered_socket import FilteredSocket
 from armident.drivers.can.frames import STANDARD_ID_MASK, BusDown
 from armident.drivers.can.socketcan import RawSocket
+from armident.drivers.can.udp import open_python_can
 from armident.drivers.canopen import objects as od
 from armident.drivers.canopen.eds import read_objects
 from armident.drivers.canopen.emcy import Emergency, read_emergencies
@@ -69,7 +70,7 @@ class NodeNetwork:
             # Raises an error that names the administrator's command if the interface is not usable.
             RawSocket(bus.channel, filters=(), receive_buffer=4096).close()
         try:
-            return can.Bus(bus.channel, interface=bus.interface, can_filters=filters)
+            return open_python_can(bus, filters)
         except (can.CanError, OSError) as error:
             raise ConfigError(f"bus {bus.channel}: {error.__cause__ or error}") from error
 
@@ -78,13 +79,7 @@ class NodeNetwork:
         return self._network.add_node(SdoNode(drive.node_id, read_objects(drive.eds, drive.node_id)))
 
     def on_sdo_write(self, node_id: int, callback: Callable[[int, int], None]) -> None:
-        """Call a function for every SDO write of another master to a node.
-
-        Our own requests are not received by the socket that sent them.
-
-        ``node_id``: node id of the drive; ``callback``: function of object index and time (ns, UTC), called in
-        canopen's thread.
-        """
+        """Call a function of object index and time (ns UTC) in canopen's thread, at foreign SDO writes to a node."""
 
         def on_request(_: int, data: bytearray, timestamp: float) -> None:
             if len(data) == 8 and data[0] >> 5 == od.SDO_DOWNLOAD:
@@ -93,10 +88,7 @@ class NodeNetwork:
         self._network.subscribe(od.COB_SDO_REQUEST + node_id, on_request)
 
     def sdo_writes(self) -> Iterator[tuple[int, int, int]]:
-        """Yield node id, object index and time (ns, UTC) of all SDO writes since the last call, our own included.
-
-        Unlike `on_sdo_write` it does not depend on canopen's thread.
-        """
+        """Yield node id, object index and time (ns UTC) of SDO writes since the last call, without canopen's thread."""
         for batch in self._requests.read():
             downloads = batch[(batch["length"] == 8) & (batch["data"][:, 0] >> 5 == od.SDO_DOWNLOAD)]
             index = downloads["data"][:, 1].astype(int) + 256 * downloads["data"][:, 2].astype(int)
@@ -116,10 +108,7 @@ class NodeNetwork:
             raise self._bus_down(error) from error
 
     def guard(self, node_id: int) -> None:
-        """Ask a node for its NMT state (node guarding, CiA 301): a remote frame, which it answers as a heartbeat.
-
-        ``node_id``: node id of the drive. Raises BusDown if the bus is down.
-        """
+        """Ask a node for its NMT state (node guarding, CiA 301): a remote frame, which it answers as a heartbeat."""
         request = can.Message(
             arbitration_id=od.COB_HEARTBEAT + node_id, is_extended_id=False, is_remote_frame=True, dlc=1
         )

@@ -40,10 +40,7 @@ class SupervisionChange:
 
 
 class NodeSupervision:
-    """Supervises the drives of a session by their heartbeats, or by node guarding where a drive has none.
-
-    ``session``: drives and heartbeat period; ``networks``: network of each bus by channel.
-    """
+    """Supervises the drives of a session by their heartbeats, or by node guarding where a drive has none."""
 
     def __init__(self, session: SessionConfig, networks: Mapping[str, NodeNetwork]) -> None:
         self._session, self._networks = session, networks
@@ -62,10 +59,7 @@ class NodeSupervision:
         return self._networks[self._session.bus_of(sdo.drive).channel]
 
     def add(self, sdo: DriveSdo) -> None:
-        """Choose how a started drive is supervised: by heartbeat, by node guarding, or not at all.
-
-        ``sdo``: the drive, with its heartbeat period. Raises BusDown if the bus is down.
-        """
+        """Choose how a started drive is supervised: by heartbeat, by node guarding, or not at all."""
         joint, period_ms = sdo.drive.joint, sdo.heartbeat_ms or self._session.heartbeat_ms
         limit = HEARTBEATS_MISSED * period_ms * 1e-3 + HEARTBEAT_MARGIN
         if sdo.heartbeat_ms is not None:
@@ -86,10 +80,7 @@ class NodeSupervision:
             sdo.remark("has no heartbeat (1017h) and does not answer node guarding: its failure is not detected")
 
     def await_operational(self, sdo: DriveSdo) -> None:
-        """Wait until a drive reports the NMT state operational; a drive that reports no state is not waited for.
-
-        ``sdo``: the drive, started. Raises ArmidentError if it does not report it; BusDown if the bus went down.
-        """
+        """Wait until a drive reports the NMT state operational; a drive that reports no state is not waited for."""
         if sdo.drive.joint not in self._limits:
             return
         deadline = time.monotonic() + NMT_TIMEOUT + (sdo.heartbeat_ms or self._session.heartbeat_ms) * 1e-3
@@ -107,10 +98,7 @@ class NodeSupervision:
         self._monitor = HeartbeatMonitor(self._limits, time.monotonic())
 
     def check(self, drives: Sequence[DriveSdo]) -> Iterator[SupervisionChange]:
-        """Yield lost and returned drives, by the receive times of heartbeats and answers to node guarding.
-
-        ``drives``: the drives of the session.
-        """
+        """Yield lost and returned drives, by the receive times of heartbeats and answers to node guarding."""
         monitor = self._monitor
         if monitor is None or time.monotonic() - monitor.updated < HEARTBEAT_CHECK_S:
             return

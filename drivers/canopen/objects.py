@@ -75,11 +75,7 @@ CYCLIC_SYNCHRONOUS_POSITION = 8
 
 @dataclass(frozen=True)
 class MappedObject:
-    """Object that can be mapped into a PDO.
-
-    ``name``: name of the object in a session; ``index``, ``subindex``: place in the object dictionary; ``format``:
-    NumPy format of its bytes.
-    """
+    """Object that can be mapped into a PDO; ``format`` is the NumPy format of its bytes."""
 
     name: str
     index: int
@@ -97,10 +93,7 @@ class MappedObject:
         return self.index << 16 | self.subindex << 8 | self.bits
 
     def packed(self, sample: int) -> "MappedObject":
-        """Element of the object's array that holds one sample of a packed TPDO.
-
-        ``sample``: number of the sample, from 1 (the oldest) to ``pack``.
-        """
+        """Element of the object's array that holds one sample, 1 (the oldest) to ``pack``, of a packed TPDO."""
         return MappedObject(self.name, self.index - ARRAY_OFFSET, sample, self.format)
 
 
@@ -132,9 +125,7 @@ EVENT_DRIVEN = 255
 class TpdoLayout:
     """Data bytes of one TPDO: its objects in mapping order, little endian, without gaps.
 
-    A packed TPDO holds several samples, the oldest first, mapped from the objects' arrays (:data:`ARRAY_OFFSET`).
-
-    ``pack``: number of samples per TPDO.
+    ``pack`` > 1: it holds several samples, the oldest first, mapped from the objects' arrays (:data:`ARRAY_OFFSET`).
     """
 
     objects: tuple[MappedObject, ...]
@@ -144,11 +135,7 @@ class TpdoLayout:
     def of(
         cls, names: Sequence[ObjectName | str], where: str = "stream", pack: int = 1, fd: bool = False
     ) -> "TpdoLayout":
-        """Layout of a stream's objects.
-
-        ``names``: names of the objects in mapping order; ``pack``: number of samples per TPDO; ``fd``: ``True`` on a
-        bus with CAN FD. Raises ConfigError if an object is unknown or repeated, or the objects exceed the frame.
-        """
+        """Layout of a stream's objects in mapping order; ConfigError if one is unknown, repeated or too much."""
         for name in names:
             if name not in OBJECTS:
                 raise ConfigError(f"{where}: no object named {name!r}; objects are {', '.join(OBJECTS)}")
@@ -198,26 +185,17 @@ class TpdoLayout:
         return tuple(o.packed(k).entry for k in range(1, self.pack + 1) for o in self.objects)
 
     def decode(self, data: NDArray[np.uint8]) -> NDArray[Any]:
-        """Data bytes of samples as records, shape (N,); a view if ``data`` is contiguous.
-
-        ``data``: data bytes, uint8, shape (N, itemsize of `dtype`).
-        """
+        """Data bytes of samples, uint8 (N, itemsize of `dtype`), as records (N,); a view if ``data`` is contiguous."""
         return np.ascontiguousarray(data).view(self.dtype)[:, 0]
 
 
 def tpdo_cob(tpdo: int, node: int) -> int:
-    """COB-ID of a TPDO in the predefined connection set (CiA 301 section 7.3.5).
-
-    ``tpdo``: number of the TPDO, 1 to 4.
-    """
+    """COB-ID of TPDO 1 to 4 in the predefined connection set (CiA 301 section 7.3.5)."""
     return 0x180 + 0x100 * (tpdo - 1) + node
 
 
 def rpdo_cob(rpdo: int, node: int) -> int:
-    """COB-ID of an RPDO in the predefined connection set (CiA 301 section 7.3.5).
-
-    ``rpdo``: number of the RPDO, 1 to 4.
-    """
+    """COB-ID of RPDO 1 to 4 in the predefined connection set (CiA 301 section 7.3.5)."""
     return 0x200 + 0x100 * (rpdo - 1) + node
 
 
@@ -227,10 +205,7 @@ def stop_rpdo(setpoints: int) -> int:
 
 
 def rated_milliamperes(drive: Drive) -> int:
-    """Rated current for 6075h, mA, so that 1000 per mille of 6078h is ``drive.rated``.
-
-    ``drive``: drive of the robot configuration.
-    """
+    """Rated current for 6075h, mA, so that 1000 per mille of 6078h is ``drive.rated``."""
     return round(drive.rated * 1000)
 
 
@@ -291,10 +266,7 @@ STATE_CODES: dict[DriveState, tuple[int, int]] = {
 
 
 def drive_state(statusword: int) -> DriveState | None:
-    """CiA 402 state of a statusword; ``None`` for a pattern that the standard does not define.
-
-    ``statusword``: value of 6041h.
-    """
+    """CiA 402 state of a statusword (6041h); ``None`` for a pattern that the standard does not define."""
     for state, (mask, value) in STATE_CODES.items():
         if statusword & mask == value:
             return state

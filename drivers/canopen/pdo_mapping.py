@@ -10,12 +10,9 @@ ROUNDING_US = 0.5
 
 
 def map_drive(sdo: DriveSdo, session: SessionConfig) -> None:
-    """Write the session's TPDOs and the RPDO of its set points, and read them back.
+    """Write the session's TPDOs and the RPDO of its set points to a pre-operational drive, and read them back.
 
-    A PDO that is right already is not written. Other TPDOs are disabled.
-
-    ``sdo``: the drive, in pre-operational; ``session``: SYNC, streams and set points. Raises ConfigError if the drive
-    refuses an object or a mapping; names both, with the text of the SDO abort. Raises BusDown if the bus is down.
+    A PDO that is right already is not written; other TPDOs are disabled. A ConfigError names the refused object.
     """
     node = sdo.drive.node_id
     streams = {s.tpdo: (name, s) for name, s in session.streams.items()}
@@ -37,10 +34,7 @@ def map_drive(sdo: DriveSdo, session: SessionConfig) -> None:
 
 
 def mapping_differs(sdo: DriveSdo, session: SessionConfig) -> str | None:
-    """Description of the first difference between a drive's TPDO mapping and the session; ``None`` if there is none.
-
-    ``session``: expected streams. Raises ConfigError if the drive does not answer.
-    """
+    """Description of the first difference between a drive's TPDO mapping and the session; ``None`` if there is none."""
     for name, stream in session.streams.items():
         entries = od.TpdoLayout.of(stream.objects, f"streams.{name}", stream.pack, sdo.fd).entries
         communication, mapping = (base + stream.tpdo - 1 for base in (od.TPDO_COMMUNICATION, od.TPDO_MAPPING))
@@ -118,11 +112,7 @@ def _write_cob(sdo: DriveSdo, communication: int, cob: int) -> None:
 
 
 def read_mapping(sdo: DriveSdo, mapping: int) -> tuple[int, ...]:
-    """Return the mapping entries of a PDO.
-
-    ``mapping``: index of the mapping record (1600h, 1A00h and following). Raises ConfigError if the drive does not
-    answer, or has no such PDO; BusDown if the bus is down.
-    """
+    """Return the entries of a PDO's mapping record (1600h, 1A00h and following)."""
     count = min(sdo.read(mapping, 0, "B"), od.MAPPED_OBJECTS)
     return tuple(sdo.read(mapping, k, "I") for k in range(1, count + 1))
 
@@ -156,11 +146,7 @@ def _set_interpolation(sdo: DriveSdo, period_us: int, sync_us: int) -> None:
 
 
 def interpolation_period(period_us: int, where: str = "setpoints") -> tuple[int, int]:
-    """Value and exponent of 60C2h for a set point period: ``value * 10**exponent`` seconds.
-
-    ``where``: name of the set points in messages. Raises ConfigError if the period cannot be expressed with a value up
-    to 255.
-    """
+    """Value (at most 255) and exponent of 60C2h for a set point period: ``value * 10**exponent`` seconds."""
     value, exponent = period_us, -6
     while value % 10 == 0 and exponent < -3:
         value, exponent = value // 10, exponent + 1

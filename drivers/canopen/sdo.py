@@ -39,10 +39,7 @@ log = logging.getLogger(__name__)
 
 
 class SdoRefusedError(ConfigError):
-    """A drive refuses an SDO transfer.
-
-    ``message``: message that names drive, object and reason; ``code``: abort code (CiA 301, SDO abort codes).
-    """
+    """A drive refuses an SDO transfer with an abort ``code`` (CiA 301, SDO abort codes)."""
 
     def __init__(self, message: str, code: int) -> None:
         super().__init__(message)
@@ -59,10 +56,7 @@ class NoAnswerError(ConfigError):
 
 
 class DriveSdo:
-    """Access to the object dictionary of one drive.
-
-    ``node``: remote node of a connected network; ``drive``: drive of the session; ``session``: bus and SDO timeout.
-    """
+    """Access to the object dictionary of one drive by the remote ``node`` of a connected network."""
 
     def __init__(self, node: canopen.RemoteNode, drive: DriveNode, session: SessionConfig) -> None:
         self.node = node
@@ -83,20 +77,13 @@ class DriveSdo:
         self._remarks: set[str] = set()
 
     def remark(self, text: str) -> None:
-        """Report once what is unusual about the drive, but does not prevent its use.
-
-        ``text``: message without the name of the drive.
-        """
+        """Report once what is unusual about the drive, but does not prevent its use, in a text without its name."""
         if text not in self._remarks:
             self._remarks.add(text)
             self.on_remark(text)
 
     def read(self, index: int, sub: int, code: str) -> int:
-        """Read an object.
-
-        ``code``: type as a format of `struct` (``B``, ``h``, ``I``). Raises ConfigError if the drive does not answer
-        (`NoAnswerError`) or refuses (`SdoRefusedError`); BusDown if the bus is down.
-        """
+        """Read an object of type ``code``, a format of `struct`; NoAnswerError or SdoRefusedError if that fails."""
         return self._read(index, sub, code, BUSY_S)
 
     def _read(self, index: int, sub: int, code: str, busy_s: float) -> int:
@@ -106,10 +93,7 @@ class DriveSdo:
         return int(struct.unpack("<" + code, data)[0])
 
     def read_optional(self, index: int, sub: int, code: str) -> int | None:
-        """Read an object; ``None`` if the drive does not have it.
-
-        ``index``, ``sub``, ``code``: as in `read`. Raises ConfigError or BusDown as `read` does.
-        """
+        """Read an object; ``None`` if the drive does not have it."""
         try:
             return self.read(index, sub, code)
         except SdoRefusedError as error:
@@ -141,11 +125,7 @@ class DriveSdo:
             time.sleep(BUSY_RETRY_S)
 
     def poll(self, index: int, sub: int, code: str, answer_s: float) -> int | None:
-        """Read an object unless another SDO transfer is in progress; ``None`` in that case.
-
-        ``index``, ``sub``, ``code``: as in `read`; ``answer_s``: longest wait for the answer, s. Raises ConfigError or
-        BusDown as `read` does.
-        """
+        """Read an object within ``answer_s``; ``None`` if another SDO transfer is in progress."""
         if not self._lock.acquire(blocking=False):
             return None
         try:
@@ -171,32 +151,20 @@ class DriveSdo:
         return data[:size]
 
     def command(self, index: int, sub: int, value: int, code: str) -> None:
-        """Write an object without reading it back.
-
-        ``index``, ``sub``, ``code``: as in `read`. Raises ConfigError if the drive does not answer, or refuses the
-        value; BusDown if the bus is down.
-        """
+        """Write an object without reading it back."""
         data = struct.pack("<" + code, value)
         what = f"refuses {_name(index, sub)} = {_hex(value, code)}"
         self._transfer(index, sub, what, lambda: self.node.sdo.download(index, sub, data), BUSY_S)
 
     def write(self, index: int, sub: int, value: int, code: str, ignored: int = 0) -> None:
-        """Write an object and read it back; a read-only object that holds the value already is accepted.
-
-        ``index``, ``sub``, ``code``: as in `read`; ``ignored``: bits that may read back otherwise. Raises ConfigError
-        if the drive does not answer, refuses the value, or holds another one afterwards; BusDown if the bus is down.
-        """
+        """Write an object and read it back, except ``ignored`` bits; a read-only one that has the value is right."""
         found = self.write_rounded(index, sub, value, code, ignored)
         if (found ^ value) & ~ignored:
             written = _hex(value, code)
             raise ConfigError(f"{self.label}: {_name(index, sub)} reads {_hex(found, code)} after writing {written}")
 
     def write_rounded(self, index: int, sub: int, value: int, code: str, ignored: int = 0) -> int:
-        """Write an object and return the value that it reads back, which the drive may have rounded.
-
-        ``index``, ``sub``, ``code``, ``value``, ``ignored``: as in `write`. Raises ConfigError if the drive does not
-        answer, or refuses the value and holds another one; BusDown if the bus is down.
-        """
+        """Write an object and return the value that it reads back, which the drive may have rounded."""
         try:
             self.command(index, sub, value, code)
         except SdoRefusedError as refused:
@@ -214,10 +182,7 @@ class DriveSdo:
         return found
 
     def no_answer(self, within_s: float | None = None) -> ArmidentError:
-        """Return the error of a drive that does not answer, or of its bus if that is down.
-
-        ``within_s``: time that was waited, s; default: the SDO timeout.
-        """
+        """Error of a drive that does not answer within a time, s (the SDO timeout), or of its bus if that is down."""
         if self._bus.interface == "socketcan":
             # A bus that is down looks like a silent drive; opening it distinguishes the two.
             try:

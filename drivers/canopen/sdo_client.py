@@ -23,24 +23,18 @@ class MatchingSdoClient(SdoClient):
     """SDO client that takes only the answer to its request: by command, and by index and sub-index or toggle bit.
 
     On the default SDO channel, answers to other clients of the drive arrive too, and some drives repeat theirs.
-
-    ``rx_cobid``, ``tx_cobid``: identifiers of requests and of answers.
     """
 
     def __init__(self, rx_cobid: int, tx_cobid: int, od: Any) -> None:
-        super().__init__(rx_cobid, tx_cobid, od)  # type: ignore[no-untyped-call]
+        super().__init__(rx_cobid, tx_cobid, od)
         self._object = bytes(3)
 
     def request_response(self, sdo_request: bytes) -> bytes:
-        """Send a request and return its answer.
-
-        ``sdo_request``: the eight bytes of the request. Raises SdoAbortedError if the drive aborts the transfer;
-        OtherAnswersError if there were answers to other requests only; SdoCommunicationError if there was no answer.
-        """
+        """Send the eight bytes of a request and return its answer; OtherAnswersError if only other answers came."""
         if sdo_request[0] >> 5 in (_DOWNLOAD, _UPLOAD):
             self._object = bytes(sdo_request[1:4])
         self.responses: queue.Queue[bytes] = queue.Queue()
-        self.send_request(sdo_request)  # type: ignore[no-untyped-call]
+        self.send_request(sdo_request)
         until, others = time.monotonic() + self.RESPONSE_TIMEOUT, 0
         while (left := until - time.monotonic()) > 0:
             try:
@@ -52,7 +46,7 @@ class MatchingSdoClient(SdoClient):
                     raise SdoAbortedError(int.from_bytes(answer[4:8], "little"))
                 return answer
             others += 1
-        self.abort(_TIMED_OUT)  # type: ignore[no-untyped-call]
+        self.abort(_TIMED_OUT)
         if others:
             raise OtherAnswersError(f"{others} answers to other requests")
         raise SdoCommunicationError("no answer")

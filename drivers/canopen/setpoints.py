@@ -8,11 +8,9 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True)
 class SetpointPlan:
-    """Position set points of all drives, one row per ``every`` SYNCs.
+    """Position set points of all n drives, counts, int32 rows (M, n), one row per ``every`` SYNCs.
 
-    ``rows``: targets, counts, int32, shape (M, n), one column per drive. ``cob_ids``: COB-ID of each drive's set point
-    RPDO, in the order of the columns, length n. ``every``: number of SYNCs between two rows. ``bus_of``: number of each
-    drive's bus, length n; empty: all drives are on one bus. Raises ValueError if shapes or types do not match.
+    ``cob_ids`` (n,): of the drives' set point RPDOs. ``bus_of`` (n,): numbers of their buses; empty: all on one.
     """
 
     rows: NDArray[np.int32]

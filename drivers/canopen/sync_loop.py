@@ -48,28 +48,16 @@ _errno_location: Any = types.ExternalFunction("__errno_location", types.voidptr(
 
 
 def is_knot(k: int, every: int) -> bool:
-    """Return True if set points become targets at a SYNC: its counter is a multiple of ``every``.
-
-    ``k``: number of the SYNC, from 0; ``every``: number of SYNCs between two set points.
-    """
+    """Return True if set points become targets at SYNC ``k``, from 0: its counter is a multiple of ``every``."""
     return (k + 1) % every == 0
 
 
 class Loop:
-    """Compiled SYNC loop with its arrays; a further call continues where the last one ended.
+    """Compiled SYNC loop with its arrays, for B buses; a further call continues where the last one ended.
 
-    Parameters
-    ----------
-    descriptors
-        Socket of each bus, shape (B,).
-    period_ns, counter
-        SYNC period, ns, and overflow of the SYNC counter; 0: none.
-    state, late
-        Shared state, shape (STATE_SIZE,), and histogram of the delays, shape (BINS,).
-    errors, unsent
-        Per bus the errno of the last SYNC (0: sent), and the number of refused SYNCs, shape (B,).
-    times
-        Ring of the times (ns, UTC) just after SYNC k was sent, at index ``k % TIMES``.
+    ``counter`` is the overflow of the SYNC counter, 0: none. ``state`` (STATE_SIZE,) is shared; ``late`` (BINS,) counts
+    delays. ``errors`` and ``unsent`` (B,) have the errno of the last SYNC (0: sent) and the number of refused ones.
+    ``times`` has ns UTC just after SYNC k was sent, at index ``k % TIMES``.
     """
 
     def __init__(
@@ -95,11 +83,7 @@ class Loop:
     def __call__(
         self, rows: NDArray[np.int32], cob_ids: NDArray[np.uint32], bus_of: NDArray[np.int64], every: int
     ) -> None:
-        """Send SYNCs and set points until ``state[STOP]``, ``state[RETURN]`` or ``state[WANTED]``.
-
-        ``rows``: set points, counts, shape (M, n); sent from row ``state[ROW]`` on. ``cob_ids``, ``bus_of``: identifier
-        and bus number of each drive's set point frame, shape (n,). ``every``: number of SYNCs between two rows.
-        """
+        """Send SYNCs, and set points (M, n) from ``state[ROW]`` on, until ``STOP``, ``RETURN`` or ``WANTED`` is set."""
         self._call(self._state, rows, cob_ids, bus_of, every)
 
     def _call(
@@ -134,10 +118,7 @@ def monotonic_ns(spec: NDArray[np.int64]) -> int:
 
 @compiled()
 def utc_ns(spec: NDArray[np.int64]) -> int:
-    """Read CLOCK_REALTIME, ns: the clock of the kernel's frame stamps.
-
-    ``spec``: memory of a ``struct timespec``, int64, shape (2,).
-    """
+    """Read CLOCK_REALTIME, ns, the clock of the kernel's frame stamps, by a ``struct timespec``, int64 (2,)."""
     _clock_gettime(_REALTIME, spec.ctypes.data)
     return int(spec[0] * 1_000_000_000 + spec[1])
 
@@ -152,11 +133,7 @@ def sleep_until(deadline: int, spec: NDArray[np.int64]) -> None:
 
 @compiled()
 def send_messages(descriptor: int, address: int, count: int, attempts: int, spec: NDArray[np.int64]) -> int:
-    """Send messages by ``sendmmsg``; return 0, or errno if the kernel refuses them.
-
-    ``address``: address of the first ``struct mmsghdr``; ``attempts``: maximum number of system calls; ``spec``: memory
-    of a ``struct timespec``, int64, shape (2,).
-    """
+    """Send ``count`` messages from ``struct mmsghdr`` at ``address`` by ``sendmmsg``; return 0 or errno."""
     sent, code = 0, 0
     for _ in range(attempts):
         done = _sendmmsg(descriptor, address + 64 * sent, count - sent, _DONTWAIT)

@@ -1,12 +1,8 @@
 """SYNC producer: SYNC with counter on an absolute time grid on all buses, and position set points after it.
 
-A compiled loop without the interpreter's lock sleeps until each deadline (``clock_nanosleep``). It sends the SYNC and
-the set points that follow it in one system call.
-
-A late SYNC is sent at once. The following ones return to the grid, at least half a period apart. On a machine that is
-too slow for its buses this pause leaves time to other threads, which a loop of real-time priority would block. If the
-delay exceeds ``MAX_LATE_PERIODS``, the grid moves by whole periods, counted in ``SyncStats.skipped``. No SYNC number is
-left out: a bus that is down misses its SYNC while the others continue.
+A compiled loop without the interpreter's lock sleeps to each deadline (``clock_nanosleep``) and sends by one system
+call. After a late SYNC the next ones return to the grid, at least half a period apart: this leaves time to other
+threads. Beyond ``MAX_LATE_PERIODS`` the grid moves by whole periods; no SYNC number is left out.
 """
 
 import errno
@@ -55,20 +51,10 @@ REALTIME_PRIORITY = 10
 
 @dataclass(frozen=True)
 class SyncStats:
-    """Punctuality of the SYNCs.
+    """Punctuality of the SYNCs; the delay counts from the grid until all buses took the SYNC.
 
-    Parameters
-    ----------
-    late_p50_us, late_p99_us, late_max_us
-        Median, 99th percentile and maximum of the delay from the grid until all buses took the SYNC, us.
-    overruns
-        Number of SYNCs that were late by more than a period.
-    skipped
-        Number of periods by which the time grid was moved because the producer was delayed.
-    realtime
-        ``True`` if the loop ran with real-time priority.
-    unsent
-        Number of SYNCs that each bus refused.
+    ``overruns``: SYNCs late by more than a period. ``skipped``: periods by which the grid moved. ``unsent``: refused,
+    by bus.
     """
 
     sent: int
@@ -82,14 +68,8 @@ class SyncStats:
 
 
 class SyncProducer:
-    """Sends SYNC k = 0, 1, 2, ... with counter ``k % counter + 1`` in a separate thread.
+    """Sends SYNC k = 0, 1, 2, ... with counter ``k % counter + 1`` in a separate thread, by sockets of its own.
 
-    ``buses``: one bus or several; the producer opens its own sockets, so that other sockets receive the SYNC.
-    ``counter``: overflow of the SYNC counter (1019h); 0: SYNC has no counter. ``setpoints``: set points to play from
-    the start; :meth:`play` sets others later.
-
-    Notes
-    -----
     A knot is a SYNC whose counter is a multiple of ``every``. A row is sent directly after the SYNC before its knot and
     becomes the target at the knot. With row 0 at SYNC ``first``, row m becomes the target at ``first + m every``, and
     the interpolated demand reaches it ``every`` SYNCs later. The drives hold the last row.
@@ -117,10 +97,7 @@ class SyncProducer:
         self._loop: Loop | None = None
 
     def start(self) -> None:
-        """Open the buses and send the first SYNC one period from now.
-
-        Raises ConfigError if a bus does not exist; BusDown if a bus is down.
-        """
+        """Open the buses and send the first SYNC one period from now."""
         with ExitStack() as opened:
             for bus in self._configured:
                 # SYNC and set points are classic frames on every bus.
@@ -144,18 +121,11 @@ class SyncProducer:
             bus.close()
 
     def stop_after(self, count: int) -> None:
-        """Limit the total number of SYNCs; :meth:`stop` is still required.
-
-        ``count``: total number of SYNCs; if more were sent already, no other follows.
-        """
+        """Limit the total number of SYNCs, those sent already included; :meth:`stop` is still required."""
         self._state[WANTED] = count
 
     def play(self, plan: SetpointPlan) -> int:
-        """Play set points from the next possible knot on, in place of the present ones.
-
-        ``plan``: the set points. Returns the number of the SYNC at which row 0 becomes the target. Raises BusDown if no
-        bus takes SYNC.
-        """
+        """Play set points from the next possible knot on, and return the SYNC at which row 0 becomes the target."""
         self._taken.clear()
         self._pending = plan
         self._state[RETURN] = 1
@@ -181,11 +151,7 @@ class SyncProducer:
         return int(self._state[SENT])
 
     def sent_at(self, first: int) -> tuple[int, NDArray[np.int64]]:
-        """Send times of the SYNCs from ``first`` on, as far as they are kept (``TIMES``).
-
-        Returns ``number``: number of the first SYNC whose time is known; ``times``: times just after sending, ns UTC,
-        shape (N,).
-        """
+        """First SYNC from ``first`` on whose time is kept (``TIMES``), and times just after sending, ns UTC, (N,)."""
         sent = self.sent
         first = min(max(first, sent - TIMES + 1, 0), sent)
         return first, self._times[np.arange(first, sent) % TIMES]

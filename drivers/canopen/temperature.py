@@ -18,10 +18,7 @@ REST_S = 60.0
 class TemperaturePoll:
     """Reads temperatures in a separate thread, one drive at a time; use it in a ``with`` block.
 
-    A drive with another SDO transfer in progress is skipped until its next turn.
-
-    ``drives``: drives; those with a configured temperature object are polled. ``rest_s``: pause after a drive did not
-    answer, s.
+    A drive with another SDO transfer in progress waits for its next turn; one that did not answer rests for ``rest_s``.
     """
 
     def __init__(self, drives: Sequence[DriveSdo], rest_s: float = REST_S) -> None:

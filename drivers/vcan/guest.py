@@ -1,8 +1,7 @@
 """Execution of a command under a User-Mode Linux kernel with vcan buses, on this machine's file system.
 
-The guest sees the host's files read-only; /tmp, the working directory and cache folders are writable. It has no stdin,
-no terminal and no network except loopback. Output is passed on at once, and so are environment, exit status, Ctrl-C
-and SIGTERM.
+The guest sees the host's files read-only; /tmp, the working directory and caches are writable. It has no stdin, no
+terminal and only the loopback network. Environment, exit status, Ctrl-C and SIGTERM pass.
 """
 
 import ctypes
@@ -53,20 +52,15 @@ def launcher_obstacle() -> str | None:
 
 
 def launcher_command(command: Sequence[str], buses: int = 1) -> list[str]:
-    """Command line that runs a command with vcan buses.
-
-    ``command``: program and arguments; ``buses``: number of buses: ``vcan0`` to ``vcan{buses - 1}``.
-    """
+    """Command line that runs a command with the buses ``vcan0`` to ``vcan{buses - 1}``."""
     return [sys.executable, "-m", "armident.drivers.vcan", "-n", str(buses), "--", *command]
 
 
 def run(command: Sequence[str], buses: int = 1, memory: str = "4096M", writable: Sequence[Path] = ()) -> int:
-    """Run ``command`` in a guest and return its exit status.
+    """Run ``command`` in a guest, in the current directory, and return its exit status.
 
-    ``command``: program and arguments, started in the current directory. ``buses``: number of vcan interfaces.
-    ``memory``: memory of the guest in the format of the kernel's ``mem=``; only used pages take memory of the host.
-    ``writable``: further folders that are writable in the guest. Raises ArmidentError if the memory is no size, or the
-    guest cannot be set up or ends without a status; contains the end of its kernel log.
+    ``memory`` has the format of the kernel's ``mem=``; only used pages take memory of the host. ``writable``: more
+    folders that are writable. An ArmidentError has the end of the guest's kernel log.
     """
     if not re.fullmatch(r"\d+[KMG]?", memory):
         raise ArmidentError(f"{memory!r}: expected the memory of a guest as a number with K, M or G, such as 4096M")
@@ -99,10 +93,7 @@ def run(command: Sequence[str], buses: int = 1, memory: str = "4096M", writable:
 
 
 def _allow_mappings(memory: str) -> None:
-    """Allow a process of the guest to use all of its memory, until the next boot; say so where that is not permitted.
-
-    Beyond the limit a process of the guest hangs in a page fault, or ends by SIGSEGV.
-    """
+    """Allow guest processes all of their memory until the next boot: beyond the limit they hang or end by SIGSEGV."""
     number, unit = (memory[:-1], memory[-1]) if memory[-1:] in MEMORY_UNITS else (memory, "")
     needed = int(number) * MEMORY_UNITS.get(unit, 1) // os.sysconf("SC_PAGE_SIZE")
     with suppress(OSError, ValueError):
@@ -152,10 +143,7 @@ def _write_scripts(
 
 @contextmanager
 def _reserved_cpu() -> Iterator[int]:
-    """Reserve one CPU that no other guest uses, if there is one.
-
-    The guest's kernel and its processes switch at every system call, which takes many times as long between CPUs.
-    """
+    """Reserve one CPU that no other guest uses, if there is one: switches between CPUs at system calls are slow."""
     cpus = sorted(os.sched_getaffinity(0), reverse=True)
     with ExitStack() as stack:
         for cpu in cpus:

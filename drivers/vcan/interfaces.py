@@ -29,10 +29,7 @@ def is_up(name: str) -> bool:
 
 
 def ensure_vcan(name: str = "vcan0") -> None:
-    """Bring a vcan interface up, and create it first if it does not exist.
-
-    Raises ConfigError if rights are missing; contains the command for an administrator.
-    """
+    """Bring a vcan interface up, and create it if needed; a ConfigError has the command for an administrator."""
     if is_up(name):
         return
     if not have_socketcan():

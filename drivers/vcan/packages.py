@@ -1,8 +1,7 @@
-"""Kernel and tools of the guest: five Debian packages, unpacked into a private folder; nothing is installed.
+"""Kernel and tools of the guest: five Debian packages, unpacked into a private folder; nothing is installed, no root.
 
-The kernel is ``user-mode-linux`` of Debian testing. From 6.16 on it runs guests by seccomp, which is fast, and on CPUs
-with AMX; the one of Debian 12 does neither. It needs the C library of testing, which is unpacked beside it and entered
-in the binary, so that the machine's own library is unchanged. Fetching needs no root.
+``user-mode-linux`` of Debian testing (from 6.16 on) runs guests by seccomp, which is fast, and on CPUs with AMX; that
+of Debian 12 does neither. Its C library is unpacked beside it and entered in the binary.
 """
 
 import fcntl
@@ -52,10 +51,7 @@ def kernel(root: Path) -> Path:
 
 
 def provide() -> Path:
-    """Folder with kernel, ``modules/`` and ``bin/``; fetched and unpacked if it does not exist yet.
-
-    Raises ArmidentError if the packages cannot be found or unpacked; names the log.
-    """
+    """Folder with kernel, ``modules/`` and ``bin/``; fetched and unpacked if it does not exist yet."""
     cache = cache_folder()
     root = cache / "root"
     if _works(root):

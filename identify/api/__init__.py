@@ -6,9 +6,10 @@ from armident.identify.api.identification_api import Identification, identify, l
 from armident.identify.api.prediction_api import TorquePrediction, predict
 from armident.identify.api.setup_api import CheckedSetup, check
 from armident.identify.api.trajectory_api import Design, design_trajectory
-from armident.identify.effects.effect import Effect, Linear, Motion, Place, Shape
+from armident.identify.effects.effect import Effect, Linear, Place, Shape
 from armident.identify.identification.options import Options
 from armident.identify.identification.robot_model import RobotModel
+from armident.identify.robot.motion import Motion
 
 __all__ = [
     "ChangeTest",

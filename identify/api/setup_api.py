@@ -57,7 +57,10 @@ class CheckedSetup(Result):
             lines.append(f"  correct it by: {finding.remedy}")
         if shift is not None and shift.applied:
             lines.append(f"remark: {shift.remark}")
-        before, after = document.relative_error_pct_by_joint.values(), document.corrected_error_pct_by_joint.values()
+        before, after = (
+            list(errors.values())
+            for errors in (document.relative_error_pct_by_joint, document.corrected_error_pct_by_joint)
+        )
         if any(error != 100.0 for error in before):
             corrected = f", corrected {_listed(after)} %" if any(f.decisive for f in self.findings) else ""
             lines.append(f"torque error of the rigid model by joint: {_listed(before)} %{corrected}")

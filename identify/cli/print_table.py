@@ -14,12 +14,7 @@ FRAME = 3
 
 
 def print_table(table: Table, console: Console | None = None) -> None:
-    """Print a table; one that the terminal is too narrow for as a list, one line per cell.
-
-    A file or a pipe has no width: there it stays a table.
-
-    ``table``: table of text cells. ``console``: console to print on; by default stdout.
-    """
+    """Print a table; on a terminal that is too narrow as a list, one line per cell. A file or a pipe has no width."""
     console = console or Console()
     columns = [[_plain(cell) for cell in (column.header, *column.cells)] for column in table.columns]
     least = [max((len(word) for cell in cells for word in WORD.findall(cell)), default=1) for cells in columns]

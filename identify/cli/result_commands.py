@@ -43,12 +43,7 @@ def identify_command(path: Path, config: Path | None, options: Options, out: Pat
 
 
 def check_command(paths: Sequence[Path], config: Path | None, *, as_json: bool) -> int:
-    """Carry out ``armident check``.
-
-    ``config``: robot configuration; ``None``: that of the first recording. ``as_json``: print the result as JSON on
-    stdout instead of a table. Returns the exit code: `UNUSABLE` with a decisive finding or a joint that is not
-    understood, otherwise 0. Raises ConfigError or DataError if a file is wrong, or the recordings cannot be checked.
-    """
+    """Carry out ``armident check``; exit code `UNUSABLE` with a decisive finding or an unexplained joint, else 0."""
     from armident.identify.api import check
     from armident.identify.cli.terminal import progress
 
@@ -88,13 +83,9 @@ def diagnose_command(
 
 
 def predict_command(paths: Sequence[Path], model: Path, config: Path | None, out: Path | None, *, as_json: bool) -> int:
-    """Carry out ``armident predict``.
+    """Carry out ``armident predict``; exit code `FOUND` if the model explains a recording no better than none.
 
-    ``model``: result with the identified parameters. ``config``: robot configuration; ``None``: that of the model.
     ``out``: folder of the results, of several recordings with a folder for each; ``None``: beside each recording.
-    ``as_json``: print the document on stdout instead of a table. Returns the exit code: `FOUND` if the model explains
-    the torques of a recording no better than none, otherwise 0. Raises ConfigError or DataError if a file is wrong, the
-    model is unusable, or a recording cannot be used.
     """
     from armident.daq.recording import read_recording
     from armident.identify.api import predict
@@ -148,23 +139,10 @@ def _prediction_folders(paths: Sequence[Path], out: Path | None) -> list[Path]:
 def compare_command(
     baseline: Path, now: Path, out: Path | None, false_alarms: float, *, common: bool, as_json: bool
 ) -> int:
-    """Carry out ``armident compare``.
+    """Carry out ``armident compare``; exit code `FOUND` if the parameters differ significantly.
 
-    Returns the exit code: `FOUND` if the parameters differ significantly, otherwise 0. Raises ConfigError or DataError
-    if a file is wrong, or the two cannot be compared.
-
-    Parameters
-    ----------
-    baseline, now
-        Two ``identification.json``, or their folders.
-    out
-        Folder of the results; ``None``: ``comparison`` beside the later one.
-    false_alarms
-        Probability of the verdict ``changed`` without a change.
-    common
-        Compare only the parameters that both have.
-    as_json
-        Print the document on stdout instead of a table.
+    ``out``: folder; ``None``: ``comparison`` beside the later one. ``false_alarms``: probability of ``changed`` without
+    a change. ``common``: compare only the parameters that both have.
     """
     from armident.identify.api import compare
     from armident.identify.cli.terminal import warn

@@ -46,11 +46,9 @@ class _Compilation(event.Listener):
 
 @contextmanager
 def progress(what: str) -> Iterator[Report]:
-    """Report stages after two seconds: a bar with the time left where stderr is a terminal, otherwise plain lines.
+    """Report stages and the share done, 0 to 1, from two seconds on: a bar on a terminal, otherwise plain lines.
 
-    The first run on a machine also prints that it compiles kernels.
-
-    ``what``: command and its argument, the beginning of each line. The result takes a stage and the share done, 0 to 1.
+    The first run on a machine also prints that it compiles kernels. ``what``: beginning of each line.
     """
     begin = time.monotonic()
     with event.install_listener("numba:compile", _Compilation(what)), _stages(what, begin) as report:
@@ -87,11 +85,7 @@ def warn(lines: list[str]) -> None:
 
 
 def design_table(robot: RobotConfig, theta: NDArray[np.float64] | None, std: NDArray[np.float64]) -> None:
-    """Print base parameters, if known, and their predicted standard deviations.
-
-    ``robot``: for the names of the parameters; ``theta``: base parameters (b,), or ``None``; ``std``: predicted
-    standard deviations (b,).
-    """
+    """Print base parameters (b,), if known, and their predicted standard deviations (b,)."""
     table = Table(title=f"{robot.name}: predicted precision, base parameters", title_justify="left")
     names = arm_model(robot).base.names
     for column in ("parameter", "value", "std", "std %") if theta is not None else ("parameter", "std"):
@@ -204,10 +198,7 @@ def diagnosis_table(document: DiagnosisDocument) -> None:
 
 
 def time_left(elapsed_s: float, share: float) -> str:
-    """Return the time left at a constant rate, in words.
-
-    ``elapsed_s``: time since the beginning, s; ``share``: share done, above 0 to 1.
-    """
+    """Return the time left at a constant rate, in words."""
     seconds = round(elapsed_s * (1.0 - share) / share)
     return f"{seconds} s" if seconds < 120 else f"{seconds // 60} min"
 

@@ -34,17 +34,9 @@ NO_FILTER = ArModel(np.empty(0), 1.0, 0.0)
 class JointResponse:
     """Impulse response of one motor's controller.
 
-    Parameters
-    ----------
-    error_taps
-        From the tracking error (rad or m at the motor) to motor torque, one per sampling period.
-    position_taps
-        From the measured motor position to motor torque. Their sum is zero, as a velocity loop responds only to changes
-        of the position. Empty where the tracking error alone explains the torque.
-    prewhitening_order
-        Order of the AR filter applied to both sides; 0 for none.
-    fit_pct
-        Share of the held-out torque's variance that is explained, percent.
+    ``error_taps``: from tracking error (rad or m at the motor) to motor torque. ``position_taps``: from measured motor
+    position; their sum is zero, as a velocity loop responds only to changes; empty where the error alone explains the
+    torque. ``prewhitening_order``: of the AR filter. ``fit_pct``: explained share of the held-out torque's variance.
     """
 
     error_taps: NDArray[np.float64]
@@ -55,10 +47,7 @@ class JointResponse:
 
 @dataclass(frozen=True)
 class IdentifiedController:
-    """Identified controller of all motors.
-
-    ``responses``: impulse response and held-out fit of each motor, n of them.
-    """
+    """Identified controller of all n motors."""
 
     controller: DiscreteController
     responses: tuple[JointResponse, ...]
@@ -76,25 +65,14 @@ def identify_crc(
 ) -> IdentifiedController:
     """Impulse response of each motor's controller from tracking error to torque.
 
-    Correlation analysis solves ``R_nu,eps(tau) = sum_k h(k) R_eps,eps(tau - k)`` (5.31, 5.32). It is done with the
-    signals as recorded, and with both signals prewhitened by an AR model of the error. The response that predicts the
-    held-out torque best is returned. A cascade also feeds back the measured velocity, which the tracking error does not
-    contain. A second response, from position changes, is therefore tried; it is kept where it reduces the held-out
-    error. Returns the controller, and impulse response and held-out fit of each motor. Raises DataError if a motor
-    never deviates from its reference.
+    Correlation analysis solves ``R_nu,eps(tau) = sum_k h(k) R_eps,eps(tau - k)`` (5.31, 5.32), with the signals as
+    recorded, and prewhitened by an AR model of the error; the better prediction of the held-out torque is returned. A
+    cascade also feeds back the measured velocity: a second response, from position changes, is kept if the held-out
+    error falls.
 
-    Parameters
-    ----------
-    q_motor, reference_motor, torque_motor
-        Measured position (rad or m), reference (rad or m) and torque (N m or N) at the motor shafts, one (N, n) array
-        per experiment.
-    length
-        Number of taps, for all motors or for each; ``None``: the one of `LENGTHS` with the least held-out error.
-    velocity_loop
-        True: include the response from position changes. False: leave it out. ``None``: compare both on the held-out
-        data.
-    saturation
-        Largest motor torque (n,), N m or N; ``None``: no limit.
+    Inputs: position, reference (rad or m) and torque (N m or N) at the motors, one (N, n) array per experiment.
+    ``length``: taps, of all motors or of each; ``None``: the best of `LENGTHS`. ``velocity_loop``: response from
+    position changes; ``None``: compare both. ``saturation``: largest torque (n,).
     """
     n = q_motor[0].shape[1]
     lengths: list[tuple[int, ...]]
@@ -158,10 +136,7 @@ class _Correlations:
         return _Correlations(self.auto + other.auto, self.cross + other.cross, self.power + other.power)
 
     def miss(self, taps: NDArray[np.float64], chosen: NDArray[np.int64]) -> float:
-        """Sum of the squared errors of a response, in the square of the torque's unit.
-
-        ``taps``: impulse response, shape (k,); ``chosen``: indices of its taps in the correlation matrix, shape (k,).
-        """
+        """Sum of the squared errors of the impulse response ``taps`` (k,), whose tap numbers are ``chosen`` (k,)."""
         explained = 2 * taps @ self.cross[chosen] - taps @ self.auto[np.ix_(chosen, chosen)] @ taps
         return max(self.power - float(explained), 0.0)
 
@@ -201,10 +176,7 @@ def _sums(
 def _lag_products(
     u: NDArray[np.float64], v: NDArray[np.float64], length: int, first: int, last: int
 ) -> NDArray[np.float64]:
-    """``sum_k u(k - i) v(k - j)`` for lags i, j, shape (length, length).
-
-    First row and column are summed; the rest follows by recursion along the diagonals.
-    """
+    """``sum_k u(k - i) v(k - j)`` for lags i, j, shape (length, length), by recursion along the diagonals."""
     out = np.empty((length, length))
     out[0], out[:, 0] = _products(u, v, length, first, last), _products(v, u, length, first, last)
     for i in range(1, length):

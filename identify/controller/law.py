@@ -22,25 +22,11 @@ Array = NDArray[np.float64]
 class Structure:
     """Structure of the control law of one drive.
 
-    Parameters
-    ----------
-    velocity
-        Input of the velocity gain. ``position``: the measured velocity (a cascade). ``error``: the derivative of the
-        tracking error (a PD, or a cascade with full velocity feed-forward). ``both``: the measured velocity, and the
-        velocity of the reference with a gain of its own.
-    velocity_taps
-        Number of backward differences in the velocity, each with its own weight.
-    filtered
-        First-order low-pass on the ``velocity``, on the whole ``command``, or none.
-    integral
-        True if the velocity loop has integral action.
-    acceleration
-        True if the acceleration of the reference is fed forward.
-    delay
-        Delay between inputs and output, whole samples.
-    added
-        True if the recorded torque contains a known torque that does not come from the controller. Its share in the
-        record is then estimated.
+    ``velocity``, input of the velocity gain: ``position``: the measured velocity (a cascade); ``error``: derivative of
+    the tracking error (a PD, or full velocity feed-forward); ``both``: that of the reference has a gain of its own.
+    ``velocity_taps``: number of backward differences in it, each with a weight. ``filtered``: low-pass on ``velocity``,
+    on the whole ``command``, or none. ``acceleration``: that of the reference is fed forward. ``delay``: whole samples.
+    ``added``: the record contains a known torque of other origin; its share is estimated.
     """
 
     velocity: Literal["position", "error", "both"] = "position"
@@ -106,11 +92,7 @@ class Structure:
 
 @dataclass(frozen=True)
 class Stretch:
-    """Uninterrupted samples of one motor.
-
-    ``q``, ``r``: measured position and reference, rad or m, shape (N,); ``nu``: recorded torque, N m or N, shape (N,);
-    ``added``: known torque in the record that does not come from the controller, N m or N, shape (N,).
-    """
+    """Samples (N,) of a motor without gaps: ``q``, ``r``, torque ``nu``; ``added``: known part of other origin."""
 
     q: Array
     r: Array
@@ -123,10 +105,7 @@ class Stretch:
 
 
 def loop_ratios(structure: Structure, theta: Array) -> tuple[float, float]:
-    """Position gain ``kp`` (1/s) and share of the reference's velocity that is fed forward; zeros before the first fit.
-
-    ``theta``: parameters (size,).
-    """
+    """Position gain ``kp`` (1/s) and share of the reference's velocity fed forward; zeros before the first fit."""
     value = _levels(structure, theta)
     kv = sum(value[f"v{i}"] for i in range(structure.velocity_taps))
     if kv == 0.0:
@@ -137,13 +116,7 @@ def loop_ratios(structure: Structure, theta: Array) -> tuple[float, float]:
 
 
 def columns(stretch: Stretch, structure: Structure, theta: Array, dt: float) -> Array:
-    """Inputs of the law (N - lead, m) in the order of its names.
-
-    The input of the integral contains the gain ratios of ``theta``, see `loop_ratios`.
-
-    ``stretch``: motor position, reference and torque, N samples; ``structure``: structure of the law, with m linear
-    parameters; ``theta``: parameters (size,).
-    """
+    """Inputs of the law (N - lead, m) in the order of its names; the integral's contains the `loop_ratios`."""
     e = stretch.r - stretch.q
     v, speed = (np.diff(x, prepend=x[0]) / dt for x in (stretch.q, stretch.r))
     velocity = speed - v if structure.velocity == "error" else -v
@@ -158,13 +131,9 @@ def columns(stretch: Stretch, structure: Structure, theta: Array, dt: float) -> 
 
 
 def integral_slopes(stretch: Stretch, structure: Structure, theta: Array, dt: float) -> Array:
-    """Derivatives of the torque by the gains inside the integral's input (N - lead, m).
+    """Derivatives of the torque by the gains inside the integral's input (N - lead, m), for a Gauss-Newton step.
 
-    The columns of `columns` plus these are the Jacobian of the torque. Their product with ``theta`` is zero, so a
-    regression on the sum is a Gauss-Newton step.
-
-    ``stretch``: motor position, reference and torque, N samples; ``structure``: structure of the law, with integral
-    action and m linear parameters; ``theta``: parameters (size,).
+    The sum with `columns` is the Jacobian; these slopes times ``theta`` are zero: a regression on the sum suffices.
     """
     names, past = structure.names, 1.0 / (1.0 - structure.pole(theta))
     level = {name: 1.0 if i < structure.unfiltered else past for i, name in enumerate(names)}
@@ -185,12 +154,7 @@ def integral_slopes(stretch: Stretch, structure: Structure, theta: Array, dt: fl
 
 
 def simulate_law(stretch: Stretch, structure: Structure, theta: Array, dt: float) -> Array:
-    """Torque of the law (N - lead,), N m or N, along measured position and reference.
-
-    The initial value of an integral is unknown; the value that fits the stretch best is used.
-
-    ``stretch``: motor position, reference and torque, N samples; ``theta``: parameters (size,).
-    """
+    """Torque of the law (N - lead,), N m or N, along measured motion; the initial integral is that of the best fit."""
     m, split = len(structure.names), structure.unfiltered
     u = columns(stretch, structure, theta, dt)
     simulated: Array = u[:, :split] @ theta[:split] + low_pass(u[:, split:] @ theta[split:m], structure.pole(theta))
@@ -200,10 +164,7 @@ def simulate_law(stretch: Stretch, structure: Structure, theta: Array, dt: float
 
 
 def low_pass(x: Array, pole: float) -> Array:
-    """``x / (1 - pole z^-1)`` along the first axis, from the steady state of its first sample.
-
-    ``x``: series, shape (N,) or (N, k). ``pole``: pole of the filter; 0 returns ``x``.
-    """
+    """``x / (1 - pole z^-1)`` along the first axis, from the steady state of its first sample."""
     if pole == 0.0 or x.size == 0:
         return x
     filtered: Array = signal.lfilter([1.0], [1.0, -pole], x, axis=0, zi=x[:1] * pole / (1 - pole))[0]
@@ -211,11 +172,7 @@ def low_pass(x: Array, pole: float) -> Array:
 
 
 def taps(structure: Structure, theta: Array, dt: float) -> tuple[Array, Array, Array]:
-    """Taps of the discrete controller on tracking error, position and own output; the reference is error plus position.
-
-    ``theta``: parameters (size,). Returns ``error``, ``position``: taps on tracking error and motor position,
-    N m/rad or N/m; ``output``: taps on the past outputs, from one sampling period ago.
-    """
+    """Taps on tracking error and motor position, N m/rad or N/m, and on past outputs, from one period ago."""
     pole = structure.pole(theta)
     kp, forward = loop_ratios(structure, theta)
     integrate = np.array([1.0, -1.0]) if structure.integral else np.ones(1)
@@ -263,10 +220,8 @@ UNITS = {
 def gains(structure: Structure, theta: Array, dt: float, unit: float) -> dict[str, float]:
     """Gains of the law by the names of a drive's data sheet, in the units of `UNITS`.
 
-    ``theta``: parameters (size,); ``unit``: motor torque per unit of the drive's signal. Returns ``kp``, ``kv`` and
-    ``stiffness`` (their product). ``error_delay`` and ``velocity_delay``: mean age of the inputs; a backward difference
-    is half a sample old. Where the structure has them: ``ti`` (reset time), ``corner`` of the filter,
-    ``velocity_feedforward`` (share), ``acceleration_feedforward``, ``added`` (share).
+    ``unit``: motor torque per unit of the drive's signal. ``stiffness`` is ``kp kv``. Delays are the mean age of the
+    inputs; a backward difference is half a sample old.
     """
     value, pole = _levels(structure, theta), structure.pole(theta)
     lags = range(structure.velocity_taps)

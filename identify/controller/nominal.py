@@ -22,10 +22,7 @@ def saturation(robot: RobotConfig) -> NDArray[np.float64]:
 
 
 def known_controller(robot: RobotConfig, dt: float) -> DiscreteController:
-    """Cascade controller with the gains of the configuration.
-
-    ``robot``: configuration with ``controller`` (``kp``, ``kv``). Raises ConfigError if the configuration has none.
-    """
+    """Cascade controller with the configured gains; ConfigError without them."""
     if robot.controller is None:
         raise ConfigError(f"controller known: the configuration of {robot.name} has no controller (kp, kv)")
     gain = np.array([joint.drive.gain for joint in robot.joints])
@@ -43,13 +40,9 @@ def known_controller(robot: RobotConfig, dt: float) -> DiscreteController:
 def nominal_controller(
     model: ArmModel, theta: NDArray[np.float64], q: NDArray[np.float64], dt: float, bandwidth_hz: float
 ) -> DiscreteController:
-    """Critically damped PD on the tracking error for the mean inertia at each motor.
+    """Critically damped PD for the mean inertia at each motor over the postures ``q`` (N, n).
 
     Its derivative acts on the error, not on the velocity, so that it follows a moving reference without lag.
-
-    ``model``: model of the arm, with n joints; ``theta``: base parameters (b,), SI units; ``q``: postures over which
-    the inertia is averaged, rad or m, shape (N, n); ``bandwidth_hz``: closed-loop bandwidth of the robot, Hz. Raises
-    DataError if these parameters give a motor no positive inertia.
     """
     ratios = model.robot.transmission_matrix
     mass = model.mass_matrix(theta, q).mean(axis=0)

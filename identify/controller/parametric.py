@@ -14,10 +14,8 @@ from armident.identify.controller.riv import LawFit, fit_law, refined_iv
 from armident.identify.robot.controller import DiscreteController
 
 WORTH = 1e-5
-"""Least decrease of the held-out error by a term of the law, over the torque's variance (0.3 % in amplitude).
-
-A relative decrease by `WORTH_OF_REST` suffices, too.
-"""
+"""Least decrease of the held-out error by a term of the law, over the torque's variance (0.3 % in amplitude); a
+relative decrease by `WORTH_OF_REST` suffices, too."""
 
 WORTH_OF_REST = 0.5
 """Relative decrease of the held-out error that always suffices for a term of the law."""
@@ -58,11 +56,10 @@ class Gain:
 
 @dataclass(frozen=True)
 class ControlLaw(JointResponse):
-    """Identified control law of one drive; ``prewhitening_order`` is the order of its AR noise model.
+    """Identified control law of one drive.
 
-    ``output_taps``: from past torque to torque, (m,). ``gains``: gains by name, see
-    :func:`armident.identify.controller.law.gains`. ``saturated``: number of saturated samples, which were left out.
-    ``iterations``, ``converged``: number of refined-IV iterations; True if they converged.
+    ``prewhitening_order``: order of its AR noise model. ``output_taps``: from past torque to torque, (m,). ``gains``:
+    see :func:`armident.identify.controller.law.gains`. ``saturated``: number of saturated samples, which were left out.
     """
 
     output_taps: Array
@@ -86,26 +83,13 @@ def identify_parametric(
 ) -> IdentifiedController:
     """Identify the control law of every drive by refined instrumental variables (thesis 3.2, 5.2.2).
 
-    Without a given structure, a stepwise search starts from a cascade or a PD on the error. Each step takes the change
-    of the structure that reduces the held-out error most. The search ends when no change reduces it by a relevant and
-    significant amount (`WORTH`, `WORTH_OF_REST`, `SIGNIFICANT`). Result: its responses are :class:`ControlLaw`. Raises
-    DataError if a motor never deviates from its reference, is always saturated, or its law is not determined by the
-    data.
+    Without ``structure`` a stepwise search starts from a cascade or a PD on the error. Each step takes the change that
+    reduces the held-out error most, until none is relevant and significant (`WORTH`, `WORTH_OF_REST`, `SIGNIFICANT`).
 
-    Parameters
-    ----------
-    q_motor, reference_motor, torque_motor
-        Measured position (rad or m), reference (rad or m) and torque (N m or N) at the motor shafts, one (N, n) array
-        per experiment.
-    structure
-        Structure for all drives or for each; ``None``: by stepwise search.
-    saturation
-        Largest motor torque (n,), N m or N; samples that reach it are left out. ``None``: no limit.
-    gain
-        Motor torque per unit of the drive's signal (n,), for the units of the gains; ``None``: one.
-    added_motor
-        Known torques in ``torque_motor`` that do not come from the controller, such as test pulses, one (N, n) array
-        per experiment. Their share in the record is estimated, too. ``None``: none.
+    Inputs: position, reference (rad or m) and torque (N m or N) at the motors, one (N, n) array per experiment.
+    ``saturation``: largest torque (n,); samples that reach it are left out. ``gain``: motor torque per unit of the
+    drive's signal (n,). ``added_motor``: known torques of other origin in the record, such as test pulses. Raises
+    DataError if a motor never deviates, is always saturated, or its law is not determined.
     """
     n = q_motor[0].shape[1]
     given = [structure] * n if structure is None or isinstance(structure, Structure) else list(structure)
@@ -251,10 +235,7 @@ def _split(stretches: Sequence[Stretch]) -> tuple[list[Stretch], list[Stretch]]:
 
 
 def _held_out_errors(first: Sequence[Stretch], last: Sequence[Stretch], structure: Structure, dt: float) -> Array:
-    """Mean squared simulation error on each stretch of held-out data, (BLOCKS,), with the law fitted to the rest.
-
-    Infinite where the data do not determine the structure.
-    """
+    """Mean squared simulation error (BLOCKS,) of each held-out stretch, law of the rest; inf if undetermined."""
     try:
         fit = refined_iv(first, structure, dt, noise_model=False, iterations=COARSE)
     except DataError:

@@ -1,8 +1,7 @@
 """Refined instrumental variables for the control law of a drive (thesis section 3.2).
 
-The recorded inputs of a controller are exactly those that it uses, without noise of their own (thesis 5.2.2). All noise
-is added to its recorded output. The inputs are therefore their own instruments. A filter in the law adds the past
-output to the regressor. Its instrument is the output of the law, simulated with the last estimate (3.10).
+A controller's recorded inputs are exactly those that it uses; all noise is on its recorded output (thesis 5.2.2). The
+inputs are their own instruments. That of a filter's past output is the output simulated with the last estimate (3.10).
 """
 
 from collections.abc import Sequence
@@ -39,10 +38,7 @@ MISFIT = 1.5
 
 @dataclass(frozen=True)
 class LawFit:
-    """Fitted control law.
-
-    ``theta``, ``covariance``: parameters (size,) of the structure and their covariance (size, size).
-    """
+    """Fitted parameters (size,) of a structure, with covariance (size, size)."""
 
     theta: Array
     covariance: Array
@@ -62,11 +58,7 @@ class _Rows:
 
 
 def fit_law(stretches: Sequence[Stretch], structure: Structure, dt: float) -> LawFit:
-    """Fit the law by refined IV, or by simplified refined IV if the noise model contains model error (`MISFIT`).
-
-    ``stretches``: samples of one motor without saturation. Raises DataError if the motion does not determine a law of
-    this structure.
-    """
+    """Fit the law by refined IV, or by simplified refined IV if the noise model contains model error (`MISFIT`)."""
     refined = refined_iv(stretches, structure, dt)
     simplified = refined_iv(stretches, structure, dt, noise_model=False)
     miss, least = (_miss(stretches, structure, fit.theta, dt) for fit in (refined, simplified))
@@ -84,13 +76,8 @@ def refined_iv(
     """Fit the law by iteration over parameters and noise model (3.2.2, steps 1 to 5).
 
     Let ``a'`` be the pole of the last iteration and ``w`` the filtered part of the torque. Index f denotes the filter
-    ``1 / (1 - a' z^-1)``. Then ``nu + a' w_f(k-1) = U0 k + U1_f b + a w_f(k-1)`` is linear in ``k``, ``b`` and ``a``.
-    The regressor contains the measured ``w``, the instruments the simulated ``w``.
-
-    ``stretches``: samples of one motor without saturation. ``noise_model``: True: an AR model of the noise filters
-    regressor, instruments and target. False: the simplified method (SRIV), with a sandwich covariance for the
-    autocorrelation of its errors. ``iterations``: largest number of iterations. Raises DataError if the motion does not
-    determine a law of this structure.
+    ``1 / (1 - a' z^-1)``. Then ``nu + a' w_f(k-1) = U0 k + U1_f b + a w_f(k-1)`` is linear in ``k``, ``b``, ``a``. The
+    regressor has the measured ``w``, the instruments the simulated one. No ``noise_model``: SRIV, sandwich covariance.
     """
     size, noise, converged = structure.size, WHITE, False
     theta = _integral_start(stretches, structure, dt) if structure.integral else np.zeros(size)
@@ -114,10 +101,7 @@ def refined_iv(
 
 
 def _integral_start(stretches: Sequence[Stretch], structure: Structure, dt: float) -> Array:
-    """Start values (size,) by least squares, with independent integrals of error and velocity and no filter.
-
-    A law with integral action is not linear in its gains, and its error has several minima.
-    """
+    """Start values (size,) by least squares with independent integrals: the error has several minima."""
     plain = replace(structure, integral=False, filtered=None)
     rows, targets = [], []
     for number, s in enumerate(stretches):

@@ -21,10 +21,7 @@ RANK_TOLERANCE = 1e-7
 
 @dataclass(frozen=True)
 class Change:
-    """Candidate change of the plant.
-
-    ``directions``: change of the known parameters (k,) per unit of the parameters of the effect, shape (k, m).
-    """
+    """Candidate change of the plant; ``directions`` (k, m): change of the known parameters per unit of the effect's."""
 
     effect: Effect
     place: Place
@@ -33,21 +30,10 @@ class Change:
 
 @dataclass(frozen=True, eq=False)
 class BaselineComparison:
-    """A fit and a baseline, with the covariance of their difference.
+    """A fit and a baseline, with the covariance of their difference; ``known``: numbers of the baseline's k parameters.
 
-    Parameters
-    ----------
-    fit
-        Fit of the present recording.
-    known
-        Numbers of the parameters of the fit that the baseline has, (k,).
-    theta0, covariance0
-        Parameters of the baseline and their covariance, (k,) and (k, k).
-    covariance
-        Covariance of the difference, (k, k).
-    absorbed
-        Change of the parameters of the baseline by terms that it lacks, had these terms acted in its data, (k, m). It
-        is unknown if they acted, so differences along these directions are no evidence.
+    ``absorbed`` (k, m): change of the baseline by terms that it lacks. They may not have acted in its data, so
+    differences along these directions are no evidence.
     """
 
     fit: IvFit
@@ -71,10 +57,9 @@ class BaselineComparison:
         return out
 
     def solved(self, changes: Sequence[Change]) -> tuple[Array, Array, Array, float, int]:
-        """Parameters of changes by generalised least squares.
+        """Parameters of changes by generalised least squares (of `absorbed` first), and their covariance.
 
-        ``changes``: changes of the plant. Returns parameters (of `absorbed` first), covariance, mask of the parameters
-        that are estimable one by one, the remaining chi-square and its degrees of freedom.
+        Then the mask of those estimable one by one, the remaining chi-square and its degrees of freedom.
         """
         stack = np.column_stack([self.absorbed, *(c.directions for c in changes)])
         target = self.whitened(self.difference)
@@ -111,11 +96,7 @@ class BaselineComparison:
 
 
 def with_baseline(fit: IvFit, baseline: IdentificationDocument) -> BaselineComparison:
-    """Comparison of a fit with a baseline.
-
-    ``fit``: fit of the present recording; ``baseline``: document of an earlier identification. Raises DataError if the
-    baseline is of another model, or its covariance has another size.
-    """
+    """Comparison of a fit with a baseline, which must be of the same model and size (else DataError)."""
     names = fit.study.model.base.names
     rigid = names[: len(names) - fit.study.model.e]
     listed = [p.name for p in baseline.parameters]
@@ -143,9 +124,9 @@ def with_baseline(fit: IvFit, baseline: IdentificationDocument) -> BaselineCompa
 
 
 def conservative_fit(fit: IvFit) -> IvFit:
-    """Fit with conservative noise models: they include the part absorbed by the parameters, and their own uncertainty.
+    """Fit whose noise models include the part absorbed by the parameters and their own uncertainty.
 
-    A search compares candidates in one recording, and needs neither; two recordings are compared by covariances.
+    Needed where two recordings are compared by covariances; candidates of a search are compared in one recording.
     """
     for _ in range(COVARIANCE_PASSES - 1):
         fit = fit.renoised(noise_models(fit.equations.train, fit.theta, fit.covariance, MAX_AR_ORDER))

@@ -16,12 +16,7 @@ from armident.identify.regression.ar_noise import ArModel
 
 @dataclass(frozen=True, eq=False)
 class FittedCandidate:
-    """A candidate in the model, before it is compared with others.
-
-    ``candidate``, ``shapes``: the effect with its place, and its nonlinear parameters; ``entry``: entry of the effect
-    in the configuration; ``state``: model with the effect; ``allowed``: False if a linear parameter has a sign or a
-    size that physics does not allow.
-    """
+    """A fitted candidate; ``allowed`` is false if a linear parameter has a sign or a size that physics excludes."""
 
     candidate: Candidate
     shapes: Shapes
@@ -32,22 +27,10 @@ class FittedCandidate:
 
 @dataclass(frozen=True, eq=False)
 class Addition:
-    """A candidate in the model, compared with the model without it.
+    """A candidate in the model, compared with the model without it under the noise models of the step.
 
-    Parameters
-    ----------
-    state
-        Model with the effect, estimated with the weights of the step.
-    gain
-        Gain of log-likelihood over the model without it, with serial correlation beyond the noise models.
-    raw_gain
-        The same if the innovations had no correlation left.
-    log_likelihood
-        Log-likelihood of the model with the effect under the noise models of the step, which all candidates share.
-    share
-        Largest share of the power of a joint's predicted errors that it removes.
-    material_pct
-        Change of that joint's torque, percent of the root mean square of its torque.
+    ``raw_gain``: without serial correlation beyond them. ``share``: of a joint's error power that it removes, at most.
+    ``material_pct``: change of that joint's torque, percent of its root mean square.
     """
 
     fitted: FittedCandidate
@@ -98,20 +81,9 @@ class Addition:
 
 @dataclass(frozen=True, eq=False)
 class SelectionStep:
-    """Candidates that were added to one model, highest log-likelihood first.
+    """Candidates added to one model, ``state``, with its weights; highest log-likelihood first.
 
-    Parameters
-    ----------
-    state
-        Model without them, estimated with the same weights.
-    noise
-        Noise models of the step: those of the model with the highest likelihood of all, one for each joint.
-    ranked
-        Candidates in the model.
-    passing
-        Those that are significant, material and physically possible.
-    tests
-        Number of candidates and nonlinear parameters from which they were selected.
+    ``tests``: number of candidates and nonlinear parameters; ``passing``: the significant, material and possible ones.
     """
 
     state: ModelState
@@ -133,15 +105,9 @@ class SelectionStep:
 def compared_candidates(
     state: ModelState, made: Sequence[FittedCandidate], tests: int, passes: Callable[[Addition, int], bool]
 ) -> SelectionStep:
-    """Compare models with candidates, all estimated and scored under the same noise models.
+    """Compare models with candidates, all under the noise models of the most likely one that physics allows.
 
-    They are those of the most likely model that physics allows, each under noise models of its own residual without
-    smooth functions of the motion. Noise models of the model without the missing effect would take the effect for
-    noise, and so would those of a whole residual while other effects are missing.
-
-    ``state``: model without the candidates; ``made``: candidates in the model; ``tests``: number of candidates and
-    nonlinear parameters from which they were selected; ``passes``: ``(addition, tests)`` to True if an addition is
-    significant, material and physically possible.
+    Those of a residual without smooth functions of the motion; else they would take missing effects for noise.
     """
     noise = _noise_of_best([state, *(m.state for m in made if m.allowed)])
     alike = state.under(noise)
@@ -171,21 +137,14 @@ def _compared(state: ModelState, made: FittedCandidate, noise: tuple[ArModel, ..
 
 
 def gain(with_it: ModelState, without: ModelState) -> float:
-    """Gain of log-likelihood by an effect, under the noise models of the model with it.
-
-    Both models are estimated with the same weights.
-
-    ``with_it``, ``without``: models with and without the effect.
-    """
+    """Gain of log-likelihood by an effect, with the weights and noise models of the model with it."""
     return with_it.score.gain_over(without.under(with_it.fit.noise).score, with_it.score.own_noise)
 
 
 def materiality(without: ModelState, with_it: ModelState) -> tuple[float, float]:
     """Return the largest share of a joint's error power that an effect removes, and its torque in percent there.
 
-    Errors of joints on which the effect does not act may change, too, with the other parameters. They do not count.
-
-    ``without``, ``with_it``: models without and with the effect.
+    Joints on which the effect does not act change with the other parameters, and do not count.
     """
     before, after = without.score.rms, with_it.score.rms
     removed = np.where(acted_on(with_it, without), np.maximum(before**2 - after**2, 0.0), 0.0)

@@ -19,9 +19,7 @@ def model_with(
 ) -> FittedCandidate | None:
     """Return a candidate in the model; ``None`` if the motion does not determine the parameters.
 
-    ``state``: model without it. ``candidate``, ``shapes``: the effect with its place, and its nonlinear parameters.
-    ``starts``: values from which the correction of a recorded torque starts; empty for a term of the model. ``fitter``:
-    fits a model.
+    ``starts``: values from which the correction of a recorded torque starts; empty for a term of the model.
     """
     effect, whole = candidate.effect, known(candidate.effect.key)
     spared = (*(p.name for p in whole.linear if p not in effect.linear), *candidate.without)
@@ -45,11 +43,7 @@ def _corrected(
 ) -> FittedCandidate | None:
     """Model in which the recordings are corrected for an effect on a recorded torque.
 
-    The first-order expansion beside the corrected torque refines the value, until what remains is within its
-    standard deviation. Where that does not come about, the value with the largest gain is chosen.
-
-    ``state``: model without the effect; ``entry``: its entry without a value: the first-order expansion; ``fitter``:
-    fits a model.
+    The first-order expansion refines the value to within its standard deviation; else the largest gain decides.
     """
     name = candidate.effect.linear[0].name
     found: list[FittedCandidate] = []

@@ -27,11 +27,7 @@ Kept = tuple[Array, bool]
 
 @dataclass(frozen=True)
 class Candidate:
-    """An effect at a place, with the grid of its nonlinear parameters.
-
-    ``grid``: combinations of nonlinear parameters to try, as pairs of name and value; ``without``: linear parameters
-    that it leaves out, because the model has others with the same torque.
-    """
+    """An effect at a place; ``without``: linear parameters left out, as others of the model have the same torque."""
 
     effect: Effect
     place: Place
@@ -46,11 +42,7 @@ class Candidate:
 
 @dataclass
 class ColumnCache:
-    """Cache of the columns of candidates.
-
-    ``theta``: parameters (b,) that predict the torques on which effects depend; ``kept``: columns computed so far, by
-    effect, place, nonlinear parameters, part and signals.
-    """
+    """Cache of the columns of candidates; ``theta`` (b,) predicts the torques on which effects depend."""
 
     study: Study
     theta: Array
@@ -60,11 +52,7 @@ class ColumnCache:
     def instruments(
         self, effect: Effect, place: Place, shapes: Shapes, noise: Sequence[ArModel], *, keep: bool = True
     ) -> Array:
-        """Whitened columns (R, k) at the simulated signals of the training data, as the search uses them.
-
-        ``effect``, ``place``, ``shapes``: effect, its place and nonlinear parameters; ``noise``: noise model of each
-        joint.
-        """
+        """Whitened columns (R, k) at the simulated signals of the training data, as the search uses them."""
         return whitened(self.band(effect, place, shapes, "train", "simulated", keep=keep), noise)
 
     def motion(self, stretch: MotionStretch, kind: str) -> Motion:
@@ -86,23 +74,14 @@ class ColumnCache:
     def band(
         self, effect: Effect, place: Place, shapes: Shapes, part: str, kind: str, *, keep: bool = True
     ) -> tuple[Array, ...]:
-        """Columns in the band of the comparison, (M, n, k) of every stretch.
-
-        ``effect``, ``place``, ``shapes``: effect, its place and nonlinear parameters. ``part``, ``kind``: ``train`` or
-        ``held``; ``measured`` or ``simulated``.
-        """
+        """Columns (M, n, k) of every stretch in the band; ``train`` or ``held``, ``measured`` or ``simulated``."""
         (made,) = self._bands(effect, place, (shapes,), part, kind, keep=keep)
         return tuple(self._of_all_joints(columns, place) for columns in made)
 
     def grid(
         self, effect: Effect, place: Place, grid: Sequence[Shapes], noise: Sequence[ArModel], *, keep: bool = True
     ) -> list[tuple[int, Array]]:
-        """Instruments of a whole grid, (R, G k), with the number of every joint on which they act.
-
-        Whitened columns at the simulated signals of the training data, one combination of the grid after the other.
-
-        ``grid``: combinations of nonlinear parameters, G of them.
-        """
+        """Whitened columns (R, G k) of G combinations at the simulated training signals, with each joint's number."""
         made = self._bands(effect, place, grid, "train", "simulated", keep=keep)
         stretches = range(len(self.study.train))
         if made[0][0][1]:
@@ -172,10 +151,9 @@ class ColumnCache:
 
 
 def candidates(column_cache: ColumnCache) -> Iterator[Candidate]:
-    """All effects of the catalogue at all places of the robot that it does not have there already.
+    """All effects that the robot does not have at a place yet, and that this motion excites.
 
-    Left out are effects that only change parameters, exchanges of signals, and effects that this motion does not
-    excite.
+    Without effects that only change parameters, and exchanges of signals.
     """
     study = column_cache.study
     motion = column_cache.motion(study.train[0], "measured")

@@ -1,9 +1,7 @@
 """Test of the parameters of a baseline, and the changes of the plant that explain a difference.
 
-A fit and a baseline of the same plant differ by their errors alone: ``d = theta - theta_0`` has the covariance
-``S = C + C_0``. A change of the plant moves d along a few directions, ``d = B p``: those that the catalogue gives for
-a payload, other friction, another drive gain. Candidates compete by how well they explain d, and have to predict
-held-out torques better than the parameters of the baseline do.
+Of the same plant, ``d = theta - theta_0`` has the covariance ``S = C + C_0``. A change of the plant (payload, friction,
+drive gain) moves d along few directions, ``d = B p``. It must also predict held-out torques better than the baseline.
 """
 
 import re
@@ -19,7 +17,7 @@ from armident.identify.diagnosis.baseline_comparison import BaselineComparison, 
 from armident.identify.diagnosis.candidates import ColumnCache
 from armident.identify.diagnosis.changes import changes, p_value_of_change, ranked
 from armident.identify.diagnosis.precision import variance_of_sum
-from armident.identify.diagnosis.regression import IvFit, relative_torque_errors
+from armident.identify.diagnosis.regression import IvFit, relative_fit_errors
 from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.regression.multiple_testing import holm
 
@@ -30,26 +28,11 @@ Array = NDArray[np.float64]
 class NumbersFinding:
     """Change of the plant that explains why parameters differ from a baseline.
 
-    Parameters
-    ----------
-    effect, joint, other
-        Entry of the catalogue and its place, or ``changed_parameters`` if no entry explains the difference.
-    parameters, std
-        Changes against the baseline, as far as they are estimable one by one, and their standard deviations, which
-        include the uncertainty of the baseline.
-    p_value
-        Probability of so large a change without a change of the plant, corrected for the number of candidates.
-    gap_before, gap_after
-        Relative torque error on held-out data, percent, with the parameters of the baseline and all findings before
-        this one, and with this one: of the joint, or of all joints for an effect of the whole arm.
-    confidence
-        Its share of the posterior odds, times the probability that anything has changed.
-    ambiguous_with
-        Effects at odds of less than 20 to 1.
-    alternatives
-        Effect, joint and score (see `RankedChange`) of the candidates next to this one.
-    words
-        Description in plain language.
+    ``effect``: ``changed_parameters`` if no entry of the catalogue explains it. ``parameters``, ``std``: changes
+    estimable one by one; includes the uncertainty of the baseline. ``p_value``: corrected for the number of candidates.
+    ``gap_before``, ``gap_after``: relative torque error on held-out data, percent, without and with this finding: of
+    the joint, or of all for the whole arm. ``confidence``: share of the posterior odds times the probability of any
+    change. ``ambiguous_with``: effects at odds below 20 to 1.
     """
 
     effect: str
@@ -69,12 +52,7 @@ class NumbersFinding:
 def stale_numbers(
     fit: IvFit, column_cache: ColumnCache, baseline: IdentificationDocument, alpha: float = 0.01
 ) -> list[NumbersFinding]:
-    """Changes of the plant since a baseline was identified.
-
-    ``fit``: fit of the model with all findings in structure; ``column_cache``: cache of the columns of the same study;
-    ``baseline``: result of an earlier identification of the same robot; ``alpha``: probability of a false alarm. Raises
-    DataError if the baseline is of another model, or has no covariance.
-    """
+    """Changes of the plant since a baseline of the same robot was identified, at the false-alarm rate ``alpha``."""
     comparison = with_baseline(conservative_fit(fit), baseline)
     if not _stale(comparison, alpha):
         return []
@@ -131,7 +109,7 @@ def _closes(comparison: BaselineComparison, before: Sequence[Change], after: Seq
 def _held_out(comparison: BaselineComparison, before: Array, after: Array) -> float:
     """Projection of the held-out residual on the change of prediction, in standard deviations.
 
-    Its variance comes from the noise, from the remaining serial correlation (Newey-West), and from the baseline.
+    Its variance comes from the noise, its serial correlation (Newey-West), and the baseline.
     """
     x, z, y = comparison.fit.held
     change = z @ (after - before)
@@ -194,7 +172,7 @@ def _joint(fit: IvFit, change: Change) -> str:
 
 def _gap(fit: IvFit, theta: Array, change: Change) -> float:
     """Relative torque error on held-out data, percent, of the joint or of all."""
-    overall, each = relative_torque_errors(fit, theta, held=True)
+    overall, each = relative_fit_errors(fit, theta, held=True)
     return overall if change.effect.scope == "arm" else float(each[change.place.joint])
 
 
@@ -226,8 +204,8 @@ def _rest(comparison: BaselineComparison, found: Sequence[Change], alpha: float)
             parameters={name: rest for name, (_, rest, _) in zip(names, changed, strict=True)},
             std={name: std for name, (_, _, std) in zip(names, changed, strict=True)},
             p_value=p,
-            gap_before=relative_torque_errors(fit, before, held=True)[0],
-            gap_after=relative_torque_errors(fit, held=True)[0],
+            gap_before=relative_fit_errors(fit, before, held=True)[0],
+            gap_after=relative_fit_errors(fit, held=True)[0],
             confidence=1.0 - p,
             ambiguous_with=(),
             alternatives=(),

@@ -15,11 +15,7 @@ from armident.identify.regression.whitening import whitened
 
 @dataclass(frozen=True, eq=False)
 class RankedChange:
-    """Score of a candidate among others.
-
-    ``p_value``: probability that a candidate without merit reduces the chi-square as much; ``score``: gain in
-    log-likelihood, less the number of its parameters (Akaike), plus the logarithm of its prior odds.
-    """
+    """Score of a change: gain in log-likelihood, less its parameters (Akaike), plus the logarithm of its prior odds."""
 
     change: Change
     p_value: float
@@ -27,10 +23,7 @@ class RankedChange:
 
 
 def changes(comparison: BaselineComparison, column_cache: ColumnCache) -> Iterator[Change]:
-    """All effects that change parameters of the model, at all their places.
-
-    ``comparison``: fit and baseline; ``column_cache``: cache of the columns of the same study.
-    """
+    """All effects that change parameters of the model, at all their places."""
     fit = comparison.fit
     motion = column_cache.motion(fit.study.train[0], "measured")
     rigid = fit.theta.size - fit.study.model.e
@@ -51,10 +44,7 @@ def changes(comparison: BaselineComparison, column_cache: ColumnCache) -> Iterat
 
 
 def p_value_of_change(comparison: BaselineComparison, others: Sequence[Change], change: Change) -> float:
-    """Probability that a change without merit, added to others, reduces the chi-square as much.
-
-    ``comparison``: fit and baseline; ``others``: changes already present; ``change``: the tested change.
-    """
+    """Probability that a change without merit, added to others, reduces the chi-square as much."""
     _, _, _, before, free_before = comparison.solved(others)
     _, _, _, after, free_after = comparison.solved([*others, change])
     if free_before == free_after:

@@ -16,22 +16,11 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Confirmation:
-    """Comparison of two models on the report part.
+    """Comparison of two models on the report part, without and with an effect; relative errors in percent, (n,).
 
-    Parameters
-    ----------
-    p_value
-        Probability of so large a projection of the errors without the effect on the change by the effect, if the effect
-        is not there.
-    before, after
-        Relative errors without and with the effect, percent, (n,).
-    noiseless
-        Relative errors with the effect whose torque is computed at the simulated motion, percent, (n,): measured
-        positions that are differentiated twice for an effect may add more noise than it has torque.
-    acts
-        True for the joints on whose torques the effect acts, (n,).
-    whole_before, whole_after
-        Norms of the errors of all joints over that of their torques without and with the effect, percent.
+    ``noiseless``: errors with the torque of the effect at the simulated motion. Measured positions, differentiated
+    twice, may add more noise than the effect has torque. ``acts``: joints on whose torques it acts. ``whole_before``,
+    ``whole_after``: errors of all joints together.
     """
 
     p_value: float
@@ -61,7 +50,7 @@ class Confirmation:
     def reduction(self) -> float:
         """Mean logarithm of the factors by which the errors of each joint and of the whole arm fall, nats.
 
-        Joints differ in size, so that the norm of all alone would judge the largest.
+        The norm of all alone would judge the largest joint.
         """
         before, after = np.append(self.before, self.whole_before), np.append(self.best, self.whole_after)
         return float(np.mean(np.log(np.maximum(before, 1e-300) / np.maximum(after, 1e-300))))
@@ -80,12 +69,8 @@ class Confirmation:
 def confirmed(with_it: ModelState, without: ModelState) -> Confirmation:
     """Compare two models that differ in one effect on the report part.
 
-    The errors of the model without the effect are projected on the change of the prediction (Clark, West 2007, Journal
-    of Econometrics 138). The change is computed at the simulated motion, which is free of noise. The variance of the
-    coefficient comes from what the projection leaves, summed over blocks of time: whatever the serial correlation, and
-    also if the effect is strong in a part of the recording only.
-
-    ``with_it``, ``without``: models with and without the effect.
+    The errors without the effect are projected on its change of the prediction (Clark, West 2007, J. Econometrics 138)
+    at the noise-free simulated motion. Block sums of the rest give the variance for any serial correlation.
     """
     before, after = (state.fit.errors(state.fit.theta, held=True) for state in (without, with_it))
     if with_it.study.recorded == without.study.recorded:

@@ -1,8 +1,4 @@
-"""Screening of effects on recorded torques, such as delays, over the values of their parameter.
-
-A first-order expansion holds for small effects only: a delay is small if it is shorter than the fastest change of the
-torque.
-"""
+"""Screening of effects on recorded torques, such as delays, over values too large for a first-order expansion."""
 
 from collections.abc import Callable, Sequence
 
@@ -28,14 +24,9 @@ def screened_correction(
 ) -> tuple[float, tuple[float, float]]:
     """Score statistic of an effect on the recorded torque of a motor, and two values of its parameter to start from.
 
-    The statistic is the reduction of the squared whitened residual by the change of the torque that the model predicts
-    at the simulated motion, which has no noise. A correction changes the noise of a torque, too, and the smoothing of
-    the positions makes low-pass filtered noise look like a better model. The likelihood of the corrected torques is
-    therefore no evidence of an effect. It gives the second value, for effects that are so large that the predicted
-    torque is far from the true one.
-
-    ``fit``: fit of the model without the effect; ``candidate``: effect on a recorded torque, and its motor;
-    ``column_cache``: cache of the columns of the same fit.
+    The statistic is the reduction of the squared whitened residual by the change of the predicted torque at the
+    simulated, noise-free motion. The likelihood of corrected torques is no evidence: smoothing favours low-pass
+    filtered noise. It gives the second value, for effects so large that the predicted torque is far from the true one.
     """
     study, effect, motor = fit.study, candidate.effect, candidate.place.joint
     assert isinstance(effect, Correction)
@@ -67,10 +58,9 @@ def _at_simulated(
 
 
 def _likelihoods(fit: IvFit, effect: Correction, motor: int, limit: float, values: Sequence[float]) -> Array:
-    """Twice the log-likelihood of the torques that are corrected for each value, (k,), without a constant.
+    """Twice the log-likelihood (k,) of the torques corrected for each value, without a constant.
 
-    The other parameters are estimated again, and the noise model of the joint of the motor: a strong correction changes
-    the spectrum of its residual. Those of the other joints stay.
+    Parameters and the noise model of the motor's joint are estimated again: a strong correction changes its spectrum.
     """
     study, transmission = fit.study, fit.study.robot.transmission_matrix
     own = [s.torque @ np.linalg.inv(transmission)[:, motor] for s in study.train]

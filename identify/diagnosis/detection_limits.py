@@ -17,13 +17,9 @@ Array = NDArray[np.float64]
 
 
 def detection_limits(state: ModelState, step: SelectionStep | None) -> list[DetectionLimit]:
-    """Return the detection limits of the effects that are not in the model.
+    """Return the detection limits of single linear parameters of effects that the final model lacks.
 
-    Each linear parameter is treated by itself, at the nonlinear parameters that fit best. At the limit, the gain of
-    log-likelihood reaches the threshold of the selection with the probability `Criteria.detection_power`, and the error
-    of the joint falls by the share that a finding requires.
-
-    ``state``: model with all findings. ``step``: comparison of all effects in that model; ``None`` if it was not made.
+    At the limit, the gain reaches its threshold with `Criteria.detection_power`, and the joint's error falls by enough.
     """
     column_cache = ColumnCache(state.study, state.fit.theta)
     shapes = {} if step is None else {a.candidate.key: a.shapes for a in reversed(step.ranked)}

@@ -46,31 +46,12 @@ Progress = Callable[[str, float], None]
 
 @dataclass(frozen=True)
 class DiagnosisResult:
-    """Result of a diagnosis, with the curves of its report.
+    """Result of a diagnosis, with the curves of its report; held-out signals are (M,) or (M, n), SI.
 
-    Parameters
-    ----------
-    document
-        ``diagnosis.json`` without the path of the model.
-    robot
-        Configuration with the findings added.
-    t, measured, before, after
-        Held-out instants (M,), s, and torques (M, n), N m or N: measured, and of the model without and with the
-        findings.
-    lacking
-        Torques (M, n) of the model with all findings but one, for each finding of the document; ``None`` for a finding
-        that is not a part of the model (wiring, parameter changes).
-    own
-        Torques (M, n) of each finding itself, in the model with all; ``None`` for a finding that is no term of it.
-        They differ from ``after - lacking``, where the other parameters compensate for the finding.
-    q, qd
-        Held-out joint positions and velocities (M, n), rad and rad/s, or m and m/s.
-    where
-        Dependences of the residual of the model as configured.
-    left
-        Dependences of the residual of the model with the findings.
-    simulated
-        Errors of the simulated closed loop before and after.
+    ``robot``: configuration with the findings. ``before``, ``after``: torques of the model without and with the
+    findings. ``lacking``: torques with all findings but one; ``own``: torques of each finding itself. They are ``None``
+    for findings outside the model. ``after - lacking`` differs from ``own``: other parameters compensate. ``where``,
+    ``left``: dependences of the residual without and with the findings.
     """
 
     document: DiagnosisDocument
@@ -101,27 +82,10 @@ def run_diagnosis(
 ) -> DiagnosisResult:
     """Find the effects that a model lacks by stepwise selection.
 
-    Returns the document, configuration with the findings, and curves. Raises DataError if the recordings cannot support
-    a diagnosis.
-
-    Parameters
-    ----------
-    training
-        Experiments to fit and to select effects by.
-    validation
-        Experiments of the report part; without them the last part of the training experiments is the report part.
-    recordings
-        References to the recordings of the experiments, for the document.
-    baseline
-        Identification whose parameters are tested for change.
-    notes
-        Messages of the conversion, for the document's warnings.
-    progress
-        Called with a stage and the share done, 0 to 1.
-    criteria
-        Thresholds; ``None``: the defaults.
-    time_limit_s
-        Wall-clock time after which the selection ends with what it has found, s; ``None``: without limit.
+    Without ``validation`` the last part of the training experiments is the report part. ``baseline``: identification
+    whose parameters are tested for change. ``notes``: messages of the conversion, for the warnings. ``progress``:
+    called with a stage and the share done, 0 to 1. After ``time_limit_s`` of wall-clock time the selection ends with
+    what it has found.
     """
     deadline = float("inf") if time_limit_s is None else time.monotonic() + time_limit_s
     # Threads gain little on tall and narrow matrices, and round otherwise.

@@ -12,7 +12,7 @@ from armident.identify.diagnosis.criteria import Criteria
 from armident.identify.diagnosis.model_state import ModelState
 from armident.identify.diagnosis.next_experiment import recommended_experiment
 from armident.identify.diagnosis.precision import standard_deviations
-from armident.identify.diagnosis.regression import relative_torque_errors
+from armident.identify.diagnosis.regression import relative_fit_errors
 from armident.identify.diagnosis.selected import Selected
 from armident.identify.documents.diagnosis import Alternative, Finding, Gap, Negligible, NotVisible, Unexplained
 from armident.identify.effects.effect import Effect
@@ -82,11 +82,7 @@ def _finding(final: ModelState, one: Selected, parameters: Mapping[str, float], 
 def less_certain(findings: Sequence[Finding], left: Sequence[Unexplained]) -> list[Finding]:
     """Return findings whose confidence allows for an effect outside the catalogue.
 
-    Odds compare the effects of the catalogue. What depends on the motion and has no name may be the rest of another
-    effect, of which a finding has taken a part. Of the power of its joint's error that is known not to be noise, the
-    finding explains a share. That share limits the probability of its name; a term without a name claims no cause.
-
-    ``findings``: findings of the selection; ``left``: unexplained dependences of the residual of the final model.
+    It is at most the share of the error's known non-noise power that the finding explains, unless it has no name.
     """
     known_shares = _known_shares(left)
     found = []
@@ -110,10 +106,7 @@ def _known_shares(left: Sequence[Unexplained]) -> dict[str, float]:
 def tempered_odds(step: SelectionStep, one: Addition) -> dict[Key, float]:
     """Return the posterior odds of each other effect in place of one, whatever its law, with equal prior odds.
 
-    Differences of log-likelihood are reduced by the serial correlation that the noise models leave: the gain of the
-    effect with it over that without it.
-
-    ``step``: step of the selection.
+    Differences of log-likelihood are reduced by the serial correlation that the noise models leave.
     """
     factor = float(np.clip(one.gain / one.raw_gain, 0.0, 1.0)) if one.raw_gain > 0.0 else 1.0
     odds: dict[Key, float] = {}
@@ -140,11 +133,7 @@ def negligible(
     step: SelectionStep | None,
     immaterial: Sequence[Addition] = (),
 ) -> list[Negligible]:
-    """Return the effects that are significant, and no cause: too small, or within the sampling convention of drives.
-
-    ``conventional``: effects of the selection within the sampling convention. ``step``: comparison of all effects in
-    it; ``None`` if it was not made. ``immaterial``: effects that change too little of the report part.
-    """
+    """Return the significant effects that are no cause: too small, or within the sampling convention of drives."""
     found: dict[Key, Negligible] = {}
     small = [*(one.addition for one in conventional), *immaterial]
     if step is not None:
@@ -165,7 +154,7 @@ def negligible(
 
 def gap_of(state: ModelState, *, held: bool) -> Gap:
     """Relative torque errors of a model. ``held``: True for the held-out data, false for the training data."""
-    overall, each = relative_torque_errors(state.fit, held=held)
+    overall, each = relative_fit_errors(state.fit, held=held)
     errors = np.concatenate(state.fit.errors(state.fit.theta, held=held))
     rms = np.sqrt(np.mean(errors**2, axis=0))
     joints = state.study.joints
@@ -177,10 +166,7 @@ def gap_of(state: ModelState, *, held: bool) -> Gap:
 
 
 def noise_floor(final: ModelState, left: Sequence[Unexplained]) -> Gap:
-    """Return the remaining error on the held-out data, less the shares that are known not to be noise.
-
-    ``left``: dependences of its residual.
-    """
+    """Return the remaining held-out error, less the shares that are known not to be noise."""
     gap = gap_of(final, held=True)
     known_shares = {name: 0.0 for name in gap.by_joint} | _known_shares(left)
     by_joint = {name: error * float(np.sqrt(1.0 - known_shares[name])) for name, error in gap.by_joint.items()}
@@ -191,10 +177,9 @@ def noise_floor(final: ModelState, left: Sequence[Unexplained]) -> Gap:
 
 
 def undetectable(state: ModelState, hidden: frozenset[Key]) -> list[NotVisible]:
-    """Return the effects of the catalogue that this motion cannot show at some joint, with the reason.
+    """Return the effects that this motion cannot show at some joint, with the reason.
 
-    ``state``: model as configured; ``hidden``: effects and places that the model contains or the motion does not
-    excite.
+    ``hidden``: effects and places that the model contains or the motion does not excite.
     """
     study = state.study
     motion = ColumnCache(study, state.fit.theta).motion(study.train[0], "measured")
@@ -241,10 +226,7 @@ def changed_parameters(numbers: Sequence[NumbersFinding]) -> list[Finding]:
 
 
 def experiment_to_separate(findings: Sequence[Finding], criteria: Criteria) -> str | None:
-    """Return the experiment that separates a finding from a close rival or raises a low confidence.
-
-    ``findings``: findings of a diagnosis. Returns ``None`` if none is needed.
-    """
+    """Return the experiment that separates a finding from a close rival or raises a low confidence, if needed."""
     named = [f for f in findings if f.effect in catalogue()]
     for finding in named:
         rivals = [known(name) for name in finding.evidence.get("ambiguous_with", [])]

@@ -31,11 +31,9 @@ POINTS = 121
 
 @dataclass(frozen=True)
 class FreeFunction:
-    """Set of basis functions of one variable, for the residual of one joint (thesis 7.3.2).
+    """Basis functions of one variable from ``low`` to ``high``, for a joint's residual (thesis 7.3.2).
 
-    ``other``: joint or motor to which the variable belongs, if it is another one. ``knots``: knots of the hat
-    functions, increasing; for an angle the wave numbers; for the time the time constant, s. ``low``, ``high``: range of
-    the curve.
+    ``other``: joint or motor of the variable, if another. ``knots``: of hats; wave numbers of angles; time constant, s.
     """
 
     joint: int
@@ -65,10 +63,7 @@ class FreeFunction:
         return signal if signal.ndim == 1 else signal[:, self.joint if self.other is None else self.other]
 
     def basis(self, x: Array, side: Array) -> Array:
-        """Basis functions, (N, k).
-
-        ``x``: values of the variable, (N,); ``side``: smoothed sign of the velocity of the joint, (N,).
-        """
+        """Basis functions (N, k) of values ``x`` (N,) and the smoothed sign ``side`` (N,) of the joint's velocity."""
         if self.kind == "velocity":
             speed = hats(np.abs(x), self.knots)
             return np.concatenate([speed * (0.5 + 0.5 * side)[:, None], speed * (0.5 - 0.5 * side)[:, None]], axis=1)
@@ -98,10 +93,7 @@ class FreeFunction:
 
 
 def free_functions(study: Study, motions: Sequence[Motion], joint: int) -> Iterator[FreeFunction]:
-    """All sets of functions for the residual of one joint.
-
-    ``study``: data with the robot; ``motions``: the training stretches at simulated signals.
-    """
+    """All sets of functions for the residual of one joint, from the training stretches at simulated signals."""
     top = max(float(np.abs(m.qd[:, joint]).max()) for m in motions)
     if top > 0:
         yield FreeFunction(joint, "velocity", None, tuple(top * share for share in SIDE), -top, top)
@@ -153,11 +145,7 @@ def _of_angle(study: Study, joint: int, motor: int, motions: Sequence[Motion]) -
 
 
 def in_band(study: Study, motion: Motion, functions: Sequence[FreeFunction]) -> dict[tuple[object, ...], Array]:
-    """Basis functions along a motion in the band of the comparison, (M, k) of every key.
-
-    ``study``: data with the filter; ``motion``: motion of the arm, at the working rate; ``functions``: sets of
-    functions of all joints.
-    """
+    """Basis functions (M, k) of every key along a motion at the working rate, in the band of the comparison."""
     unique = {f.key: f for f in functions}
     made = [f.columns(motion) for f in unique.values()]
     ends = np.cumsum([columns.shape[1] for columns in made])[:-1]

@@ -1,11 +1,8 @@
-"""Lack of fit: dependences of the residual of each joint on free functions of the reference motion (thesis 7.3.2).
+"""Lack of fit: dependences of each joint's residual on free functions of the simulated motion (thesis 7.3.2).
 
-The residual is that at measured signals; the functions are evaluated at the simulated motion of the closed loop, in
-which measurement noise has no part. They are orthogonal to the regressor of the model, so that errors of its parameters
-cancel. The shape is fitted on the training data, smoothed by likelihood, and tested by its prediction of the held-out
-residual. Noise models come from the residual beyond these functions: an autoregressive model of a residual that
-contains a missing effect takes the effect for noise. Serial correlation beyond the order of that model is contained in
-block sums (Kuensch 1989, Annals of Statistics 17(3)).
+The functions are free of noise and orthogonal to the regressor. The residual beyond them gives the noise models, which
+would otherwise take a missing effect for noise. Block sums contain further serial correlation (Kuensch 1989, Annals of
+Statistics 17(3)).
 """
 
 from collections.abc import Sequence
@@ -48,11 +45,7 @@ class Fitted(Protocol):
 
 @dataclass(frozen=True)
 class Curve:
-    """A shape with its uncertainty.
-
-    ``x``: values of the variable, (G,); ``value``: missing torque of the model there, N m or N, (G,); ``band``: two
-    standard deviations, (G,).
-    """
+    """Missing torque ``value`` (G,) at ``x`` (G,), N m or N, with two standard deviations ``band`` (G,)."""
 
     x: Array
     value: Array
@@ -61,20 +54,11 @@ class Curve:
 
 @dataclass(frozen=True)
 class ResidualDependence:
-    """Dependence of one joint's residual on one variable.
+    """Dependence of one joint's residual on one variable; ``other``: joint or motor of the variable, if another one.
 
-    Parameters
-    ----------
-    kind, other
-        Variable; the joint or motor to which it belongs, if it is another one.
-    share
-        Share of the power of the joint's held-out residual that the dependence, fitted on the training data, predicts.
-        For a frequency: share of the residual at the working rate.
-    p_value
-        Probability of so clear a result without the dependence, of this one test.
-    curve
-        Its shape. For a frequency: the spectrum around it. For the motion: the root of the spectral density of the
-        residual, per root of a hertz, with that of the residual without the dependence as band.
+    ``share``: share of the power of the held-out residual that the training shape predicts; for a frequency, of that at
+    the working rate. ``p_value``: of this one test. ``curve``: for a frequency the spectrum around it. For the motion
+    the root of the residual's spectral density, with that without the dependence as band.
     """
 
     joint: str
@@ -110,19 +94,14 @@ class ResidualDependence:
 
 
 def dependences(state: Fitted) -> tuple[ResidualDependence, ...]:
-    """Significant dependences of the residual, at most one for each joint and variable, largest share first.
-
-    ``state``: fitted model.
-    """
+    """Significant dependences of the residual, at most one for each joint and variable, largest share first."""
     return LackOfFit(state.fit).dependences
 
 
 def unexplained(state: Fitted) -> tuple[ResidualDependence, ...]:
     """Significant and material dependences, each in addition to the ones before it, largest share first.
 
-    A variable that is merely correlated with a stronger one (speed with torque, for example) is not listed again.
-
-    ``state``: fitted model.
+    So a variable correlated with a stronger one (speed with torque, for example) is not listed again.
     """
     return LackOfFit(state.fit).unexplained
 
@@ -354,10 +333,7 @@ class LackOfFit:
 def limited(residual: Array, joints: Sequence[slice], deviations: float) -> Array:
     """Return whitened residuals (R,) limited to a number of robust standard deviations of each joint.
 
-    About a reversal the sign of a measured velocity is uncertain, and with it the whole dry friction. A few samples
-    there would outweigh all others.
-
-    ``residual``: whitened residuals of all joints, (R,); ``joints``: rows of each joint.
+    Signs of measured velocities are uncertain at reversals: a few errors of dry friction would outweigh all others.
     """
     found = residual.copy()
     for rows in joints:

@@ -27,10 +27,7 @@ offset and all functions of a table over a predicted torque may do, it belongs t
 
 @dataclass(frozen=True, eq=False)
 class Equations:
-    """Equations in the band of the comparison, computed when they are first used.
-
-    ``theta``: parameters (b,) that predict the torques on which terms depend; ``None`` if no term does.
-    """
+    """Equations in the band; ``theta`` (b,) predicts the torques on which terms depend (``None`` if no term does)."""
 
     study: Study
     theta: Array | None
@@ -64,10 +61,7 @@ class Equations:
         return self._part("joints", lambda: tuple(JointEquations.of(self.train, j, copied=True) for j in joints))
 
     def of_study(self, study: Study) -> "Equations":
-        """Equations of the same training part with another held-out part.
-
-        ``study``: data with the same training stretches.
-        """
+        """Equations of the same training part with another held-out part."""
         parts = self._parts
         if study.held is not self.study.held:
             parts = {name: part for name, part in parts.items() if name != "held"}
@@ -89,12 +83,9 @@ class Equations:
 
 
 def regressors(study: Study, stretch: MotionStretch, theta: Array | None) -> tuple[Array, Array]:
-    """Regressor (M, n, b) at measured and at simulated signals, in the band of the comparison.
+    """Regressors (M, n, b) at measured and at simulated signals in the band; ``theta`` (b,) predicts torques for terms.
 
-    Effects that depend on accelerations or torques are computed at simulated signals in both. Effects with jumps, which
-    a simulation does not reproduce to the sample, are computed at measured signals in both.
-
-    ``theta``: parameters (b,) that predict the torques on which terms depend; ``None`` if no term does.
+    Effects of accelerations or torques are simulated in both; effects with irreproducible jumps measured in both.
     """
     model = study.model
     terms = effect_terms(model)
@@ -118,11 +109,7 @@ def regressors(study: Study, stretch: MotionStretch, theta: Array | None) -> tup
 
 @dataclass(frozen=True)
 class _Signals:
-    """One kind of signals of a stretch, with the regressors computed from them.
-
-    ``kind``: ``measured`` or ``simulated``. ``theta``: parameters of the rigid model that predict the torques on which
-    terms depend; ``None`` if no term does.
-    """
+    """Signals of a stretch, ``measured`` or ``simulated``, with their regressors; ``theta``: rigid model, for terms."""
 
     study: Study
     stretch: MotionStretch
@@ -149,10 +136,7 @@ class _Signals:
         return self.study.regressors.get(key, made)[0]
 
     def fill(self, term: Term, out: Array) -> None:
-        """Write the columns of a term in the band of the comparison; those of one joint are filtered alone.
-
-        ``term``: term of the model; ``out``: output array, (M, n, k).
-        """
+        """Write the columns (M, n, k) of a term in the band; columns of one joint are filtered alone."""
         signals, model = self._signals, self.study.model
         torques = (model.base.names[: -model.e or None], self._theta_bytes) if term.depends_on_torque else None
         place = (term.effect.key, term.place.joint, term.place.other, tuple(term.shapes.items()), term.kept)

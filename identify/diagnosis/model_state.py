@@ -54,10 +54,7 @@ class ModelState:
         return PredictiveScore(self.fit)
 
     def release(self) -> None:
-        """Free the memory of the equations; predictive score, parameters and simulated motion stay.
-
-        A selection compares hundreds of models, of which it uses few again.
-        """
+        """Free the memory of the equations; predictive score, parameters and simulated motion stay."""
         self.score.keep_errors()
         self.fit.release()
         for other in self._under.values():
@@ -65,10 +62,9 @@ class ModelState:
 
     @cached_property
     def weights(self) -> tuple[ArModel, ...]:
-        """Noise models of the residual without smooth functions of the motion, one for each joint.
+        """Noise models of the residual without smooth functions of the motion, one for each joint, for all candidates.
 
-        Noise models of the residual itself would take missing effects for noise. All candidates for this model are
-        fitted and compared under these.
+        Noise models of the residual itself would take missing effects for noise.
         """
         return tuple(noise_beyond_shapes(self.fit, ColumnCache(self.study, self.fit.theta)))
 
@@ -78,10 +74,7 @@ class ModelState:
         return self.fit.own_noise(MAX_AR_ORDER)
 
     def under(self, noise: tuple[ArModel, ...]) -> "ModelState":
-        """The model fitted under given noise models, so that it can be compared with another one fitted under them.
-
-        ``noise``: noise model of each joint.
-        """
+        """The model fitted under given noise models, so that it can be compared with another one fitted under them."""
         if all(one is own for one, own in zip(noise, self.fit.noise, strict=True)):
             return self
         if noise not in self._under:
@@ -103,17 +96,11 @@ class ModelState:
         return self.fit.theta[own], np.sqrt(np.maximum(np.diag(self.fit.covariance)[own], 0.0))
 
     def term_of(self, entry: Entry) -> Term:
-        """Term of an entry of the configuration.
-
-        ``entry``: entry that is a term of the model, and no correction of the recordings.
-        """
+        """Term of a configuration entry that is no correction of the recordings."""
         return self.terms[[e for e in self.robot.effects if not of_recording(e)].index(entry)]
 
     def with_values(self, shapes: Mapping[int, Mapping[str, float]] | None = None) -> RobotConfig:
-        """Configuration with the estimated values in its effect entries.
-
-        ``shapes``: other nonlinear parameters, by number of the entry and name.
-        """
+        """Configuration with the estimated values in its effect entries, or other nonlinear ``shapes`` by entry."""
         entries: list[Entry] = list(self.robot.effects)
         for k, entry in enumerate(entries):
             if of_recording(entry):
@@ -131,12 +118,9 @@ Fitter = Callable[[RobotConfig, ModelState], ModelState | None]
 
 
 def fitted(study: Study, robot: RobotConfig, before: ModelState | None) -> ModelState:
-    """Fit the model of a configuration in the closed loop that it makes.
+    """Fit the model of a configuration in its own closed loop, with torques for terms and noise models of ``before``.
 
-    ``study``: data with another model of the same recordings. ``before``: earlier model. Its rigid parameters predict
-    the torques on which terms depend, and its residual gives the noise models. ``None``: fit a rigid model first, and
-    alternate between parameters and noise models. Raises DataError if the motion does not determine the parameters of
-    the model.
+    ``None``: fit a rigid model first, and alternate between parameters and noise models.
     """
     changed = study.of_robot(robot)
     model = changed.model
@@ -160,11 +144,7 @@ def fitted(study: Study, robot: RobotConfig, before: ModelState | None) -> Model
 
 
 def fitted_in_loop_of(before: ModelState, robot: RobotConfig) -> ModelState | None:
-    """Fit the model of a configuration with the simulated motion of another one: quick, for small changes of the model.
-
-    ``before``: model of the same recordings, with its loop. Returns ``None`` if the motion does not determine the
-    parameters of the model.
-    """
+    """Fit a model with the simulated motion of another one: quick, for small changes; ``None`` if undetermined."""
     study = before.study.of_robot(robot)
     try:
         return ModelState(fit_model(study, rigid_parameters(before.fit, study.model), before.weights))
@@ -185,12 +165,9 @@ def without_entry(robot: RobotConfig, entry: Entry) -> RobotConfig:
 
 
 def with_own_noise(state: ModelState) -> ModelState:
-    """Return a model fitted with the noise models of its own residual, in which no effect is missing any more.
+    """Return a model fitted with the noise models of its own residual, in which no effect should be missing any more.
 
-    If something is missing all the same, they take it for noise. The model stays as it is if it predicts with smaller
-    errors: the mean of their logarithms, as joints differ in size.
-
-    ``state``: model of the selection, fitted with the noise models of an earlier one.
+    It stays as it is if it predicts with smaller errors: mean of their logarithms, as joints differ in size.
     """
     own = ModelState(safe(state.fit.renoised(state.own_noise)))
     sizes = (float(np.log(np.maximum(one.score.rms, 1e-300)).sum()) for one in (own, state))
@@ -203,26 +180,17 @@ def with_first_motions(state: ModelState) -> ModelState:
 
 
 def with_references(state: ModelState) -> ModelState:
-    """Return a model with whose rigid parameters its successors are compared at joints with much measurement noise.
-
-    ``state``: model to which nothing is added yet.
-    """
+    """Return the base model with the rigid parameters that successors use at joints with much measurement noise."""
     return state.of_study(replace(state.study, references=references_of(state.fit)))
 
 
 def with_report_part(state: ModelState) -> ModelState:
-    """Return a model whose loop is simulated for the report part, too.
-
-    The selection simulates the training part alone.
-    """
+    """Return a model whose loop is simulated for the report part, too."""
     return state.of_study(state.study.with_report_part(state.fit.theta))
 
 
 def viscous_friction_rises(state: ModelState, term: Term) -> bool:
-    """False if a term makes the viscous friction of its joint fall with the speed, beyond two standard deviations.
-
-    Friction that falls with the speed is Stribeck friction; a viscous friction never does.
-    """
+    """False if the viscous friction of a term's joint falls with the speed (Stribeck) by two standard deviations."""
     slopes, names = term.effect.viscous_slope(term.shapes)[list(term.kept)], state.study.model.base.names
     viscous = f"fv{term.place.joint + 1}"
     if not slopes.any() or viscous not in names:
@@ -235,12 +203,7 @@ def viscous_friction_rises(state: ModelState, term: Term) -> bool:
 
 
 def acted_on(with_it: ModelState, without: ModelState) -> NDArray[np.bool_]:
-    """Return the joints on whose torques the terms act that a model has and another one has not, (n,).
-
-    All joints if the models differ in a correction of the recordings.
-
-    ``with_it``, ``without``: models with and without an effect.
-    """
+    """Return the joints (n,) on whose torques the terms differ between two models; all if their corrections differ."""
     known = set(without.study.model.base.names)
     added = [k for k, name in enumerate(with_it.study.model.base.names) if name not in known]
     joints = with_it.fit.equations.joints

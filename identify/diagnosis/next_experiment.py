@@ -20,11 +20,7 @@ CONTAINS = {
 
 
 def recommended_experiment(effect: Effect, joint: str, rivals: Sequence[Effect] = ()) -> str:
-    """Return the experiment that raises the confidence of a finding or separates it from its nearest alternative.
-
-    ``effect``, ``joint``: effect found, and the joint's name; ``rivals``: effects that explain the recording nearly as
-    well, best first.
-    """
+    """Return the experiment that raises the confidence of a finding or separates it from its rivals (best first)."""
     others = [rival for rival in rivals if rival.name != effect.name]
     kinds = list(dict.fromkeys(tag for e in (effect, *others[:1]) for tag in e.excitation))
     parts = [CONTAINS.get(tag, tag) for tag in kinds]

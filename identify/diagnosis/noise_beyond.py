@@ -1,9 +1,7 @@
 """Noise models of a residual of which functions that a missing effect may follow have been taken out.
 
-An autoregressive model of a residual that contains a missing effect takes the effect for noise and whitens it away. The
-weight of a spring, for example, is forty times too small. The selection takes out smooth functions of each joint's own
-motion (`noise_beyond_shapes`). The lack of fit takes out the dependences that it finds (`noise_beyond`); there, the
-expected autocovariances of the noise that least squares removes with them are added.
+Otherwise they whiten the effect away: the weight of a spring, for example, is forty times too small. The selection uses
+`noise_beyond_shapes` (smooth functions of a joint's motion), the lack of fit `noise_beyond` (dependences found).
 """
 
 from collections.abc import Sequence
@@ -31,13 +29,9 @@ RANK = 1e-8
 
 
 def noise_beyond(errors: Sequence[Array], functions: Sequence[Array]) -> ArModel:
-    """Autoregressive noise model of one joint, of the residual beyond some functions.
+    """Autoregressive noise model of one joint, of the residual (M,) of every stretch beyond functions (M, k).
 
-    Least squares removes noise in the directions of the functions, which are those of low frequency. The expected
-    autocovariances of this part, by the noise model itself, are added.
-
-    ``errors``: residual, (M,) of every stretch, zero where the joint stands still; ``functions``: instruments of the
-    model and functions of the effects, (M, k) of every stretch.
+    Expected autocovariances of the noise that least squares removes with them, by the model itself, are added.
     """
     span = _orthonormal(functions)
     inside = sum(q.T @ e for q, e in zip(span, errors, strict=True))
@@ -70,8 +64,7 @@ def _orthonormal(columns: Sequence[Array]) -> list[Array]:
 def _taken(noise: ArModel, span: Sequence[Array], highest: int) -> Array:
     """Expected sums of lagged products, lags 0 to ``highest``, that least squares on a span takes out of noise.
 
-    They are the sums along the diagonals of ``P W + W P - P W P``, with the projector P on the span and the covariance
-    matrix W of the noise.
+    Sums along the diagonals of ``P W + W P - P W P``: projector P on the span, covariance W of the noise.
     """
     size = fft.next_fast_len(2 * max(q.shape[0] for q in span), real=True)
     gain = np.fft.rfft(np.append(1.0, noise.coefficients), size)

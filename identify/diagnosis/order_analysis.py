@@ -1,8 +1,4 @@
-"""Order analysis: torque ripple that is periodic in an angle, at any real order.
-
-The spectrum of the residual over the angle instead of over time: samples are summed in bins of the angle, and a fast
-Fourier transform of the bins gives every order at once. Orders stand out against the median of their neighbourhood.
-"""
+"""Order analysis: torque ripple at any real order of an angle, by a fast Fourier transform of bins of the angle."""
 
 from collections.abc import Sequence
 
@@ -31,12 +27,7 @@ PEAKS = 3
 def strongest_orders(
     angle: Sequence[Array], residual: Sequence[Array], highest: float, lowest: float = 0.0
 ) -> list[tuple[float, float]]:
-    """Return the strongest orders of a residual over an angle, with their power over the background, strongest first.
-
-    ``angle``: angles of every stretch, rad (m for a prismatic joint), (N,) each; ``residual``: residual torques,
-    N m or N, (N,) each; ``highest``: highest order, cycles per 2 pi of the angle. Returns orders (cycles per 2 pi), and
-    power over the median of the neighbourhood; at most `PEAKS`.
-    """
+    """Return the `PEAKS` strongest orders, cycles per 2 pi of the angle, with power over the neighbourhood's median."""
     low = min(float(a.min()) for a in angle)
     span = max(float(a.max()) for a in angle) - low
     if span <= 0.0 or highest <= lowest:
@@ -68,10 +59,7 @@ def strongest_orders(
 
 
 def motor_orders(study: Study, theta: Array, motor: int) -> tuple[Shapes, ...]:
-    """Return the orders of the strongest ripples of a residual over the angle of a motor, as a grid of an effect.
-
-    ``theta``: parameters of the model, (b,); ``motor``: index of the motor, from 0.
-    """
+    """Return the orders of the strongest ripples of a residual over the angle of a motor, as a grid of an effect."""
     ratios = study.robot.transmission_matrix[motor]
     joint = int(np.argmax(np.abs(ratios)))
     residual = [s.torque[:, joint] - study.torques(s, "measured", theta)[:, joint] for s in study.train]
@@ -88,10 +76,7 @@ def motor_orders(study: Study, theta: Array, motor: int) -> tuple[Shapes, ...]:
 
 
 def nearby_orders(study: Study, motor: int, order: float) -> tuple[Shapes, ...]:
-    """Return orders close to one order, at a sixteenth of the resolution of the motion.
-
-    ``motor``: index of the motor, from 0; ``order``: cycles per 2 pi of the angle of the motor.
-    """
+    """Return orders (cycles per 2 pi of the motor's angle) close to one, at a sixteenth of the motion's resolution."""
     apart = _resolution(study, motor)
     return tuple((("harmonic", order + k * apart / 16),) for k in range(-3, 4))
 

@@ -30,11 +30,8 @@ STEP = 0.01
 def standard_deviations(state: ModelState) -> dict[int, dict[str, float]]:
     """Standard deviations of all parameters of every effect of the model, by the number of its entry and their names.
 
-    The derivative of the torque with respect to a nonlinear parameter is one more column (Gauss-Newton). Its
-    uncertainty thus enters that of the linear ones. The value of a correction of the recordings has the column of its
-    first-order term. Parameters from a set of whole numbers count as known. The residual
-    is no white noise where an effect is only approximately right. The variances are then those of the residual along
-    the influence of each parameter, if they are larger (Newey, West 1987, Econometrica 55(3)).
+    Nonlinear parameters (Gauss-Newton) and corrections are further columns; whole numbers count as known. If larger,
+    the variances along the influence of each parameter count (Newey, West 1987, Econometrica 55(3)).
     """
     fit, terms = state.fit, _terms(state)
     slopes, owners = _further_columns(state)
@@ -51,11 +48,7 @@ def standard_deviations(state: ModelState) -> dict[int, dict[str, float]]:
 def p_value_of_effect(state: ModelState, entry: Entry) -> float:
     """Probability of linear parameters of an effect so far from zero if it is not there (Wald's test).
 
-    Their covariance is that of `standard_deviations` with the nonlinear parameters of the effect as they are: without
-    it, they mean nothing. The nonlinear parameters of all others are free. The likelihood of a model can rise without
-    such evidence: corrected torques have other noise, and the time at which dry friction reverses is uncertain.
-
-    ``entry``: its entry in the configuration.
+    Its own nonlinear parameters are fixed: without it, they mean nothing. A likelihood can rise without such evidence.
     """
     number = list(state.robot.effects).index(entry)
     every, owners = _further_columns(state)
@@ -128,10 +121,7 @@ def _slope(column_cache: ColumnCache, noise: Sequence[ArModel], term: Term, name
 
 
 def _deviations(fit: IvFit, slopes: list[Array]) -> Array:
-    """Standard deviations of the model's own parameters and of further ones with columns ``slopes``, (b + s,).
-
-    Those of the rigid model stay as they are (4.34).
-    """
+    """Standard deviations (b + s,) of the model's own parameters (4.34) and of further ones with columns ``slopes``."""
     b, e = fit.theta.size, fit.study.model.e
     variances: Array = np.concatenate([np.diag(fit.covariance), np.zeros(len(slopes))])
     if e or slopes:
@@ -141,10 +131,7 @@ def _deviations(fit: IvFit, slopes: list[Array]) -> Array:
 
 
 def _covariances(fit: IvFit, slopes: list[Array], own: list[int]) -> tuple[Array, Array]:
-    """Covariances (k, k) of some parameters beside further ones with columns ``slopes``.
-
-    The first is that of white innovations, the second that of the residual along the influence of each parameter.
-    """
+    """Covariances (k, k) of parameters beside columns ``slopes``: white innovations, then along each influence."""
     b = fit.theta.size
     z = np.column_stack([fit.instruments, *slopes])
     scale = np.linalg.norm(z, axis=0)
@@ -162,8 +149,5 @@ def _covariances(fit: IvFit, slopes: list[Array], own: list[int]) -> tuple[Array
 
 
 def variance_of_sum(products: Array) -> float:
-    """Variance of the sum of serially correlated terms (R,), their mean removed.
-
-    ``products``: terms of the sum, (R,).
-    """
+    """Variance of the sum of serially correlated terms (R,), their mean removed."""
     return float(newey_west([products - products.mean()], NEWEY_WEST_LAGS))

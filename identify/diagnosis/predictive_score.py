@@ -1,15 +1,9 @@
-"""Predictive score of a model: cross-validated log-likelihood of the torques with serially correlated noise.
+"""Predictive score: cross-validated log-likelihood of the torques with serially correlated noise; ranks all models.
 
-The one criterion by which models are ranked, admitted, exchanged and reduced. Errors are those of torques that the
-parameters did not see. The training data are cut into `BLOCKS` blocks of equal length, and every `FOLDS`-th block is
-left out in turn. The instrumental-variable estimate of the other blocks predicts it. The autoregressive noise model
-turns these errors into innovations. They carry all the information that serially correlated errors have about the model
-(Box, Jenkins 1976, chapter 7).
-
-Coarse encoders make measured accelerations noisy. Their noise times the inertia is an error of the prediction, so that
-a model with a smaller inertia would predict better. At joints where `references_of` finds such noise, a change of the
-rigid parameters is predicted without it, see `noise_of_motion`. What stays is the noise times the parameters of the
-first model: the same for all models of a diagnosis.
+Every `FOLDS`-th of `BLOCKS` equal blocks is predicted by the instrumental-variable estimate of the others. The
+autoregressive noise model turns these errors into innovations (Box, Jenkins 1976, chapter 7). Noise of measured
+accelerations would favour a smaller inertia. Where `references_of` finds it, changes of the rigid parameters are
+predicted without it (`noise_of_motion`); the rest is the same for all models.
 """
 
 from collections.abc import Sequence
@@ -71,11 +65,7 @@ class PredictiveScore:
 
     @cached_property
     def _prior(self) -> Array:
-        """Inverse prior variances of the parameters, (b,): zero except for those of free shapes.
-
-        The values of a free shape are torques of the size of its joint's torque error. Without this, a fold that does
-        not visit a part of the range leaves them undetermined there.
-        """
+        """Inverse prior variances (b,) of free shapes, for folds that do not visit a part of their range; else zero."""
         study = self.fit.study
         inverse = np.zeros(self.fit.theta.size)
         errors = np.concatenate(self.fit.left)
@@ -147,7 +137,7 @@ class PredictiveScore:
 
     @cached_property
     def own_log_likelihoods(self) -> Array:
-        """Log-likelihood of the data of each joint under noise models of the model's own predicted errors, (n,).
+        """Log-likelihood (n,) of each joint's data under noise models of the model's own predicted errors.
 
         One is subtracted for each coefficient of the noise models, which are not cross-validated (Akaike's criterion).
         """
@@ -169,12 +159,9 @@ class PredictiveScore:
         return float(self.log_likelihoods_under(noise).sum())
 
     def inflation_over(self, other: "PredictiveScore", noise: Sequence[ArModel]) -> Array:
-        """Variance of the score along the change of prediction over that of white innovations, of each joint, (n,).
+        """Variance (n,) of the score along the change of prediction over that of white innovations, at least 1.
 
-        Noise that changes slowly leaves correlation in the innovations which an autoregressive model of limited order
-        does not take. Block sums contain it, whatever its form (Kuensch 1989, Annals of Statistics 17(3)). At least 1.
-
-        ``other``: score of the model without the effect in question.
+        Block sums contain the correlation left by slow noise (Kuensch 1989, Annals of Statistics 17(3)).
         """
         found = []
         for ar, own, less in zip(noise, self._parts, other._parts, strict=True):
@@ -186,10 +173,9 @@ class PredictiveScore:
         return np.array(found)
 
     def gain_over(self, other: "PredictiveScore", noise: Sequence[ArModel]) -> float:
-        """Gain of log-likelihood over another model, both under the same noise models.
+        """Gain of log-likelihood over a model without an effect, both under the same noise models.
 
-        ``other``: score of the model without the effect in question. ``noise``: noise model of each joint: of a model
-        in which nothing is missing, as far as known. Others would take what is missing for noise.
+        These should be of a model in which nothing is missing. Others would take what is missing for noise.
         """
         own, less = self.innovations(noise), other.innovations(noise)
         rows = self.rows
@@ -204,13 +190,9 @@ def fold_of(rows: int) -> NDArray[np.int64]:
 
 
 def references_of(fit: IvFit) -> tuple[Array | None, ...]:
-    """Rigid parameters of a fit, (b - e,), for each joint whose motion has much measurement noise; ``None`` for others.
+    """Rigid parameters (b - e,) for each joint whose motion has much measurement noise; ``None`` for others.
 
-    Measured motion beyond the simulated one is measurement noise, or motion that disturbances caused. Measurement noise
-    appears in the errors of a fit with the opposite sign. Real motion does not appear there (errors in variables:
-    Fuller 1987, section 1.2).
-
-    ``fit``: fit of the model to which nothing is added yet.
+    Unlike real motion, this noise appears in the errors of a fit, with opposite sign (Fuller 1987, section 1.2).
     """
     theta = fit.theta[: fit.theta.size - fit.study.model.e]
     found: list[Array | None] = []
@@ -226,12 +208,9 @@ def references_of(fit: IvFit) -> tuple[Array | None, ...]:
 
 
 def noise_of_motion(joint: JointEquations, rows: Array, theta: Array) -> Array:
-    """Torque of the rigid model at measured signals beyond that at simulated ones, (M, k).
+    """Torque (M, k) of k sets of rigid parameters at measured signals beyond that at simulated ones.
 
-    Simulated torques follow the measured ones through a short filter, as simulated and real loop differ a little. What
-    that filter does not give is noise of the measured motion, or motion that disturbances caused.
-
-    ``rows``: their rows in one stretch, (M, x + z + 1); ``theta``: sets of rigid parameters, (k, b - e).
+    Simulated torques first follow the measured ones through a short filter, as simulated and real loop differ a little.
     """
     if rows.shape[0] < LEAST_ROWS:
         return np.zeros((rows.shape[0], theta.shape[0]))

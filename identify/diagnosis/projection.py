@@ -1,8 +1,7 @@
-"""Projection of a joint's residual on free functions of the reference motion, with its significance.
+"""Projection of a joint's residual on free functions orthogonal to the regressor, with its significance.
 
-The functions are orthogonal to the regressor of the model, so that errors of its parameters cancel. The shape is fitted
-on the training data, smoothed by likelihood, and tested by its prediction of the held-out residual. Serial correlation
-beyond the order of the noise model is contained in block sums (Kuensch 1989, Annals of Statistics 17(3)).
+The shape is smoothed by likelihood on the training data, and tested by its prediction of the held-out residual. Block
+sums contain further serial correlation (Kuensch 1989, Annals of Statistics 17(3)).
 """
 
 from collections.abc import Sequence
@@ -27,24 +26,12 @@ STRENGTHS = np.geomspace(1e-8, 1e8, 65)
 
 @dataclass(frozen=True, eq=False)
 class Projection:
-    """Projection of a joint's residual on one set of free functions.
+    """Projection of a joint's residual on one set of free functions; ``function`` is ``None`` for the whole motion.
 
-    Parameters
-    ----------
-    function, columns
-        Set of functions, ``None`` for all functions of the motion together; numbers of the columns.
-    p_train
-        Probability of so large a projection of the training residual on all directions of the set, from noise alone.
-    p_held
-        The same of the held-out residual along the shape that the training data determined.
-    share
-        Share of the power of the joint's held-out residual that this shape removes.
-    size
-        Root mean square of the torque by which it reduces that residual, N m or N.
-    values, covariance
-        Smoothed coefficients (k,), and their covariance (k, k).
-    change
-        Torque of the shape in the held-out data, beyond the model, (M,), N m or N.
+    ``p_train``: probability by noise alone of so large a projection on all directions; ``p_held``: of the held-out
+    residual along the trained shape. ``share``, ``size``: power share and root mean square torque (N m or N) that the
+    shape removes. ``values`` (k,), ``covariance`` (k, k): smoothed coefficients. ``change`` (M,): held-out torque of
+    the shape beyond the model.
     """
 
     function: FreeFunction | None
@@ -69,28 +56,10 @@ class Projection:
 class JointResidual:
     """Residual of the model and free functions of one joint, whitened unless stated otherwise.
 
-    Parameters
-    ----------
-    rows, held_rows
-        Its rows among those of all joints.
-    d
-        Functions at the simulated motion, its training rows, (R_j, K).
-    z
-        The same orthogonal to the model, training rows of all joints, (R, K).
-    held
-        The same, held-out rows of all joints, (R', K).
-    e, held_e
-        Residuals, (R,) and (R',).
-    band
-        ``held`` at this joint before whitening, (M', K).
-    errors
-        Held-out errors of this joint before whitening, (M',), N m or N.
-    held_joints
-        Held-out rows of every joint.
-    regressor, covariance
-        Held-out regressor of the model, (R', b), and the covariance of its parameters, (b, b).
-    least
-        Least norm of a direction orthogonal to the model, over its own: see `Criteria.beyond_model_function`.
+    ``rows``, ``held_rows``: of this joint among all. ``d`` (R_j, K): functions at the simulated motion; ``z`` (R, K),
+    ``held`` (R', K): orthogonal to the model, training and held-out. ``e`` (R,), ``held_e`` (R',): residuals. ``band``
+    (M', K), ``errors`` (M',): held-out functions and errors before whitening. ``regressor`` (R', b): held-out, of the
+    model, with its ``covariance``. ``least``: see `Criteria.beyond_model_function`.
     """
 
     joint: int
@@ -109,10 +78,7 @@ class JointResidual:
     least: float
 
     def directions(self, columns: NDArray[np.int64]) -> tuple[Array, Array, Array] | None:
-        """Orthonormal directions (R, r) of some functions beyond the model, their coefficients (k, r), and powers (r,).
-
-        ``columns``: numbers of the functions, (k,).
-        """
+        """Orthonormal directions (R, r) of some functions beyond the model, coefficients (k, r), and powers (r,)."""
         d, z = self.d[:, columns], self.z[:, columns]
         scale = np.linalg.norm(d, axis=0)
         scale = np.where(scale > 0, scale, np.inf)
@@ -127,10 +93,7 @@ class JointResidual:
         return u, through, power
 
     def beyond(self, columns: NDArray[np.int64]) -> "JointResidual":
-        """Residual and functions orthogonal to some of the functions, too.
-
-        ``columns``: numbers of the functions that the model takes in, (k,).
-        """
+        """Residual and functions orthogonal to the functions ``columns`` (k,), too."""
         found = self.directions(columns)
         if found is None:
             return self
@@ -151,11 +114,7 @@ class JointResidual:
         )
 
     def projection(self, function: FreeFunction | None, columns: NDArray[np.int64]) -> Projection | None:
-        """Projection of the residual on one set of functions; ``None`` if the model contains it.
-
-        ``function``: set of functions; ``None`` for all functions of the motion together. ``columns``: numbers of its
-        columns, (k,).
-        """
+        """Projection of the residual on one set (``None``: on all functions); ``None`` if the model contains it."""
         found = self.directions(columns) if columns.size else None
         if found is None:
             return None
@@ -194,11 +153,7 @@ class JointResidual:
 def significance(u: Array, e: Array, estimate: Array) -> tuple[float, float]:
     """Return the probability of so large a projection from noise alone, and its variance over that of white noise.
 
-    The power of correlated normal variables is approximated by a scaled chi-square (Box 1954, Annals of Mathematical
-    Statistics 25(2)) whose scale comes from block sums.
-
-    ``u``: directions, (R, r); ``e``: whitened residual, (R,); ``estimate``: projection of the residual on the
-    directions, (r,).
+    Correlated power as a chi-square scaled by block sums (Box 1954, Annals of Mathematical Statistics 25(2)).
     """
     edges = np.arange(SUMS + 1) * e.size // SUMS
     sums, white = [], 0.0
@@ -219,10 +174,7 @@ def significance(u: Array, e: Array, estimate: Array) -> tuple[float, float]:
 
 
 def inflation_of_sums(change: Array, e: Array) -> float:
-    """Variance of block sums of ``change * e`` over that of white noise.
-
-    ``change``: change of prediction, (R,); ``e``: whitened residual orthogonal to it, (R,).
-    """
+    """Variance of block sums of ``change * e`` over that of white noise; ``e`` (R,) orthogonal to ``change`` (R,)."""
     edges = np.arange(SUMS) * e.size // SUMS
     sums, weights = np.add.reduceat(change * e, edges), np.add.reduceat(change**2, edges)
     total = float(weights.sum())
@@ -238,13 +190,8 @@ def _mean_square(e: Array) -> float:
 def smoothing(estimate: Array, through: Array, power: Array, function: FreeFunction | None) -> tuple[Array, Array]:
     """Factor of each coordinate (r,) at the smoothing strength of the largest likelihood, and the coordinates (r, r).
 
-    State-dependent parameters are smoothed as integrated random walks, whose noise-variance ratio is found by maximum
-    likelihood (thesis section 7.3.2; Young, McKenna, Bruun 2001, Int. J. Control 74(18)). That is a spline penalised on
-    its second differences. All functions together are penalised on the size of their coefficients.
-
-    ``estimate``: estimate of unit variance in every direction, (r,). ``through``: coefficients of the directions,
-    (k, r). ``power``: power of each direction beyond the model over that of the functions, (r,). ``function``: set of
-    functions; ``None`` for all functions of the motion together.
+    A spline penalised on its second differences, as state-dependent parameters (thesis section 7.3.2; Young, McKenna,
+    Bruun 2001, Int. J. Control 74(18)); all functions together on their size. ``power`` (r,): beyond the model.
     """
     if function is None:
         roughness, axes = 1.0 / power, np.eye(power.size)

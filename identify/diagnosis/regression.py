@@ -32,10 +32,7 @@ PASSES = 3
 
 @dataclass(frozen=True, eq=False)
 class IvFit:
-    """Parameters, noise models, and the whitened rows of both parts of the data.
-
-    ``equations``: rows before whitening; ``regression``: regression of the training rows.
-    """
+    """Parameters, noise models, and the whitened rows of both parts of the data."""
 
     equations: Equations
     regression: IvRegression
@@ -72,17 +69,11 @@ class IvFit:
             self.__dict__.pop(name, None)
 
     def renoised(self, noise: Sequence[ArModel]) -> "IvFit":
-        """The fit with other noise models.
-
-        ``noise``: noise model of each joint. Raises DataError if the equations are singular with them.
-        """
+        """The fit with other noise models; DataError if the equations are singular with them."""
         return solved(self.equations, noise, self.regression)
 
     def errors(self, theta: Array, *, held: bool) -> list[Array]:
-        """``y - X theta`` at measured signals in the band of the comparison, (M, n) of every stretch, N m or N.
-
-        ``theta``: parameters, (b,); ``held``: True for the held-out data, false for the training data.
-        """
+        """``y - X theta`` at measured signals in the band of the comparison, (M, n) of every stretch, N m or N."""
         return residuals(self.equations.held if held else self.equations.train, theta)
 
     @cached_property
@@ -118,12 +109,7 @@ class IvFit:
 
 
 def fit_model(study: Study, theta0: Array | None = None, noise: Sequence[ArModel] | None = None) -> IvFit:
-    """Alternate instrumental variables and AR noise models (thesis sections 2.3.3 and 6.1.3).
-
-    ``theta0``: parameters (b,) that predict the torques on which terms depend; ``None`` if no term does. ``noise``:
-    noise models; ``None``: start with white noise, and alternate. Raises DataError if the training motion leaves
-    parameters undetermined.
-    """
+    """Alternate instrumental variables and AR noise models (thesis sections 2.3.3, 6.1.3), from ``noise`` if given."""
     equations = Equations(study, theta0)
     if noise is None:
         rows = Triangle.of(stacked_parts(equations.train, [WHITE] * study.robot.n))
@@ -142,8 +128,7 @@ def fit_model(study: Study, theta0: Array | None = None, noise: Sequence[ArModel
 def safe(found: IvFit) -> IvFit:
     """Return the fit, or one with noise models of lower order if its errors are much larger than with white weights.
 
-    Weights of a strongly coloured noise emphasise frequencies at which the simulated and the measured motion may have
-    little in common. The instruments are weak there, and the estimate is far from any that fits the data.
+    Strongly coloured noise emphasises frequencies where simulated and measured motion differ: weak instruments.
     """
     white = found.renoised([ArModel(np.empty(0), ar.variance, 0.0) for ar in found.noise])
     most = found.study.criteria.weighted_errors * _rms(white)
@@ -160,22 +145,14 @@ def _rms(found: IvFit) -> Array:
 
 
 def require_solution(found: IvFit) -> None:
-    """Refuse a model whose parameters the motion leaves undetermined.
-
-    Raises DataError if the instruments do not determine all parameters.
-    """
+    """Raise DataError if the instruments do not determine all parameters."""
     values = np.linalg.svd(found.regression.solution.cross, compute_uv=False)
     if not np.isfinite(found.theta).all() or values[-1] < SINGULAR * values[0]:
         raise DataError(UNDETERMINED)
 
 
 def solved(equations: Equations, noise: Sequence[ArModel], known: IvRegression | None = None) -> IvFit:
-    """Parameters by instrumental variables under given noise models.
-
-    ``equations``: equations of all stretches; ``noise``: noise model of each joint; ``known``: regression of the same
-    equations under other noise models. Raises DataError if the equations are singular: a parameter has no effect on the
-    torques, for example.
-    """
+    """Parameters by instrumental variables under given noise models; DataError if the equations are singular."""
     found = IvFit(equations, IvRegression.of(equations, noise, known))
     try:
         _ = found.theta
@@ -184,12 +161,8 @@ def solved(equations: Equations, noise: Sequence[ArModel], known: IvRegression |
     return found
 
 
-def relative_torque_errors(fit: IvFit, theta: Array | None = None, *, held: bool) -> tuple[float, Array]:
-    """``|y - X theta| / |y|`` in percent in the band of the comparison, overall and of each joint (n,).
-
-    ``fit``: fit with data and model. ``theta``: parameters (b,); ``None``: those of the fit. ``held``: True for the
-    held-out data, false for the training data.
-    """
+def relative_fit_errors(fit: IvFit, theta: Array | None = None, *, held: bool) -> tuple[float, Array]:
+    """``|y - X theta| / |y|`` in percent in the band of the comparison, overall and of each joint (n,)."""
     y = np.concatenate([s.y for s in (fit.study.held if held else fit.study.train)])
     error = np.concatenate(fit.errors(fit.theta if theta is None else theta, held=held))
     each = np.linalg.norm(error, axis=0) / np.maximum(np.linalg.norm(y, axis=0), 1e-300)

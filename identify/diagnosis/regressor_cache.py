@@ -21,10 +21,7 @@ class RegressorCache:
     _bytes: int = 0
 
     def get(self, key: Hashable, made: Callable[[], Arrays]) -> Arrays:
-        """Return the arrays of a key; computed where the cache does not have them.
-
-        ``key``: all that the arrays depend on, among them the signals, which are equal only to themselves.
-        """
+        """Return the arrays of a key, computed if absent; signals in the key are equal only to themselves."""
         kept = self._kept.pop(key, None)
         if kept is None:
             kept = made()

@@ -16,10 +16,7 @@ REFINEMENTS = 12
 
 
 def screened(fit: IvFit, candidate: Candidate, column_cache: ColumnCache) -> tuple[float, Shapes] | None:
-    """Best score statistic of a candidate on its grid, by the training data, and the nonlinear parameters there.
-
-    ``fit``: fit of the model; ``column_cache``: cache of the columns of the same fit.
-    """
+    """Best score statistic of a candidate on its grid, by the training data, and the nonlinear parameters there."""
     if not candidate.grid:
         return None
     # Columns that depend on theta are useless for the next model, and a grid of them is large.
@@ -33,11 +30,9 @@ def screened(fit: IvFit, candidate: Candidate, column_cache: ColumnCache) -> tup
 
 
 def score_statistics(fit: IvFit, columns: Sequence[tuple[int, Array]], count: int, sign: int = 0) -> Array:
-    """Power of the training residual along groups of instruments orthogonal to the model's own, (G,).
+    """Power (G,) of the training residual along groups of instruments (R, G k) orthogonal to the model's own.
 
-    ``columns``: whitened instruments (R, G k) of each joint on which they act, with its number, group after group.
-    ``sign``: +1 or -1: sign of the parameter of a group of one, which physics determines; 0: none. Returns zero where
-    the parameter would have the wrong sign. Not a number where the model contains a group.
+    ``sign``: that of a single parameter by physics, or 0. Wrong signs give zero; groups that the model contains, NaN.
     """
     if not columns:
         return np.full(count, np.nan)
@@ -57,11 +52,7 @@ def score_statistics(fit: IvFit, columns: Sequence[tuple[int, Array]], count: in
 
 
 def score_statistic(fit: IvFit, columns: Sequence[tuple[int, Array]], sign: int = 0) -> float | None:
-    """Score statistic of one group of instruments; ``None`` if the model contains it.
-
-    ``columns``: whitened instruments (R, k) of each joint on which they act, with its number; ``sign``: see
-    `score_statistics`.
-    """
+    """Score statistic of one group of instruments (R, k), see `score_statistics`; ``None`` if the model has it."""
     found = float(score_statistics(fit, columns, 1, sign)[0])
     return None if np.isnan(found) else found
 
@@ -70,8 +61,6 @@ def contained(fit: IvFit, candidate: Candidate, column_cache: ColumnCache, shape
     """Linear parameters of a candidate whose torque the model can give without it, such as an inertia of two joints.
 
     None if these are all: an effect keeps one parameter, which is then zero.
-
-    ``column_cache``: cache of the columns of the same fit; ``shapes``: nonlinear parameters of the candidate.
     """
     columns = column_cache.grid(candidate.effect, candidate.place, (shapes,), fit.noise, keep=False)
     size = np.sqrt(np.sum([np.einsum("ij,ij->j", own, own) for _, own in columns], axis=0))
@@ -87,10 +76,7 @@ def contained(fit: IvFit, candidate: Candidate, column_cache: ColumnCache, shape
 
 
 def orthogonal_directions(fit: IvFit, instruments: Array) -> tuple[Array, Array, Array] | None:
-    """Orthonormal directions (R, r) of instruments orthogonal to the model's, and their map (k, r) with scales (k,).
-
-    ``instruments``: whitened instruments, (R, k).
-    """
+    """Orthonormal directions (R, r) of instruments orthogonal to the model's, and their map (k, r) with scales (k,)."""
     scale = np.linalg.norm(instruments, axis=0)
     if np.any(scale == 0) or not np.isfinite(scale).all():
         return None
@@ -105,11 +91,7 @@ def orthogonal_directions(fit: IvFit, instruments: Array) -> tuple[Array, Array,
 
 
 def refined(fit: IvFit, candidate: Candidate, column_cache: ColumnCache, best: tuple[float, Shapes]) -> Shapes:
-    """Nonlinear parameters between those of the grid, one continuous parameter after the other, on a logarithmic scale.
-
-    ``fit``: fit of the model; ``column_cache``: cache of the columns of the same fit; ``best``: score statistic and
-    nonlinear parameters of the grid, the start.
-    """
+    """Nonlinear parameters between those of the grid, one continuous one after the other, on a logarithmic scale."""
     found = best
     for k, free in enumerate(candidate.effect.refinable(fit.study.robot, candidate.place)):
         values = sorted({grid[k][1] for grid in candidate.grid})
@@ -135,8 +117,5 @@ def refined(fit: IvFit, candidate: Candidate, column_cache: ColumnCache, best: t
 
 
 def replaced(shapes: Shapes, k: int, value: float) -> Shapes:
-    """Nonlinear parameters with another value of the k-th.
-
-    ``shapes``: pairs of name and value; ``k``, ``value``: number of the parameter, and its new value.
-    """
+    """Nonlinear parameters with another value of the k-th."""
     return (*shapes[:k], (shapes[k][0], value), *shapes[k + 1 :])

@@ -13,22 +13,9 @@ from armident.identify.effects.recording_corrections import of_recording
 
 @dataclass(frozen=True, eq=False)
 class Selected:
-    """An effect that was selected.
+    """A selected effect, with the step in which it was compared without it in the model.
 
-    Parameters
-    ----------
-    entry
-        Its entry in the configuration.
-    step
-        Step in which it was compared with the others, without it in the model.
-    addition
-        Test of the effect in that step.
-    confirmation
-        Comparison of the final models with and without it on the report part; ``None`` before that.
-    without
-        Final model without it; ``None`` before the comparison.
-    p_value
-        Probability of its parameters in the final model if it is not there.
+    ``confirmation``, ``without``: comparison with the final model without it, and that model; ``None`` before.
     """
 
     entry: Entry
@@ -39,10 +26,7 @@ class Selected:
     p_value: float = 0.0
 
     def conventional(self, state: ModelState, uncertain: float) -> bool:
-        """True if the effect is a part of every model, or within the sampling convention of drives: no finding.
-
-        ``state``: final model; ``uncertain``: time by which the common instant of all torques is uncertain, s.
-        """
+        """True for a part of every model, or within the drives' sampling convention (``uncertain``, s): no finding."""
         effect = self.addition.candidate.effect
         if of_recording(self.entry):
             values = np.array([self.entry.parameters[p.name] for p in effect.linear])

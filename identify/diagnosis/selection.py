@@ -1,15 +1,11 @@
 """Stepwise selection of the effects that a model lacks.
 
-1. Screening: the score statistic of every candidate at every place, in one factorisation of the model's equations
-   (`armident.identify.diagnosis.shortlist`).
-2. Closed loop: each of the best candidates is added to the model, and the loop with it is simulated. All parameters are
-   estimated with instruments from that loop (`armident.identify.diagnosis.candidate_models`).
-3. Ranking by cross-validated log-likelihood (`armident.identify.diagnosis.candidate_comparison`).
-4. Admission of the best one that is significant, material and physically possible; then the next step.
-5. Findings that later ones made superfluous are removed. Each finding competes once more with the effects that act on a
-   joint on which it acts.
-6. Report part: a finding stays if data that are not used for selection confirm it
-   (`armident.identify.diagnosis.confirmation`).
+1. Screening: score statistic of every candidate at every place (`shortlist`).
+2. Closed loop: the best candidates are added, simulated and estimated with instruments (`candidate_models`).
+3. Ranking by cross-validated log-likelihood (`candidate_comparison`).
+4. Admission of the best significant, material and physically possible one; then the next step.
+5. Superfluous findings are removed. Each competes once more with the effects on its joints.
+6. Report part: findings that data not used for selection confirm stay (`confirmation`).
 """
 
 import contextlib
@@ -58,20 +54,10 @@ Array = NDArray[np.float64]
 
 @dataclass
 class StepwiseSelection:
-    """Selection of the effects of one diagnosis.
+    """Selection of the effects of one diagnosis; ``shifts``: undecided common shifts of all torques, samples.
 
-    Parameters
-    ----------
-    study
-        Data with the model as configured.
-    progress
-        Called with the name of each step.
-    deadline
-        Time of `time.monotonic` after which no further step begins and the current one is dropped, s.
-    tested
-        Called with the share of a step's candidates that have been tested, 0 to 1.
-    shifts
-        Common shifts of all torques between which the check of the set-up could not decide, samples.
+    ``progress``, ``tested``: called with the name of each step, and the share of its candidates done. At ``deadline``
+    of `time.monotonic`, s, the current step is dropped.
     """
 
     study: Study
@@ -92,10 +78,7 @@ class StepwiseSelection:
         return self.study.criteria
 
     def start(self) -> ModelState:
-        """Model as configured, with the transition of dry friction at reversals where the configuration leaves it free.
-
-        Raises DataError if the motion does not determine the parameters of the model.
-        """
+        """Model as configured, with the transition of dry friction at reversals that the configuration leaves free."""
         state = self._aligned(fitted(self.study, self.study.robot, None))
         self.study = state.study
         if not self.study.sign_given:
@@ -106,11 +89,7 @@ class StepwiseSelection:
         return state
 
     def run(self, first: ModelState) -> tuple[ModelState, tuple[Selected, ...]]:
-        """Select effects.
-
-        ``first``: model to start from, of `start`. Returns the model with the effects, and the effects: those with a
-        name first, then by reduction of the errors.
-        """
+        """Select effects, from a model of `start`; those with a name come first, then by reduction of the errors."""
         state = first
         found: tuple[Selected, ...] = ()
         seen = {_key(first.robot)}
@@ -146,11 +125,7 @@ class StepwiseSelection:
         return with_own_noise(state)
 
     def step(self, state: ModelState, incumbent: Incumbent | None = None) -> SelectionStep:
-        """Compare all candidates in a model.
-
-        ``state``: model without them; ``incumbent``: finding that the model is without, if only effects that could take
-        its place are compared: those that act on a joint on which it acts, and do not promise much less.
-        """
+        """Compare all candidates in a model; with an ``incumbent``, those on its joints that promise hardly less."""
         key = _key(state.robot)
         if key in self._steps:
             return self._steps[key]
@@ -186,13 +161,9 @@ class StepwiseSelection:
         return self._steps.get(_key(state.robot))
 
     def passes(self, addition: Addition, tests: int) -> bool:
-        """True if an addition is significant, material and physically possible.
+        """True if an addition, found among ``tests`` candidates, is significant, material and physically possible.
 
-        A ratio of likelihoods of ``r`` has at most the probability ``1 / r`` without the effect (Ville 1939), so that
-        no null distribution is needed. The parameters of the effect differ from zero at the same level by their own
-        standard deviations.
-
-        ``tests``: number of candidates among which it was found.
+        Without the effect, a likelihood ratio of ``r`` has at most the probability ``1 / r`` (Ville 1939).
         """
         return (
             addition.allowed
@@ -205,10 +176,9 @@ class StepwiseSelection:
     def admitted(self, step: SelectionStep) -> Addition | None:
         """Addition that the step admits: the best law of the best effect; ``None`` if there is none.
 
-        An effect with a name is admitted only if no other explanation of the same joint is clearly better. Even one
-        that is too small to be a finding counts. A term without a name claims no cause. An effect with a name comes
-        first if it explains most of what the best term without a name does. Of the laws of one effect that predict as
-        well, that with the fewest parameters comes first, and a free shape last.
+        A named effect is admitted if no explanation of its joint, even one too small for a finding, is clearly better.
+        It comes first if it explains most of what the best unnamed term does. Of equal laws, the fewest parameters come
+        first.
         """
         able = [a for a in step.passing if not (a.named and self._superseded(a, step))]
         if not able:
@@ -236,8 +206,7 @@ class StepwiseSelection:
     def _aligned(self, state: ModelState) -> ModelState:
         """Model with the common shift of the torques with which the base fit predicts clearly better.
 
-        A joint may have an effect that looks like a shift: the evidence of each is limited. A loop that follows the
-        measured motion contains disturbances, whose feedback looks like a shift, too.
+        The evidence of each joint is limited: an effect, or feedback of disturbances, may look like a shift.
         """
         if state.study.loop == "nominal" or not self.shifts:
             return state
@@ -286,10 +255,7 @@ class StepwiseSelection:
         return state, found
 
     def _superfluous(self, state: ModelState, less: ModelState, tests: int) -> bool:
-        """True if a finding is insignificant or immaterial beside the others of a model.
-
-        ``state``, ``less``: models with and without it; ``tests``: number of candidates among which it was found.
-        """
+        """True if a finding, selected among ``tests``, is insignificant or immaterial beside the others of a model."""
         share, changed = materiality(less, state)
         material = share >= self.criteria.least_share and changed >= self.criteria.material_pct
         return not material or gain(state, less) < self.criteria.needed_gain(tests)
@@ -297,12 +263,9 @@ class StepwiseSelection:
     def _exchanged(
         self, state: ModelState, found: tuple[Selected, ...], changed: NDArray[np.bool_] | None = None
     ) -> tuple[ModelState, tuple[Selected, ...]]:
-        """Model whose findings have competed with the other effects on their joints, beside the findings made later.
+        """Model whose findings have competed with the other effects on joints ``changed`` (n,), beside later findings.
 
-        A rival makes the finding superfluous; an effect beside which it stays explains something else. No exchange
-        returns to an earlier model: each could prefer its own noise models.
-
-        ``changed``: joints whose models changed since the findings last competed, (n,); ``None`` for all.
+        A rival makes a finding superfluous. No return to an earlier model: each could prefer its own noise models.
         """
         self._visited.add(_key(state.robot))
         for one in found:
@@ -328,7 +291,7 @@ class StepwiseSelection:
     def _confirmed(self, state: ModelState, found: tuple[Selected, ...]) -> tuple[ModelState, tuple[Selected, ...]]:
         """Model with the findings that the report part confirms: those with a name, then by reduction of the errors.
 
-        The models are compared as they are reported: each estimated under the noise models of its own residual.
+        Each model is estimated under the noise models of its own residual, as it is reported.
         """
         self.progress("confirmation by the report part")
         while True:
@@ -355,10 +318,7 @@ class StepwiseSelection:
             found = tuple(one for one in found if one.entry is not gone.entry)
 
     def _holds(self, one: Selected) -> bool:
-        """True if the report part confirms a finding: the change goes the same way, and is material there, too.
-
-        Its parameters still differ from zero beside all others.
-        """
+        """True if the report part confirms a finding: same direction, material, and parameters still significant."""
         report = one.confirmation
         assert report is not None
         determined = one.p_value < self.criteria.selection_level(one.step.tests)

@@ -20,28 +20,11 @@ REMARKS = ("rate_too_slow", "joint_at_rest")
 
 @dataclass(frozen=True)
 class SetupStage:
-    """Recordings and configuration with the set-up corrected, and the entries of the document.
+    """Recordings and configuration with the set-up corrected (clock and torque shift, too), and the document's entries.
 
-    Parameters
-    ----------
-    training, validation
-        Experiments; their clock is corrected, and so is a common shift of their torques.
-    robot
-        Configuration with the corrections.
-    findings
-        Mistakes of the set-up as findings of a diagnosis.
-    unexplained
-        Joints that the rigid model does not explain in any set-up.
-    warnings
-        Remarks on the recordings.
-    errors
-        Relative error of the rigid model in the set-up as configured by joint, percent, (n,).
-    shifts
-        Common shifts of the torques between which the check could not decide, samples; the diagnosis compares them.
-    shift_known
-        True if the common shift of the torques is known.
-    criteria
-        Thresholds.
+    ``findings``: mistakes of the set-up. ``unexplained``: joints that the rigid model explains in no set-up. ``errors``
+    (n,): relative errors of the rigid model as configured, percent. ``shifts``: undecided common shifts of the torques,
+    samples.
     """
 
     training: tuple[Experiment, ...]
@@ -56,10 +39,7 @@ class SetupStage:
     criteria: Criteria = field(default_factory=Criteria)
 
     def as_configured(self, gap: Gap) -> Gap:
-        """Gap of the model in the set-up as configured, from that in the corrected one.
-
-        ``gap``: relative errors of the model in the corrected set-up.
-        """
+        """Gap of the model in the set-up as configured, from that in the corrected one."""
         if not self.findings:
             return gap
         names = list(gap.by_joint)
@@ -74,18 +54,11 @@ class SetupStage:
         )
 
     def doubtful(self, gap: Gap) -> list[Unexplained]:
-        """Entries of the joints that the model with the effects found does not explain, either.
-
-        ``gap``: held-out errors of the model with the effects found.
-        """
+        """Entries of the joints that the model with the effects found does not explain, either."""
         return [entry for entry in self.unexplained if gap.by_joint[entry.joint] > self.criteria.set_up_doubtful_pct]
 
     def left(self, unexplained: Sequence[Unexplained], gap: Gap) -> list[Unexplained]:
-        """Joints that the rigid model does not explain, then the dependences at the others.
-
-        ``unexplained``: remaining dependences of the residual; ``gap``: held-out errors of the model with the effects
-        found.
-        """
+        """Joints that the rigid model does not explain, then the dependences at the others."""
         doubtful = self.doubtful(gap)
         joints = {entry.joint for entry in doubtful}
         return [*doubtful, *(entry for entry in unexplained if entry.joint not in joints)]
@@ -94,11 +67,7 @@ class SetupStage:
 def set_up(
     training: Sequence[Experiment], validation: Sequence[Experiment], robot: RobotConfig, criteria: Criteria
 ) -> SetupStage:
-    """Check the set-up and correct its mistakes.
-
-    ``training``, ``validation``: experiments of a diagnosis. Raises DataError if nothing moves, or the recordings do
-    not fit together.
-    """
+    """Check the set-up and correct its mistakes; DataError if nothing moves or recordings do not fit together."""
     check = check_setup([*training, *validation], robot)
     shift = check.torque_shift
     for finding in check.findings:

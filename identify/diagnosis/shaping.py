@@ -1,8 +1,6 @@
 """Nonlinear parameters of a candidate by two-stage least squares (Amemiya 1974, J. Econometrics 2).
 
-A search at simulated signals finds their approximate values, but the simulated loop does not contain the candidate: its
-motor does not jump in the backlash, for example. The columns of the candidate are right at measured signals only. The
-simulated ones are the instruments.
+The simulated loop lacks the candidate: its columns are right at measured signals, with simulated ones as instruments.
 """
 
 from collections.abc import Callable
@@ -29,10 +27,7 @@ def shapes_of_both_signals(
 ) -> tuple[Shapes, ...]:
     """Nonlinear parameters by measured signals and by simulated ones, where these differ; either may be wrong.
 
-    Simulated signals are those of a loop without the effect, and measured ones contain noise that it amplifies.
-
-    ``fit``: fit of the model; ``candidate``: candidate with its grid; ``column_cache``: cache of the columns of the
-    same fit; ``shapes``: nonlinear parameters by simulated signals.
+    Simulated signals are of a loop without the effect; measured ones contain noise that it amplifies.
     """
     found = instrumented_shapes(fit, candidate, column_cache, shapes)
     return (shapes,) if found == shapes else (found, shapes)
@@ -41,11 +36,8 @@ def shapes_of_both_signals(
 def instrumented_shapes(fit: IvFit, candidate: Candidate, column_cache: ColumnCache, shapes: Shapes) -> Shapes:
     """Continuous nonlinear parameters, one after the other, between their neighbours on the grid.
 
-    Those of effects that depend on the motion alone stay. That motion is simulated well, and measured velocities are
-    least accurate around standstill, where friction changes most.
-
-    ``fit``: fit of the model; ``column_cache``: cache of the columns of the same fit; ``shapes``: start: the best
-    values at simulated signals.
+    Effects of the motion alone keep theirs: that is simulated well; measured velocities are least accurate at
+    standstill.
     """
     found = shapes
     if not candidate.effect.depends_on_torque:

@@ -21,11 +21,7 @@ Starts = tuple[float, ...]
 
 @dataclass(frozen=True, eq=False)
 class Incumbent:
-    """A finding with which other effects compete.
-
-    ``gain``: its gain of log-likelihood beside the other findings, nats. ``joints``: joints on whose torques it acts,
-    (n,). An effect that acts on none of them cannot take its place.
-    """
+    """A finding with which effects compete that act on one of its joints (n,); ``gain``: of log-likelihood, nats."""
 
     gain: float
     joints: NDArray[np.bool_]
@@ -33,11 +29,7 @@ class Incumbent:
 
 @dataclass(frozen=True, eq=False)
 class Shortlist:
-    """Candidates of a step that are tested in their own closed loops.
-
-    ``chosen``: the candidates, each with its nonlinear parameters, or with the values from which its correction of
-    recorded torques starts; ``hidden``: candidates that the motion does not show.
-    """
+    """Candidates of a step, with nonlinear parameters or starting values; ``hidden``: not shown by the motion."""
 
     chosen: list[tuple[Candidate, Shapes, Starts]]
     tests: int
@@ -45,11 +37,7 @@ class Shortlist:
 
 
 def shortlist(state: ModelState, incumbent: Incumbent | None) -> Shortlist:
-    """Return the candidates with the highest statistics less their numbers of parameters.
-
-    ``state``: model without them; ``incumbent``: finding that the model is without, if only effects that could take its
-    place are compared.
-    """
+    """Return the candidates with the highest statistics less their parameters; with ``incumbent``, its rivals alone."""
     criteria, column_cache = state.study.criteria, ColumnCache(state.study, state.fit.theta)
     noise = state.fit.renoised(state.weights)
     looks: list[tuple[float, Candidate, tuple[float, Shapes], Starts]] = []

@@ -15,13 +15,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class SimulatedErrors:
-    """Errors of simulated velocities and torques on the held-out data, percent of the measured ones, (n,) each.
-
-    NaN where a simulated loop diverges or the difference is undefined.
-
-    ``velocity_before``, ``velocity_after``: errors of the simulated velocities with the model as configured, and with
-    the findings; ``torque_before``, ``torque_after``: errors of the simulated torques with both models.
-    """
+    """Errors of simulated signals, percent of the measured held-out ones, (n,); NaN where a loop diverges."""
 
     joints: tuple[str, ...]
     velocity_before: Array
@@ -39,10 +33,7 @@ class SimulatedErrors:
 
 
 def simulated_errors(first: ModelState, final: ModelState) -> SimulatedErrors:
-    """Errors of the closed loops of two models, simulated along the references.
-
-    ``first``, ``final``: model as configured, and with the findings.
-    """
+    """Errors of the closed loops of the models as configured and with the findings, simulated along the references."""
     before, after = _errors(first), _errors(final)
     if before is None or after is None:
         unknown = np.full(first.study.robot.n, np.nan)

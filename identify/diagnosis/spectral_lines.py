@@ -28,20 +28,11 @@ EQUIVALENT = BLOCK / 1.5 * np.log(2) ** 2
 
 @dataclass(frozen=True)
 class SpectralLine:
-    """Spectral line of one joint.
+    """Spectral line of one joint; ``share`` of the held-out residual's power at the working rate, ``size`` in N m or N.
 
-    Parameters
-    ----------
-    p_train, p_held
-        Probability of such a line in the training residual at any frequency, and in the held-out one at this frequency,
-        without a line.
-    share
-        Share of the held-out residual's power at the working rate.
-    size
-        Root mean square of the line, N m or N.
-    f, amplitude, noise
-        Frequencies around the line, Hz; amplitudes of the training residual there, N m or N; amplitudes that a residual
-        without a line exceeds at one frequency in twenty, (G,) each.
+    ``p_train``: probability of such a line at any frequency without one; ``p_held``: at this frequency in the held-out
+    data. ``f``, ``amplitude``, ``noise`` (G,): frequencies around it, Hz; amplitudes of the training residual;
+    amplitudes exceeded without a line at one frequency in twenty.
     """
 
     frequency: float
@@ -60,26 +51,17 @@ class SpectralLine:
 
 
 def working_rate_residuals(study: Study, stretches: Sequence[MotionStretch], theta: Array) -> list[Array]:
-    """Torques less those of the model at the working rate, (N, n) each, N m or N.
-
-    ``stretches``: stretches of the study; ``theta``: parameters of the model, (b,).
-    """
+    """Torques less those of the model at the working rate, (N, n) each, N m or N."""
     return [s.torque - study.torques(s, "measured", theta) for s in stretches]
 
 
 def bandwidth_of_motion(study: Study) -> float:
-    """Bandwidth of the motion, Hz; below it the repeatable part of the residual has lines, too.
-
-    ``study``: data with the filter of the comparison.
-    """
+    """Bandwidth of the motion, Hz; below it the repeatable part of the residual has lines, too."""
     return 0.5 / (study.dt * study.decimation.factor * study.criteria.band)
 
 
 def lines_of_joints(study: Study, theta: Array) -> Iterator[tuple[int, SpectralLine]]:
-    """Strongest line of each joint above the frequencies of the motion that the references do not contain.
-
-    ``theta``: parameters of the model, (b,).
-    """
+    """Strongest line of each joint above the frequencies of the motion that the references do not contain."""
     train, held = (working_rate_residuals(study, part, theta) for part in (study.train, study.held))
     lowest = bandwidth_of_motion(study)
     for j in range(study.robot.n):
@@ -89,12 +71,9 @@ def lines_of_joints(study: Study, theta: Array) -> Iterator[tuple[int, SpectralL
 
 
 def strongest_line(train: Sequence[Array], held: Sequence[Array], dt: float, lowest: float) -> SpectralLine | None:
-    """Strongest line of one joint's residuals from a frequency on; ``None`` where the recording is too short.
+    """Strongest line of residuals (N,) above ``lowest``, Hz; ``None`` where the recording is too short.
 
-    Without a line, the power at a frequency over that of its surroundings has an F-distribution. Its phase may differ
-    from one stretch to the next.
-
-    ``train``, ``held``: residuals, (N,) each; ``lowest``: lowest frequency of the search, Hz.
+    Without a line, power over that of the surroundings has an F-distribution. Its phase may differ between stretches.
     """
     spectra = [_Spectrum.of(e, dt) for e in train]
     size = max(s.power.size for s in spectra)
@@ -124,12 +103,9 @@ def strongest_line(train: Sequence[Array], held: Sequence[Array], dt: float, low
 
 
 def of_references(study: Study, frequency: float) -> bool:
-    """Return true if the references contain the line, too.
+    """Return true if the references contain the line, too: set points have a rate of their own.
 
-    Set points have a rate of their own, and the arm follows them. The motion modulates the line, so its width is a
-    share of the bandwidth of the motion.
-
-    ``study``: data with the references.
+    The motion modulates the line, so its width is a share of the bandwidth of the motion.
     """
     wide = study.criteria.modulated_line * bandwidth_of_motion(study)
     for reference in study.auxiliary.references:

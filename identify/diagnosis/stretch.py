@@ -17,31 +17,12 @@ KINDS = ("measured", "simulated")
 
 @dataclass(frozen=True, eq=False)
 class MotionStretch:
-    """One uninterrupted stretch of motion at the working rate, SI, joint side.
+    """One uninterrupted stretch of motion at the working rate (N samples), SI, joint side.
 
-    Parameters
-    ----------
-    measured
-        Smoothed positions and their derivatives.
-    simulated
-        The same motion without noise, of the simulated closed loop: instruments.
-    y
-        Torques (M, n) in the band of the comparison, N m or N.
-    torque
-        Torques at the working rate, not limited to that band, (N, n), N m or N.
-    t
-        Instants of ``y``, s, (M,).
-    experiment
-        Number of the experiment that it is cut from.
-    rows
-        Its samples in that experiment, (N,).
-    span
-        Its samples after decimation to the working rate.
-    before
-        Measured and simulated motion before the stretch, where the experiment starts earlier. Effects with internal
-        states start there.
-    moving
-        False where a joint stands still at an instant of ``y``, (M, n).
+    ``simulated``: motion of the simulated closed loop without noise: instruments. ``y`` (M, n), ``t`` (M,): torques and
+    instants in the band of the comparison; ``torque`` (N, n): the full band. ``rows``: samples in its experiment;
+    ``span``: after decimation to the working rate. ``before``: motion before the stretch, where effects with internal
+    states start. ``moving`` (M, n): false where a joint stands still.
     """
 
     measured: Derivatives
@@ -56,10 +37,7 @@ class MotionStretch:
     before: tuple[Derivatives, Derivatives] | None = None
 
     def resimulated(self, motion: Derivatives, dt: float, factor: int) -> "MotionStretch":
-        """Stretch with another simulation of the whole experiment.
-
-        ``motion``: simulated motion of the experiment; ``factor``: decimation factor to the working rate.
-        """
+        """Stretch with another simulation of the whole experiment, decimated by ``factor`` to the working rate."""
         simulated = replace(at_rows(motion, self.rows, dt, factor), start=self.simulated.start)
         if self.before is None:
             return replace(self, simulated=simulated)
@@ -71,11 +49,7 @@ class MotionStretch:
 
 
 def at_rows(signals: Derivatives, rows: NDArray[np.int64], dt: float, factor: int) -> Derivatives:
-    """Signals at some of their samples.
-
-    ``signals``: positions and derivatives; ``rows``: numbers of the samples, (N,); ``dt``: sampling period of the
-    signals, s; ``factor``: distance of the chosen samples.
-    """
+    """Signals at samples ``rows`` (N,), which are ``factor`` sampling periods ``dt`` apart."""
     return Derivatives(
         np.ascontiguousarray(signals.q[rows]),
         np.ascontiguousarray(signals.qd[rows]),
@@ -87,10 +61,7 @@ def at_rows(signals: Derivatives, rows: NDArray[np.int64], dt: float, factor: in
 
 
 def rows_before(kept: NDArray[np.int64], rows: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Samples before a stretch, as many as it has itself if there are enough.
-
-    ``kept``: samples of the experiment at the working rate; ``rows``: samples of the stretch, (N,).
-    """
+    """Samples before a stretch, as many as it has itself if there are enough."""
     first = int(np.searchsorted(kept, rows[0]))
     return kept[max(first - rows.size, 0) : first]
 
@@ -105,12 +76,7 @@ def distances(stretches: Sequence[MotionStretch]) -> Array:
 def moving_rows(qd: Array, slowest: Array, width: int, instants: NDArray[np.int64]) -> NDArray[np.bool_]:
     """Return false where a joint stands still, (M, n): its dry friction is undetermined there.
 
-    A joint stands still where it is slower than the width of its smoothed sign throughout a window. Reversals are
-    shorter and stay. Filters spread standstill by their length, so that its neighbours are left out too.
-
-    ``qd``: velocities at the working rate, (N, n), rad/s or m/s; ``slowest``: width of the smoothed sign of each joint,
-    rad/s or m/s, (n,); ``width``: half the length of the window, samples: the decimation factor of the comparison;
-    ``instants``: samples of the comparison, (M,).
+    It stays slower than its smoothed sign's width ``slowest`` (n,) for ``width`` samples to either side.
     """
     still = minimum_filter1d((np.abs(qd) < slowest).astype(np.int8), 2 * width + 1, axis=0, mode="nearest")
     spread = maximum_filter1d(still, 8 * width + 1, axis=0, mode="nearest")

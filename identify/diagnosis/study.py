@@ -57,39 +57,10 @@ KAISER = 6.0
 class Study:
     """Training and held-out stretches of one robot.
 
-    Parameters
-    ----------
-    decimation
-        Filter and decimation from the working rate to the rate of the comparison.
-    dt
-        Sampling period of the working rate, s.
-    duration
-        Duration of all recordings, s.
-    loop
-        Kind of controller of the closed loop that gives the instruments.
-    auxiliary
-        That loop, with the IDIM-LS estimate of the rigid arm.
-    thinning
-        Filter and decimation from the recorded to the working rate.
-    sources
-        Recordings for training and for validation, without corrections.
-    signals
-        Derivatives of their positions at the recorded rate.
-    warnings
-        Lines for the user.
-    sign_given
-        True if the configuration gives the smoothing of the sign.
-    volume
-        Logarithm of the volume by which the corrections of a joint's torques scale its noise, per row, (n,): see
-        `log_volume`.
-    criteria
-        Thresholds of the diagnosis.
-    regressors
-        Cache of the regressors that all models of the study share; see
-        `armident.identify.diagnosis.model_equations.regressors`.
-    references
-        Rigid parameters of the model to which nothing is added yet, for each joint with much measurement noise; see
-        `armident.identify.diagnosis.predictive_score.references_of`. Empty before it is fitted.
+    ``decimation``: from the working rate (period ``dt``, s) to that of the comparison; ``thinning``: from the recorded
+    to the working rate. ``loop``: kind of controller; ``auxiliary``: that loop with the IDIM-LS estimate. ``sources``:
+    training and validation recordings without corrections; ``signals``: derivatives of their positions. ``volume``
+    (n,): see `log_volume`. ``references``: see `predictive_score.references_of`; empty before the fit.
     """
 
     robot: RobotConfig
@@ -119,8 +90,7 @@ class Study:
     def of_robot(self, robot: RobotConfig) -> "Study":
         """The same recordings for another model, corrected again where its effect entries require other corrections.
 
-        Other corrections of torques leave the controller and the simulated motion as they are: instruments need not be
-        exact. Other wiring is another arm. Raises DataError if no closed loop can be simulated with other wiring.
+        Other wiring is another arm. Other torque corrections keep the simulated motion: instruments need not be exact.
         """
         changed = replace(self, robot=robot, model=self.model.with_effects_of(robot, terms_of(robot)))
         if changed.recorded == self.recorded:
@@ -129,18 +99,12 @@ class Study:
         return changed._with_torques(self.sources) if wiring[0] == wiring[1] else self._rebuilt(robot)
 
     def with_torque_shift(self, samples: float) -> "Study":
-        """The study with torques that are late by another time.
-
-        ``samples``: shift of all torques, see `armident.identify.signals.experiments.Experiment`.
-        """
+        """The study with all torques late by another time, samples."""
         training, validation = ([replace(e, torque_shift=samples) for e in part] for part in self.sources)
         return self._with_torques((training, validation))
 
     def with_own_controller(self) -> "Study":
-        """The study with the controller that its corrected torques identify, and the loop that this makes.
-
-        Raises DataError if no closed loop can be simulated with it.
-        """
+        """The study with the controller that its corrected torques identify, and the loop that this makes."""
         return self._rebuilt(self.robot, self.signals)
 
     def _rebuilt(self, robot: RobotConfig, signals: Sequence[Derivatives] | None = None) -> "Study":
@@ -171,11 +135,7 @@ class Study:
         return [joint.name for joint in self.robot.joints]
 
     def motion(self, stretch: MotionStretch, kind: str, theta: Array | None) -> Motion:
-        """Signals of a stretch on which effects depend, with the motion before it.
-
-        ``kind``: ``measured`` or ``simulated``. ``theta``: parameters (b,) that predict the torques on which terms
-        depend; ``None`` if no term does.
-        """
+        """Signals (``measured`` or ``simulated``) on which effects depend; ``theta`` (b,) predicts their torques."""
         parts: list[Derivatives] = [getattr(stretch, kind)]
         if stretch.before is not None:
             parts.insert(0, stretch.before[KINDS.index(kind)])
@@ -184,30 +144,20 @@ class Study:
         return Motion(self.model, q, qd, qdd, self.dt, parts[0].start, theta, self.duration, lead=lead)
 
     def terms(self, stretch: MotionStretch, kind: str, theta: Array | None) -> Array:
-        """Columns (N, n, e) of the model's terms along a stretch.
-
-        ``kind``: ``measured`` or ``simulated``. ``theta``: parameters (b,) that predict the torques on which terms
-        depend; ``None`` if no term does.
-        """
+        """Columns (N, n, e) of terms at ``measured`` or ``simulated`` signals; ``theta`` (b,) predicts torques."""
         motion = self.motion(stretch, kind, theta)
         return self.model.term_regressor(motion)[motion.lead :]
 
     def torques(self, stretch: MotionStretch, kind: str, theta: Array) -> Array:
-        """Torques (N, n) of the model along a stretch, terms included, N m or N.
-
-        ``kind``: ``measured`` or ``simulated``; ``theta``: parameters of the model, (b,).
-        """
+        """Torques (N, n) of the model along a stretch, terms included, N m or N."""
         signals: Derivatives = getattr(stretch, kind)
         rigid = self.model.inverse_dynamics(theta, signals.q, signals.qd, signals.qdd)
         return rigid + self.terms(stretch, kind, theta) @ theta[-self.model.e :] if self.model.e else rigid
 
     def resimulated(self, theta: Array) -> "Study":
-        """The study with the motion that the closed loop makes with its model, terms included, at these parameters.
+        """The study with the closed-loop motion of its model at ``theta`` (b,), except experiments held out altogether.
 
-        Experiments that are held out altogether keep their motion, see `with_report_part`.
-
-        ``theta``: (b,). Returns the same where that loop diverges, or follows the arm less closely than the one there
-        is: large additions to the compiled loop may be too stiff for it (see `armident.identify.robot.relaxation`).
+        The same where that loop diverges or follows the arm less closely: it may be too stiff (`robot.relaxation`).
         """
         motions = self._simulated(theta, sorted({s.experiment for s in self.train}))
         if motions is None:
@@ -222,9 +172,7 @@ class Study:
     def with_first_motions(self, theta: Array) -> "Study":
         """The study whose simulations begin with the torques of terms at the motion of its own loop.
 
-        Loops of models with one more or one less effect then take one simulation instead of several.
-
-        ``theta``: parameters of the loop, (b,).
+        Loops of models with one effect more or less then take one simulation instead of several.
         """
         if self.auxiliary.first_motions is None or not self.model.e:
             return self
@@ -238,10 +186,7 @@ class Study:
         return replace(self, auxiliary=replace(self.auxiliary, first_motions=motions))
 
     def with_report_part(self, theta: Array) -> "Study":
-        """The study with the motion of its loop for the experiments that are held out altogether.
-
-        ``theta``: parameters of the loop, (b,).
-        """
+        """The study with the motion of its loop for the experiments that are held out altogether."""
         trained = {s.experiment for s in self.train}
         numbers = sorted({s.experiment for s in self.held} - trained)
         motions = self._simulated(theta, numbers) if numbers else None
@@ -283,13 +228,7 @@ def build_study(
     known_signals: Sequence[Derivatives] | None = None,
     criteria: Criteria | None = None,
 ) -> Study:
-    """Differentiate, simulate, split and filter the experiments.
-
-    ``training``: experiments to fit; without ``validation`` their last part is held out. ``validation``: experiments
-    for the tests, or none. ``robot``: configuration, with effect entries that correct recordings. ``known_signals``:
-    derivatives of the positions of both, if they were computed before. Raises DataError if rates differ, or the motion
-    is too short or does not determine the parameters of the model.
-    """
+    """Differentiate, simulate, split and filter the experiments; without ``validation`` their last part is held out."""
     criteria = criteria or Criteria()
     experiments = corrected_experiments([*training, *validation], robot)
     check_one_rate(experiments)
@@ -340,12 +279,8 @@ def build_study(
 def log_volume(experiments: Sequence[Experiment], robot: RobotConfig, band: Callable[[Array], Array]) -> Array:
     """Return the logarithm of the volume by which corrections scale the noise of each joint's torque, per row, (n,).
 
-    Likelihoods of corrected torques refer to those that were recorded by this determinant: a correction that is a
-    low-pass filter makes noise smaller, and no model better. By the theorem of Szegoe it is the logarithm of the ratio
-    of the innovations of white noise with and without the correction.
-
-    ``experiments``: recordings without corrections; ``robot``: configuration, with effect entries that correct
-    recordings; ``band``: filter and decimation to the rows of the comparison.
+    It refers likelihoods of corrected torques to the recorded ones: a low-pass correction makes no model better.
+    Szegoe's theorem: log ratio of the innovations of white noise with and without the correction.
     """
     if not any(of_recording(e) and isinstance(known(e.effect), Correction) for e in robot.effects):
         return np.zeros(robot.n)
@@ -360,10 +295,9 @@ def log_volume(experiments: Sequence[Experiment], robot: RobotConfig, band: Call
 
 
 def _aligned(e: Experiment) -> Array:
-    """Torques (N, n) at the instants of the positions, N m or N.
+    """Torques (N, n) at the instants of the positions, N m or N; a held torque belongs half a sample later.
 
-    A torque that is held until the next sample belongs half a sample later. Unlike the mean of two samples, the
-    interpolation (windowed sinc) keeps all frequencies up to half the sampling rate, whatever the shift.
+    Windowed-sinc interpolation keeps all frequencies up to Nyquist, unlike the mean of two samples.
     """
     k = np.arange(-REACH, REACH + 1)
     taps = np.sinc(k - (e.torque_shift - 0.5)) * np.kaiser(k.size, KAISER)
@@ -394,8 +328,7 @@ def _simulated(
 def _seen(q: Array, measured: Derivatives, dt: float) -> Derivatives:
     """Simulated motion after the smoother of the measured one.
 
-    Set points arrive in steps, which a simulated acceleration shows and a smoothed one does not. The columns of effects
-    at either should differ by the noise alone.
+    Set points arrive in steps, which the smoother removes: columns at either should differ by the noise alone.
     """
     assert measured.nvr is not None
     return replace(differentiate(q, dt, nvr=measured.nvr[:, 0]), start=measured.start)

@@ -19,13 +19,8 @@ ROUNDS = 4
 def with_transitions(state: ModelState, model: Fitter) -> ModelState:
     """Model with the transition of dry friction at the reversals of each joint, where it predicts better.
 
-    The smoothed sign of the model approaches its limits slowly. Beside another law of the reversal it looks like
-    friction that depends on the velocity (Stribeck), or like a torque that is early. All joints are tried at once; each
-    keeps what predicts its own torque best. A pattern search goes on from the best values of a grid (Hooke, Jeeves
-    1961, J. ACM 8(2)): the likelihood of a smooth reversal is narrow in its velocity, that of a joint that sticks in
-    its lead.
-
-    ``state``: model to start from; ``model``: fits a model.
+    A grid for all joints at once; then a pattern search (Hooke, Jeeves 1961, J. ACM 8(2)): the likelihood is narrow.
+    Beside another law of the reversal, the smoothed sign looks like Stribeck friction or an early torque.
     """
     search = _Search(state)
     for number in range(search.count):
@@ -67,10 +62,7 @@ class _Search:
         return {place: entry_of(self.effect, place, self.state.robot, dict(one)) for place, one in shapes.items()}
 
     def tried(self, shapes: dict[Place, Shapes], before: ModelState) -> ModelState | None:
-        """Model with transitions; each that predicts the torque of its joint better becomes the best one.
-
-        ``shapes``: nonlinear parameters of the transition at each place; ``before``: model that gives the noise models.
-        """
+        """Model with transitions; each that predicts the torque of its joint better becomes the best one."""
         entries = self.entries(shapes)
         made = fitted_in_loop_of(before, with_entries(self.state.robot, list(entries.values())))
         if made is None:
@@ -83,10 +75,7 @@ class _Search:
         return made
 
     def converged(self, state: ModelState) -> ModelState | None:
-        """Model with the transitions that a pattern search finds from the best ones so far.
-
-        ``state``: model that gives the noise models.
-        """
+        """Model with the transitions that a pattern search finds from the best ones so far."""
         made = self.tried(self.chosen, state)
         for step in STEPS if made else ():
             for _ in range(ROUNDS):
@@ -101,10 +90,7 @@ class _Search:
         return made
 
     def _moved(self, place: Place, shapes: Shapes, factor: float, samples: float) -> Shapes:
-        """Return a transition beside another one, with velocity and lead no less than those of the grid.
-
-        No lead would be a value that is certain; the smallest one of the grid has a standard deviation.
-        """
+        """Return a transition beside another one, no less than the grid: a lead of zero would have no uncertainty."""
         given = dict(shapes)
         velocities, leads = ([dict(one)[name] for one in self.grids[place]] for name in ("velocity", "lead"))
         velocity = float(np.clip(given["velocity"] * np.exp(factor), min(velocities), max(velocities)))
@@ -127,7 +113,7 @@ def _clear(state: ModelState, less: ModelState | None, entry: Entry, joint: int)
 def _possible(state: ModelState, entry: Entry, joint: int) -> bool:
     """True if a transition is positive, and at most `Criteria.largest_transition` within two standard deviations.
 
-    Together with the smoothed sign, a larger one is friction that falls with the velocity: an effect (Stribeck).
+    A larger one, with the smoothed sign, is friction that falls with the velocity: an effect (Stribeck).
     """
     names = state.study.model.base.names
     own, dry = names.index(state.term_of(entry).names[0]), f"fc{joint + 1}"

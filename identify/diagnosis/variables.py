@@ -16,19 +16,9 @@ functions of their own: a frequency independent of the motion, and all functions
 
 @dataclass(frozen=True)
 class ResidualVariable:
-    """Variable of a residual.
+    """Variable of a residual; ``units``: at a revolute and at a prismatic joint; ``signal``: attribute of the motion.
 
-    Parameters
-    ----------
-    meaning
-        The variable, and what usually depends on it.
-    units
-        Units at a revolute and at a prismatic joint.
-    hint
-        Probable causes and checks at the machine. ``joint``, ``other`` (joint or motor of the variable) and ``at``
-        (value of the largest error) are filled in.
-    signal
-        Attribute of the motion that holds its values; empty for a variable without free functions.
+    ``hint``: causes and checks; ``joint``, ``other`` and ``at`` (value of the largest error) are filled in.
     """
 
     meaning: str

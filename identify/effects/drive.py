@@ -26,10 +26,7 @@ NOMINAL_TORQUE = 100.0
 
 
 def motor_limit(robot: RobotConfig, motor: int) -> float:
-    """Return the largest torque of a motor at its shaft, N m or N; that of `NOMINAL_TORQUE` if no limit is known.
-
-    ``robot``: configuration with the limits of the joints and the transmission; ``motor``: index of the motor, from 0.
-    """
+    """Return the largest torque of a motor at its shaft, N m or N; that of `NOMINAL_TORQUE` if no limit is known."""
     limit = robot.joints[motor].limits.torque
     torque = limit if math.isfinite(limit) else NOMINAL_TORQUE
     return float(torque / np.abs(robot.transmission_matrix[motor]).max())
@@ -38,33 +35,22 @@ def motor_limit(robot: RobotConfig, motor: int) -> float:
 class Correction(TorqueDependent):
     """Effect with one linear parameter, for whose value the recorded torque of a motor can be corrected.
 
-    The columns are the first-order expansion of the correction. Their noise at measured signals exceeds the effect; the
-    corrected recording has no added noise.
+    The columns, its first-order expansion, have noise larger than the effect; a corrected recording adds none.
     """
 
     scope = "motor"
 
     @abstractmethod
     def shaft_column(self, torque: Array, motion: Motion, motor: int) -> Array:
-        """Return the torque (N,) at the shaft of a motor per unit of the parameter.
-
-        ``torque``: predicted torque at the shaft, N m or N, (N,); ``motion``: the motion, N samples; ``motor``: index
-        of the motor, from 0.
-        """
+        """Return the torque (N,) at a motor's shaft per unit of the parameter; ``torque`` (N,): predicted."""
 
     @abstractmethod
     def true_torque(self, recorded: Array, value: float, dt: float, limit: float) -> Array:
-        """Return the true torque (N,) of a motor.
-
-        ``recorded``: recorded torque, N m or N, (N,); ``limit``: largest torque of the motor, N m or N.
-        """
+        """Return the true torque (N,) of a motor whose largest torque is ``limit``, N m or N."""
 
     @abstractmethod
     def values_to_test(self, recorded: Array, dt: float, limit: float) -> Array:
-        """Return the values at which a diagnosis tests the correction, increasing in size for each sign.
-
-        ``recorded``: recorded torque, N m or N, (N,); ``limit``: largest torque of the motor, N m or N.
-        """
+        """Return the values at which a diagnosis tests the correction, increasing in size for each sign."""
 
     def relative_slope(self, value: float) -> float:
         """Return the change of the true torque by a change of the value, over that by a further small correction.
@@ -154,9 +140,9 @@ class DriveGainSaturation(Correction):
         return loss
 
     def true_torque(self, recorded: Array, value: float, dt: float, limit: float) -> Array:
-        """Return ``i / sqrt(1 + 2 loss (i / limit)^2)``.
+        """Return ``i / sqrt(1 + 2 loss (i / limit)^2)``, sample by sample.
 
-        Sample by sample: the saturation acts on the noise that the controller adds, too.
+        The saturation acts on the noise that the controller adds, too.
         """
         given: Array = recorded / np.sqrt(np.maximum(1.0 + 2.0 * value * (recorded / limit) ** 2, LEAST))
         return given

@@ -15,10 +15,7 @@ KNOTS = 9
 
 
 def hats(x: Array, knots: Sequence[float] | Array) -> Array:
-    """Return piecewise linear functions (N, k), one at each knot, constant beyond the outermost.
-
-    ``x``: values, (N,); ``knots``: increasing knots, (k,).
-    """
+    """Return piecewise linear functions (N, k), one at each of the increasing knots, constant beyond them."""
     at = np.asarray(knots, dtype=np.float64)
     if x.dtype == object:
         # Symbols in place of numbers: a formula is derived, see `armident.identify.model_export.formulas`.
@@ -32,18 +29,12 @@ def hats(x: Array, knots: Sequence[float] | Array) -> Array:
 
 
 def table(x: Array, low: float, high: float) -> Array:
-    """Return the functions (N, `KNOTS` - 1) of a table, whose value is zero at the first knot.
-
-    ``x``: values, (N,); ``low``, ``high``: first and last knot.
-    """
+    """Return the functions (N, `KNOTS` - 1) of a table, whose value is zero at the first knot."""
     return hats(x, np.linspace(low, high, KNOTS))[:, 1:]
 
 
 def values(prefix: str, unit: tuple[str, str], curve: str) -> tuple[Linear, ...]:
-    """Return the linear parameters of a table: its values at the knots after the first one.
-
-    ``prefix``: beginning of their names; ``unit``: units at a revolute and at a prismatic joint.
-    """
+    """Return the linear parameters of a table: its values at the knots after the first one."""
     quantity, variable = curve.split(" over ")
     return tuple(
         Linear(

@@ -32,10 +32,7 @@ SLOWEST = 0.03
 
 
 def speeds(motion: Motion, place: Place) -> Sequence[float]:
-    """Return characteristic speeds from those of the reversal to a third of the joint's top speed, rad/s or m/s.
-
-    ``motion``: motion of the arm; ``place``: location with the joint.
-    """
+    """Return characteristic speeds from those of the reversal to a third of the joint's top speed, rad/s or m/s."""
     return [float(v) for v in float(motion.top_speed[place.joint]) * np.geomspace(SLOWEST, 0.35, 7)]
 
 
@@ -65,8 +62,7 @@ class CoulombTransition(Effect):
     def columns(self, motion: Motion, place: Place, shapes: Mapping[str, float]) -> Array:
         """Return ``tanh((qd + lead qdd) / velocity) - sign(qd)``.
 
-        A joint stops suddenly and leaves standstill slowly, while its friction reverses under the rising torque. A
-        smoothed velocity passes zero late in that time.
+        A joint stops suddenly and leaves standstill slowly: a smoothed velocity is late under the rising torque.
         """
         j = place.joint
         reversal = motion.qd[:, j] + shapes["lead"] * motion.qdd[:, j]
@@ -223,8 +219,7 @@ class StribeckFrictionTable(FreeShape, StribeckBell):
     def possible(self, values: Array, shapes: Mapping[str, float]) -> bool:
         """Return True if friction falls with the speed.
 
-        The value at rest is not judged alone: there the curve also contains the transition of dry friction at
-        reversals.
+        The value at rest is not judged alone: it contains the transition of dry friction at reversals.
         """
         return bool(values[1] > 0.0 and values[1] >= values[-1] and values[0] + values[1] > 0.0)
 
@@ -301,11 +296,9 @@ class PreslidingFriction(Effect):
 
 @compiled("f8[:], f8", "f8[::1], f8", **ARITHMETIC)
 def dahl(q: Array, displacement: float) -> Array:
-    """Return Dahl's friction over its level, shape (N,), integrated exactly between samples.
+    """Return Dahl's friction over its level, shape (N,), integrated exactly between samples ``q`` (N,).
 
-    ``dz/dq = (1 - z sign(qd)) / displacement``: after a reversal it approaches its level exponentially in the distance.
-
-    ``q``: positions, rad or m, shape (N,); ``displacement``: constant of the exponential, in the unit of ``q``.
+    ``dz/dq = (1 - z sign(qd)) / displacement``: after a reversal it approaches its level exponentially.
     """
     z = np.empty(q.size)
     state = 0.0

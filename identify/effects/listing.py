@@ -46,11 +46,7 @@ def effect_json(effect: Effect) -> dict[str, Any]:
 
 
 def effects_command(name: str | None, *, as_json: bool) -> None:
-    """Print the effects of the catalogue.
-
-    ``name``: name of one effect; ``None``: all. ``as_json``: print JSON instead of a table. Raises ConfigError if there
-    is no such effect.
-    """
+    """Print the effects of the catalogue, or the one named; ConfigError if there is no such effect."""
     chosen = list(catalogue().values()) if name is None else [known(name)]
     if as_json:
         sys.stdout.write(json.dumps([effect_json(effect) for effect in chosen], indent=1) + "\n")

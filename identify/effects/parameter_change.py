@@ -20,10 +20,7 @@ class ParameterChange(Effect):
         """Return the names of the standard parameters that the linear ones change, (k,)."""
 
     def change(self, motion: Motion, place: Place) -> Array:
-        """Return the Jacobian (b, k) of the base parameters with respect to the linear ones.
-
-        ``motion``: motion of the model.
-        """
+        """Return the Jacobian (b, k) of the base parameters with respect to the linear ones."""
         model = motion.model
         chosen = [model.names.index(name) for name in self.parameters(place, motion.n)]
         change: Array = model.base.regroup[:, chosen]

@@ -14,18 +14,13 @@ from armident.identify.signals.streamed import kept
 def of_recording(entry: Entry) -> bool:
     """Return True if an effect entry corrects the recordings instead of being a term of the model.
 
-    Wiring errors always do. A torque correction (gain, delay, lag, saturation) does if the entry gives its value;
-    otherwise the value is a parameter of the model and estimated with the rest.
+    Wiring errors always do; torque corrections (gain, delay, lag, saturation) only if the entry gives the value.
     """
     return of_entry(entry).corrects(entry)
 
 
 def corrected_experiments(experiments: Sequence[Experiment], robot: RobotConfig) -> Sequence[Experiment]:
-    """Return the experiments corrected for the effects on signals of a robot's configuration.
-
-    ``robot``: configuration with the effect entries. Raises ConfigError if the entry of a wiring error does not name
-    the signal or the other joint.
-    """
+    """Return the experiments corrected for effects on signals; ConfigError if a wiring error lacks signal or joint."""
     experiments = rewired(experiments, robot)
     for entry in robot.effects:
         effect = of_entry(entry)

@@ -23,10 +23,7 @@ def own_effects() -> list[Effect]:
 
 @cache
 def catalogue() -> dict[str, Effect]:
-    """Return all effects by name, those of this package first.
-
-    Raises ConfigError if an entry point cannot be loaded, is not an effect, or repeats a name.
-    """
+    """Return all effects by name, those of this package first; ConfigError if an entry point is faulty."""
     found = {effect.key: effect for effect in own_effects()}
     for point in sorted(entry_points(group=ENTRY_POINTS), key=lambda p: p.name):
         where = f"effect {point.name} ({point.value})"
@@ -57,10 +54,7 @@ def _instance(one: object, where: str) -> Effect:
 
 
 def known(name: str) -> Effect:
-    """Return the effect of a name.
-
-    ``name``: name in the catalogue. Raises ConfigError if there is no such effect; the message lists all.
-    """
+    """Return the effect of a name; ConfigError, which lists all, if there is none."""
     effects = catalogue()
     if name not in effects:
         raise ConfigError(f"effects: {name!r} is not in the catalogue ({', '.join(effects)})")
@@ -68,9 +62,5 @@ def known(name: str) -> Effect:
 
 
 def of_entry(entry: Entry) -> Effect:
-    """Return the effect of an entry of a robot configuration, with the law that the entry names.
-
-    ``entry``: entry of the ``effects`` of the configuration. Raises ConfigError if there is no such effect, or no such
-    law of it; the message lists all.
-    """
+    """Return the effect of a configuration entry, with the law that it names; ConfigError, which lists all, if none."""
     return known(f"{entry.effect}/{entry.law}" if entry.law else entry.effect)

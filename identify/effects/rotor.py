@@ -27,10 +27,7 @@ APART = 0.05
 def rotors(motion: Motion, joint: int) -> Sequence[float]:
     """Return the rotor inertias to try, kg m^2 or kg: zero where the model has one, else shares of the link's inertia.
 
-    The base parameters of joints with a constant axis, and of models without rotors, contain the rotor in the link. It
-    matters for load-dependent friction, elasticity and backlash, unless all load is proportional to the acceleration.
-
-    ``motion``: motion of the arm; ``joint``: index of the joint, from 0.
+    Base parameters without a rotor contain it in the link. It matters where load is not proportional to acceleration.
     """
     if f"ia{joint + 1}" in motion.model.base.names:
         return (0.0,)

@@ -18,11 +18,9 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Term:
-    """One entry of a robot's ``effects`` as a model term.
+    """One entry of a robot's ``effects`` as a model term with k linear parameters (all or some of the effect's).
 
-    ``effect``, ``place``, ``shapes``: effect of the catalogue, its location, and its nonlinear parameters; ``kept``:
-    indices of the effect's linear parameters that the term has, (k,); ``names``, ``units``: names and units of these in
-    results; ``values``: their values in the configuration, zero where it gives none, (k,).
+    ``kept`` (k,): their indices in the effect; ``values`` (k,): in the configuration, zero where it gives none.
     """
 
     effect: Effect
@@ -39,11 +37,7 @@ class Term:
         return every if len(self.kept) == every.shape[2] else every[:, :, list(self.kept)]
 
     def add_torque(self, motion: Motion, values: Array, torque: Array) -> None:
-        """Add the torque of the term.
-
-        ``motion``: the motion, N samples. ``values``: values of the linear parameters, (k,). ``torque``: torques of all
-        joints, (N, n), N m or N; changed in place.
-        """
+        """Add the torque of the term for values (k,) to ``torque`` (N, n) of all joints, in place, N m or N."""
         columns = self.effect.columns(motion, self.place, {**self.effect.defaults, **self.shapes})
         if columns.ndim == 3:
             torque += columns @ self.of_effect(values)
@@ -83,10 +77,7 @@ def effect_terms(model: ArmModel) -> tuple[Term, ...]:
 
 
 def terms_of(robot: RobotConfig) -> tuple[Term, ...]:
-    """Return the terms of a robot's effects in their order, without those that correct the recordings.
-
-    Raises ConfigError if an effect is unknown, lacks a parameter, has an unknown one, or cannot be at the joint.
-    """
+    """Return the terms of a robot's effects in order, without corrections of recordings; else ConfigError."""
     terms: list[Term] = []
     taken: dict[str, int] = {}
     for k, entry in enumerate(robot.effects):
@@ -119,11 +110,7 @@ def terms_of(robot: RobotConfig) -> tuple[Term, ...]:
 
 
 def place_of_entry(entry: Entry, effect: Effect, robot: RobotConfig, where: str) -> Place:
-    """Return the location of an effect entry.
-
-    ``entry``: entry of the ``effects`` of the configuration; ``where``: key of the entry, for messages. Raises
-    ConfigError if a pair lacks its second joint, or another effect has one.
-    """
+    """Return the location of an effect entry; ``where`` is its key, for messages of the ConfigError."""
     names = [joint.name for joint in robot.joints]
     joint = names.index(entry.joint)
     if not effect.two_joints:
@@ -138,11 +125,7 @@ def place_of_entry(entry: Entry, effect: Effect, robot: RobotConfig, where: str)
 def entry_of(
     effect: Effect, place: Place, robot: RobotConfig, parameters: dict[str, float], without: tuple[str, ...] = ()
 ) -> Entry:
-    """Return the configuration entry of an effect.
-
-    ``effect``, ``place``: effect and location; ``robot``: configuration, for the names of the joints; ``without``:
-    linear parameters that it leaves out.
-    """
+    """Return the configuration entry of an effect; ``without``: linear parameters that it leaves out."""
     other = None if place.other is None else robot.joints[place.other].name
     return Entry(
         effect=effect.name,

@@ -70,10 +70,7 @@ class CoggingTorque(MotorOrder):
         return columns
 
     def trial_values(self, motion: Motion, place: Place) -> Trials:
-        """Return harmonics of a motor turn; of a prismatic axis the wave numbers that its travel resolves.
-
-        The pitch of a prismatic axis is unknown.
-        """
+        """Return harmonics of a motor turn; of a prismatic axis, whose pitch is unknown, wave numbers by its travel."""
         if motion.model.robot.joints[place.joint].type == "revolute":
             return ((1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 12.0, 16.0, 18.0, 24.0),)
         resolution = np.pi / float(motion.span[place.joint])
@@ -99,8 +96,7 @@ class JointElasticity(TorqueDependent):
     def columns(self, motion: Motion, place: Place, shapes: Mapping[str, float]) -> Array:
         """Return the torques by `swinging` of the link.
 
-        ``frequency`` refers to the mean inertia over the postures of the arm, so that it stands for the same stiffness
-        in every motion.
+        ``frequency`` refers to the mean inertia over the arm's postures: the same stiffness in every motion.
         """
         j, rotor = place.joint, shapes["rotor"]
         inertia, share = inertias(motion, j, rotor), np.ones(motion.samples)
@@ -118,13 +114,10 @@ class JointElasticity(TorqueDependent):
 
 @compiled("f8[::1], f8[::1], f8, f8, f8", **ARITHMETIC)
 def swinging(pull: Array, share: Array, w: float, damping: float, dt: float) -> tuple[Array, Array, Array]:
-    """Return position, velocity and acceleration (N,) of ``share x'' + 2 damping w x' + w^2 x = w^2 pull``, from rest.
+    """Position, velocity, acceleration (N,) of ``share x'' + 2 damping w x' + w^2 x = w^2 pull``, from rest.
 
-    Trapezoidal rule (Newmark 1959), which is stable at any frequency.
-
-    ``pull``: position at equilibrium, shape (N,). The results have its unit (per s, per s^2); for a gear it is minus
-    the transmitted torque, N m or N: the position per unit of compliance. ``share``: inertia over its mean, shape (N,).
-    ``w``: angular frequency of the resonance at mean inertia, rad/s. ``damping``: damping ratio.
+    Trapezoidal rule (Newmark 1959), stable at any frequency. For a gear, ``x`` is minus the transmitted torque: the
+    position per unit of compliance. ``share`` (N,): inertia over its mean; ``w``: resonance at mean inertia, rad/s.
     """
     way, rate, acceleration = np.empty(pull.size), np.zeros(pull.size), np.zeros(pull.size)
     way[0] = pull[0]
@@ -140,8 +133,7 @@ def swinging(pull: Array, share: Array, w: float, damping: float, dt: float) -> 
 class Backlash(TorqueDependent):
     """Gap of the gear, in which the link moves freely until the teeth are in contact again.
 
-    The motion has jumps at instants that a simulation does not reproduce to the sample, so that the columns at measured
-    signals are their own instruments.
+    A simulation does not reproduce its jumps to the sample: columns at measured signals are their own instruments.
     """
 
     name = "backlash"
@@ -174,11 +166,7 @@ class Backlash(TorqueDependent):
 
 
 def falls(motion: Motion, joint: int, rotor: float = 0.0) -> Array:
-    """Return the acceleration (N,) of a link relative to its motor without contact of the teeth, rad/s^2 or m/s^2.
-
-    ``motion``: motion of the arm, N samples; ``joint``: index of the joint, from 0; ``rotor``: rotor inertia that the
-    model contains in the link, kg m^2 or kg.
-    """
+    """Return the free acceleration (N,) of a link relative to its motor, rad/s^2 or m/s^2; ``rotor``: in the link."""
     inertia = inertias(motion, joint, rotor)
     if inertia.max() <= 0.0:
         return np.zeros(motion.samples)
@@ -190,10 +178,7 @@ def falls(motion: Motion, joint: int, rotor: float = 0.0) -> Array:
 def crossing(pull: Array, gap: float, dt: float) -> tuple[Array, Array, Array]:
     """Return position, velocity and acceleration (N,) of a link relative to its motor, in the gap of the gear.
 
-    Leapfrog integration with plastic impacts at half a gap to either side. Velocity and acceleration are central
-    differences of the position, so that they have no delay.
-
-    ``pull``: free acceleration of the link, rad/s^2 or m/s^2, shape (N,); ``gap``: width of the gap, rad or m.
+    Leapfrog with plastic impacts at half a gap; central differences have no delay. ``pull``: free acceleration.
     """
     way, rate, acceleration = np.zeros(pull.size), np.zeros(pull.size), np.zeros(pull.size)
     way[0] = 0.5 * gap if pull[0] > 0.0 else -0.5 * gap
@@ -212,12 +197,9 @@ def crossing(pull: Array, gap: float, dt: float) -> tuple[Array, Array, Array]:
 
 
 def inertias(motion: Motion, joint: int, rotor: float) -> Array:
-    """Return the inertia (N,) of the link that a gear drives, kg m^2 or kg.
+    """Return the inertia (N,) of the link that a gear drives, kg m^2 or kg; at least `LEAST_INERTIA`.
 
-    It has a lower bound, `LEAST_INERTIA`, and is zero where the fit has no inertia.
-
-    ``motion``: motion of the arm, N samples; ``joint``: index of the joint, from 0; ``rotor``: rotor inertia that the
-    model contains in the link, kg m^2 or kg.
+    Zero where the fit has no inertia. ``rotor``: rotor inertia that the model contains in the link.
     """
     inertia = motion.slopes(joint, links=True)[2][:, joint] - rotor
     believed: Array = np.maximum(inertia, LEAST_INERTIA * inertia.max())

@@ -82,13 +82,7 @@ class OfTimeAndDirection(OfTime):
 
 
 class OverSignal(Unnamed):
-    """Torque by a table over a signal of the joint, or of another one.
-
-    Attributes
-    ----------
-    signal
-        Attribute of the motion, (N, n).
-    """
+    """Torque by a table over a signal ``signal`` (N, n) of the joint, or of another one."""
 
     signal: str
 

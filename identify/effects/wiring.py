@@ -124,11 +124,7 @@ BY_NAME = {effect.name: effect() for effect in EFFECTS}
 
 
 def rewired(experiments: Sequence[Experiment], robot: RobotConfig) -> Sequence[Experiment]:
-    """Return the experiments corrected for the wiring errors of a robot's configuration.
-
-    ``robot``: configuration with the effect entries. Raises ConfigError if an entry does not name the signal or the
-    other joint.
-    """
+    """Return the experiments corrected for wiring errors; ConfigError if an entry lacks signal or other joint."""
     position, torque = exchanges(robot)
     if np.array_equal(position, np.eye(robot.n)) and np.array_equal(torque, np.eye(robot.n)):
         return experiments
@@ -150,11 +146,9 @@ def rewired(experiments: Sequence[Experiment], robot: RobotConfig) -> Sequence[E
 def exchanges(robot: RobotConfig) -> tuple[Array, Array]:
     """Return the matrices (n, n) that correct the motors' positions and torques for the configured wiring errors.
 
-    Raw values (counts, shares of the rated signal) are exchanged, while the scaling belongs to the drive. So these are
-    signed permutations, scaled where two drives differ in resolution, gain or rating. With ``joint_side: 1`` columns in
-    SI units on the joint side are concerned, as they are after an import; `signal_scale` always acts on these, and with
-    an ``other`` joint adds a multiple of its signal. Several entries act one after the other: exchanges express any
-    permutation. Raises ConfigError if an entry does not name the signal or the other joint.
+    Raw values are exchanged, while the scaling belongs to the drive: signed permutations, scaled where drives differ.
+    ``joint_side: 1`` and `signal_scale` concern SI columns on the joint side, as after an import. `signal_scale` with
+    an ``other`` joint adds a multiple of its signal. Entries act one after the other, which expresses any permutation.
     """
     names = [joint.name for joint in robot.joints]
     worth = {"position": _per_count(robot), "torque": _per_share(robot)}

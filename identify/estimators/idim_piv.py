@@ -107,10 +107,9 @@ def idim_piv(
 def _solve(problem: Problem) -> Solved:
     """IDIM-PIV, or IDIM-IV where the prefilter contradicts it or does not converge.
 
-    A noise model may move the estimate within its uncertainty only. Where it moves it further, the residual is model
-    error and not noise, and the inverse filter amplifies it (thesis section 6.2.3). Then, as in SEP-PEM, the dynamic
-    model is estimated without the noise model, which only enters the covariance (6.2.1). The same holds where the
-    iterations with the prefilter, which weights frequencies beyond those of the motion, do not converge.
+    A noise model may move the estimate within its uncertainty only. Beyond, the residual is model error, which the
+    inverse filter amplifies (thesis section 6.2.3); the noise model then only enters the covariance, as in SEP-PEM
+    (6.2.1). The same holds where the iterations with the prefilter do not converge.
     """
     plain, order = problem.plain_problem, problem.max_ar_order
     without = idim_iv(plain.blocks, plain.auxiliary, problem.start, serial_order=order)
@@ -139,10 +138,9 @@ def _solve(problem: Problem) -> Solved:
 
 
 def _difference_without_model_error(problem: Problem, estimate: Estimate, without: Estimate) -> NDArray[np.float64]:
-    """Difference (b,) of IDIM-PIV and IDIM-IV on data of exactly the model, by derivatives and sampling alone.
+    """Difference (b,) of IDIM-PIV and IDIM-IV on data of exactly the model; zero where no loop can be simulated.
 
-    The prefilter weights high frequencies, at which the smoothed derivatives of few noisy or undecimated samples are
-    wrong. The two estimates then differ although the model misses nothing. Zero where no loop can be simulated.
+    The prefilter weights high frequencies, at which the smoothed derivatives of few noisy samples are wrong.
     """
     refined = problem.bias(estimate, prefiltered=True)
     plain = problem.plain_problem.bias(without, prefiltered=False)

@@ -1,6 +1,6 @@
-"""Distances between the links of an arm, and between links and boxes, along a motion.
+"""Distances between links and of links to boxes along a motion, by the library coal.
 
-Links are capsules: given, from the geometry of a URDF, or from joint to joint. Distances are those of the library coal.
+Links are capsules: given, from the geometry of a URDF, or from joint to joint.
 """
 
 from collections.abc import Sequence
@@ -19,10 +19,8 @@ from armident.identify.robot.chain import Chain, chain_of, link_frames
 Array = NDArray[np.float64]
 
 JOINT_ZONE = 1.5
-"""Distance from a joint's axis, over the sum of the radii and the clearance, up to which its two links may touch.
-
-Beyond it they touch when the angle between them is below ``2 asin(1 / (2 * 1.5))``, 39 degrees.
-"""
+"""Distance from a joint's axis, over radii plus clearance, up to which its two links may touch. Beyond it they touch
+when the angle between them is below ``2 asin(1 / (2 * 1.5))``, 39 degrees."""
 
 ALWAYS = 0.95
 """Share of random postures in which two bodies overlap by construction: that of the set-up assistant of MoveIt."""
@@ -36,10 +34,7 @@ STRIDE = 10
 
 @dataclass(frozen=True)
 class ClosestApproach:
-    """Smallest distance along a motion.
-
-    ``distance``: metres; negative where bodies overlap. ``first``, ``second``: names of the two bodies.
-    """
+    """Smallest distance of two named bodies along a motion, m; negative where they overlap."""
 
     distance: float
     first: str
@@ -82,10 +77,9 @@ class _Body:
 
 
 class CollisionModel:
-    """Pairs of bodies of an arm and its cell, and their distances.
+    """Pairs of bodies of an arm and its cell; ConfigError if a box contains the arm in nearly every posture.
 
-    ``robot``: geometry, limits and ``collision``; ``geometry``: capsules of links, in frames j, for links without given
-    ones: those of a URDF. Raises ConfigError if a box contains the arm in nearly every posture.
+    ``geometry``: capsules, in frames j, for links without given ones.
     """
 
     def __init__(self, robot: RobotConfig, geometry: Sequence[LinkCapsule] = ()) -> None:
@@ -110,10 +104,7 @@ class CollisionModel:
         return len(self._pairs)
 
     def closest(self, q: Array) -> ClosestApproach | None:
-        """Return the smallest distance along a motion; ``None`` if there is nothing to compare.
-
-        ``q``: postures (N, n), rad or m.
-        """
+        """Return the smallest distance along postures (N, n); ``None`` if there is nothing to compare."""
         if not self._pairs:
             return None
         frames, travel = self._motion(q)
@@ -133,10 +124,7 @@ class CollisionModel:
         return np.array([self._distance(frame)[0] for frame in frames])
 
     def shortfall(self, q: Array) -> float:
-        """Return the mean distance by which a motion misses the clearance, m; 0 where it keeps it.
-
-        ``q``: postures (N, n), rad or m.
-        """
+        """Return the mean distance, m, by which postures (N, n) miss the clearance; 0 where they keep it."""
         if not self._pairs:
             return 0.0
         frames, travel = self._motion(q)
@@ -260,10 +248,7 @@ class CollisionModel:
 
 
 def _to_next_joint(chain: Chain, link: int) -> Array:
-    """Segment (2, 3) from the origin of a link's frame to that of the next; a point for the last link.
-
-    A rail is left out: the next link slides along it.
-    """
+    """Segment (2, 3) from a link's frame to the next without a rail's travel; a point for the last link."""
     segment = np.zeros((2, 3))
     if link < chain.d.size:
         r = 0.0 if chain.prismatic[link] else chain.r[link]

@@ -1,15 +1,10 @@
 """Optimal experiment design: exciting trajectories (thesis section 2.3.5).
 
-Candidates that exceed a torque limit or bring two bodies too close are ranked behind all others, by how far they do.
-
-A trajectory is a sequence of point-to-point moves within the limits, or a finite Fourier series per joint. A random
-search improves waypoints and paces, or coefficients. The criterion is D-optimality: the smallest geometric mean of the
-standard deviations of the base parameters, with the torque noise of each joint as weight. The condition number must be
-below `armident.identify.excitation.point_to_point.CONDITION`. As sole criterion it would prefer slow moves, whose
-gravity torques are as small as their inertial ones.
-
-With an `EffectObjective` the criterion is that of the linear parameters of one effect, or of two effects to separate;
-the base parameters have a small weight.
+A random search improves point-to-point moves, or the Fourier series of each joint. The criterion is D-optimality: the
+smallest geometric mean of the standard deviations of the base parameters, weighted by the torque noise of each joint.
+Violations of limits rank behind everything else. The condition number is only a bound (`CONDITION`): as criterion it
+would prefer slow moves, whose gravity torques are as small as their inertial ones. With an `EffectObjective` the
+criterion is that of the effect; the base parameters have a small weight.
 """
 
 from collections.abc import Callable
@@ -54,23 +49,10 @@ ASSUMED_NOISE = 0.02
 class Design:
     """Trajectory and its predicted precision.
 
-    Parameters
-    ----------
-    trajectory
-        Reference within the limits of the robot.
-    condition
-        Condition number of the filtered, weighted base regressor along it.
-    std
-        Predicted standard deviation of each base parameter, shape (b,), in its unit; ``None`` if the noise is unknown.
-    slow_share
-        Share of the samples of each joint, shape (n,), slower than `armident.identify.excitation.point_to_point.SLOW`
-        of its velocity limit.
-    torque
-        Predicted torques (N, n) at `PERIOD`, N m or N; ``None`` if the parameters of the robot are unknown.
-    wanted
-        Predicted standard deviations of the linear parameters of the wanted effects; ``None`` as for ``std``.
-    closest
-        Smallest distance between bodies at `PERIOD`; ``None`` if there are none to compare.
+    ``condition``: condition number of the filtered, weighted base regressor. ``std``: predicted standard deviations
+    (b,); ``None`` if the noise is unknown. ``slow_share``: share of the samples of each joint (n,) slower than `SLOW`
+    of its limit. ``torque``: (N, n) at `PERIOD`, ``None`` without parameters. ``wanted``: standard deviations of the
+    wanted effects. ``closest``: smallest distance between bodies; ``None`` if there are none to compare.
     """
 
     trajectory: Trajectory
@@ -97,34 +79,13 @@ def design_trajectory(
     collision: CollisionModel | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> Design:
-    """Design an exciting trajectory by random search.
+    """Design an exciting trajectory by random search; the same seed gives the same trajectory.
 
-    Returns the best trajectory found, with its predicted precision. Raises ConfigError if the robot cannot make a
-    single move in that time, an argument is wrong, or no candidate keeps the limits of torque and the clearance.
-
-    Parameters
-    ----------
-    duration
-        Length, s, met within a millisecond.
-    seed
-        Seed of the search; the same seed gives the same trajectory.
-    noise
-        Standard deviation of the torque noise of each joint after the low-pass filter, (n,), N m or N: weight of
-        the regressor. By default proportional to the torque limits.
-    evaluations
-        Number of candidates to try.
-    margin
-        Share of each limit that may be used.
-    theta
-        Standard or base parameters; with them torques stay within their limits, too.
-    aim
-        Effects to make visible; those that depend on torques need ``theta``.
-    shape, harmonics
-        ``moves``: point-to-point with trapezoidal velocities; ``fourier``: series of that many harmonics.
-    collision
-        Bodies that the trajectory keeps apart by their clearance.
-    progress
-        Called with the share done, 0 to 1.
+    ``duration`` (s) is met within a millisecond. ``noise``: standard deviations (n,) of the filtered torque noise, the
+    weight; by default proportional to the torque limits. ``evaluations``: number of candidates. ``margin``: usable
+    share of each limit. ``theta``: standard or base parameters, so that torques stay within limits. ``aim``: effects to
+    make visible. ``shape``: trapezoidal ``moves`` or a ``fourier`` series of ``harmonics``. Raises ConfigError if no
+    move or no candidate keeps the limits.
     """
     robot.check_movable()
     model = arm_model(robot)
@@ -157,10 +118,7 @@ def design_trajectory(
 
 
 def excesses(robot: RobotConfig, design: Design, collision: CollisionModel | None, share: float = 1.0) -> list[str]:
-    """Return the violated limits of torque and distance of a trajectory, in words.
-
-    ``collision``: bodies to keep apart; ``share``: share of the torque limits that may be used.
-    """
+    """Return the violated limits of torque (times ``share``) and distance of a trajectory, in words."""
     found = []
     if design.torque is not None:
         for joint, peak in zip(robot.joints, np.abs(design.torque).max(axis=0), strict=True):
@@ -210,10 +168,6 @@ def with_objective(
     """Return the objective of the options ``--for``, ``--joint`` and ``--against``; ``None`` without ``--for``.
 
     Speeds and loads at which the effect is to be visible are those of a typical trajectory of the robot.
-
-    ``wanted``, ``against``: names of the effect and of the effect to separate it from. ``joint``: name of the joint;
-    ``None``: all. ``theta``: standard or base parameters, if known. Raises ConfigError: see
-    `armident.identify.excitation.objective.effect_objective`; or if ``joint`` or ``against`` are given alone.
     """
     if wanted is None:
         for option, value in (("--joint", joint), ("--against", against)):
@@ -240,17 +194,8 @@ def predict_precision(
 ) -> Design:
     """Predict condition number and standard deviations of an identification along a trajectory.
 
-    Parameters
-    ----------
-    noise
-        Standard deviation of the filtered torque noise of each joint, (n,), N m or N.
-    cutoff_hz
-        Cut-off of the zero-phase low-pass filter, Hz; one sample per independent interval is kept (thesis section
-        2.3.2).
-    known_noise
-        False if ``noise`` is only a weight: there are no standard deviations then.
-    theta, aim, collision
-        As in `design_trajectory`.
+    ``noise``: of the filtered torques (n,), N m or N; without ``known_noise`` only a weight, so no standard deviations.
+    ``cutoff_hz``: low-pass; one sample per independent interval is kept (thesis section 2.3.2).
     """
     period = PERIOD
     q, qd, qdd = sample_trajectory(trajectory, period)

@@ -27,10 +27,9 @@ DIGITS = 7
 
 @dataclass(frozen=True)
 class FourierSeries:
-    """Candidate of the search.
+    """Candidate: sine and cosine ``coefficients`` (2, H, n) before scaling to the limits.
 
-    ``coefficients``: sine and cosine coefficients (2, H, n) before scaling to the limits; ``share``: used share (n,) of
-    the amplitude that the limits allow; ``middle``: position (n,) of the motion in the free range, 0 to 1.
+    ``share`` (n,) of the amplitude that the limits allow; ``middle`` (n,) of the motion in the free range, 0 to 1.
     """
 
     coefficients: Floats
@@ -39,10 +38,7 @@ class FourierSeries:
 
 
 class FourierSearch:
-    """Search space of Fourier series; limits and cost are those of the point-to-point search.
-
-    ``search``: limits, noise, model and cost. ``harmonics``: number of harmonics; ``None``: up to `HIGHEST_HZ`.
-    """
+    """Search space of Fourier series with the point-to-point cost; ``harmonics`` ``None``: up to `HIGHEST_HZ`."""
 
     def __init__(self, search: PointToPointSearch, harmonics: int | None = None) -> None:
         self._search, self._rng, self.n = search, search.rng, search.low.size

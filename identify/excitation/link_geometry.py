@@ -35,10 +35,7 @@ def capsules_of(shapes: Iterable[UrdfShape]) -> tuple[list[LinkCapsule], list[st
 
 
 def bounding_capsule(points: Array) -> tuple[Array, float]:
-    """Return segment (2, 3) and radius of a capsule that contains points and lies along their largest extent.
-
-    ``points`` (K, 3), m.
-    """
+    """Return segment (2, 3) and radius of a capsule around points (K, 3) along their largest extent, m."""
     middle = (points.min(axis=0) + points.max(axis=0)) / 2.0
     axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2]
     boxed = (points - middle) @ axes.T

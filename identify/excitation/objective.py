@@ -34,22 +34,14 @@ class EffectLocation:
     shapes: tuple[Shapes, ...]
 
     def columns(self, motion: Motion, shapes: Shapes, decimation: Decimation, sigma: Array) -> Array:
-        """Return the filtered columns over the noise of each joint, (M n, k), per unit of the linear parameters.
-
-        ``motion``: motion at the input rate of the decimation; ``shapes``: nonlinear parameters by name;
-        ``decimation``: filter of the regression; ``sigma``: standard deviation of the torque noise of each joint,
-        N m or N, (n,).
-        """
+        """Return the filtered columns over the noise of each joint, (M n, k), per unit of the linear parameters."""
         columns = decimation(self.effect.torque(motion, self.place, dict(shapes))) / sigma[:, None]
         return columns.reshape(-1, columns.shape[2])
 
 
 @dataclass(frozen=True)
 class EffectObjective:
-    """Objective of a design for effects.
-
-    ``pairs``: effects to estimate, each with the effect to separate it from, or ``None``.
-    """
+    """Effects to estimate, each with the effect to separate it from, or ``None``."""
 
     pairs: tuple[tuple[EffectLocation, EffectLocation | None], ...]
 
@@ -63,9 +55,7 @@ class EffectObjective:
     def cost(self, motion: Motion, x: Array, decimation: Decimation, sigma: Array) -> float:
         """Return the mean log standard deviation of all linear parameters (D-optimality); lower is better.
 
-        ``motion``: motion at the input rate of the decimation; ``x``: weighted base regressor at the instants that the
-        decimation keeps, (M n, b); ``decimation``: filter of the regression; ``sigma``: standard deviation of the
-        torque noise of each joint, N m or N, (n,).
+        ``x``: weighted base regressor (M n, b) at the instants that the decimation keeps; ``sigma``: torque noise (n,).
         """
         values = []
         for location, rival in self.pairs:
@@ -76,14 +66,7 @@ class EffectObjective:
         return float(np.mean(values))
 
     def std(self, motion: Motion, x: Array, decimation: Decimation, sigma: Array) -> dict[str, float]:
-        """Return the predicted standard deviations of the linear parameters by name, in their units.
-
-        Nonlinear parameters are in the middle of their grids. Parameters that are not identifiable are infinite.
-
-        ``motion``: motion at the input rate of the decimation; ``x``: weighted base regressor at the instants that the
-        decimation keeps, (M n, b); ``decimation``: filter of the regression; ``sigma``: standard deviation of the
-        torque noise of each joint, N m or N, (n,).
-        """
+        """Return standard deviations by name, nonlinear parameters at mid-grid; inf: not identifiable; see `cost`."""
         found: dict[str, float] = {}
         for location, rival in self.pairs:
             shapes = location.shapes[len(location.shapes) // 2]
@@ -101,10 +84,8 @@ def effect_objective(
 ) -> EffectObjective:
     """Return the objective for an effect at one joint or at all joints.
 
-    ``wanted``, ``against``: names of the effect and of the effect to separate it from. ``joint``: name of the joint;
-    ``None``: all. ``motion``: typical motion of the robot; its speeds and loads give the values of nonlinear
-    parameters. Raises ConfigError if there is no such effect or joint, the robot has no location for it, or any motion
-    shows it.
+    ``motion``: typical motion; its speeds and loads give the nonlinear parameters. Raises ConfigError if the robot has
+    no such effect or joint, or any motion shows the effect.
     """
     effect, rival = _designable(wanted, "--for"), None if against is None else _designable(against, "--against")
     if rival is not None and rival.name == effect.name:
@@ -130,10 +111,7 @@ def effect_objective(
 
 
 def weighted_rows(x: Array, sigma: ArrayLike) -> Array:
-    """Return a regressor over the noise of each joint as rows (M n, b).
-
-    ``x``: regressor, shape (M, n, b); ``sigma``: standard deviation of the torque noise of each joint, N m or N, (n,).
-    """
+    """Return a regressor (M, n, b) over the noise of each joint (n,) as rows (M n, b)."""
     rows: Array = (x / np.asarray(sigma, dtype=np.float64)[:, None]).reshape(-1, x.shape[2])
     return rows
 
@@ -156,10 +134,7 @@ def _locations(effect: Effect, robot: RobotConfig, joint: int | None, motion: Mo
 
 
 def _typical(every: Sequence[Shapes]) -> tuple[Shapes, ...]:
-    """Return the nonlinear parameters of a grid at the positions `TYPICAL` of the values of each.
-
-    Positions in the list of all combinations would depend on how many values the last parameter has.
-    """
+    """Return the grid's nonlinear parameters at the positions `TYPICAL` of each one's values."""
     values = [[(name, value) for value in dict.fromkeys(dict(one)[name] for one in every)] for name, _ in every[0]]
     chosen = (tuple(own[round(share * (len(own) - 1))] for own in values) for share in TYPICAL)
     return tuple(dict.fromkeys(chosen))
@@ -192,8 +167,8 @@ def _information(
 ) -> tuple[Array, Array]:
     """Return the information on the linear parameters in the effect's columns alone (k,), and a relative one (k, k).
 
-    The second one is that beside model and rival effect, over the first. An effect that only changes parameters is
-    tested against a baseline, so the model does not absorb it.
+    The second is that beside model and rival effect, over the first. An effect that only changes parameters is tested
+    against a baseline, so the model does not absorb it.
     """
     own = location.columns(motion, shapes, decimation, sigma)
     power = np.einsum("rk,rk->k", own, own)

@@ -16,12 +16,7 @@ LINE, LIMIT, OUTSIDE = "#2a5d8f", "#b5403a", "#f6dfdd"
 
 
 def draw(robot: RobotConfig, design: Design, path: Path, title: str) -> None:
-    """Write a plot with one row per joint.
-
-    ``robot``: names, units and limits. ``design``: trajectory; torques are drawn if they are known. ``path``: file to
-    write; its suffix gives the format, see `SUFFIXES`. Raises ConfigError if the file cannot be written, or its suffix
-    is not in `SUFFIXES`.
-    """
+    """Plot a trajectory, one row per joint, in the format of the suffix (`SUFFIXES`)."""
     check_name(path)
     q, qd, qdd = sample_trajectory(design.trajectory, PERIOD)
     time = np.arange(len(q)) * PERIOD
@@ -79,10 +74,7 @@ def check_name(path: Path) -> None:
 
 
 def limits_of(joint: Joint, name: str) -> tuple[float, float]:
-    """Return the lower and upper limit of a quantity of a joint, rad or m, s, N m or N.
-
-    ``name``: ``position``, ``velocity``, ``acceleration`` or ``torque``.
-    """
+    """Return the lower and upper limit of a joint's ``position``, ``velocity``, ``acceleration`` or ``torque``."""
     if name == "position":
         return joint.limits.position
     most = float(getattr(joint.limits, name))

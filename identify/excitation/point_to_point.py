@@ -75,10 +75,10 @@ MISS_UNIT = 0.01
 
 
 class Rank(NamedTuple):
-    """Rank of a candidate; the smaller one is better, and nothing is better than a violated limit.
+    """Rank of a candidate, smaller is better: ``violation`` of limits first, then ``cost``.
 
-    ``violation``: excess of torque over its limit, relative, plus missing distance in `MISS_UNIT`; 0 if all limits are
-    kept. ``cost``: mean log standard deviation with penalties.
+    ``violation``: relative excess of torque plus missing distance in `MISS_UNIT`. ``cost``: mean log std with
+    penalties.
     """
 
     violation: float
@@ -89,10 +89,7 @@ WORST = Rank(np.inf, np.inf)
 
 
 def slow_share(robot: RobotConfig, qd: Floats) -> Floats:
-    """Return the share of slow samples of each joint, (n,).
-
-    ``robot``: velocity limits. ``qd``: velocities (N, n), rad/s or m/s; slow means below `SLOW` of the limit.
-    """
+    """Return the share (n,) of samples with a velocity below `SLOW` of its limit."""
     limit = SLOW * np.array([joint.limits.velocity for joint in robot.joints])
     result: Floats = (np.abs(qd) < limit).mean(axis=0)
     return result
@@ -109,9 +106,8 @@ class PointToPoint:
 class PointToPointSearch:
     """Search space of point-to-point trajectories, and the cost of a trajectory.
 
-    ``sigma``: standard deviation (n,) of the torque noise, N m or N. ``margin``: share of each limit that may be used.
-    ``theta``: standard or base parameters, or ``None``. ``aim``: effects to make visible; ``None``: base parameters
-    only. ``collision``: bodies to keep apart, or ``None``. Raises ConfigError if no posture is free of collisions.
+    ``sigma``: standard deviation (n,) of the torque noise; ``margin``: usable share of each limit; ``aim``: effects to
+    make visible, ``None``: base parameters only. Raises ConfigError if no posture is free of collisions.
     """
 
     def __init__(
@@ -214,11 +210,7 @@ class PointToPointSearch:
         return Trajectory(schema="armident/trajectory/1", start=tuple(float(v) for v in self.home), moves=moves)
 
     def rank(self, candidate: PointToPoint, best: Rank) -> Rank:
-        """Return the rank of a candidate.
-
-        ``candidate``: candidate; one that exceeds a limit of velocity or acceleration is the worst. ``best``: rank that
-        it must beat: the distances of a candidate that does not are not computed.
-        """
+        """Return the rank of a candidate; distances are computed only if it can beat ``best``."""
         durations = self._durations(candidate)
         lengths = np.diff(np.vstack([self.home, candidate.points]), axis=0)
         if (durations < np.maximum(self._shortest(lengths), SHORTEST_MOVE)).any():
@@ -226,10 +218,7 @@ class PointToPointSearch:
         return self.trajectory_rank(self.trajectory(candidate), best)
 
     def trajectory_rank(self, trajectory: Trajectory, best: Rank) -> Rank:
-        """Return the rank of a trajectory within the limits of motion.
-
-        ``best``: rank that it must beat, as for `rank`.
-        """
+        """Return the rank of a trajectory within the limits of motion; ``best`` as for `rank`."""
         factor = 1 if self.aim is None else AIM_FACTOR
         period = 1.0 / (factor * SEARCH_RATE)
         q, qd, qdd = sample_trajectory(trajectory, period)
@@ -286,11 +275,7 @@ class PointToPointSearch:
 def equations_of(
     model: ArmModel, motion: Motion, decimation: Decimation, sigma: Floats
 ) -> tuple[Floats, Decimation, Floats]:
-    """Return the arguments of `EffectObjective.cost`: weighted base regressor (R, b), decimation and noise.
-
-    ``motion``: motion along the trajectory; ``decimation``: filter of the regression; ``sigma``: standard deviation
-    (n,) of the torque noise, N m or N.
-    """
+    """Return the arguments of `EffectObjective.cost`: weighted base regressor (R, b), decimation and noise."""
     kept = decimation.instants(motion.samples)
     x = model.rigid_regressor(motion.q[kept], motion.qd[kept], motion.qdd[kept])
     if model.terms:
@@ -299,11 +284,7 @@ def equations_of(
 
 
 def predicted_torque(model: ArmModel, theta: ArrayLike, q: Floats, qd: Floats, qdd: Floats, period: float) -> Floats:
-    """Return the joint torques along a motion with those of the model's terms, (N, n), N m or N.
-
-    ``theta``: standard (p,) or base parameters (b,), SI; ``q``, ``qd``, ``qdd``: positions, velocities and
-    accelerations (N, n), rad or m, s.
-    """
+    """Return the joint torques along a motion with those of the model's terms, (N, n), N m or N."""
     torque = model.inverse_dynamics(theta, q, qd, qdd)
     if model.terms:
         torque += model.term_torque(model.anchored(theta).motion(q, qd, qdd, period), np.asarray(theta)[-model.e :])

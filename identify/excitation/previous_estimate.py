@@ -20,24 +20,17 @@ FREQUENCIES = 4096
 
 @dataclass(frozen=True)
 class PreviousEstimate:
-    """An earlier estimate and its noise.
-
-    ``theta``: base parameters (b,); ``noise``: standard deviation (n,) of the torque noise below the cut-off of the
-    regression, N m or N.
-    """
+    """Earlier base parameters (b,) and torque noise (n,) below the cut-off of the regression, N m or N."""
 
     theta: NDArray[np.float64]
     noise: NDArray[np.float64]
 
 
 def previous_estimate(document: IdentificationDocument, robot: RobotConfig, where: str) -> PreviousEstimate:
-    """Return parameters and noise of an identification of the same robot.
+    """Return parameters and noise of an identification of the same robot; ``where`` names the document in errors.
 
     The noise is that of its noise models (thesis equation 6.19) below `LS_CUTOFF` times the closed-loop bandwidth,
-    where the regression is made (thesis section 2.3.1); without a configured bandwidth, all of it.
-
-    ``where``: source of the document, for messages. Raises DataError if it is of another robot or model, or its noise
-    models are not of joint torques.
+    where the regression is made (2.3.1); without a configured bandwidth, all of it.
     """
     model = arm_model(robot)
     if document.robot != robot.name:
@@ -58,10 +51,8 @@ def previous_estimate(document: IdentificationDocument, robot: RobotConfig, wher
 def physical_estimate(document: IdentificationDocument, robot: RobotConfig, where: str) -> PreviousEstimate:
     """Return the estimate of `previous_estimate` with parameters that an arm can have: others predict wrong torques.
 
-    Where the document has the nearest physically consistent parameters, they are taken.
-
-    ``where``: source of the document, for messages. Raises DataError as `previous_estimate`; or if the identification
-    calls itself unusable, or friction, rotor inertias or mass matrix are impossible by more than their uncertainty.
+    They are the nearest physically consistent ones where the document has them. Raises DataError if the identification
+    is unusable, or friction, rotor inertias or mass matrix are impossible by more than their uncertainty.
     """
     found = previous_estimate(document, robot, where)
     without = "Next: identify the arm from a better recording, or design without --known"

@@ -24,12 +24,7 @@ NO_BOXES = "list what stands around it in collision.boxes of the robot configura
 
 @dataclass(frozen=True, eq=False)
 class SafetyModel:
-    """Masses and bodies of an arm.
-
-    ``collision``: bodies of arm and cell. ``theta``: base (b,) or standard (p,) parameters that predict torques;
-    ``None`` if no masses are known. ``torque_source``: origin of the parameters, for messages. ``remarks``: properties
-    that cannot be checked.
-    """
+    """Masses (parameters (b,) or (p,), ``None`` if unknown) and bodies of an arm; ``remarks``: not checkable."""
 
     collision: CollisionModel
     theta: Floats | None
@@ -39,10 +34,7 @@ class SafetyModel:
 
 @dataclass(frozen=True)
 class SafetyChecks:
-    """Results of the checks of a trajectory, one sentence each.
-
-    ``checked``, ``unchecked``: properties that were checked, with the result, and those that were not, with the reason.
-    """
+    """Properties of a trajectory that were checked, with results, and those that were not, with reasons."""
 
     checked: tuple[str, ...]
     unchecked: tuple[str, ...]
@@ -57,10 +49,7 @@ def safety_model(
 ) -> SafetyModel:
     """Collect masses and bodies of an arm: of an earlier estimate, of a file, of its configuration, of its URDF.
 
-    ``source``: path or shipped name from which it was loaded: its URDF is read; ``None``: there is none. ``prior``,
-    ``prior_name``: earlier estimate, and its name in messages. ``masses``: JSON file of standard parameters, as
-    ``armident robot --truth`` writes it; replaces the masses of the URDF. Raises ConfigError if masses, shapes or boxes
-    are wrong.
+    ``masses``: file of standard parameters from ``armident robot --truth``; replaces the masses of the URDF.
     """
     shapes = None if source is None else load_shapes(source)
     capsules, unread = ([], []) if shapes is None else capsules_of(shapes.shapes)
@@ -122,10 +111,7 @@ def _not_negative(names: Sequence[str], *kinds: str) -> list[str]:
 
 
 def check_safety(robot: RobotConfig, design: Design, safety: SafetyModel) -> SafetyChecks:
-    """Return what was checked of a trajectory, with the results, and what was not.
-
-    ``safety``: masses and bodies by which it was designed or checked.
-    """
+    """Return what was checked of a trajectory, with the results, and what was not."""
     done = ["position, velocity and acceleration keep their limits"]
     left = list(safety.remarks)
     if design.torque is None:
@@ -154,24 +140,9 @@ def check_safety(robot: RobotConfig, design: Design, safety: SafetyModel) -> Saf
 
 @dataclass(frozen=True, eq=False)
 class CheckedTrajectory:
-    """Result of ``armident trajectory``.
+    """Result of ``armident trajectory``; ``excess``: limits that an existing trajectory exceeds.
 
-    Parameters
-    ----------
-    path
-        File of the trajectory; ``None``: it is not in a file.
-    design
-        Trajectory with its predicted precision.
-    std
-        Predicted standard deviations of the base parameters (b,), SI.
-    prior
-        Earlier estimate; ``None``: the standard deviations are those of an assumed noise.
-    safety
-        Masses and bodies.
-    checks
-        Properties that were checked, and those that were not.
-    excess
-        Limits that an existing trajectory exceeds.
+    ``std``: predicted standard deviations of the base parameters (b,), SI; without ``prior``, of an assumed noise.
     """
 
     robot: RobotConfig
@@ -184,10 +155,7 @@ class CheckedTrajectory:
     excess: tuple[str, ...]
 
     def refuse_excess(self) -> None:
-        """Refuse a trajectory that exceeds limits of torque or distance.
-
-        Raises ConfigError: names each excess and the next step.
-        """
+        """Raise ConfigError if limits of torque or distance are exceeded, with each excess and the next step."""
         if self.excess:
             next_step = "Next: design another one with --out FILE, or correct limits.torque and collision of the robot"
             raise ConfigError(f"{self.path}: needs {'; '.join(self.excess)}. {next_step}")
@@ -196,10 +164,7 @@ class CheckedTrajectory:
 def checked_trajectory(
     robot: RobotConfig, design: Design, safety: SafetyModel, prior: PreviousEstimate | None, path: Path | None = None
 ) -> CheckedTrajectory:
-    """Return a trajectory with all checks.
-
-    ``safety``: masses and bodies by which it was designed or checked; ``prior``: earlier estimate, if there is one.
-    """
+    """Return a trajectory with all checks."""
     std, checks = expected_std(robot, design, prior), check_safety(robot, design, safety)
     return CheckedTrajectory(
         robot, path, design, std, prior, safety, checks, tuple(excesses(robot, design, safety.collision))
@@ -207,10 +172,7 @@ def checked_trajectory(
 
 
 def expected_std(robot: RobotConfig, design: Design, prior: PreviousEstimate | None) -> Floats:
-    """Return the predicted standard deviations of the base parameters (b,), SI; of an assumed noise without estimate.
-
-    ``prior``: earlier estimate, if there is one.
-    """
+    """Return predicted standard deviations of the base parameters (b,); of an assumed noise without ``prior``."""
     std = design.std
     if prior is None or std is None:
         std = predict_precision(arm_model(robot), design.trajectory, assumed_noise(robot)).std

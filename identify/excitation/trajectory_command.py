@@ -30,12 +30,7 @@ from armident.identify.excitation.trajectory_options import TrajectoryOptions
 
 
 def trajectory_command(options: TrajectoryOptions) -> CheckedTrajectory:
-    """Carry out ``armident trajectory`` but for its report.
-
-    Result: a trajectory to check may exceed limits of torque, if masses are known, and of distance. Raises ConfigError
-    if an option is wrong, no trajectory keeps all limits, or a trajectory to check exceeds the limits of motion;
-    DataError if ``known`` is of another robot or model, or is not physical.
-    """
+    """Carry out ``armident trajectory`` but for its report; a trajectory to check may exceed torques and distances."""
     robot, out, look_at = load_robot(options.config, "trajectory"), options.out, options.look_at
     _check_files(options)
     picture = options.picture

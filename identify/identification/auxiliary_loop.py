@@ -43,11 +43,9 @@ Array = NDArray[np.float64]
 
 
 class ClosedLoop(NamedTuple):
-    """The closed loop that an estimator simulates.
+    """The simulated closed loop of an estimator, first theta (b,), and why a preferred controller was not used.
 
-    ``start``: parameters with which it runs, shape (b,): the first iterate; ``controller``: description of the
-    controller, as in the result document: its kind, parameters, and the relative error of the simulated velocities in
-    percent; ``warnings``: reasons why a preferred controller was not used.
+    ``controller``: as in the document, with the error of the simulated velocities, percent.
     """
 
     auxiliary: AuxiliaryModel
@@ -66,13 +64,8 @@ def closed_loop(
 ) -> ClosedLoop:
     """Return the first closed loop whose simulation runs and moves like the robot (thesis 5.2).
 
-    Controllers are tried in order of preference: the identified or known one, then a stiff PD controller. Each is
-    simulated with the IDIM-LS estimate, then with the initial parameters of the configuration.
-
-    ``prepared``: the arm, the experiments and the derivatives of their positions; ``options``: method and controller;
-    ``ls``: IDIM-LS estimate, shape (b,); ``decimation``: parallel filter of the method; ``excluded``: kind of
-    controller that is not tried. Raises DataError if every simulation diverges and the method has no measured
-    regressor.
+    The identified or known controller comes before a stiff PD controller, IDIM-LS (b,) before the initial parameters.
+    Raises DataError if all diverge and the method has no measured regressor.
     """
     model, experiments, signals = prepared.model, prepared.experiments, prepared.signals
     dt = experiments[0].dt
@@ -129,8 +122,7 @@ def closed_loop(
 def _bandpassed(options: Options, bandwidth: float, dt: float) -> Callable[[Array, int], Derivatives] | None:
     """The bandpass of the measured positions, for the instruments; ``None`` where another filter was chosen.
 
-    Without it the instruments of IDIM-PIV hold frequencies that the measured regressor lacks, and the prefilter takes
-    them for information.
+    Other instruments have frequencies that the regressor lacks; the prefilter of IDIM-PIV takes them for information.
     """
     if options.derivatives != "bandpass" or not estimator(options.method).measured:
         return None
@@ -138,10 +130,7 @@ def _bandpassed(options: Options, bandwidth: float, dt: float) -> Callable[[Arra
 
 
 def velocity_error(runs: Sequence[Simulation], signals: Sequence[Derivatives]) -> float:
-    """Norm of the difference of simulated and smoothed velocities over that of the smoothed ones.
-
-    ``runs``, ``signals``: simulated and smoothed motion of every experiment.
-    """
+    """Norm of the difference of simulated and smoothed velocities over that of the smoothed ones."""
     differences = [float(np.linalg.norm(run.qd - s.qd)) for run, s in zip(runs, signals, strict=True)]
     return float(np.linalg.norm(differences) / np.linalg.norm([np.linalg.norm(s.qd) for s in signals]))
 
@@ -216,10 +205,7 @@ def _description(response: JointResponse) -> dict[str, Any]:
 
 
 def initial_parameters(model: ArmModel) -> Array:
-    """Base parameters (b,) of the configuration's ``initial_parameters`` (standard names), the rest zero.
-
-    Raises ConfigError if a name is not a standard parameter of the robot.
-    """
+    """Base parameters (b,) of ``initial_parameters``, the rest zero; raises ConfigError if a name is unknown."""
     standard = np.zeros(len(model.names))
     for name, value in model.robot.initial_parameters.items():
         if name not in model.names:

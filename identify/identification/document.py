@@ -21,12 +21,7 @@ from armident.identify.identification.identification_result import Identificatio
 def identification_document(
     result: IdentificationResult, recordings: Sequence[Recording], robot: RobotConfig, notes: Sequence[str] = ()
 ) -> IdentificationDocument:
-    """Return the document of an identification.
-
-    ``result``: estimates of the base parameters with covariance, residual statistics and timing. ``recordings``:
-    recordings that they come from. ``robot``: configuration of the robot, which the document keeps. ``notes``: messages
-    of the conversion; they precede the estimator's warnings.
-    """
+    """Document of an identification; ``notes`` of the conversion precede the estimator's warnings."""
     joints = [joint.name for joint in robot.joints]
     essential = np.asarray(result.essential, dtype=bool)
     parameters = [

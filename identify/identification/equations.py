@@ -31,29 +31,19 @@ EQUATIONS_PER_PARAMETER = 10.0
 
 
 def least_rows(model: ArmModel) -> int:
-    """Least number of decimated instants of all experiments together: each gives one equation per joint.
-
-    ``EQUATIONS_PER_PARAMETER b / n``, rounded up, for b base parameters and n joints.
-    """
+    """Least number of decimated instants of all experiments: ``EQUATIONS_PER_PARAMETER b / n``, rounded up."""
     return math.ceil(EQUATIONS_PER_PARAMETER * model.base.b / model.n)
 
 
 def decimated_rows(decimation: Decimation, samples: Sequence[int]) -> int:
-    """Number of instants that a decimation leaves, of all experiments together.
-
-    ``decimation``: parallel filter; ``samples``: length of every experiment.
-    """
+    """Number of instants that a decimation leaves, of all experiments together."""
     return sum(decimation.count(count) for count in samples)
 
 
 def sufficient(decimation: Decimation, dt: float, samples: Sequence[int], rows: int) -> Decimation:
-    """Return the decimation or, where it leaves too few instants, the strongest one that leaves enough.
+    """Return the decimation or, where it leaves fewer than ``rows`` instants, the strongest one that leaves enough.
 
-    Motion slower than the cut-off passes any wider filter. A higher cut-off only admits noise, which the estimator
-    averages, while too few equations determine neither parameters nor noise.
-
-    ``decimation``: decimation by the bandwidth. ``samples``: length of every experiment. ``rows``: least number of
-    instants of all experiments together, see :func:`least_rows`. Without decimation there may be fewer.
+    A higher cut-off only admits noise, which the estimator averages; too few equations determine nothing.
     """
     if decimated_rows(decimation, samples) >= rows:
         return decimation
@@ -70,13 +60,9 @@ def sufficient(decimation: Decimation, dt: float, samples: Sequence[int], rows: 
 
 
 def aligned_torque(tau: NDArray[np.float64], late: float = 0.0) -> NDArray[np.float64]:
-    """Mean of the torques held before and after each position sample, shape (N, n).
+    """Mean of the torques (N, n) held before and after each position sample; ``late`` ones, samples, are interpolated.
 
-    Sample k is held over ``[k, k + 1)``, so the torque as recorded belongs half a period after the position. A torque
-    that is late by some more is interpolated between its samples.
-
-    ``tau``: torques as recorded, (N, n); ``late``: samples by which they are late, see
-    :class:`~armident.identify.signals.experiments.Experiment`.
+    Sample k is held over ``[k, k + 1)``, so the torque as recorded belongs half a period after the position.
     """
     if late:
         k = np.arange(tau.shape[0], dtype=np.float64)
@@ -89,13 +75,9 @@ def aligned_torque(tau: NDArray[np.float64], late: float = 0.0) -> NDArray[np.fl
 def equations(
     model: ArmModel, experiments: Sequence[Experiment], signals: Sequence[Derivatives], decimation: Decimation
 ) -> Sequence[ExperimentEquations]:
-    """Filtered and decimated equations of every experiment.
+    """Filtered and decimated equations of every experiment, without rows slower than a ``velocity_threshold``.
 
-    The sign of the velocity is the smoothed one of the robot's configuration, so all samples can stay, as a linear
-    filter requires. Where the configuration gives ``velocity_threshold``, slower rows are left out.
-
-    ``experiments``, ``signals``: recordings of one sampling rate, and the derivatives of their positions;
-    ``decimation``: parallel filter.
+    Without one all samples stay, as a linear filter requires: the sign of the velocity is smoothed.
     """
     threshold = model.robot.friction.velocity_threshold
 
@@ -113,10 +95,7 @@ def equations(
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
-    """Recordings with the derivatives of their positions, and their equations, computed once for every decimation.
-
-    ``experiments``, ``signals``: recordings of one sampling rate, and the derivatives of their positions.
-    """
+    """Recordings of one rate with the derivatives of their positions, and equations computed once per decimation."""
 
     model: ArmModel
     experiments: Sequence[Experiment]
@@ -135,10 +114,7 @@ class Prepared:
 
 
 def tested(blocks: Sequence[ExperimentEquations]) -> list[int]:
-    """Numbers of the experiments that tests of an estimate use: all, or evenly spaced stretches of a long recording.
-
-    The tests take several times the memory of their equations, and need no hour to reject what is wrong.
-    """
+    """Experiments that tests of an estimate use: all, or evenly spaced stretches of a long recording (memory)."""
     if not isinstance(blocks, Streamed):
         return list(range(len(blocks)))
     rows = sum(block.y.shape[0] for block in blocks)
@@ -149,10 +125,7 @@ def tested(blocks: Sequence[ExperimentEquations]) -> list[int]:
 def published_equations(
     model: ArmModel, experiments: Sequence[Experiment], preprocessing: Preprocessing
 ) -> Sequence[ExperimentEquations]:
-    """Equations by the filters of a published fit: sharp ``sign``, torque as recorded, all rows.
-
-    ``preprocessing``: filters, decimation and dropped samples of the published fit.
-    """
+    """Equations by the filters of a published fit: sharp ``sign``, torque as recorded, all rows."""
     p = preprocessing
 
     def of(experiment: Experiment) -> ExperimentEquations:

@@ -34,8 +34,7 @@ Array = NDArray[np.float64]
 class StretchRule:
     """Size from which a recording is identified in stretches, of which one is in memory at a time.
 
-    ``beyond``: number of values (samples times joints) up to which a recording is one piece. An identification takes up
-    to 260 bytes per value. ``length``: largest number of values of a stretch.
+    In values (samples times joints), each of up to 260 bytes in an identification; ``length`` of a stretch.
     """
 
     beyond: int = 12_000_000
@@ -49,16 +48,10 @@ WHOLE = StretchRule(beyond=2**62)
 def experiments_from_recording(
     recording: Recording, robot: RobotConfig, stretches: StretchRule = WHOLE
 ) -> tuple[Sequence[Experiment], list[str]]:
-    """Experiments of a recording in SI units on the joint side, cut at the experiment marks and at gaps.
+    """Experiments of a recording in SI units on the joint side, cut at the experiment marks and at gaps; and remarks.
 
-    Joint positions are ``R^-1 q_motor`` and joint torques ``R' tau_motor`` (thesis equation 2.14 and section B.1).
-    The reference between two set points is the straight line that a CiA 402 drive interpolates (60C2h).
-
-    ``recording``: of a torn one the readable part is used. ``robot``: may have other numbers than the recorded one.
-    ``stretches``: size from which pieces are cut into stretches, which are kept on disk. Returns one experiment per
-    piece or stretch, in time order, and remarks for the user. Raises ConfigError if the robot lacks a value; DataError
-    if the recording is of another robot, lacks a quantity or too many samples, contains NaN, or disagrees with its own
-    counters.
+    Joint positions are ``R^-1 q_motor`` and joint torques ``R' tau_motor`` (thesis equation 2.14 and section B.1). The
+    reference between set points is straight, as a CiA 402 drive interpolates (60C2h). Raises ConfigError or DataError.
     """
     try:
         robot.check_filled("identify")
@@ -167,11 +160,7 @@ def _part(recording: Recording, rows: NDArray[np.int64]) -> Recording:
 
 
 def joint_positions(stream: Stream, quantity: Literal["position", "demand"], robot: RobotConfig) -> Array:
-    """Position or demand of a stream on the joint side, shape (N, n), rad or m.
-
-    ``stream``: samples of one stream; ``quantity``: ``position`` or ``demand``; ``robot``: configuration with the
-    transmission. Raises DataError if the stream has no such quantity, or a value that is not finite.
-    """
+    """Position or demand of a stream, joint side, (N, n), rad or m; DataError if it is missing or not finite."""
     name = stream.named(quantity)
     if name is None:
         raise DataError(f"stream {stream.name!r} has no {quantity}; it has {', '.join(sorted(stream.fields))}")
@@ -182,12 +171,9 @@ def joint_positions(stream: Stream, quantity: Literal["position", "demand"], rob
 
 
 def joint_torques(stream: Stream, robot: RobotConfig) -> Array:
-    """Joint torques from the signals of the drives, shape (N, n), N m or N.
+    """Joint torques from the signals of the drives, shape (N, n), N m or N; DataError if missing or not finite.
 
     Current and voltage belong to the motor, independently of the side of the positions; a torque names its side.
-
-    ``stream``: samples of one stream; ``robot``: configuration with the drive gains and the transmission. Raises
-    DataError if the stream has neither current, voltage nor torque, or a value that is not finite.
     """
     wanted = robot.joints[0].drive.signal
     for quantity in sorted(EFFORTS, key=lambda effort: effort != wanted):
@@ -317,10 +303,7 @@ def _usual_range(joint: Joint) -> float:
 
 
 def rest_notes(experiments: Sequence[Experiment], robot: RobotConfig) -> list[str]:
-    """Remarks on joints that do not move; an identification has them in its verdict.
-
-    ``experiments``: experiments of one robot.
-    """
+    """Remarks on joints that do not move; an identification has them in its verdict."""
     q = np.concatenate([e.q for e in experiments])
     return [
         f"{joint.name} does not move: its own parameters cannot be determined from this recording"
@@ -332,9 +315,7 @@ def rest_notes(experiments: Sequence[Experiment], robot: RobotConfig) -> list[st
 def _rate_notes(recording: Recording) -> list[str]:
     """Notes on a SYNC rate that differs from the nominal one by the receive times.
 
-    A SYNC producer that was held up moves its time grid by whole periods and counts them (``sync_skipped_periods``).
-    This delay is no error of a clock. It matters on a physical bus, where the arm moves in the meantime; a virtual
-    arm advances by one period per SYNC.
+    Whole periods that the producer skipped and counted are no clock error, but matter where a real arm moves on.
     """
     samples, nominal = recording.samples, recording.sample_rate_hz
     elapsed = float(samples.t_ns[-1] - samples.t_ns[0]) * 1e-9

@@ -21,12 +21,9 @@ SINGULAR = 1e-12
 
 
 def held_out_errors(blocks: Sequence[ExperimentEquations], theta: Array) -> tuple[float, Array] | None:
-    """``|y - X theta| / |y|`` in percent on held-out parts, overall and per joint (n,).
+    """``|y - X theta| / |y|`` in percent on held-out parts, overall and per joint (n,); ``None`` if undetermined.
 
-    Parts are stretches of time, so that the correlation of the noise reaches over their ends only.
-
-    ``theta``: base parameters (b,), SI; their residuals are the weights of the least squares. Returns ``None`` if the
-    rest of the recordings does not determine all parameters.
+    Parts are stretches, as noise is correlated; residuals of ``theta`` (b,), SI, weigh the least squares.
     """
     # Blocks of a long recording are on disk: one at a time is in memory.
     n = len(blocks[0].y[0])

@@ -29,10 +29,7 @@ WORTHLESS_PCT = 100.0
 
 @dataclass(frozen=True)
 class JointWhiteness:
-    """Residual autocorrelation of one joint.
-
-    ``fraction_outside_2sigma``: share of the lags outside the 2-sigma band, about 0.05 if white.
-    """
+    """Residual autocorrelation of one joint: share of the lags outside the 2-sigma band, about 0.05 if white."""
 
     joint: str
     lags: int
@@ -43,51 +40,12 @@ class JointWhiteness:
 class IdentificationResult:
     """The result of an identification; SI, joint side.
 
-    Parameters
-    ----------
-    verdict
-        Judgement of the result with its reasons.
-    criteria
-        Limits of the verdict.
-    names, units, formulas, theta, std, covariance, essential
-        Base parameters (b,) in SI units, the formulas of regrouped ones, their standard deviations (b,), their
-        covariance (b, b), and the mask (b,) of the essential ones.
-    diagnostics
-        Tests of the estimate.
-    physical
-        The nearest physically consistent arm; ``None`` if not requested.
-    delay
-        Delay of the recorded torques against the positions; ``None`` without a reference trajectory.
-    sign_smoothing
-        ``g`` (n,) of each joint's smoothed sign, s/rad or s/m.
-    interval_warnings
-        Reasons why the standard deviations are doubtful; they are among the reasons of the verdict, too.
-    bias
-        Bias (b,) by derivatives, encoder noise and sampling that was subtracted, SI; ``None``: irrelevant.
-    relative_error_pct, relative_error_pct_by_joint
-        ``|y - X theta| / |y|`` on the torques decimated to twice the bandwidth, overall and (n,), percent.
-    iterations, converged, stop_reason
-        Iterations of the method, true if they converged to parameters that explain torques better than none, and the
-        rule that ended them.
-    whiteness, residual_autocorrelation, autocorrelation_bound
-        Whiteness test of the whitened residuals, their autocorrelation (n, lags), and its 2-sigma bound (n,).
-    noise_model
-        Noise models of the joints and their rate, as in the result document.
-    controller
-        Description of the controller of the auxiliary model, as in the result document.
-    timing_s
-        Duration of every stage, s.
-    warnings
-        Lines for the user.
-    idim_ls, idim_ls_relative_error_pct
-        Theta and standard deviations of IDIM-LS on the same data, for comparison, and its relative error, percent.
-    held_out
-        Relative torque error of held-out parts of the recordings, percent, overall and (n,); ``None`` if the rest does
-        not determine the parameters.
-    residual_statistics
-        Statistics of the residuals of every joint, for a later comparison; empty: none.
-    t, tau_measured, tau_predicted
-        Decimated instants (M,), s, and torques (M, n), N m or N, experiments one after the other.
+    ``theta``, ``std``, ``essential`` (b,) and ``covariance`` (b, b) belong to the base parameters; ``formulas`` are of
+    regrouped ones. ``relative_error_pct`` is ``|y - X theta| / |y|`` on torques decimated to twice the bandwidth,
+    overall and by joint (n,). ``bias`` (b,) was subtracted; ``None``: irrelevant. ``sign_smoothing`` is ``g`` (n,),
+    s/rad or s/m. ``converged`` requires that the parameters explain torques better than none. ``held_out`` is ``None``
+    if the rest does not determine the parameters. ``t`` (M,), s, and the torques (M, n), N m or N, are decimated
+    instants of one experiment after the other.
     """
 
     verdict: Verdict
@@ -130,11 +88,7 @@ class IdentificationResult:
 
 @dataclass(frozen=True)
 class LeastSquares:
-    """The IDIM-LS estimate and its equations.
-
-    ``decimation``: parallel filter of the methods without a noise model. ``factor``: decimation factor chosen by the
-    user or from the noise; ``None``: from the bandwidth. ``published``: True for the filters of a published fit.
-    """
+    """The IDIM-LS estimate and its equations; ``factor``: decimation chosen by the user or from the noise."""
 
     estimate: Estimate
     blocks: Sequence[ExperimentEquations]
@@ -145,11 +99,7 @@ class LeastSquares:
 
 @dataclass(frozen=True)
 class MethodResult:
-    """The estimate of the chosen method.
-
-    ``controller``: description of the controller of the auxiliary model; its kind is ``none`` for IDIM-LS.
-    ``noise_of``: quantity to which noise models and residuals belong.
-    """
+    """Estimate of the chosen method; ``noise_of``: quantity of its residuals. IDIM-LS: controller of kind ``none``."""
 
     estimate: Estimate
     blocks: Sequence[ExperimentEquations]
@@ -159,25 +109,7 @@ class MethodResult:
 
 @dataclass(frozen=True)
 class Statistics:
-    """Tests of an estimate.
-
-    Parameters
-    ----------
-    essential
-        Mask (b,) of the essential parameters.
-    diagnostics
-        Tests of instruments and residuals.
-    delay
-        Delay of the recorded torques; ``None`` without a reference trajectory.
-    physical
-        Nearest physically consistent parameters; ``None`` if not requested.
-    interval_warnings
-        Reasons why the standard deviations are doubtful.
-    bias
-        Bias (b,) that was subtracted from the estimate, SI; ``None``: irrelevant.
-    residuals
-        Statistics of the residuals of every joint; empty: none.
-    """
+    """Tests of an estimate; ``essential`` (b,) is a mask, ``bias`` (b,), SI, was subtracted; ``None``: irrelevant."""
 
     essential: NDArray[np.bool_]
     diagnostics: Diagnostics
@@ -198,12 +130,7 @@ def make_result(
     warnings: Sequence[str],
     timing_s: dict[str, float],
 ) -> IdentificationResult:
-    """Assemble the result; relative errors are those on the equations of IDIM-LS.
-
-    ``options``, ``model``: options and arm of the identification. ``found``, ``ls``: estimate of the method, and of
-    IDIM-LS for comparison. ``statistics``: tests of the estimate of the method. ``judged``: verdict, and its limits.
-    ``warnings``: lines for the user; each is kept once. ``timing_s``: duration of every stage, s.
-    """
+    """Assemble the result; relative errors are those on the equations of IDIM-LS, and each warning is kept once."""
     estimate, ls_blocks = found.estimate, ls.blocks
     joints = [joint.name for joint in model.robot.joints]
     overall, by_joint = relative_torque_errors(ls_blocks, estimate.theta)
@@ -279,10 +206,7 @@ UNITS = {"ia": ("kg m^2", "kg"), "fv": ("N m s/rad", "N s/m"), "fc": ("N m", "N"
 
 
 def unit(name: str, robot: RobotConfig) -> str:
-    """SI unit of a base parameter, joint side.
-
-    ``name``: base parameter. ``robot``: its robot; joints are revolute or prismatic.
-    """
+    """SI unit of a base parameter, joint side, whose joints are revolute or prismatic."""
     kind = name[:2]
     if kind in ("mx", "my", "mz"):
         return "kg m"

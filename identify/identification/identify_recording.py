@@ -24,11 +24,7 @@ CHECKED_VALUES = 6_000_000
 
 @dataclass(frozen=True)
 class IdentificationOutcome:
-    """An identification with all data of its report.
-
-    ``recordings``: identified recordings; ``robot``: configuration of the robot, with the smoothing of the sign that
-    was used; ``result``: the estimate with its curves; ``document``: contents of ``identification.json``.
-    """
+    """An identification with all data of its report; ``robot`` has the smoothing of the sign that was used."""
 
     recordings: tuple[Recording, ...]
     robot: RobotConfig
@@ -44,25 +40,10 @@ def identify_recording(
     check: Callable[[Sequence[Experiment], RobotConfig], SetupCheck] | None = check_setup,
     stretches: StretchRule | None = None,
 ) -> IdentificationOutcome:
-    """Identification of recordings, read from files or assembled from the stream.
+    """Identify recordings of one robot, read from files or assembled from the stream.
 
-    Raises ConfigError if the configuration cannot support the request; DataError if the data cannot support the
-    request.
-
-    Parameters
-    ----------
-    recordings
-        One or several recordings of one robot.
-    robot
-        Configuration to use; ``None``: the one inside the first recording.
-    options
-        Options of the identification; ``None``: the defaults.
-    progress
-        Called with the name of a stage and the share done, 0 to 1.
-    check
-        Check of the set-up, whose findings enter the verdict; ``None``: none.
-    stretches
-        Size from which recordings are identified in stretches; ``None``: the default.
+    ``robot``: default that of the first recording. ``progress`` takes stage and share done, 0 to 1; findings of
+    ``check`` enter the verdict. Raises ConfigError or DataError if the request is not supported.
     """
     recordings = (recordings,) if isinstance(recordings, Recording) else tuple(recordings)
     robot = robot or recordings[0].robot
@@ -94,11 +75,9 @@ def _checked(experiments: Sequence[Experiment]) -> Sequence[Experiment]:
 def experiments_of(
     recordings: Sequence[Recording], robot: RobotConfig, *, name_files: bool, stretches: StretchRule = WHOLE
 ) -> tuple[Sequence[Experiment], list[str]]:
-    """Return the experiments of recordings, one recording after the other, and remarks on them.
+    """Experiments of recordings in order, and remarks, which begin with the file if ``name_files``.
 
-    ``robot``: configuration to convert them with. ``name_files``: True to begin each remark with the name of its file.
-    ``stretches``: size from which recordings are cut into stretches; all together count. Raises ConfigError if a
-    recording is of another robot; DataError if a recording holds no experiment that can be used.
+    Raises ConfigError if a recording is of another robot, DataError if one holds no experiment that can be used.
     """
     found: list[Sequence[Experiment]] = []
     notes: list[str] = []

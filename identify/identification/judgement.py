@@ -48,10 +48,7 @@ def judgement(judged: Judged, criteria: IdentificationCriteria) -> list[Reason]:
 
 
 def require_finite(estimate: Estimate) -> None:
-    """Raise if an estimate or its covariance is not finite, or a variance is negative.
-
-    ``estimate``: estimate of any method. Raises LinAlgError if so.
-    """
+    """Raise LinAlgError if an estimate or its covariance is not finite, or a variance is negative."""
     finite = np.isfinite(estimate.theta).all() and np.isfinite(estimate.covariance).all()
     if not finite or (np.diag(estimate.covariance) < 0.0).any():
         raise np.linalg.LinAlgError("the estimate or its covariance is not finite")
@@ -63,10 +60,7 @@ def refusing_singular(
 ) -> Iterator[None]:
     """Turn equations without a finite solution into a `DataError` that lists what the motion supports.
 
-    Floating-point warnings of such equations are suppressed: the verdict states the defect.
-
-    ``method``: name of the method; ``support``: parameters that the motion supports. Raises DataError if numpy finds a
-    singular matrix, or scipy a number that is not finite (which it reports as ``ValueError``).
+    Floating-point warnings are suppressed. Scipy reports numbers that are not finite as ``ValueError``.
     """
     try:
         with np.errstate(invalid="ignore", divide="ignore", over="ignore"), warnings.catch_warnings():

@@ -1,8 +1,7 @@
 """Dependence of the residuals on the motion, which noise does not have.
 
-An autoregressive noise model can absorb a model error, so that the whitened residuals are white. Averages of the
-residuals over bins of position and velocity cannot: noise has no part in the motion. Circular shifts of the residuals
-against the motion keep their serial correlation and give the distribution of the averages without a dependence.
+An AR model can absorb a model error; averages over bins of position and velocity cannot. Circular shifts against the
+motion keep the serial correlation and give the distribution without dependence.
 """
 
 from collections.abc import Sequence
@@ -31,11 +30,9 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class MotionDependence:
-    """Dependence of the residuals of one joint on its motion.
+    """Dependence of one joint's residuals on ``position`` (and direction) or ``velocity``.
 
-    ``joint``: index of the joint; ``variable``: ``position`` (and direction) or ``velocity``; ``share``: share of the
-    power of the residuals that the averages explain beyond chance, 0 to 1; ``deviation``: difference of that share from
-    its mean under shifts, in standard deviations of the shifts.
+    ``share``: power explained beyond chance, 0 to 1; ``deviation``: of it from its mean under shifts, in their std.
     """
 
     joint: int
@@ -47,10 +44,7 @@ class MotionDependence:
 def motion_dependence(
     prepared: Prepared, blocks: Sequence[ExperimentEquations], theta: Array
 ) -> list[MotionDependence]:
-    """Return the dependence of the residuals of every joint on its own position and velocity.
-
-    ``prepared``: experiments with the derivatives of their positions; ``theta``: base parameters (b,), SI.
-    """
+    """Dependence of the residuals of ``theta`` (b,), SI, of every joint on its own position and velocity."""
     dt = prepared.experiments[0].dt
     errors = residuals(blocks, theta)
     pairs = [(s.q[at], s.qd[at]) for s, at in zip(prepared.signals, instants(blocks, dt), strict=True)]

@@ -29,13 +29,7 @@ def joint_ranges(experiments: Sequence[Experiment]) -> Array:
 
 
 def moving_joints(experiments: Sequence[Experiment], robot: RobotConfig, criteria: IdentificationCriteria) -> Mask:
-    """Mask (n,) of the joints that move; the others are at rest by the limits of ``criteria``.
-
-    A joint whose recorded reference rests is at rest, whatever disturbances deflect it.
-
-    ``experiments``: recordings of the robot; ``criteria``: limits in encoder counts, position noise, and ranges of
-    limits and other joints.
-    """
+    """Mask (n,) of the joints that move: beyond the limits of ``criteria``, and with a reference that does not rest."""
     ranges = joint_ranges(experiments)
     limits = np.array([joint.limits.position for joint in robot.joints], dtype=np.float64)
     least = criteria.rest_noise_std * np.max([_position_noise(e.q) for e in experiments], axis=0)
@@ -55,11 +49,7 @@ def moving_joints(experiments: Sequence[Experiment], robot: RobotConfig, criteri
 
 
 def require_motion(experiments: Sequence[Experiment], robot: RobotConfig, moving: Mask) -> None:
-    """Raise if no joint moves.
-
-    ``experiments``: recordings of the robot; ``moving``: mask (n,) of the joints that move. Raises DataError if no
-    joint moves; the message gives the largest range.
-    """
+    """Raise DataError, with the largest range, if no joint moves."""
     if moving.any():
         return
     ranges = joint_ranges(experiments)

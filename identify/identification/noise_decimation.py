@@ -15,11 +15,9 @@ MAX_ORDER = 250
 
 @dataclass(frozen=True)
 class NoiseDecimation:
-    """Decimation and the correlation time of each joint's noise.
+    """Decimation by the orders (n,) of the AR models of each joint's noise; the greatest is ``factor``.
 
-    ``factor``: ``n_d``: keep one sample of so many; the greatest of the orders, at least 1. ``orders``: orders of the
-    AR models of each joint's noise, shape (n,). ``bounded``: True if an order is the highest tried: the noise may be
-    correlated over longer times.
+    ``bounded``: an order is the highest tried, so that the noise may be correlated over longer times.
     """
 
     factor: int
@@ -30,9 +28,7 @@ class NoiseDecimation:
 def decimation_from_noise(series: Sequence[NDArray[np.float64]], max_order: int = MAX_ORDER) -> NoiseDecimation:
     """Decimation after which the noise is hardly correlated any more: the order of its AR model (section 6.2.3).
 
-    ``series``: torque residuals at the sampling rate, one array (N, n) per experiment, N m or N. ``max_order``: highest
-    order tried; a tenth of the samples at most. Raises DataError if there is no series, their shapes differ, or a
-    residual is not finite.
+    ``series``: residuals (N, n) at the sampling rate per experiment, N m or N; a tenth of the samples limits the order.
     """
     if not series or any(s.ndim != 2 or s.shape[1] != series[0].shape[1] for s in series):
         raise DataError(f"decimation from noise: expected residuals (N, n), got {[s.shape for s in series]}")

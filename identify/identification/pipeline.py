@@ -76,15 +76,8 @@ def identify_experiment(
 ) -> IdentificationResult:
     """Identify the base parameters of a robot, and judge the result.
 
-    The steps are those of the thesis: derivatives (5.1), IDIM-LS (2.3.2), controller (5.2), auxiliary closed loop,
-    IDIM-IV (2.3.3) or IDIM-PIV (6.2.2). IDIM-LS is always computed: it starts the iterations and is reported beside
-    their result.
-
-    ``experiments``: one or more recordings of the same robot at one sampling rate. ``options``: options; ``None``: the
-    defaults. ``progress``: called with a stage and the share done, 0 to 1. ``setup``: check of the set-up of these
-    recordings, which enters the verdict; ``None``: not made. Raises ConfigError if ``controller='known'`` and the
-    configuration has none; DataError if the data cannot support the request: too short, not finite, motion that leaves
-    parameters undetermined.
+    Derivatives (5.1), IDIM-LS (2.3.2), which starts the iterations, controller (5.2), closed loop, and IDIM-IV (2.3.3)
+    or IDIM-PIV (6.2.2). Raises ConfigError or DataError if it is impossible.
     """
     if isinstance(experiments, Experiment):
         experiments = [experiments]
@@ -220,21 +213,14 @@ def _least_squares(
 
 
 def has_published_filters(robot: RobotConfig, options: Options) -> bool:
-    """Return True if IDIM-LS uses the filters of a published fit, which takes the torque as recorded.
-
-    ``robot``, ``options``: configuration, which may have such filters, and options of the identification.
-    """
+    """True if IDIM-LS uses the filters of a published fit, which takes the torque as recorded."""
     return options.derivatives is None and options.decimation is None and robot.preprocessing is not None
 
 
 def shifted_experiments(
     experiments: Sequence[Experiment], robot: RobotConfig, options: Options, setup: SetupCheck | None, notes: Notes
 ) -> Sequence[Experiment]:
-    """Return the experiments with the common shift of the torques that the check of the set-up found.
-
-    ``experiments``: experiments of one robot. ``robot``, ``options``: its configuration, and options of the
-    identification. ``setup``: check of the set-up; ``None``: not made. ``notes``: receives a remark on the shift.
-    """
+    """Experiments with the common shift of the torques that the check of the set-up found; ``notes`` takes a remark."""
     shift = None if setup is None else setup.torque_shift
     if shift is None or not shift.applied or (options.method == "idim-ls" and has_published_filters(robot, options)):
         return experiments
@@ -308,11 +294,7 @@ def _statistics(prepared: Prepared, found: MethodResult, solution: Solution | No
 
 
 def _defect_of_loop(solution: Solution, signals: Sequence[Derivatives]) -> str:
-    """Reason why the instruments of an estimate are unsuitable; empty if they are suitable.
-
-    A controller can move the arm with the first estimate and, at the edge of stability, not with a later one. Then the
-    iterates do not settle, or settle where the instruments have little to do with the motion.
-    """
+    """Reason why the instruments of an estimate are unsuitable, as at the edge of stability; empty if suitable."""
     runs = solution.runs
     if runs is None:
         defect = "diverges with"
@@ -367,11 +349,7 @@ def _memory_of_noise(prepared: Prepared, theta: Array, reasons: list[Reason]) ->
 def smoothed_derivatives(
     experiments: Sequence[Experiment], robot: RobotConfig, options: Options, bandwidth: float
 ) -> Sequence[Derivatives]:
-    """Smoothed positions of every experiment and their derivatives (5.1).
-
-    ``experiments``: experiments of one robot; ``robot``, ``options``: its configuration, and options of the
-    identification; ``bandwidth``: closed-loop bandwidth, Hz.
-    """
+    """Smoothed positions of every experiment and their derivatives (5.1); ``bandwidth``: of the closed loop, Hz."""
     resolution = encoder_resolution(robot) if options.nvr == "tracking-error" else None
 
     def derived(e: Experiment) -> Derivatives:

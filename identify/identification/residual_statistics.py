@@ -1,9 +1,7 @@
 """Statistics of the residuals that a later identification of the same arm can be compared with.
 
-Free functions of the motion describe what the model lacks: piecewise linear ones of position, of position with the
-direction of motion, and of velocity. Their coefficients are estimated beside all base parameters, with the serial
-correlation of the noise in the weights, so that a change of parameters does not enter them. The power of the residuals
-in bands of frequency describes the rest, which may be no function of the motion of the joint.
+Piecewise linear functions of position, of position with direction, and of velocity describe what the model lacks. They
+are estimated beside all base parameters, weighted for serial correlation. The power in bands of frequency is the rest.
 """
 
 from collections.abc import Sequence
@@ -49,24 +47,11 @@ RANK = 1e-10
 
 @dataclass(frozen=True)
 class JointResidualStatistics:
-    """Statistics of the residuals of one joint.
+    """Statistics of the residuals of one joint; knots span ``position_range`` and ``velocity_limit``.
 
-    Parameters
-    ----------
-    position_range
-        Smallest and largest position, rad or m: first and last knot.
-    velocity_limit
-        Last knot of velocity, `SPEED_QUANTILE` of the speeds, rad/s or m/s.
-    score, information
-        ``P' W e`` (k,) and ``P' W P`` (k, k) of the functions P without their projection on the regressor, with W the
-        inverse covariance of the noise: the coefficients are ``information^-1 score``, their covariance is
-        ``information^-1``. The first ``2 POSITION_KNOTS`` functions are those of position.
-    band_edges_hz
-        Limits of the frequency bands (m + 1,), Hz.
-    band_power
-        Mean square of the residuals in each band (m,), N^2 m^2 or N^2.
-    band_degrees
-        Degrees of freedom of each power as a chi-square variable (m,).
+    ``score`` (k,) is ``P' W e`` and ``information`` (k, k) is ``P' W P``, W the inverse noise covariance and P the
+    functions without their projection on the regressor, first ``2 POSITION_KNOTS`` of position. Coefficients are
+    ``information^-1 score`` with covariance ``information^-1``. Powers (m,), N^2 m^2 or N^2, are chi-square.
     """
 
     joint: str
@@ -82,11 +67,7 @@ class JointResidualStatistics:
 def residual_statistics(
     prepared: Prepared, blocks: Sequence[ExperimentEquations], estimate: Estimate
 ) -> tuple[JointResidualStatistics, ...]:
-    """Return the statistics of the residuals of every joint.
-
-    ``prepared``: experiments with the derivatives of their positions. ``blocks``: equations of the estimate.
-    ``estimate``: whose noise models weigh the residuals; a model is fitted where it has none.
-    """
+    """Statistics of the residuals of every joint; the noise models of the estimate weigh them, else fitted ones."""
     noise: Sequence[ArModel] = estimate.noise
     if not any(ar.order for ar in noise):
         noise = noise_models(blocks, estimate.theta, estimate.covariance, MAX_AR_ORDER)
@@ -121,11 +102,7 @@ def residual_statistics(
 
 
 def motion_functions(q: Array, qd: Array, limits: tuple[float, float], fastest: float) -> Array:
-    """Return the free functions of the motion of a joint at every instant, shape (M, k).
-
-    ``q``, ``qd``: position and velocity (M,), rad and rad/s, or m and m/s. ``limits``: first and last knot of position.
-    ``fastest``: last knot of velocity; the first is its negative.
-    """
+    """Free functions (M, k) of the motion (M,) of a joint, SI, with knots in ``limits`` and up to ``fastest``."""
     place = _hats(q, np.linspace(*limits, POSITION_KNOTS))
     direction = qd / np.hypot(qd, max(DIRECTION * fastest, 1e-300))
     return np.hstack([place, place * direction[:, None], _hats(qd, np.linspace(-fastest, fastest, VELOCITY_KNOTS))])
@@ -137,12 +114,9 @@ def _hats(x: Array, knots: Array) -> Array:
 
 
 def band_powers(series: Sequence[Array], noise: ArModel) -> tuple[Array, Array]:
-    """Return the mean square of residuals in the frequency bands and the degrees of freedom of each.
+    """Mean square of residuals in the frequency bands and its degrees of freedom, by Satterthwaite's approximation.
 
-    Ordinates of a periodogram are independent chi-square variables with two degrees of freedom each, scaled by the
-    spectrum. Satterthwaite's approximation with the spectrum of the noise model gives those of their sum.
-
-    ``series``: residuals of one joint, one array (M,) per experiment; ``noise``: noise model of the joint.
+    Its spectrum is that of the noise model; ordinates of a periodogram are chi-square with two degrees each.
     """
     bands = len(BANDS) - 1
     power, sums, squares = np.zeros(bands), np.zeros(bands), np.zeros(bands)

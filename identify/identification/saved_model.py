@@ -27,15 +27,10 @@ def load_model(
     default: RobotConfig | None = None,
     progress: Callable[[str, float], None] | None = None,
 ) -> RobotModel:
-    """Read an identified model from a result.
+    """Read an identified model from ``identification.json``, ``diagnosis.json``, or the folder of one of them.
 
-    The structure that a diagnosis found is identified by IDIM-IV from the recordings of the diagnosis.
-
-    ``path``: ``identification.json``, ``diagnosis.json``, or the folder of one of them. ``robot``: configuration to
-    use; ``None``: that of the document. ``default``: configuration to use if the document, written by a former version,
-    has none. ``progress``: called with the name of a stage and the share done, 0 to 1. Raises ConfigError if there is
-    no such file, or no configuration for it; DataError if the file is no result, is judged unusable, or belongs to
-    another configuration.
+    The structure that a diagnosis found is identified by IDIM-IV from its recordings. ``default``: robot of documents
+    without one. Raises ConfigError if a file is missing, DataError if it is unusable or of another robot.
     """
     path = _file(path)
     if str(read_json(path).get("schema", "")).startswith("armident/diagnosis/"):
@@ -97,10 +92,7 @@ def _file(path: Path) -> Path:
 
 
 def configuration_of(document: IdentificationDocument, path: Path) -> RobotConfig | None:
-    """Return the robot configuration that an identification keeps; ``None`` in documents of former versions.
-
-    ``path``: its file, for messages. Raises DataError if it is no robot configuration.
-    """
+    """Robot configuration of a document, ``None`` in former versions; raises DataError if it is wrong."""
     if document.configuration is None:
         return None
     try:

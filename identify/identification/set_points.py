@@ -9,8 +9,7 @@ def between_set_points(
 ) -> tuple[NDArray[np.bool_], NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
     """Places of samples with the SYNC numbers ``sync`` (N,) among set points at ``at`` (k,), reported ``every`` SYNCs.
 
-    Returns a mask (N,) of the samples with a reference, the number of the set point before and after each, and its
-    share (N, 1) of the way between them. A lost set point leaves the samples around it without a reference.
+    Mask (N,) without those near a lost set point, set points before and after, and share (N, 1) of the way.
     """
     before = np.searchsorted(at, sync, side="right") - 1
     low = np.maximum(before, 0)

@@ -1,7 +1,6 @@
 """Smoothing of the sign of each joint's velocity, chosen from the recorded motion (thesis appendix B.2).
 
-``sign(qd)`` is ``(2/pi) atan(g qd)`` in regressors and simulations. The width ``1/g`` is a velocity and belongs to the
-speeds of the joint: 150 s/rad saturates on a wrist of some rad/s, but not on a lift of some centimetres per second.
+The width ``1/g`` of ``(2/pi) atan(g qd)`` is a velocity: 150 s/rad saturates on a wrist, but not on a slow lift.
 """
 
 from collections.abc import Sequence
@@ -20,10 +19,8 @@ from armident.identify.signals.streamed import Streamed
 SATURATION = 450.0
 """``g`` times the top speed of the joint.
 
-Source: the thesis finds 150 s/rad sufficient for all joints of the TX40 (appendix B.2), so also for the slowest one,
-whose top speed is 3.1 rad/s (joint 5 of `tx40_4.yaml`, 99 % quantile; all joints of its four trajectories: 3.1 to
-9.3 rad/s). "The value depends especially on the velocity range of the trajectory" (below equation 2.7). The smoothed
-sign reaches 0.99 at 14 % of the top speed.
+Source: 150 s/rad suffices for all joints of the TX40 (appendix B.2), so for the slowest one, of 3.1 rad/s (joint 5 of
+`tx40_4.yaml`, 99 % quantile; all: 3.1 to 9.3 rad/s). The smoothed sign reaches 0.99 at 14 % of the top speed.
 """
 
 TOP_QUANTILE = 0.99
@@ -41,11 +38,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Speeds:
-    """Velocities of each joint in the recordings, rad/s or m/s, shape (n,) each.
-
-    ``top``: 99 % quantile of the absolute velocity; ``rms``: root mean square velocity; ``noise``: standard deviation
-    of the velocity that the noise of the encoder causes after the same filter.
-    """
+    """Top (99 % quantile) and rms velocity of each joint, and its noise by the encoder, (n,) each, rad/s or m/s."""
 
     top: Array
     rms: Array
@@ -69,13 +62,9 @@ def recorded_speeds(experiments: Sequence[Experiment], bandwidth_hz: float) -> S
 
 
 def with_sign_smoothing(robot: RobotConfig, experiments: Sequence[Experiment], bandwidth_hz: float) -> RobotConfig:
-    """Return the configuration with a number for each joint's ``friction.sign_smoothing``.
+    """Return the configuration with a number for each joint's ``friction.sign_smoothing``, where it gives none.
 
-    The width ``1/g`` is ``1 / SATURATION`` of the joint's top speed. It is not below the noise of the measured
-    velocity: the sign of a narrower one would be that of the noise. A joint without any motion keeps the nominal value.
-
-    ``robot``: configuration; it is returned as it is where it gives the smoothing. ``experiments``: recordings,
-    corrected for wiring errors. ``bandwidth_hz``: closed-loop bandwidth, Hz.
+    The width ``1/g`` is ``1 / SATURATION`` of the top speed, but not below the noise of the velocity.
     """
     if robot.friction.sign_smoothing is not None:
         return robot
@@ -90,10 +79,7 @@ def with_sign_smoothing(robot: RobotConfig, experiments: Sequence[Experiment], b
 
 
 def with_numbers(robot: RobotConfig, smoothing: Sequence[float] | Array) -> RobotConfig:
-    """Return the configuration with numbers for ``friction.sign_smoothing`` where it gives none.
-
-    ``smoothing``: ``g`` of each joint, s/rad or s/m, (n,).
-    """
+    """Configuration with numbers ``g`` (n,), s/rad or s/m, for ``friction.sign_smoothing`` where it gives none."""
     if robot.friction.sign_smoothing is not None:
         return robot
     numbers = tuple(float(g) for g in smoothing)
@@ -103,11 +89,7 @@ def with_numbers(robot: RobotConfig, smoothing: Sequence[float] | Array) -> Robo
 def unsaturated_joints(
     given: RobotConfig, robot: RobotConfig, experiments: Sequence[Experiment], bandwidth_hz: float
 ) -> list[str]:
-    """Warnings for joints that move so slowly that the smoothing of the sign biases their friction.
-
-    ``given``: configuration of the user; ``robot``: configuration with numbers, from `with_sign_smoothing`;
-    ``bandwidth_hz``: closed-loop bandwidth, Hz.
-    """
+    """Warnings for joints so slow that the smoothing of the sign biases their friction; ``given``: by the user."""
     speeds = recorded_speeds(experiments, bandwidth_hz)
     reached = 2 / np.pi * np.arctan(robot.sign_smoothing * speeds.rms)
     warnings = []

@@ -13,15 +13,10 @@ from armident.identify.signals.bandwidth import motion_bandwidth
 
 
 def simulate_model(model: RobotModel, trajectory: Trajectory, rate_hz: float | None = None) -> Recording:
-    """Simulate the recording of an arm that is exactly the model, with its effects, and without noise.
+    """Simulate the recording of an arm that is exactly the model, with its effects, without noise; SI, joint side.
 
-    The dynamics are those of the identification (thesis section B.3), not those of the virtual arm. The controller is
-    that of the configuration, otherwise a critically damped PD for the closed-loop bandwidth.
-
-    ``trajectory``: reference positions. ``rate_hz``: sampling rate, Hz; ``None``: that of the recording that the model
-    was identified from. Returns positions, velocities and torques of the joints, and the reference, in SI units. Raises
-    ConfigError if the trajectory leaves the limits of the robot; DataError if the closed loop diverges: the parameters
-    are not physical, or the controller does not suit them.
+    Dynamics: thesis section B.3; controller: known, else a critically damped PD. Raises ConfigError or DataError if the
+    trajectory leaves the limits or the loop diverges.
     """
     robot, arm = model.robot, model.arm
     trajectory.check(robot)

@@ -64,24 +64,10 @@ def decimation_of(
     warnings: list[str] | None = None,
     reasons: list[Reason] | None = None,
 ) -> Decimation:
-    """Return low-pass and decimation for a method; enough equations are left unless the user chose the factor.
+    """Low-pass and decimation of a method, rough for one with a noise model; a chosen ``factor`` is kept.
 
-    Parameters
-    ----------
-    method
-        Name of the method; those with a noise model decimate only roughly.
-    bandwidth_hz
-        Closed-loop bandwidth, Hz.
-    factor
-        Factor chosen by the user, kept even if too few equations are left; ``None``: from the bandwidth.
-    samples
-        Length of every experiment.
-    rows
-        Least number of instants of all experiments together, see `least_rows`.
-    warnings
-        List to which a line is added if the cut-off was raised.
-    reasons
-        List to which a reason of the verdict is added if too few equations are left.
+    Else at least ``rows`` equations are left (`least_rows`). A line is added to ``warnings`` if the cut-off was raised,
+    to ``reasons`` if too few equations are left.
     """
     share = PIV_CUTOFF if estimator(method).prefiltered else LS_CUTOFF
     cutoff = share * bandwidth_hz if factor is None else 0.5 / (dt * factor)
@@ -105,11 +91,7 @@ def decimation_of(
 
 @dataclass(frozen=True)
 class IdentificationProblem:
-    """Input of every method: experiments with derivatives, the closed loop, and the first iterate.
-
-    ``prepared``: arm, experiments and derivatives; ``auxiliary``: the simulated closed loop with the decimation of the
-    method; ``start``: first theta, shape (b,); ``plain``: decimation of the methods without a noise model.
-    """
+    """Input of every method: experiments, closed loop, first theta (b,); ``plain``: decimation without noise model."""
 
     prepared: Prepared
     auxiliary: AuxiliaryModel
@@ -143,10 +125,7 @@ class IdentificationProblem:
         return None if found is None else found.bias
 
     def simulated_bias(self, estimate: Estimate, *, prefiltered: bool, runs: int | None = None) -> SimulatedBias | None:
-        """Bias of IDIM-IV or IDIM-PIV on recordings simulated with the estimate; ``None`` if that is impossible.
-
-        Of a long recording the `tested` stretches are simulated: more of them take as much time as all iterations.
-        """
+        """Bias of IDIM-IV or IDIM-PIV on simulated `tested` stretches; ``None`` if that is impossible."""
         numbers = tested(self.blocks)
         return simulated_bias(
             self.prepared.part(numbers),
@@ -166,10 +145,7 @@ class IdentificationProblem:
 
     @cached_property
     def in_band(self) -> "IdentificationProblem":
-        """Problem decimated to the band of the instruments where the equations have a wider one.
-
-        At the recorded rate nearly all rows lie beyond the band of the instruments and carry no information.
-        """
+        """Problem decimated to the band of the instruments, beyond which rows carry no information."""
         auxiliary = self.auxiliary
         if not auxiliary.limits_band:
             return self
@@ -178,23 +154,7 @@ class IdentificationProblem:
 
 @dataclass(frozen=True)
 class Solution:
-    """Estimate with the problem that it solves.
-
-    Parameters
-    ----------
-    estimate, problem
-        Estimate, and the equations to which it belongs.
-    prefiltered
-        True if the noise models weighted the rows; false if they only entered the covariance.
-    noise_of
-        Quantity to which noise models and residuals belong.
-    reasons
-        Defects for the verdict.
-    interval_warnings
-        Reasons why the standard deviations are doubtful.
-    bias
-        Bias (b,) that was subtracted, SI; ``None``: irrelevant.
-    """
+    """Estimate with its problem and the bias (b,), SI, that was subtracted; ``prefiltered``: with weighted rows."""
 
     estimate: Estimate
     problem: IdentificationProblem
@@ -211,10 +171,7 @@ class Solution:
 
     @cached_property
     def motions(self) -> Sequence[Derivatives]:
-        """Simulated motion of the estimate along the recorded references, without the disturbances of the recordings.
-
-        Raises DataError if neither the estimate nor any point between it and the last good one can be simulated.
-        """
+        """Simulated motion along the references, without disturbances; raises DataError if it cannot be simulated."""
         auxiliary = self.problem.auxiliary.fresh()
         return auxiliary.motions(self.estimate.theta) if self.runs is None else auxiliary.motions_of(self.runs)
 
@@ -246,10 +203,7 @@ class Solution:
         )
 
     def delay(self) -> TorqueDelay | None:
-        """Delay of the recorded torques, with the motion simulated along the recorded reference as instruments.
-
-        ``None`` if its equations have no finite solution.
-        """
+        """Delay of the torques, with simulated motion as instruments; ``None`` if there is no finite solution."""
         problem, prepared = self.problem, self.problem.prepared
         blocks = prepared.equations(problem.plain)
         numbers = tested(blocks)
@@ -269,10 +223,7 @@ class Solution:
 
 
 def is_singular(error: Exception) -> bool:
-    """Return true for a singular matrix, and for scipy's ``ValueError`` about numbers that are not finite.
-
-    ``error``: exception of numpy or scipy.
-    """
+    """Return true for a singular matrix, and for scipy's ``ValueError`` about numbers that are not finite."""
     return isinstance(error, np.linalg.LinAlgError) or NOT_FINITE in str(error)
 
 
@@ -328,10 +279,7 @@ def _doubted(solution: Solution) -> Solution:
 
 
 def doubts_of_serial_correlation(method: str, names: Sequence[str], estimate: Estimate, std: Array) -> tuple[str, ...]:
-    """Warning if the residuals of a joint are not white (Ljung and Box 1978) and intervals are too narrow for it.
-
-    ``std`` (b,) are the standard deviations that allow for serial correlation, SI.
-    """
+    """Warning if the residuals of a joint are not white (Ljung and Box 1978), and intervals too narrow for ``std``."""
     ratio = std / estimate.std
     worst = int(np.argmax(ratio))
     white = all(ljung_box(series, FEW_LAGS)[2] >= IdentificationCriteria.serial_level for series in estimate.residuals)

@@ -36,11 +36,9 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True, eq=False)
 class Support:
-    """Base parameters that a motion supports.
+    """Base parameters (b,) that a motion of the ``moving`` joints (n,) supports.
 
-    ``moving``: joints that move (n,). ``supported``: parameters that can be estimated together (b,). Each includes what
-    the motion cannot separate from it. ``theta``, ``std``: least-squares estimate of these alone, from the joints that
-    move, and its standard deviations; NaN elsewhere (b,), SI.
+    Each includes what the motion cannot separate from it. ``theta``, ``std``: estimate of these alone, SI; else NaN.
     """
 
     moving: Mask
@@ -49,19 +47,13 @@ class Support:
     std: Array
 
     def determined(self, model: ArmModel, share: float) -> Mask:
-        """Return the supported parameters that are precise, and not negative where nature forbids it.
-
-        ``share``: largest relative standard deviation. Returns the mask (b,).
-        """
+        """Mask (b,) of supported parameters with relative std up to ``share``, not negative where impossible."""
         possible = np.array([not name.startswith(NON_NEGATIVE) for name in model.base.names]) | (self.theta > 0)
         with np.errstate(invalid="ignore"):
             return np.asarray(self.supported & possible & (self.std <= share * np.abs(self.theta)), dtype=np.bool_)
 
     def sentence(self, model: ArmModel, criteria: IdentificationCriteria) -> str:
-        """List the parameters that the motion determines in words, with values if they are few.
-
-        ``criteria``: limits of the relative standard deviation and of the number of parameters that are listed.
-        """
+        """List the parameters that the motion determines in words, with values if they are few."""
         found = np.flatnonzero(self.determined(model, criteria.max_relative_std))
         limit = f"within {100 * criteria.max_relative_std:.0f} %"
         if not found.size:
@@ -84,13 +76,8 @@ def examine_support(
 ) -> Support:
     """Find the base parameters that a motion supports, by rank-revealing QR of the weighted regressor.
 
-    Joints at rest are held exactly still, so that noise and deflection do not count as excitation; their equations are
-    left out. Columns are taken in the order of pivoted QR. The subset is the largest leading one in which the standard
-    deviation of every parameter changes the torque of its joints by less than ``max_relative_std`` of it.
-
-    ``prepared``: arm, experiments and derivatives. ``blocks``, ``decimation``: equations of least squares, and their
-    parallel filter. ``moving``: joints that move (n,). ``noise``: residual variances of least squares, which weigh the
-    equations; ``None``: the variances of the torques.
+    Joints at rest are held still, so that noise is no excitation. The largest leading subset of pivoted QR counts in
+    which one standard deviation moves the torques by less than ``max_relative_std``.
     """
     model = prepared.model
     b, rows = model.base.b, 0
@@ -137,10 +124,7 @@ def _moving_rows(
     moving: Mask,
     noise: Sequence[ArModel] | None,
 ) -> Iterator[tuple[int, Array]]:
-    """Yield the joints that move, experiment by experiment, with regressor and torques side by side (R, b + 1).
-
-    The rows are in residual standard deviations.
-    """
+    """Yield moving joints, with regressor and torques (R, b + 1) in residual standard deviations, by experiment."""
     regressors = mapped(lambda b: b.x, blocks)
     if not moving.all():
         blocks = prepared.equations(decimation)

@@ -1,12 +1,9 @@
 """Delay between torque and position, estimated with the inverse dynamic model (thesis 2.33).
 
-A drive that reports the torque it holds from one sample to the next reports it half a sample early. Filters and buses
-add further delay. ``tau(k)`` then belongs to the instant ``k + delta`` of the positions. To first order in the delay,
-``tau = phi theta + delta d(phi theta)/dk + e``: one more parameter per joint, beside those of the inverse dynamics.
-
-In a closed loop a disturbance moves the arm first and the torque afterwards. Least squares therefore finds a delay in
-the noise itself (tens of samples on an arm with slow disturbances). The instruments of IDIM-IV (2.33) are independent
-of the disturbance: the regressor along the reference, or better along a simulated motion.
+A torque held from sample to sample is reported half a sample early; filters and buses delay it. If ``tau(k)`` belongs
+to the instant ``k + delta``, ``tau = phi theta + delta d(phi theta)/dk + e`` to first order. In a closed loop a
+disturbance moves the arm before the torque, so that least squares finds a delay in the noise itself. Instruments of
+IDIM-IV, along the reference or a simulated motion, are independent of it.
 """
 
 from collections.abc import Sequence
@@ -46,17 +43,9 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class TorqueDelay:
-    """Number of samples by which the recorded torques lead the positions.
+    """Number of samples by which the recorded torques lead the positions, and its standard deviation, (n,) each.
 
-    Parameters
-    ----------
-    samples
-        Estimates, shape (n,): recorded torque k belongs to the instant ``k + samples`` of the positions.
-    std
-        Standard deviations, shape (n,), samples.
-    instrumented
-        True if there were instruments independent of the disturbances. Otherwise the delay is that of least squares.
-        In a closed loop with disturbances its bias is far larger than its standard deviation.
+    Torque k belongs to the instant ``k + samples``. Least squares, without instruments, is biased by disturbances.
     """
 
     samples: Array
@@ -70,10 +59,7 @@ class TorqueDelay:
         return self.samples * self.dt
 
     def contradicts(self, expected: float = HELD, deviations: float = 3.0) -> NDArray[np.bool_]:
-        """Mask (n,) of the joints whose delay differs significantly from an expected one.
-
-        ``expected``: expected delay, samples; ``deviations``: standard deviations by which the delay must differ.
-        """
+        """Mask (n,) of the joints whose delay differs from an expected one, samples, by some standard deviations."""
         contradiction: NDArray[np.bool_] = np.abs(self.samples - expected) > deviations * self.std
         return contradiction
 
@@ -86,25 +72,10 @@ def torque_delay(
     instruments: Sequence[Derivatives] | None = None,
     regressors: tuple[Sequence[Array], Sequence[Array]] = ((), ()),
 ) -> TorqueDelay:
-    """Delay between torque and position of every joint, in fractions of samples.
+    """Delay between torque and position of every joint, in fractions of samples, beside all base parameters.
 
-    The torque is taken as recorded. All base parameters are estimated along with the delays, so a delay explains only
-    the part that they cannot. Each joint has its own delay; coupled motors of a wrist give the mixture that acts on the
-    joint. Result: with standard deviations that allow for serially correlated residuals. Raises DataError if a
-    recording is shorter than the parallel filter.
-
-    Parameters
-    ----------
-    experiments, signals
-        Recordings of one sampling rate, and the derivatives of their positions.
-    decimation
-        Parallel filter of the fit.
-    instruments
-        Motions without the disturbances of the recordings, for instance simulated. ``None``: the references or, where
-        one is missing, the measured motion, which is least squares.
-    regressors
-        Filtered regressors, (M, n, b) each, at the measured motions and at the instruments, if they were computed
-        before.
+    Instruments are by default the references, else the measured motion (least squares). Coupled motors give a mixture.
+    ``regressors`` (M, n, b) are filtered; standard deviations allow for serial correlation.
     """
     references = [e.q_ref for e in experiments if e.q_ref is not None]
     instrumented = instruments is not None or len(references) == len(experiments)

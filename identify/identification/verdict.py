@@ -13,11 +13,7 @@ AT_REST = ("standstill", "joint_at_rest")
 
 @dataclass(frozen=True)
 class Verdict:
-    """Judgement of a result.
-
-    ``level``: ``trustworthy``: no defect was found. ``doubtful``: usable within the limits that the reasons state.
-    ``unusable``: the parameters must not be used. ``reasons``: defects, the most severe first; empty if trustworthy.
-    """
+    """Judgement: trustworthy, doubtful (usable within the limits of its reasons) or unusable; worst reason first."""
 
     level: Level
     reasons: tuple[Reason, ...] = ()
@@ -38,13 +34,7 @@ class Verdict:
 
 
 def judge(reasons: Sequence[Reason], setup: SetupCheck | None = None) -> Verdict:
-    """Return the verdict that reasons and the check of the set-up lead to.
-
-    The level is that of the most severe reason. Reasons are sorted by severity, those of the set-up first; each message
-    occurs once.
-
-    ``reasons``: defects found in data and result. ``setup``: check of the set-up; ``None``: not made.
-    """
+    """Verdict of the most severe reason; each message occurs once, sorted by severity, those of the set-up first."""
     every = _merged(reasons, setup)
     once = {reason.message: reason for reason in reversed(every)}
     found = sorted(reversed(once.values()), key=lambda reason: -LEVELS.index(reason.level))
@@ -54,8 +44,7 @@ def judge(reasons: Sequence[Reason], setup: SetupCheck | None = None) -> Verdict
 def _merged(reasons: Sequence[Reason], setup: SetupCheck | None) -> list[Reason]:
     """Reasons of the set-up and of the result, each defect once.
 
-    Joints at rest are a matter of the excitation, and a common delay one of the set-up. Joints that no hypothesis
-    explains are named in the reason that gives their error.
+    Rest belongs to the excitation, a common delay to the set-up, and unexplained joints to the reason with their error.
     """
     if setup is None:
         return list(reasons)
@@ -101,10 +90,7 @@ def _tried(setup: SetupCheck) -> str:
 
 
 def listed(names: Sequence[str], most: int = 12) -> str:
-    """Return names as a list in words, cut after ``most``.
-
-    ``names``: at least one; ``most``: largest number of names.
-    """
+    """Return at least one name as a list in words, cut after ``most``."""
     shown = list(names[:most])
     if len(names) > most:
         return f"{', '.join(shown)} and {len(names) - most} more"

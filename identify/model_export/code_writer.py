@@ -39,10 +39,7 @@ _TEMPLATES.filters["quoted"] = lambda text: json.dumps(text, ensure_ascii=False)
 
 @dataclass(frozen=True)
 class Code:
-    """Content of the files of a model.
-
-    ``name``: identifier of the robot; ``content``: variables of the templates; ``sheet``: what the code does not hold.
-    """
+    """Files of a model: identifier of the robot, variables of the templates, and what the code does not hold."""
 
     name: str
     content: Mapping[str, Any]
@@ -61,10 +58,7 @@ def write_python(model: ExportedModel, path: Path) -> tuple[list[Path], Limitati
 
 
 def write_c(model: ExportedModel, path: Path) -> tuple[list[Path], LimitationSheet]:
-    """Write a C99 source file and its header, with inverse and forward dynamics.
-
-    ``path``: source file to write; the header is beside it and has the name of the robot.
-    """
+    """Write a C99 source file, with inverse and forward dynamics, and beside it a header named after the robot."""
     code = code_of(model, "c")
     header = path.with_name(f"{code.name}.h")
     write_atomically(header, code.render("model.h.jinja"))

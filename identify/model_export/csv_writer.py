@@ -19,8 +19,7 @@ COLUMNS = ("name", "value", "std", "unit", "identifiable", "remark")
 def write_csv(model: ExportedModel, path: Path) -> tuple[list[Path], LimitationSheet]:
     """Write the standard parameters in modified Denavit-Hartenberg frames, with those of the effects.
 
-    ``identifiable`` is ``alone``, ``group`` or ``no``; ``std`` is empty where the recordings do not determine the
-    parameter alone.
+    ``identifiable``: ``alone``, ``group`` or ``no``; ``std`` is empty where the parameter is not determined alone.
     """
     found = model.consistent
     rigid = len(found.names) - model.arm.e

@@ -28,10 +28,8 @@ IMPOSSIBLE = (
 """Next step where no physical arm has the parameters."""
 
 BALL_KG, BALL_RADIUS_M = 1e-3, 1e-2
-"""Mass and radius of a ball that every exported link contains, at the origin of its frame.
-
-Simulators refuse links without mass or extent. No link of an arm is smaller, and no recording shows a gram.
-"""
+"""Mass and radius of a ball at the origin of every exported link's frame: simulators refuse links without mass or
+extent. No link of an arm is smaller, and no recording shows a gram."""
 
 SMALLEST_LINK = BALL_KG * np.diag([*np.full(3, BALL_RADIUS_M**2 / 5), 1.0])
 """Pseudo-inertia of that ball: second moments of a uniform ball (kg m^2) and mass (kg)."""

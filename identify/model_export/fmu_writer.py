@@ -29,11 +29,7 @@ EPOCH = (1980, 1, 1, 0, 0, 0)
 
 @dataclass(frozen=True)
 class Variable:
-    """Variable of an FMU.
-
-    ``name``, ``causality``, ``initial``, ``unit``, ``description``: as in ``modelDescription.xml``; ``initial`` is
-    empty where there is none. ``start``: value at the start; ``None``: computed.
-    """
+    """Variable of ``modelDescription.xml``; ``initial`` may be empty; ``start``: ``None`` if computed."""
 
     name: str
     causality: str
@@ -44,10 +40,7 @@ class Variable:
 
 
 def write_fmu(model: ExportedModel, path: Path) -> tuple[list[Path], LimitationSheet]:
-    """Write an FMU for 64-bit Linux, compiled on this machine; its sources are inside.
-
-    Raises ConfigError if there is no C compiler, or the machine is another one.
-    """
+    """Write an FMU for 64-bit Linux with its sources; ConfigError without a C compiler or on another machine."""
     code, variables = code_of(model, "fmu"), variables_of(model)
     source = code.render("model.c.jinja")
     start = [variable.start or 0.0 for variable in variables[model.arm.n : 2 * model.arm.n]]
@@ -78,10 +71,7 @@ def write_fmu(model: ExportedModel, path: Path) -> tuple[list[Path], LimitationS
 
 
 def variables_of(model: ExportedModel) -> list[Variable]:
-    """Return the variables of an FMU: torques, positions, velocities and accelerations of the joints.
-
-    ``model``: the model. Joints start at zero, or in the middle of limits that exclude zero.
-    """
+    """Return torques and motion of the joints; they start at zero, or in the middle of limits that exclude zero."""
     kinds = (
         ("tau", "input", "", ("N.m", "N"), "torque or force of {}, held during a communication step"),
         ("q", "output", "exact", ("rad", "m"), "position of {}"),
@@ -107,11 +97,7 @@ def variables_of(model: ExportedModel) -> list[Variable]:
 
 
 def compiled(sources: dict[str, str], name: str) -> bytes:
-    """Compile C sources to a shared library with the compiler of this machine.
-
-    ``sources``: texts by file name. Raises ConfigError if there is no compiler, or the machine is not one of 64-bit
-    Linux.
-    """
+    """Compile C sources by file name to a shared library; ConfigError without compiler or 64-bit Linux."""
     if (platform.system(), platform.machine()) != MACHINE:
         raise ConfigError(f"--format fmu: needs {' '.join(MACHINE)}; on other machines use --format c")
     compiler = shutil.which("gcc") or shutil.which("cc")

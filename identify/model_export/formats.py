@@ -19,11 +19,7 @@ from armident.identify.model_export.urdf_writer import write_urdf
 
 @dataclass(frozen=True)
 class Format:
-    """A format of exported models.
-
-    ``suffix``: suffix of its main file, with the dot. ``title``: name in words. ``write``: writes the model to the path
-    of the main file; returns all files written, the main one first, and the sheet.
-    """
+    """A format of exported models; ``write`` returns all files, the main one first, and the sheet."""
 
     suffix: str
     title: str
@@ -44,20 +40,15 @@ FORMATS: dict[str, Format] = {
 
 
 def check_format(format_name: str) -> None:
-    """Refuse a format that does not exist.
-
-    Raises ConfigError if there is no such format; names those that there are.
-    """
+    """Raise ConfigError, with the names of all formats, if a format does not exist."""
     if format_name not in FORMATS:
         raise ConfigError(f"--format: {format_name!r} is not one of {', '.join(FORMATS)}")
 
 
 def export_model(model: ExportedModel, format_name: str, out: Path) -> tuple[list[Path], LimitationSheet]:
-    """Write a model in a format, and the sheet of its limits beside it.
+    """Write a model in a format, and the sheet of its limits beside it; return the files, sheet last, and the sheet.
 
-    ``format_name``: name in `FORMATS`; ``out``: main file, or a folder in which it is named after the robot. Returns
-    ``files``: files written: the main one first, the sheet last; ``sheet``: parts that the format cannot hold, and
-    parameters that were not determined. Raises ConfigError if there is no such format.
+    ``out``: main file, or a folder in which it is named after the robot.
     """
     check_format(format_name)
     chosen = FORMATS[format_name]

@@ -1,8 +1,7 @@
 """Torques of effects as formulas of one instant, in the notation that Python and C share.
 
-The columns of an effect are evaluated with symbols in place of signals: elements of numpy's object arrays that record
-each operation. A formula is accepted if it has the values of the effect along a random motion. Effects with memory,
-such as backlash, have no such formula.
+An effect's columns are evaluated with symbols that record each operation, as elements of numpy's object arrays. A
+formula is accepted if it has the effect's values along a random motion. Effects with memory (backlash) have none.
 """
 
 import math
@@ -94,8 +93,7 @@ class Formula:
     def hats(self, knots: Floats) -> "list[Formula]":
         """Return the piecewise linear functions at increasing knots, constant beyond the outermost.
 
-        ``hat(x, left, top, right)`` rises from zero at ``left`` to one at ``top``; it stays one on a side whose end is
-        ``top``.
+        ``hat(x, left, top, right)`` rises from 0 at ``left`` to 1 at ``top``, and stays 1 where an end is ``top``.
         """
         ends = [knots[0], *knots, knots[-1]]
         return [
@@ -204,20 +202,11 @@ def _symbols(name: str, n: int) -> Any:
 
 @dataclass(frozen=True, eq=False)
 class InstantModel:
-    """The dynamics of one instant: parameters, gravity, and effects as formulas.
+    """Dynamics of one instant: standard parameters (p,), gravity (3,) in the base frame, and effects as formulas.
 
-    Parameters
-    ----------
-    theta
-        Standard parameters (p,), with those of effects that change them.
-    gravity
-        Gravity in the base frame, m/s^2, (3,).
-    torques
-        Formulas of the further torque by effect (its number in the configuration) and joint, N m or N. Symbols are
-        ``q``, ``dq``, ``ddq``; ``sign``, the smoothed sign of the velocity; ``load``, the torque of the links;
-        ``torque``, that of the links, rotors, couplings and friction.
-    held
-        Numbers of the effects of the configuration that the model contains.
+    ``torques``: formulas by number of the effect and joint, N m or N. Symbols: ``q``, ``dq``, ``ddq``; ``sign``, the
+    smoothed sign of the velocity; ``load``, torque of the links; ``torque``, that of links, rotors, couplings and
+    friction. ``held``: numbers of the effects that the model contains.
     """
 
     theta: Floats
@@ -227,11 +216,7 @@ class InstantModel:
 
 
 def instant_model(arm: ArmModel, theta: Floats) -> InstantModel:
-    """Return the dynamics of an arm at one instant, with those of its effects that have no memory.
-
-    ``arm``: dynamic model with the effects as terms; ``theta``: standard parameters (p,), those of the effects last,
-    SI.
-    """
+    """Return the dynamics of an arm at one instant, with those of its effects that have no memory."""
     theta, gravity = theta.copy(), arm.chain.gravity.copy()
     torques: dict[int, dict[int, str]] = {}
     held: set[int] = set()

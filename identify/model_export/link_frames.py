@@ -13,22 +13,10 @@ from armident.identify.robot.chain import Floats, cos_sin
 class LinkFrames:
     """Frames of n links and their joints, all joint variables zero.
 
-    Parameters
-    ----------
-    links, joints
-        Names of the moving links and of their joints, (n,).
-    placements
-        Frame of each link in that of the link before it, the first in the base link, homogeneous, (n, 4, 4).
-    axes
-        Unit vector of each joint axis in the frame of its link, (n, 3).
-    from_mdh
-        Modified Denavit-Hartenberg frame of each link in the frame of the link, homogeneous, (n, 4, 4).
-    frame_0
-        Rotation of frame 0 of the robot configuration in the base link, (3, 3).
-    gravity
-        Acceleration of gravity in the base link, m/s^2, (3,).
-    endless
-        True for joints that turn without end, (n,).
+    ``placements`` (n, 4, 4): of each link in the link before it, the first in the base link. ``axes`` (n, 3): unit
+    vectors in the link's frame. ``from_mdh`` (n, 4, 4): modified Denavit-Hartenberg frame in the link's. ``frame_0``
+    (3, 3): rotation of the configuration's frame 0 in the base link. ``gravity`` (3,): in the base link, m/s^2.
+    ``endless`` (n,): joints that turn without end.
     """
 
     base: str
@@ -51,10 +39,7 @@ class LinkFrames:
 
 
 def mdh_link_frames(robot: RobotConfig) -> LinkFrames:
-    """Return the modified Denavit-Hartenberg frames of a robot configuration as link frames.
-
-    ``robot``: configuration, n joints. A link is named after its joint.
-    """
+    """Return the modified Denavit-Hartenberg frames of a robot as link frames; links are named after joints."""
     n = robot.n
     links = tuple(f"{joint.name}_link" for joint in robot.joints)
     return LinkFrames(
@@ -71,10 +56,7 @@ def mdh_link_frames(robot: RobotConfig) -> LinkFrames:
 
 
 def mdh_transform(mdh: Mdh) -> Floats:
-    """Return frame j in frame j-1 at position zero, ``Rot(x, alpha) Trans(x, d) Rot(z, theta) Trans(z, r)``, (4, 4).
-
-    ``mdh``: modified Denavit-Hartenberg parameters (thesis section 2.1.1).
-    """
+    """Return frame j in frame j-1 at position zero, ``Rot(x, alpha) Trans(x, d) Rot(z, theta) Trans(z, r)`` (2.1.1)."""
     (ca, sa), (ct, st) = cos_sin(mdh.alpha), cos_sin(mdh.theta)
     return np.array(
         [

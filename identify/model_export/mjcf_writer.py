@@ -125,7 +125,7 @@ def _add_tendons(
 def _tendon(first: float, second: float, shared: float) -> tuple[float, float] | None:
     """Coefficient of the first joint, and strength, of a tendon for ``[[first, shared], [shared, second]]``.
 
-    Both joints then keep what the tendon leaves, which must not be negative; ``None`` if that is impossible.
+    The joints keep the rest, which must not be negative; ``None`` if that is impossible.
     """
     if shared <= min(first, second):
         return 1.0, shared

@@ -19,10 +19,7 @@ TAG = "model"
 
 
 def write_pinocchio(model: ExportedModel, out: Path) -> tuple[list[Path], LimitationSheet]:
-    """Write an XML archive that ``pinocchio.Model.loadFromXML(file, "model")`` reads.
-
-    Returns ``files``: the file; ``sheet``: limits of the format. Raises ConfigError if Pinocchio is not installed.
-    """
+    """Write an XML archive that ``pinocchio.Model.loadFromXML(file, "model")`` reads; needs Pinocchio."""
     try:
         import pinocchio
     except ImportError as error:

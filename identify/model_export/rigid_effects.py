@@ -12,11 +12,9 @@ SPRINGS = "springs"
 
 
 def with_rigid_effects(model: ExportedModel) -> tuple[ExportedModel, dict[int, str]]:
-    """Return the model with such effects added to its joints, couplings and gravity.
+    """Return the model with such effects added to its joints, couplings and gravity, and the part that holds each.
 
-    Returns ``model``: the model with the sums; its effects are still listed. ``parts``: part of the model that holds an
-    effect, by index of the effect: ``rotor inertia``, ``couplings``, ``gravity`` or `SPRINGS`. Springs are not added to
-    anything: see `springs`.
+    Parts by index of the effect: ``rotor inertia``, ``couplings``, ``gravity`` or `SPRINGS`. Springs are not added.
     """
     parts = {k: part for k, effect in enumerate(model.effects) if (part := _part(model, effect)) is not None}
     joints, couplings, gravity = list(model.joints), list(model.couplings), model.frames.gravity

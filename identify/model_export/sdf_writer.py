@@ -18,10 +18,7 @@ VERSION = "1.7"
 
 
 def write_sdf(model: ExportedModel, out: Path) -> tuple[list[Path], LimitationSheet]:
-    """Write an SDF file with one model, fixed to the world.
-
-    Returns ``files``: the file; ``sheet``: limits of the format.
-    """
+    """Write an SDF file with one model, fixed to the world; return it and the limits of the format."""
     model, parts = with_rigid_effects(model)
     root = ET.Element("sdf", version=VERSION)
     arm = ET.SubElement(root, "model", name=model.robot.name)

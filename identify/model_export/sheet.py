@@ -23,11 +23,7 @@ ATTRIBUTES = ("rotor_inertia", "viscous", "coulomb", "offset")
 
 @dataclass(frozen=True)
 class Omission:
-    """Part of the model that a format cannot hold.
-
-    ``part``: part of the model with its joint and values, for example ``offset of joint_2: 0.31 N m``. ``reason``:
-    consequence or the next step, one sentence; empty: none.
-    """
+    """Part that a format cannot hold, as ``offset of joint_2: 0.31 N m``; ``reason``: consequence or next step."""
 
     part: str
     reason: str = ""
@@ -35,12 +31,7 @@ class Omission:
 
 @dataclass(frozen=True)
 class LimitationSheet:
-    """Limits of an exported file.
-
-    ``held``: parts of the model that the file holds, one phrase each; ``omitted``: parts of the model that the file
-    does not hold; ``undetermined``: names of the parameters that the recordings did not determine, with the reason;
-    ``remarks``: further sentences for the user.
-    """
+    """Limits of an exported file: parts held and omitted, undetermined parameters with the reason, remarks."""
 
     format_name: str
     held: tuple[str, ...]
@@ -91,11 +82,9 @@ def limitation_sheet(
     parts: Mapping[int, str] = MappingProxyType({}),
     remarks: Collection[str] = (),
 ) -> LimitationSheet:
-    """Return the sheet of a file.
+    """Return the sheet of a file that ``holds`` links and some of `PARTS`, ``couplings``, ``gravity``, ``springs``.
 
-    ``holds``: parts that the file holds: those of `PARTS`, ``couplings``, ``gravity`` and ``springs``; every file holds
-    the links. ``effects``: effects that the file holds as such. ``parts``: part of the arm that another effect was
-    added to, by index of the effect; ``holds`` says if the file holds it. ``remarks``: further sentences for the user.
+    ``effects``: held as such. ``parts``: part of the arm that another effect was added to, by index of the effect.
     """
     held = ["masses, centres of mass and inertias of the links", *(part for part in PARTS if part in holds)]
     omitted = [

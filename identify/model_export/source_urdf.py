@@ -25,10 +25,7 @@ SAME_GEOMETRY = 1e-5
 
 @dataclass(frozen=True)
 class SourceUrdf:
-    """URDF of an arm, and the chain in it that was identified.
-
-    ``base``, ``tip``: first and last link of the chain; ``None``: the root, and the last link that moves.
-    """
+    """URDF and the identified chain in it; ``base`` ``None``: the root; ``tip`` ``None``: the last link that moves."""
 
     file: Path
     base: str | None = None
@@ -40,10 +37,7 @@ class SourceUrdf:
 
 
 def source_of(robot: str | Path) -> SourceUrdf | None:
-    """Return the URDF that a robot configuration names, ``None`` if it names none.
-
-    ``robot``: path or shipped name of the configuration; it has been loaded before.
-    """
+    """Return the URDF that a loaded robot configuration (path or shipped name) names, if any."""
     path = config_path(robot)
     data = read_yaml(path.read_text(encoding="utf-8"), str(path))
     if not isinstance(data, dict) or "urdf" not in data:
@@ -53,10 +47,7 @@ def source_of(robot: str | Path) -> SourceUrdf | None:
 
 
 def source_for(robot: RobotConfig, file: Path) -> SourceUrdf:
-    """Return the chain of a URDF that ends with the last joint of a robot.
-
-    Raises ConfigError if there is no such file, or the URDF has no such joint.
-    """
+    """Return the chain of a URDF that ends with the last joint of a robot; ConfigError if it has no such joint."""
     if not file.is_file():
         raise ConfigError(f"--urdf: {file}: no such file")
     last = robot.joints[-1].source_name or robot.joints[-1].name
@@ -73,10 +64,9 @@ def source_for(robot: RobotConfig, file: Path) -> SourceUrdf:
 
 
 def source_frames(source: SourceUrdf, robot: RobotConfig) -> LinkFrames:
-    """Return the frames of the URDF's links.
+    """Return the frames of the URDF's links; frame 0 of the configuration may be anywhere.
 
-    ``source``: URDF and chain. ``robot``: configuration of the same arm, n joints; its frame 0 may be anywhere. Raises
-    ConfigError if the URDF cannot be read, or its arm is another one than that of the configuration.
+    Raises ConfigError if the URDF cannot be read, or its arm differs from that of the configuration.
     """
     joints = read_chain(source.file, source.base, source.tip)
     ours = np.stack(list(accumulate((mdh_transform(joint.mdh) for joint in robot.joints), np.matmul)))
@@ -100,10 +90,7 @@ def source_frames(source: SourceUrdf, robot: RobotConfig) -> LinkFrames:
 
 
 def known_bodies(source: SourceUrdf, arm: ArmModel, frames: LinkFrames) -> Floats | None:
-    """Return the masses of the URDF as standard parameters (p,) of the arm, the others zero.
-
-    ``source``: URDF and chain. Returns ``None`` if a link has no mass, or one that no body has.
-    """
+    """Return the URDF's masses as standard parameters (p,), others zero; ``None`` if a link has no possible mass."""
     try:
         given = read_inertials(source.file, source.base, source.tip)
     except ConfigError:
@@ -128,10 +115,7 @@ def known_bodies(source: SourceUrdf, arm: ArmModel, frames: LinkFrames) -> Float
 
 
 def _frame_0(source: SourceUrdf, joints: tuple[UrdfJoint, ...], robot: RobotConfig, ours: Floats) -> Floats:
-    """Frame 0 of the configuration in the base link, so that all axes coincide at position zero, (4, 4).
-
-    Raises ConfigError if there is no such frame: the arms differ.
-    """
+    """Frame 0 (4, 4) of the configuration in the base link by coinciding axes; ConfigError if the arms differ."""
     names = ", ".join(joint.name for joint in joints)
     hint = "give the URDF of this arm, or the configuration that names it with --config"
     if [MOVING[joint.type] for joint in joints] != [joint.type for joint in robot.joints]:
@@ -155,13 +139,7 @@ def _frame_0(source: SourceUrdf, joints: tuple[UrdfJoint, ...], robot: RobotConf
 
 
 def _aligned(axes: Floats, points: Floats, onto: Floats, onto_points: Floats, revolute: NDArray[np.bool_]) -> Floats:
-    """Motion that brings joint axes onto others, in the least-squares sense, homogeneous, (4, 4).
-
-    A prismatic joint has a direction, and no place.
-
-    ``axes``, ``points``: unit vectors of the axes, and a point on each, (n, 3); ``onto``, ``onto_points``: the same of
-    the axes to coincide with, (n, 3); ``revolute``: True for revolute joints, (n,).
-    """
+    """Least-squares motion (4, 4) of joint axes (n, 3), each with a point, onto others; prismatic: no point."""
     vectors, images = axes, onto
     if np.linalg.norm(np.cross(axes, axes[0]), axis=1).max() < PARALLEL and revolute.any():
         # Parallel axes leave the angle about them free; the distances of the axes determine it.

@@ -19,10 +19,7 @@ def numbers(values: float | Iterable[float] | Floats) -> str:
 
 
 def roll_pitch_yaw(rotation: Floats) -> Floats:
-    """Return the fixed-axis angles of a rotation, ``Rot(z, yaw) Rot(y, pitch) Rot(x, roll)``, rad, (3,).
-
-    ``rotation``: rotation matrix (3, 3).
-    """
+    """Return the fixed-axis angles (3,) of a rotation, ``Rot(z, yaw) Rot(y, pitch) Rot(x, roll)``, rad."""
     r = rotation
     level = float(np.hypot(r[0, 0], r[1, 0]))
     pitch = np.arctan2(-r[2, 0], level)

@@ -18,11 +18,7 @@ PIECE = 4096
 
 @dataclass(frozen=True, eq=False)
 class ArModel:
-    """Noise model ``C(z^-1) xi = e`` with ``C = 1 + c_1 z^-1 + ...`` (6.19), ``e`` white.
-
-    ``coefficients``: ``c_1 .. c_l``, shape (l,); order 0 is white noise. ``variance``: variance of ``e``, ``lambda^2``,
-    in squared units of the series. ``aic``: Akaike criterion (6.24) by which the order was chosen.
-    """
+    """Noise model ``C(z^-1) xi = e`` with ``C = 1 + c_1 z^-1 + ...`` (6.19), ``e`` white; ``aic``: see (6.24)."""
 
     coefficients: NDArray[np.float64]
     variance: float
@@ -40,7 +36,7 @@ class ArModel:
         return response
 
     def whiten(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """``C(z^-1) x / lambda`` along the first axis, (M, ...) to (M - order, ...); no initial state is assumed.
+        """``C(z^-1) x / lambda`` along the first axis, (M, ...) to (M - order, ...), without an initial state.
 
         Shape (0, ...) where there are no more samples than coefficients.
         """
@@ -52,14 +48,10 @@ class ArModel:
     def widened(self, samples: int) -> "ArModel":
         """The same filter, its variance times ``((N + l) / (N - l))^2``: for weights and covariances of an estimate.
 
-        Two errors of relative size ``2 l / N`` make the information ``X' Omega^-1 X`` of the model too large. First,
-        the filter was fitted to the residuals that it whitens. On other residuals of the same process its error has a
-        variance ``(N + l) / (N - l)`` times as large (Akaike, Fitting autoregressive models for prediction, 1969).
-        Second, an estimate weighted by the model scatters more than one weighted by the process itself. The excess is
-        the relative variance of an AR spectrum, less the part to which the parameters are insensitive. The former is
-        ``2 l / N`` on the average of the frequencies (Berk, Consistent autoregressive spectral estimates, 1974).
-
-        ``samples``: N, length of the residuals behind the model, of all experiments together; more than the order.
+        The information ``X' Omega^-1 X`` has two relative errors of ``2 l / N`` (N: all ``samples``). On other
+        residuals the filter's error has ``(N + l) / (N - l)`` times the variance (Akaike, Fitting autoregressive models
+        for prediction, 1969). A weighted estimate scatters by the relative variance of an AR spectrum, ``2 l / N`` on
+        the average of the frequencies (Berk, Consistent autoregressive spectral estimates, 1974).
         """
         factor = ((samples + self.order) / (samples - self.order)) ** 2
         return replace(self, variance=factor * self.variance)
@@ -71,10 +63,7 @@ WHITE = ArModel(np.empty(0), 1.0, 0.0)
 
 @dataclass(frozen=True)
 class WhitenessTest:
-    """Autocorrelation of residuals against the 2-sigma band of white noise.
-
-    ``autocorrelation``: autocorrelation at lags 1..L, shape (L,); ``bound``: half width of the band.
-    """
+    """Autocorrelation of residuals at lags 1..L, with the half width ``bound`` of the 2-sigma band of white noise."""
 
     autocorrelation: NDArray[np.float64]
     bound: float
@@ -98,25 +87,11 @@ def ar_models(
     parameters: float = 0.0,
     absorbed: Sequence[NDArray[np.float64]] | None = None,
 ) -> list[ArModel]:
-    """AR model of the errors of each joint (2.25, 2.26, 6.21 to 6.25).
+    """AR model of the errors (M, n) of each joint (2.25, 2.26, 6.21 to 6.25); order at most a tenth of the samples.
 
-    Two corrections make up for the noise that estimated parameters have taken out of the errors. The number of
-    parameters widens all variances by the same factor, which suffices for weights and comparisons. The autocovariances
-    of that noise (``absorbed``) are right for every frequency, but need the covariance of the parameters. Raises
-    ValueError if ``keep`` is given for coloured noise.
-
-    Parameters
-    ----------
-    errors
-        Errors, one (M, n) array per experiment, N m or N.
-    max_order
-        Highest order tried; limited to a tenth of the samples. 0: white noise.
-    keep
-        Equations to use, (M, n) per experiment; ``None``: all. For white noise alone: a filter needs a gapless record.
-    parameters
-        Number of estimated parameters. Joints share their degrees of freedom in proportion to their equations.
-    absorbed
-        Sums of the autocovariances that the parameters took from each joint, see `fit_ar`; ``None``: nothing.
+    ``parameters``: number of estimated ones, which widens all variances: enough for weights and comparisons.
+    ``absorbed``: autocovariances of the noise that they took from each joint (see `fit_ar`), for every frequency.
+    ``keep`` (M, n): for white noise alone, as a filter needs a gapless record.
     """
     if keep is not None and max_order:
         raise ValueError("coloured noise needs a record without gaps")
@@ -135,15 +110,7 @@ def fit_ar(
 ) -> ArModel:
     """AR model of residuals by Levinson-Durbin on the Yule-Walker equations, order by AIC (6.21 to 6.25).
 
-    Parameters
-    ----------
-    series
-        Residuals of one joint, one array (M,) per experiment. Their mean is not removed: it is noise like the rest.
-    max_order
-        Highest order tried; limited to a tenth of the samples.
-    absorbed
-        Sums over the samples of the autocovariances that the fitted parameters took out of the residuals, at lags
-        0..``max_order``; ``None``: nothing.
+    The order is at most a tenth of the samples. ``absorbed``: autocovariance sums, lags 0.., that parameters took out.
     """
     total = sum(s.size for s in series)
     max_order = max(0, min(max_order, total // 10, min(s.size for s in series) - 1))
@@ -157,20 +124,12 @@ def fit_ar(
 
 
 def lowest_aic(r: NDArray[np.float64], samples: int) -> ArModel:
-    """AR model of the order with the lowest Akaike criterion (6.24, 6.25).
-
-    ``r``: autocovariances at lags 0..highest order, ``r[0] > 0``; ``samples``: length of the residuals from which they
-    come, of all experiments together.
-    """
+    """AR model of the order with the lowest Akaike criterion (6.24, 6.25), from autocovariances ``r``, ``r[0] > 0``."""
     return ArModel(*_lowest_aic(r, samples))
 
 
 def fit_spectrum(power: NDArray[np.float64], order: int) -> ArModel:
-    """AR model of a given order whose spectrum ``variance / |C|^2`` follows a given one; its inverse is stable.
-
-    ``power``: positive spectral density at equally spaced frequencies from zero to the Nyquist frequency. ``order``:
-    order; less where a shorter model is exact.
-    """
+    """Stable AR model, of at most an order, whose ``variance / |C|^2`` follows a spectrum from zero to Nyquist."""
     r = np.fft.irfft(power)[: order + 1]
     coefficients, variances = levinson_durbin(r)
     last = variances.size - 1
@@ -179,11 +138,9 @@ def fit_spectrum(power: NDArray[np.float64], order: int) -> ArModel:
 
 @compiled("f8[::1]", **ARITHMETIC)
 def levinson_durbin(r: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Solutions of the Yule-Walker equations of every order by the Levinson-Durbin recursion (6.21 to 6.23).
+    """Yule-Walker coefficients (P + 1, L) and variances (P + 1,) of every order by Levinson-Durbin (6.21 to 6.23).
 
-    ``r``: autocovariances at lags 0..L, ``r[0] > 0``. Returns ``coefficients``: row l holds ``c_1 .. c_l`` of the model
-    of order l, then zeros; shape (P + 1, L). ``variances``: variances of the innovations, shape (P + 1,). P is L, or
-    less where a model of order P + 1 would be exact.
+    ``r``: autocovariances at lags 0..L, ``r[0] > 0``. P is L, or less where a model of order P + 1 would be exact.
     """
     highest = r.size - 1
     coefficients, variances = np.zeros((highest + 1, highest)), np.zeros(highest + 1)
@@ -204,18 +161,12 @@ def levinson_durbin(r: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArra
 
 
 def lagged_sums(x: NDArray[np.float64], max_lag: int, first: int = 0) -> NDArray[np.float64]:
-    """``sum_t x(t) . x(t - k)`` for lags 0..max_lag, shape (max_lag + 1,).
-
-    ``x``: vector series, shape (M, m); ``max_lag``: highest lag k.
-    """
+    """``sum_t x(t) . x(t - k)`` of ``x`` (M, m) for lags 0..max_lag, shape (max_lag + 1,)."""
     return _lagged_sums(np.ascontiguousarray(x, dtype=np.float64), max_lag, first)
 
 
 def whiteness(series: Sequence[NDArray[np.float64]], lags: int = 20) -> WhitenessTest:
-    """Autocorrelation of residuals pooled over experiments, with the bound ``2 / sqrt(M)``.
-
-    ``series``: residuals of one joint, one array (M,) per experiment.
-    """
+    """Autocorrelation of residuals pooled over experiments, with the bound ``2 / sqrt(M)``."""
     total = sum(s.size for s in series)
     mean = sum(float(s.sum()) for s in series) / total
     r = np.zeros(lags + 1)

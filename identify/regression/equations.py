@@ -32,10 +32,9 @@ ROWS_PER_TASK, SAMPLES_PER_TASK = 256, 4096
 
 @dataclass(frozen=True)
 class ExperimentEquations:
-    """Equations of one experiment after the parallel filter (thesis 2.3.1).
+    """Equations of one experiment after the parallel filter (thesis 2.3.1), with instants ``t`` (M,), s.
 
-    ``y``: torques, shape (M, n), N m or N; ``x``: regressor at measured signals, shape (M, n, b); ``keep``: equations
-    to use, shape (M, n); ``t``: instants, s, shape (M,).
+    ``y`` (M, n): torques; ``x`` (M, n, b): regressor at measured signals; ``keep`` (M, n): equations to use.
     """
 
     y: NDArray[np.float64]
@@ -53,24 +52,9 @@ class InstrumentedEquations(ExperimentEquations):
 
 @dataclass(frozen=True)
 class Estimate:
-    """Result of an estimator.
+    """Result of an estimator: base parameters (b,) and their covariance (b, b), SI.
 
-    Parameters
-    ----------
-    theta, covariance
-        Base parameters (b,) and their covariance (b, b), SI units.
-    noise
-        Noise model of each joint; its variance is the sigma_j^2 of 2.25.
-    residuals
-        Whitened residuals of each joint, one array per experiment, in standard deviations.
-    iterations
-        Iterations done.
-    converged
-        True if the iterations converged.
-    stop_reason
-        Rule that ended the iterations, as a sentence.
-    warnings
-        Lines for the user.
+    ``noise``: the sigma_j^2 of 2.25. ``residuals``: whitened, per joint and experiment, in standard deviations.
     """
 
     theta: NDArray[np.float64]
@@ -91,14 +75,9 @@ class Estimate:
 def filtered_regressor(
     model: ArmModel, signals: Derivatives, decimation: Decimation, *, sharp_sign: bool = False
 ) -> NDArray[np.float64]:
-    """Base regressor after the parallel filter, shape (M, n, b).
+    """Base regressor (M, n, b) of signals (N, n) after the parallel filter; ``sharp_sign``: unsmoothed friction sign.
 
-    It is computed piece by piece, so that unfiltered rows stay in the cache, and on all processors: neither kernel nor
-    product holds the interpreter lock. Terms of the model may depend on the past, so they get the whole motion at once.
-
-    ``signals``: positions and derivatives, (N, n) each. ``decimation``: parallel filter. ``sharp_sign``: True for
-    ``sign`` of the velocity in the friction; false for the smoothed sign of the configuration. Raises ValueError if the
-    model has terms and the signals no sampling period.
+    Piece by piece on all processors: unfiltered rows stay in the cache. Terms depend on the past: they get all at once.
     """
     count = decimation.count(signals.q.shape[0])
     rows = max(ROWS_PER_TASK, SAMPLES_PER_TASK // decimation.factor)
@@ -148,10 +127,7 @@ def filtered_regressor(
 def stacked(
     blocks: Sequence[ExperimentEquations], noise: Sequence[ArModel]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Regressor (rows, b) and torques (rows,) of 2.20 and 2.21, whitened, without the equations left out.
-
-    ``noise``: noise model of each joint.
-    """
+    """Regressor (rows, b) and torques (rows,) of 2.20 and 2.21, whitened, without the equations left out."""
     keep = [b.keep for b in blocks]
     return whitened(mapped(lambda b: b.x, blocks), noise, keep), whitened([b.y for b in blocks], noise, keep)
 
@@ -159,10 +135,7 @@ def stacked(
 def stacked_parts(
     blocks: Iterable[ExperimentEquations], noise: Sequence[ArModel]
 ) -> Iterator[tuple[NDArray[np.float64], NDArray[np.float64]]]:
-    """Yield `stacked` of one experiment after the other: rows of a long recording are in memory one at a time.
-
-    ``noise``: noise model of each joint.
-    """
+    """Yield `stacked` of one experiment after the other: rows of a long recording are in memory one at a time."""
     for block in blocks:
         yield stacked([block], noise)
 
@@ -170,10 +143,7 @@ def stacked_parts(
 def instrumented(
     blocks: Sequence[ExperimentEquations], instruments: Sequence[NDArray[np.float64]]
 ) -> Sequence[InstrumentedEquations]:
-    """Equations with instruments.
-
-    ``instruments``: regressor at simulated signals, one (M, n, b) array per experiment.
-    """
+    """Equations with instruments: the regressor at simulated signals, (M, n, b) per experiment."""
     return mapped(lambda b, z: InstrumentedEquations(b.y, b.x, b.keep, b.t, z), blocks, instruments)
 
 
@@ -199,18 +169,12 @@ def residuals_of(estimate: Estimate, numbers: Sequence[int]) -> Estimate:
 
 
 def joint_variances(blocks: Sequence[ExperimentEquations], theta: NDArray[np.float64]) -> list[ArModel]:
-    """Serially uncorrelated noise with the residual variance of each joint (2.25, 2.26).
-
-    ``theta``: base parameters, shape (b,).
-    """
+    """Serially uncorrelated noise with the residual variance of each joint (2.25, 2.26)."""
     return ar_models(residuals(blocks, theta), 0, keep=[b.keep for b in blocks], parameters=theta.size)
 
 
 def residual_norm(blocks: Sequence[ExperimentEquations], theta: NDArray[np.float64], scale: Sequence[ArModel]) -> float:
-    """Norm of the residuals, each joint in the units of ``scale``.
-
-    ``theta``: base parameters, shape (b,); ``scale``: noise model of each joint that scales its residuals.
-    """
+    """Norm of the residuals, each joint in the units of its noise model in ``scale``."""
     keep = [b.keep for b in blocks]
     return float(np.linalg.norm(whitened(residuals(blocks, theta), scale, keep)))
 
@@ -220,13 +184,9 @@ def noise_models(
 ) -> list[ArModel]:
     """AR model of each joint's noise from the residuals of an estimate (6.21 to 6.25).
 
-    The residuals lack the noise that the parameters have absorbed. They absorb the low frequencies, which hold the
-    motion and decide the precision: ``cov(e - X d) = Omega - X C X'`` for an efficient estimate of covariance C. The
-    autocovariances of ``X C X'`` are added again. Without them, standard deviations of the virtual TX40 are 9 % too
-    small (median, 20 seeds). The variances are widened because the coefficients are estimates themselves
-    (:meth:`ArModel.widened`).
-
-    ``theta``, ``covariance``: base parameters (b,) and their covariance (b, b); ``max_order``: highest order tried.
+    Parameters absorb low-frequency noise: ``cov(e - X d) = Omega - X C X'`` for an efficient estimate of covariance C.
+    The autocovariances of ``X C X'`` are added again; without them, standard deviations of the virtual TX40 are 9 % too
+    small (median, 20 seeds). Variances are widened (:meth:`ArModel.widened`).
     """
     errors = residuals(blocks, theta)
     factor = _square_root(covariance)
@@ -243,13 +203,9 @@ def noise_models(
 
 
 def absorbed_sums(x: NDArray[np.float64], factor: NDArray[np.float64], max_lag: int) -> NDArray[np.float64]:
-    """``sum_t f(t) . f(t - k)`` for lags 0..max_lag of ``f = x factor``, shape (max_lag + 1,).
+    """``sum_t f(t) . f(t - k)`` for lags 0..max_lag of ``f = x factor`` (x: (M, b), factor: (b, b)).
 
-    They correct the autocovariances of the residuals by the share b / M. One stretch in ``EVERY`` of a long series is
-    accurate enough for that: ``SAMPLED`` rows, after those that its lags need.
-
-    ``x``: regressor of one joint, shape (M, b); ``factor``: factor of the covariance, shape (b, b); ``max_lag``:
-    highest lag k.
+    A correction by the share b / M: one stretch of ``SAMPLED`` rows in ``EVERY`` is accurate enough for that.
     """
     rows = x.shape[0]
     stretch = max_lag + SAMPLED
@@ -274,8 +230,5 @@ def _square_root(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
 def whitened_residuals(
     blocks: Sequence[ExperimentEquations], theta: NDArray[np.float64], noise: Sequence[ArModel]
 ) -> tuple[tuple[NDArray[np.float64], ...], ...]:
-    """Residuals of each joint in standard deviations of its noise model, one array per experiment.
-
-    ``theta``: base parameters, shape (b,).
-    """
+    """Residuals of each joint in standard deviations of its noise model, one array per experiment."""
     return whitened_series(residuals(blocks, theta), noise, [b.keep for b in blocks])

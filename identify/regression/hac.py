@@ -9,16 +9,9 @@ Array = NDArray[np.float64]
 
 
 def newey_west(series: Sequence[Array], lags: int) -> Array:
-    """Heteroskedasticity and autocorrelation consistent variance of the sum of all terms, with Bartlett weights.
+    """Heteroskedasticity and autocorrelation consistent variance, () or (b,), of the sum of terms of mean zero.
 
-    ``series``: terms of mean zero, one array (M,) or (M, b) per experiment. Different experiments are independent.
-    ``lags``: number L of autocovariances; lag k has the weight ``1 - k / (L + 1)``. Lags longer than a series are
-    skipped. Returns the variance of the sum, shape () or (b,), not negative.
-
-    Notes
-    -----
-    Source: Newey and West, A simple, positive semi-definite, heteroskedasticity and autocorrelation consistent
-    covariance matrix, Econometrica 55, 1987.
+    Lag k of L has the weight ``1 - k / (L + 1)`` (Newey, West 1987, Econometrica 55); experiments are independent.
     """
     variance = np.asarray(sum(_summed_products(s, s) for s in series))
     for lag in range(1, min(lags, max(s.shape[0] for s in series) - 1) + 1):
@@ -28,10 +21,7 @@ def newey_west(series: Sequence[Array], lags: int) -> Array:
 
 
 def newey_west_matrix(series: Sequence[Array], lags: int) -> Array:
-    """Covariance matrix of the sums of all terms, (b, b): `newey_west` with the covariances between the sums.
-
-    ``series``: terms of mean zero, one array (M, b) per experiment; ``lags``: number of autocovariances.
-    """
+    """Covariance matrix (b, b) of the sums of all terms: `newey_west` with the covariances between the sums."""
     total = np.asarray(sum(s.T @ s for s in series))
     for lag in range(1, min(lags, max(s.shape[0] for s in series) - 1) + 1):
         products = np.asarray(sum(s[lag:].T @ s[: s.shape[0] - lag] for s in series if s.shape[0] > lag))

@@ -17,11 +17,7 @@ EXACT = 1e-10
 
 
 class Iterations(NamedTuple):
-    """End of an iteration.
-
-    ``theta``: last or best iterate, shape (b,); ``converged``: True if the iterates settled; ``reason``: rule that
-    ended the iteration, as a sentence.
-    """
+    """End of an iteration: last or best theta (b,), convergence, and the rule that ended it, as a sentence."""
 
     theta: NDArray[np.float64]
     done: int
@@ -35,13 +31,9 @@ def iterate(
     iterations: int = ITERATIONS,
     tolerance: float = TOLERANCE,
 ) -> Iterations:
-    """Repeat a step until neither theta nor the residual norm changes by more than ``tolerance``.
+    """Repeat ``step(theta, k)`` until theta and the residual norm change by at most ``tolerance``, relative.
 
-    Where that does not happen, the iterate of the smallest residual norm is kept. Equations without a finite
-    solution end the iterations.
-
-    ``step``: ``step(theta, k) -> (theta, residual norm)`` of iteration k, from 1 on; ``start``: first theta, shape
-    (b,); ``iterations``: most iterations; ``tolerance``: relative change that ends the iterations.
+    Else the iterate of the smallest residual norm is kept. Equations without a finite solution end the iterations.
     """
     theta, norm = start, np.inf
     best, least = start, np.inf

@@ -1,9 +1,7 @@
 """Instrumental variables: products of whitened equations, their solution and its covariance (thesis 2.33, 4.34, 6.30).
 
-At the recorded rate the whitened regressor and instruments of six joints are many times as large as the recording.
-Their orthogonal triangularisation costs more than everything else. So rows are whitened joint by joint, a few at a
-time, summed and forgotten. Instruments in nearly orthonormal combinations, found from a share of the rows, make plain
-sums of products as accurate.
+Whitened rows are many times as large as the recording: joint by joint, a few at a time, they are summed and forgotten.
+Nearly orthonormal instruments make plain sums as accurate as a triangularisation.
 """
 
 import os
@@ -42,11 +40,7 @@ NEGLIGIBLE = 1e-14
 
 @dataclass(frozen=True, eq=False)
 class IvProducts:
-    """Products of whitened rows: combinations ``Q = Z T`` of the instruments, of norm one, and columns ``X D``.
-
-    ``gram``: ``Q' Q``, shape (b, b); ``cross``: ``Q' X D``, shape (b, b); ``projected``: ``Q' y``, shape (b,);
-    ``scale``: inverse diagonal of D, shape (b,).
-    """
+    """Products of whitened rows: ``Q' Q``, ``Q' X D`` (b, b) and ``Q' y`` (b,) with ``Q = Z T`` of norm one."""
 
     gram: Array
     cross: Array
@@ -61,56 +55,40 @@ class IvProducts:
         return lu, pivots
 
     def parameters(self, through: Array) -> Array:
-        """Parameters (b,) or (b, k) of torques with the products ``Q' torques`` = ``through``.
-
-        Raises numpy.linalg.LinAlgError if the equations are singular.
-        """
+        """Parameters (b,) or (b, k) of torques with ``Q' torques`` = ``through``; LinAlgError if singular."""
         solved: Array = linalg.lu_solve(self._factors, through, check_finite=False)
         return (solved.T / self.scale).T
 
     def projection_weights(self, through: Array) -> Array:
-        """Weights W (b, k) of the combinations with ``X' Q W`` = ``through``.
+        """Weights W (b, k) of the combinations with ``X' Q W`` = ``through``; LinAlgError if singular.
 
-        Instruments less ``Q W`` are orthogonal to the regressor, where ``through`` are their products with it. Raises
-        numpy.linalg.LinAlgError if the equations are singular.
+        Instruments less ``Q W`` are orthogonal to the regressor, where ``through`` are their products with it.
         """
         weights: Array = linalg.lu_solve(self._factors, through / self.scale[:, None], trans=1, check_finite=False)
         return weights
 
     @cached_property
     def theta(self) -> Array:
-        """The solution of ``Z' W (y - X theta) = 0`` (2.33, 6.30), shape (b,).
-
-        Raises numpy.linalg.LinAlgError if the equations are singular.
-        """
+        """The solution (b,) of ``Z' W (y - X theta) = 0`` (2.33, 6.30); LinAlgError if singular."""
         return self.parameters(self.projected)
 
     @cached_property
     def covariance(self) -> Array:
-        """``(Z' W X)^-1 Z' W Z (X' W Z)^-1`` (4.34), shape (b, b).
+        """``(Z' W X)^-1 Z' W Z (X' W Z)^-1`` (4.34), shape (b, b); LinAlgError if singular.
 
-        It equals ``(Z' W Z)^-1`` (2.34, 6.31) where the simulator is exact. It stays valid where the controller is only
-        approximate, as an identified impulse response is. Raises numpy.linalg.LinAlgError if the equations are
-        singular.
+        Equals ``(Z' W Z)^-1`` (2.34, 6.31) with an exact simulator, and stays valid with an approximate controller.
         """
         covariance = self.parameters(self.parameters(self.gram).T)
         return (covariance + covariance.T) / 2
 
 
 def factored(z: Array, x: Array, y: Array) -> IvProducts:
-    """Products of whitened rows with orthonormal instruments, by the QR factors of ``z``: none of ``z' x`` is formed.
-
-    ``z``, ``x``: instruments and regressor, shape (rows, b); ``y``: torques, shape (rows,).
-    """
+    """Products of whitened rows with orthonormal instruments, by the QR factors of ``z``, without ``z' x``."""
     return factored_parts([(z, x, y)], x.shape[1])
 
 
 def factored_parts(parts: Iterable[tuple[Array, Array, Array]], b: int) -> IvProducts:
-    """`factored` of rows that come in parts, of which one is in memory.
-
-    ``parts``: whitened instruments and regressor (rows, b) and torques (rows,) of each part; ``b``: number of
-    parameters.
-    """
+    """`factored` of rows that come in parts, of which one is in memory; b parameters."""
     top, norms = triangularize_parts(parts, columns=b)
     scale = norms[b : 2 * b]
     return IvProducts(np.eye(b), top[:, b : 2 * b] / scale, top[:, 2 * b], scale)
@@ -119,10 +97,7 @@ def factored_parts(parts: Iterable[tuple[Array, Array, Array]], b: int) -> IvPro
 def instrumented_parts(
     blocks: Iterable[InstrumentedEquations], noise: Sequence[ArModel]
 ) -> Iterator[tuple[Array, Array, Array]]:
-    """Yield whitened instruments, regressor (rows, b) and torques (rows,) of one experiment after the other.
-
-    ``noise``: noise model of each joint.
-    """
+    """Yield whitened instruments, regressor (rows, b) and torques (rows,) of one experiment after the other."""
     for block in blocks:
         z, x, y = (whitened([values], noise, [block.keep]) for values in (block.z, block.x, block.y))
         yield z, x, y
@@ -137,12 +112,8 @@ def serial_covariance(
 ) -> Array:
     """Covariance (b, b) of an IV estimate with weights 2.24 whose residuals are serially correlated.
 
-    ``A = (Z' W X)^-1 Z' W`` maps the noise to the estimate and ``A Omega A'`` is its covariance, with ``Omega`` given
-    by the AR model of each joint: ``Z' W Omega W Z`` is the Gram matrix of ``H' W Z``.
-
-    ``zeta``, ``x``: instruments and regressor, one (M, n, b) array per experiment; ``keep``: equations to use, (M, n)
-    per experiment; ``weights``: white noise models by which the estimate weights its rows, one per joint; ``noise``:
-    noise model of the residuals of each joint.
+    ``A Omega A'`` with ``A = (Z' W X)^-1 Z' W`` and ``Omega`` of the AR models ``noise``: ``Z' W Omega W Z`` is the
+    Gram matrix of ``H' W Z``. ``zeta``, ``x`` (M, n, b) and ``keep`` (M, n): per experiment.
     """
     b = zeta[0].shape[2]
     squares, cross, meat = np.zeros(b), np.zeros((b, b)), np.zeros((b, b))
@@ -161,11 +132,7 @@ def serial_covariance(
 
 @dataclass(frozen=True, eq=False)
 class Columns:
-    """Rows ``[X, Z, y]`` of one joint in one experiment, collected when they are used.
-
-    ``x``, ``z``: regressor and instruments, shape (M, b), in which the numbers of the columns are those of a
-    `JointEquations`; ``y``: torques, shape (M,); ``chosen``: numbers of the columns of regressor and instruments.
-    """
+    """Rows ``[X, Z, y]`` of one joint in one experiment, collected from the ``chosen`` columns when they are used."""
 
     x: Array
     z: Array
@@ -183,9 +150,7 @@ class Columns:
 class JointEquations:
     """Equations of one joint without the columns that are zero there: a link acts on the joints before it only.
 
-    ``x``, ``z``: numbers of the columns of regressor and instruments that are not zero. ``parts``: rows ``[X, Z, y]``
-    of these columns, one array (M, x + z + 1) per experiment. ``keep``: rows to use, (M,) per experiment; ``None``:
-    all.
+    ``x``, ``z``: numbers of the columns. ``parts``: rows ``[X, Z, y]``, (M, x + z + 1) per experiment. ``keep``: (M,).
     """
 
     x: NDArray[np.int64]
@@ -195,11 +160,7 @@ class JointEquations:
 
     @classmethod
     def of(cls, blocks: Sequence[InstrumentedEquations], joint: int, *, copied: bool) -> "JointEquations":
-        """Equations of a joint.
-
-        ``blocks``: equations of every experiment; ``copied``: True to copy the columns side by side: faster where the
-        same equations are whitened many times.
-        """
+        """Equations of a joint; ``copied``: columns side by side, faster to whiten many times."""
         x = np.unique(np.concatenate([columns_of(b.x[:, joint]) for b in blocks]))
         z = np.unique(np.concatenate([columns_of(b.z[:, joint]) for b in blocks]))
         parts = [Columns(b.x[:, joint], b.z[:, joint], b.y[:, joint], (x, z)) for b in blocks]
@@ -215,11 +176,7 @@ class JointEquations:
                 yield rows if kept is None else rows[kept[span][ar.order :]]
 
     def products(self, rows: Iterable[Array], combine: Array | None = None) -> Array:
-        """``Q' [X, Q, y]`` of whitened rows, shape (q, x + q + 1).
-
-        ``rows``: whitened rows ``[X, Z, y]``. ``combine``: combinations T of the instruments, ``Q = Z T``, shape
-        (b, b); ``None``: the instruments of the joint.
-        """
+        """``Q' [X, Q, y]`` (q, x + q + 1) of whitened rows ``[X, Z, y]``; ``Q = Z T``, or ``Z`` without T (b, b)."""
         width = self.x.size
         count = self.z.size if combine is None else combine.shape[1]
         sums = np.zeros((count, width + count + 1))
@@ -238,10 +195,9 @@ class JointEquations:
 def together(
     products: Iterable[tuple[JointEquations, Array]], b: int, *, combined: bool = False, scale: Array | None = None
 ) -> IvProducts:
-    """Products of the rows of all joints, with combinations of the instruments of norm one.
+    """Products of the rows of all joints, added in this order, with combinations of the instruments of norm one.
 
-    ``products``: equations of each joint, or of parts of it, and their products; added in this order. ``b``: number of
-    parameters. ``scale``: scale of the parameters' columns, shape (b,); ``None``: norms of the instruments.
+    ``scale`` (b,): of the parameters' columns; ``None``: norms of the instruments.
     """
     gram, cross, projected = np.zeros((b, b)), np.zeros((b, b)), np.zeros(b)
     for joint, sums in products:
@@ -256,10 +212,7 @@ def together(
 
 
 def iv_products(blocks: Sequence[InstrumentedEquations], noise: Sequence[ArModel]) -> IvProducts:
-    """Whiten every joint by its noise model and sum the products that the IV equations need.
-
-    ``blocks``: equations of every experiment.
-    """
+    """Whiten every joint by its noise model and sum the products that the IV equations need."""
     combine, scale = _combinations(blocks, noise)
 
     def of_joint(block: InstrumentedEquations, j: int) -> tuple[JointEquations, Array]:
@@ -273,9 +226,9 @@ def iv_products(blocks: Sequence[InstrumentedEquations], noise: Sequence[ArModel
 
 
 def _combinations(blocks: Sequence[InstrumentedEquations], noise: Sequence[ArModel]) -> tuple[Array | None, Array]:
-    """``T`` (b, b) that makes the columns of ``Z T`` nearly orthonormal, and norms (b,), from every so many rows.
+    """``T`` (b, b) that makes columns of ``Z T`` nearly orthonormal, and norms (b,), from every so many rows.
 
-    ``None`` instead of ``T`` where the columns are far enough from dependent as they are.
+    ``T`` is ``None`` where the columns are far enough from dependent.
     """
     b = blocks[0].z.shape[2]
     total = sum(int(block.keep.sum()) for block in blocks)

@@ -36,11 +36,7 @@ class Jointwise(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class IvRegression:
-    """Solution of whitened equations with instruments, and their rows.
-
-    ``equations``: equations of each joint; ``products``: products ``Z' [X, Z, y]`` of the rows of each joint;
-    ``solution``: products of all rows, with the instruments in units of their norms.
-    """
+    """Solution of whitened equations with instruments (in units of their norms), and products ``Z' [X, Z, y]``."""
 
     equations: Jointwise
     noise: tuple[ArModel, ...]
@@ -49,11 +45,7 @@ class IvRegression:
 
     @classmethod
     def of(cls, equations: Jointwise, noise: Sequence[ArModel], known: "IvRegression | None" = None) -> "IvRegression":
-        """Regression under given noise models.
-
-        ``equations``: equations of each joint. ``noise``: noise model of each joint. ``known``: regression of the same
-        equations; rows and products of joints with the same noise model are reused.
-        """
+        """Regression under given noise models; reuses joints of ``known`` that have the same noise model."""
         joints, rows, products = equations.joints, [], []
         for j, (joint, ar) in enumerate(zip(joints, noise, strict=True)):
             if known is not None and known.noise[j] is ar:
@@ -92,28 +84,19 @@ class IvRegression:
             self.__dict__.pop(name, None)
 
     def absorbed(self, columns: Array) -> Array:
-        """Parameters (b, k) that the model would give to torques (R, k): ``(Z'X)^-1 Z' columns``.
-
-        ``columns``: whitened torques of all joints, (R, k).
-        """
+        """Parameters (b, k) that the model would give to whitened torques (R, k): ``(Z'X)^-1 Z' columns``."""
         _, q = self._through([(j, columns[own]) for j, own in enumerate(self.rows_of)], columns.shape[1])
         return self.solution.parameters(q)
 
     def without_model(self, torques: Array) -> Array:
-        """Torques (R, k) less those that the model gives to them: ``T - X (Z'X)^-1 Z'T``.
-
-        ``torques``: whitened torques T of all joints, (R, k).
-        """
+        """Whitened torques (R, k) less those that the model gives to them: ``T - X (Z'X)^-1 Z'T``."""
         theta, rest = self.absorbed(torques), torques.copy()
         for joint, rows, own in zip(self.equations.joints, self.rows, self.rows_of, strict=True):
             rest[own] -= rows[:, : joint.x.size] @ theta[joint.x]
         return rest
 
     def orthogonalized(self, instruments: Array) -> Array:
-        """Instruments (R, k) orthogonal to the regressor: ``D - Z (X'Z)^-1 X'D``.
-
-        ``instruments``: whitened instruments D of all joints, (R, k).
-        """
+        """Whitened instruments (R, k) orthogonal to the regressor: ``D - Z (X'Z)^-1 X'D``."""
         x, _ = self._through([(j, instruments[own]) for j, own in enumerate(self.rows_of)], instruments.shape[1])
         weights = self.solution.projection_weights(x) / self.solution.scale[:, None]
         rest = instruments.copy()
@@ -124,8 +107,7 @@ class IvRegression:
     def orthogonal_products(self, columns: Sequence[tuple[int, Array]], count: int) -> tuple[Array, Array]:
         """``B'B`` (G, k, k) and ``B' residual`` (G, k) of ``B = orthogonalized(D)``, without computing B.
 
-        ``columns``: instruments (R_j, G k) of each joint on which they act, with its number, group after group;
-        ``count``: number of groups, G.
+        ``columns``: instruments (R_j, G k) of each joint on which they act, with its number, group after group.
         """
         width = columns[0][1].shape[1]
         gram, score = np.zeros((count, width // count, width // count)), np.zeros(width)

@@ -19,11 +19,7 @@ RANK_TOLERANCE = 1e-10
 
 @dataclass(frozen=True, eq=False)
 class Triangle:
-    """QR factors of a column-normalised regressor with torques.
-
-    ``factor``: triangular factor of the regressor, (b, b). ``projected``: projections of the torques, (b,); of no use
-    where the rows had no torques. ``scale``: norms of the regressor's columns, 1 where a column is zero, (b,).
-    """
+    """QR factors (b, b), projections (b,) and column norms (b,) of a column-normalised regressor with torques."""
 
     factor: Array
     projected: Array
@@ -31,10 +27,7 @@ class Triangle:
 
     @classmethod
     def of(cls, parts: Iterable[tuple[Array, Array]]) -> "Triangle":
-        """Factors of rows that come in parts.
-
-        ``parts``: regressor (rows, b) and torques (rows,) of each part, of which there is at least one.
-        """
+        """Factors of regressor (rows, b) and torques (rows,) that come in parts, at least one."""
         rows = iter(parts)
         first = next(rows)
         b = first[0].shape[1]
@@ -56,10 +49,7 @@ class Triangle:
 
 
 def least_squares(x: Array, y: Array) -> Array:
-    """Solution (b,) of ``min |y - x theta|`` by QR of the column-normalised regressor (2.22).
-
-    ``x``: regressor, shape (rows, b); ``y``: torques, shape (rows,).
-    """
+    """Solution (b,) of ``min |y - x theta|`` by QR of the column-normalised regressor (2.22)."""
     return Triangle.of([(x, y)]).theta
 
 
@@ -75,11 +65,7 @@ def column_norms(x: Array) -> Array:
 
 
 def require_excitation(rows: Triangle, names: Sequence[str]) -> int:
-    """Rank of the stacked regressor; a motion that leaves parameters undetermined is an error.
-
-    ``rows``: factors of the regressor; ``names``: base parameters, shape (b,), for the message. Raises DataError:
-    naming the parameters that the motion did not excite.
-    """
+    """Rank of the stacked regressor; DataError names the parameters that the motion leaves undetermined."""
     dead = [name for name, used in zip(names, np.any(rows.factor, axis=0).tolist(), strict=True) if not used]
     if not dead:
         _, s, vt = np.linalg.svd(rows.factor)

@@ -1,9 +1,7 @@
-"""QR factorisation of tall, narrow systems: every estimator solves its equations through it.
+"""QR factorisation of tall, narrow systems by one thread, in cache: the same rows always give the same bits.
 
-A regression has tens of columns and thousands of rows. A few rows at a time are reduced in cache by one thread, so the
-same rows always give the same bits. scipy.linalg.qr(mode="r") on one thread takes 0.5 to 1.1 of the time (300 to 60 000
-rows, 20 to 53 columns). It rounds differently, which the finite differences of CLOE amplify to 3e-9 of a parameter: a
-change to it has to come with new reference results.
+scipy.linalg.qr(mode="r") takes 0.5 to 1.1 of the time (300 to 60 000 rows, 20 to 53 columns). It rounds differently,
+which CLOE's finite differences amplify to 3e-9 of a parameter: a change needs new reference results.
 """
 
 from collections.abc import Iterable, Sequence
@@ -20,11 +18,9 @@ _ROWS = 64
 def triangularize(
     *blocks: NDArray[np.float64], columns: int, scales: Sequence[NDArray[np.float64]] = ()
 ) -> NDArray[np.float64]:
-    """Reflect ``[A1 A2 ...]`` until its first columns are upper triangular (Householder, ``Q' A``).
+    """Reflect ``[A1 A2 ...]`` until its first ``columns`` are upper triangular (Householder); first b rows of ``Q' A``.
 
-    ``blocks``: arrays (m, p_i) or (m,), side by side; ``columns``: number b of the leading columns to make triangular;
-    ``scales``: divisors (p_i,) of the columns of the first arrays. Returns the first b rows of ``Q' [A1 A2 ...]``,
-    shape (b, sum of p_i): the triangular factor, then the projections of the other columns on the space of the first.
+    ``blocks``: (m, p_i) or (m,), side by side; ``scales``: divisors (p_i,) of their first columns.
     """
     matrices = [block.reshape(block.shape[0], -1) for block in blocks]
     ends = np.cumsum([0, *(matrix.shape[1] for matrix in matrices)])
@@ -39,11 +35,9 @@ def triangularize(
 def triangularize_parts(
     parts: Iterable[Sequence[NDArray[np.float64]]], columns: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Reflect rows that come in parts, of which one is in memory, as `triangularize` does with all together.
+    """`triangularize` of rows that come in parts (equal column counts), of which one is in memory.
 
-    ``parts``: arrays (m, p_i) or (m,), side by side, of each part; the numbers of their columns are the same in all.
-    ``columns``: number b of the leading columns to make triangular. Returns ``top``: triangular factor and projections,
-    as `triangularize` returns them, (b, p); ``norms``: norm of every column over all rows, 1 where it is zero, (p,).
+    Returns factor and projections (b, p), and the norm (p,) of every column, 1 where it is zero.
     """
     top, squares = np.empty((0, 0)), np.zeros(0)
     for part in parts:

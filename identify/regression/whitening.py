@@ -15,10 +15,9 @@ Array = NDArray[np.float64]
 def whitened(
     values: Sequence[Array], noise: Sequence[ArModel], keep: Sequence[NDArray[np.bool_]] | None = None
 ) -> Array:
-    """Values of all joints, one below the other as in 2.21, each whitened by its noise model, shape (R,) or (R, k).
+    """Values of all joints, as in 2.21, each whitened by its noise model, shape (R,) or (R, k).
 
-    ``values``: one (M, n) or (M, n, k) array per experiment. ``keep``: equations to use, (M, n) per experiment;
-    ``None``: all.
+    ``values``: (M, n) or (M, n, k) per experiment; ``keep`` (M, n): equations to use.
     """
     return np.concatenate([part for joint in whitened_series(values, noise, keep) for part in joint])
 
@@ -26,11 +25,7 @@ def whitened(
 def whitened_series(
     values: Sequence[Array], noise: Sequence[ArModel], keep: Sequence[NDArray[np.bool_]] | None = None
 ) -> tuple[tuple[Array, ...], ...]:
-    """Values of each joint in standard deviations of its noise model, one array per experiment.
-
-    ``values``: one (M, n) or (M, n, k) array per experiment. ``keep``: equations to use, (M, n) per experiment;
-    ``None``: all.
-    """
+    """Values of each joint in standard deviations of its noise model, one array per experiment."""
     acts = [range(len(noise)) if value.ndim == 2 else joints_of(value) for value in values]
     out = []
     for j, ar in enumerate(noise):

@@ -12,10 +12,7 @@ from armident.identify.report.plots import Plot, Series, plots_html
 
 
 def comparison_report(document: ComparisonDocument, glossary_of: IdentificationDocument) -> str:
-    """Return the HTML page of a comparison, complete in one file.
-
-    ``glossary_of``: the later identification, whose parameters the glossary explains.
-    """
+    """Return the HTML page of a comparison; its glossary explains the parameters of ``glossary_of``."""
     return render(
         "comparison.html",
         document=document,

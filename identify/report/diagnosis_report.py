@@ -27,10 +27,7 @@ FOLLOWS = 0.6
 
 
 def diagnosis_report(diagnosis: DiagnosisResult, document: DiagnosisDocument) -> str:
-    """Return the HTML page of a diagnosis, complete in one file.
-
-    ``diagnosis``: curves and configuration with the findings; ``document``: ``diagnosis.json``.
-    """
+    """Return the HTML page of a diagnosis, complete in one file."""
     joints = [joint.name for joint in diagnosis.robot.joints]
     hidden: dict[str, list[str]] = {}
     for i in document.not_visible:
@@ -88,10 +85,9 @@ def posterior_probability(finding: Finding) -> str:
 
 
 def closed_gap_share(finding: Finding, document: DiagnosisDocument) -> float | None:
-    """Return the share of the joint's held-out gap above the noise floor that a finding closes, 0 to 1.
+    """Return the share of the joint's held-out gap above the noise floor that a finding closes; ``None`` without gap.
 
-    The gap after is that without derivative noise where this is smaller. Returns ``None`` if there is no gap above the
-    noise floor.
+    The gap after is that without derivative noise where this is smaller.
     """
     after = finding.gap_after
     floor = min(document.noise_floor.by_joint[finding.joint], after)
@@ -132,9 +128,7 @@ def _gap_figure(document: DiagnosisDocument) -> str:
 def _finding_figure(diagnosis: DiagnosisResult, joint: int, lacking: Array | None, own: Array | None) -> str:
     """Return a figure of the joint's held-out residual without and with a finding, over time and over its variable.
 
-    ``joint``: index of the joint. ``lacking``: torques (M, n) of the model without the finding; ``None`` compares the
-    model as configured with that of all findings. ``own``: torques (M, n) of the finding itself, which depend on its
-    variable alone; ``None`` if it is no term.
+    ``lacking``: torques (M, n) without it, ``None``: the model as configured; ``own``: its torques, ``None``: no term.
     """
     name, unit = diagnosis.robot.joints[joint].name, _unit(diagnosis, joint)
     seen = [d for d in diagnosis.where if d.joint == name]
@@ -171,11 +165,9 @@ def telling_stretch(added: Array) -> slice:
 
 
 def followed_variable(diagnosis: DiagnosisResult, joint: int, added: Array) -> tuple[str, str, Array]:
-    """Return the variable that a finding is drawn over: name, unit, values (M,).
+    """Return the variable that a finding with torque ``added`` (M,) is drawn over: name, unit, values (M,).
 
     Speed, position or time, the first whose means have the share `FOLLOWS` of its power; otherwise its own torque.
-
-    ``joint``: index of the joint; ``added``: torque (M,) of the finding, N m or N.
     """
     way = "m" if diagnosis.robot.joints[joint].type == "prismatic" else "rad"
     for name, unit, x in (

@@ -15,11 +15,7 @@ from armident.identify.effects.registry import catalogue
 
 @dataclass(frozen=True)
 class GlossaryEntry:
-    """One entry of the glossary.
-
-    ``name``: parameter or term. ``text``: explanation, one or two sentences. ``units``: units at a revolute and at a
-    prismatic joint; empty strings for a number without unit.
-    """
+    """Explanation of a parameter or term, with its units at a revolute and at a prismatic joint; empty: no unit."""
 
     name: str
     text: str
@@ -125,19 +121,12 @@ _NAME = re.compile(r"([a-z_]+?)(m?\d+)(r?)((?:_\d+)?)$")
 
 
 def effect_entries(effect: Effect) -> list[GlossaryEntry]:
-    """Return the entries of all linear and nonlinear parameters of an effect.
-
-    ``effect``: entry of the catalogue. Parameters of a plug-in are explained by its description. Result: in the order
-    of the effect: linear, nonlinear; of a wiring error the signals.
-    """
+    """Return entries of an effect's parameters, linear, then nonlinear; of a wiring error those of the signals."""
     return [GlossaryEntry(p.name, p.meaning or effect.description, p.unit) for p in effect.parameters_of_entry]
 
 
 def base_entry(name: str) -> GlossaryEntry | None:
-    """Return the entry of the kind of a base parameter, for example of ``zz`` for ``zz1r``; ``None`` if unknown.
-
-    ``name``: as in ``identification.json``; of terms of effects, too.
-    """
+    """Return the entry of the kind of a base parameter, of ``zz`` for ``zz1r``; ``None`` if unknown."""
     match = _NAME.match(name)
     kind = name if match is None else match[1]
     known = {entry.name: entry for entry in RIGID}
@@ -150,16 +139,10 @@ def base_entry(name: str) -> GlossaryEntry | None:
 
 
 def in_words(name: str) -> str:
-    """Return the meaning of a base parameter in a few words, with its link, joint or coupling; empty if unknown.
+    """Return the meaning of a base parameter with its link, joint or coupling; empty if unknown.
 
-    ``name``: as in ``identification.json``.
-
-    Examples
-    --------
     >>> in_words("my5r")
     'first moment of mass of link 5 along y, grouped'
-    >>> in_words("fv3")
-    'viscous friction, joint 3'
     """
     entry, match = base_entry(name), _NAME.match(name)
     if entry is None:
@@ -177,10 +160,7 @@ def in_words(name: str) -> str:
 
 
 def parameter_meaning(name: str, finding: Finding) -> str:
-    """Return the meaning of a parameter of a finding, as a sentence; empty if unknown.
-
-    ``name``: parameter of the finding; ``finding``: a finding of a diagnosis.
-    """
+    """Return the meaning of a parameter of a finding, as a sentence; empty if unknown."""
     effects = catalogue()
     effect = effects.get(f"{finding.effect}/{finding.law}" if finding.law else finding.effect)
     entries = [] if effect is None else [entry for entry in effect_entries(effect) if entry.name == name]

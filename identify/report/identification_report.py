@@ -29,11 +29,7 @@ def identification_report(
     result: IdentificationResult | None,
     document: IdentificationDocument,
 ) -> str:
-    """Return the HTML page of an identification, complete in one file.
-
-    ``recordings``: recordings that were used, none if they are not at hand; ``result``: estimates and curves, ``None``
-    if only the document is left.
-    """
+    """Return the HTML page; ``result`` is ``None``, and ``recordings`` are empty, if only the document is left."""
     joints = [joint.name for joint in robot.joints]
     return render(
         "identification.html",
@@ -82,10 +78,9 @@ def recorded(recording: Recording) -> dict[str, Any]:
 def torque_plots(
     t: Array, measured: Array, predicted: Array, joints: list[str], units: list[str], before: Array | None = None
 ) -> Markup:
-    """Return plots of measured and predicted torque and their difference, one per joint, with common zoom.
+    """Return plots of measured and predicted torques (M, n) and their difference, one per joint, with common zoom.
 
-    ``t``: instants (M,), s; a step back begins another experiment. ``measured``, ``predicted``: torques (M, n),
-    N m or N. ``before``: torques (M, n) of another model for comparison, the one as configured.
+    In ``t`` (M,), s, a step back begins another experiment. ``before``: torques (M, n) of the model as configured.
     """
     breaks = np.flatnonzero(np.diff(t) <= 0)
     measured = measured.copy()

@@ -60,20 +60,13 @@ _TEMPLATES.filters["fixed"] = lambda value, digits=2: "" if value is None else f
 
 
 def render(template: str, **content: Any) -> str:
-    """Return the HTML page of a template; it needs no other file.
-
-    ``template``: name in ``templates``; ``**content``: variables of the template.
-    """
+    """Return the HTML page of a file in ``templates``; it needs no other file."""
     return _TEMPLATES.get_template(template).render(**content)
 
 
 @contextmanager
 def figure(rows: int, columns: int, height: float) -> Iterator[tuple["Figure", Any, list[str]]]:
-    """Draw on a grid of axes; at the end of the block the list receives the picture as a ``data:`` URL.
-
-    ``rows``, ``columns``: size of the grid; ``height``: height of one row, inches. Yields the figure, its axes
-    (rows, columns), and the list for the picture.
-    """
+    """Draw on a grid of axes, ``height`` inches a row; the list finally receives the picture as a ``data:`` URL."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

@@ -20,12 +20,7 @@ DIGITS = 5
 
 @dataclass(frozen=True, eq=False)
 class Series:
-    """Curve of a plot.
-
-    ``name``: name in words. ``y``: values (M,); NaN breaks the curve. ``colour``, ``width``: CSS colour, and width of
-    the line, pixels. ``half``: half widths (M,) of the intervals around the values: points with bars are drawn instead
-    of a curve.
-    """
+    """Curve of values ``y`` (M,); NaN breaks it. ``half``: half widths (M,) of intervals: points with bars instead."""
 
     name: str
     y: Array
@@ -36,11 +31,10 @@ class Series:
 
 @dataclass(frozen=True, eq=False)
 class Plot:
-    """Curves over a common axis.
+    """Curves over a common ascending axis ``x`` (M,); ``limits`` are horizontal lines with names.
 
-    ``x``: ascending values (M,) of the axis. ``limits``: horizontal lines: name and value. ``names``: names of the
-    points, M of them, at integer ``x`` from 0; empty: the axis has numbers. ``readings``: text that is read at each
-    point, M of them; empty: the values of the curves.
+    ``names``: of the points at integer ``x`` from 0, or empty for numbers. ``readings``: text that is read at each
+    point, or empty for the values of the curves.
     """
 
     title: str
@@ -61,10 +55,7 @@ def plots_html(plots: Sequence[Plot]) -> Markup:
 
 
 def kept_points(curves: Sequence[Array], most: int = MOST_POINTS) -> NDArray[np.intp]:
-    """Return the indices of the points to draw: of every stretch the extremes of each curve, and all breaks.
-
-    ``curves``: values (M,) of each curve; NaN is a break. ``most``: largest number of points without breaks.
-    """
+    """Return the indices of at most ``most`` points, extremes of each curve (M,), and of all breaks (NaN)."""
     size = curves[0].size
     if size <= most:
         return np.arange(size)

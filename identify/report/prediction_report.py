@@ -15,10 +15,7 @@ Array = NDArray[np.float64]
 def prediction_report(
     document: PredictionDocument, model: RobotModel, t: Array, measured: Array, predicted: Array
 ) -> str:
-    """Return the HTML page of a prediction, complete in one file.
-
-    ``t``: instants (M,), s; ``measured``, ``predicted``: torques (M, n), N m or N.
-    """
+    """Return the HTML page of a prediction: torques (M, n), N m or N, over instants (M,), s."""
     return render(
         "prediction.html",
         document=document,

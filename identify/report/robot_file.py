@@ -10,11 +10,7 @@ from armident.identify.identification.identify_recording import IdentificationOu
 
 
 def write_identification(outcome: IdentificationOutcome, out: Path) -> tuple[Path, Path]:
-    """Write ``identification.json`` and ``report.html`` into a folder.
-
-    ``outcome``: result with its document. ``out``: folder; created if it is missing. Returns paths of document and
-    report.
-    """
+    """Write ``identification.json`` and ``report.html`` into a folder; return their paths."""
     from armident.identify.report.identification_report import identification_report
 
     document, report = out / "identification.json", out / "report.html"

@@ -36,39 +36,15 @@ PIECE = 4096
 
 @dataclass(frozen=True, eq=False)
 class ArmModel:
-    """Inverse dynamic model ``tau = phi(q, qd, qdd) theta`` of a serial arm (thesis equations 2.3, 2.8).
+    """Inverse dynamic model ``tau = phi(q, qd, qdd) theta`` of a serial arm (thesis 2.3, 2.8); joint side, SI.
 
-    All quantities are joint side and SI. Friction is ``fv qd + fc sign(qd) + off`` (2.7). Unless ``sharp_sign`` is
-    true, the sign is ``(2/pi) atan(g qd)`` with the ``sign_smoothing`` g of each joint in the robot configuration
-    (section B.2).
+    Friction is ``fv qd + fc sign(qd) + off`` (2.7), with ``sign`` as ``(2/pi) atan(g qd)`` (section B.2) unless
+    ``sharp_sign``. The last e of the p ``names`` and b ``base.names`` are those of the terms: torques linear in them.
+    Mass matrix, Newton-Euler recursion and simulation step omit the terms. ``anchor``: parameters, (p,) or (b,), that
+    predict the torques for terms that depend on them.
 
-    Terms add torques that are linear in e further parameters: the last ones of ``names`` and of ``base.names``.
-    The mass matrix, the Newton-Euler recursion and the simulation step omit these terms.
-
-    Parameters
-    ----------
-    robot
-        Configuration of the robot, n joints.
-    names
-        Names of the standard parameters (p,), those of the terms last.
-    chain
-        Geometry of the chain; m, rad, and gravity in m/s^2.
-    columns, base_columns
-        Regressor columns of the standard and of the base parameters.
-    base
-        The b base parameters and their formulas.
-    terms
-        Additional torque terms.
-    anchor
-        Standard (p,) or base (b,) parameters, SI, that predict the torques for terms that depend on them.
-
-    Examples
-    --------
     >>> from armident.configs import load_robot
-    >>> model = ArmModel.from_config(load_robot("tx40"))
-    >>> len(model.names), len(model.base.names)
-    (87, 61)
-    >>> model.base.formulas["my5r"]
+    >>> ArmModel.from_config(load_robot("tx40")).base.formulas["my5r"]
     'my5 - mz6'
     """
 
@@ -83,11 +59,7 @@ class ArmModel:
 
     @classmethod
     def from_config(cls, robot: RobotConfig, terms: tuple[ModelTerm, ...] = ()) -> Self:
-        """Build the model of a robot configuration.
-
-        ``robot``: the configuration; its ``effects`` are not read here (`armident.identify.effects.terms.arm_model`
-        does). ``terms``: additional torque terms.
-        """
+        """Build the model of a robot without its ``effects``; see `armident.identify.effects.terms.arm_model`."""
         chain = chain_of(robot)
         names = standard_names(robot)
         columns = columns_of(robot, names)
@@ -148,11 +120,9 @@ class ArmModel:
         return replace(self, chain=self.chain._replace(gravity=np.asarray(gravity, dtype=np.float64)))
 
     def smooth_sign(self, qd: Floats, joints: tuple[int, ...] | None = None) -> Floats:
-        """``(2/pi) atan(g qd)`` of velocities (thesis appendix B.2).
+        """``(2/pi) atan(g qd)`` of velocities of all joints (..., n), or of a series of ``joints`` (thesis B.2).
 
-        ``qd``: velocities, rad/s or m/s: of all joints, (..., n), or, with ``joints``, one series of any shape;
-        ``joints``: from 0, to whose friction the series belongs: one, or the two of a coupling, which has the smaller
-        ``g`` of both.
+        ``joints``: one, or the two of a coupling, which has the smaller ``g`` of both.
         """
         g = self.smoothing if joints is None else self.smoothing[list(joints)].min()
         smooth: Floats = 2 / np.pi * np.arctan(g * qd)
@@ -161,12 +131,7 @@ class ArmModel:
     def motion(
         self, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, dt: float, start: float = 0.0, *, sharp_sign: bool = False
     ) -> Motion:
-        """Return the motion from which the terms compute their columns.
-
-        ``q``, ``qd``, ``qdd``: positions, velocities, accelerations, each (N, n); rad or m, s. ``start``: time of the
-        first sample since the beginning of the first recording, s. ``sharp_sign``: ``sign(qd)`` instead of its smoothed
-        form.
-        """
+        """Return the motion from which the terms compute their columns; ``start``: s since the first recording."""
         q, qd, qdd = self._motion(q, qd, qdd)
         return Motion(self, q, qd, qdd, dt, start, self.anchor, sharp=sharp_sign)
 
@@ -176,10 +141,7 @@ class ArmModel:
         return np.concatenate(columns, axis=2) if columns else np.zeros((motion.samples, self.n, 0))
 
     def term_torque(self, motion: Motion, values: Floats) -> Floats:
-        """Joint torques of the terms, N m or N, shape (N, n).
-
-        ``motion``: the motion, N samples; ``values``: values of the linear parameters, (e,).
-        """
+        """Joint torques (N, n) of the terms, N m or N, with their linear parameters (e,)."""
         torque, first = np.zeros((motion.samples, self.n)), 0
         for term in self.terms:
             last = first + len(term.names)
@@ -196,12 +158,9 @@ class ArmModel:
         sharp_sign: bool = False,
         out: Floats | None = None,
     ) -> Floats:
-        """Regressor of the standard parameters without those of the terms.
+        """Regressor (N, n, p - e) of the standard parameters without those of the terms.
 
-        ``q``, ``qd``, ``qdd``: positions, velocities, accelerations, each (N, n); rad or m, s. ``sharp_sign``:
-        ``sign(qd)`` instead of its smoothed form. ``out``: array to write into: zeros, or an earlier regressor of this
-        model and length, which is then reused. Result: shape (N, n, p - e): row j of sample k times ``theta`` is the
-        torque of joint j.
+        ``out``: array to write into: zeros, or an earlier regressor of this model and length.
         """
         return self._regressor(self.columns, len(self.names) - self.e, q, qd, qdd, sharp_sign, out)
 
@@ -215,14 +174,7 @@ class ArmModel:
         dt: float | None = None,
         start: float = 0.0,
     ) -> Floats:
-        """Regressor of the base parameters, shape (N, n, b); see `regressor`.
-
-        A model with terms needs ``dt``, ``start`` and the whole motion: terms may depend on earlier samples.
-
-        ``q``, ``qd``, ``qdd``: positions, velocities, accelerations, each (N, n); rad or m, s. ``sharp_sign``:
-        ``sign(qd)`` instead of its smoothed form. ``start``: time of the first sample since the beginning of the first
-        recording, s. Raises ValueError if the model has terms and ``dt`` is missing.
-        """
+        """Regressor (N, n, b) of the base parameters; with terms it needs ``dt``, ``start`` and the whole motion."""
         rigid = self.rigid_regressor(q, qd, qdd, sharp_sign=sharp_sign)
         if not self.terms:
             return rigid
@@ -232,21 +184,13 @@ class ArmModel:
         return np.concatenate([rigid, further], axis=2)
 
     def rigid_regressor(self, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, *, sharp_sign: bool = False) -> Floats:
-        """Regressor of the base parameters without those of the terms, shape (N, n, b - e).
-
-        ``q``, ``qd``, ``qdd``: positions, velocities, accelerations, each (N, n); rad or m, s. ``sharp_sign``:
-        ``sign(qd)`` instead of its smoothed form.
-        """
+        """Regressor (N, n, b - e) of the base parameters without those of the terms."""
         return self._regressor(self.base_columns, self.base.b - self.e, q, qd, qdd, sharp_sign)
 
     def inverse_dynamics(
         self, theta: ArrayLike, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, *, sharp_sign: bool = False
     ) -> Floats:
-        """Joint torques (N, n) along a motion, by the Newton-Euler recursion (A.22 to A.26), without the terms.
-
-        ``theta``: standard parameters (p,) or base parameters (b,), SI. ``q``, ``qd``, ``qdd``: positions, velocities,
-        accelerations, each (N, n); rad or m, s. ``sharp_sign``: ``sign(qd)`` instead of its smoothed form.
-        """
+        """Joint torques (N, n) along a motion, by the Newton-Euler recursion (A.22 to A.26), without the terms."""
         q, qd, qdd = self._motion(q, qd, qdd)
         out = np.empty_like(q)
         smoothing = np.zeros(self.n) if sharp_sign else self.smoothing
@@ -254,10 +198,7 @@ class ArmModel:
         return out
 
     def mass_matrix(self, theta: ArrayLike, q: ArrayLike) -> Floats:
-        """Mass matrices (N, n, n) with rotors and couplings, kg m^2, kg m or kg.
-
-        ``theta``: standard parameters (p,) or base parameters (b,), SI; ``q``: postures (N, n), rad or m.
-        """
+        """Mass matrices (N, n, n) with rotors and couplings at postures (N, n), kg m^2, kg m or kg."""
         (q,) = self._motion(q)
         out = np.empty((q.shape[0], self.n, self.n))
         fill_mass_matrices(self.chain, self.values(theta), q, out)
@@ -266,9 +207,7 @@ class ArmModel:
     def forward_dynamics(self, theta: ArrayLike, q: ArrayLike, qd: ArrayLike, tau: ArrayLike) -> Floats:
         """Joint accelerations (N, n) of the direct dynamic model with smoothed friction (2.9), without the terms.
 
-        ``theta``: standard parameters (p,) or base parameters (b,), SI. ``q``, ``qd``: positions and velocities, each
-        (N, n); rad or m, s. ``tau``: joint torques or forces (N, n), N m or N. Raises ArmidentError if the mass matrix
-        of a sample is not positive definite; the message names the sample.
+        Raises ArmidentError, with the sample, if a mass matrix is not positive definite.
         """
         q, qd, tau = self._motion(q, qd, tau)
         out = np.empty_like(q)
@@ -286,10 +225,7 @@ class ArmModel:
         return theta
 
     def values(self, theta: ArrayLike) -> Values:
-        """Parameter arrays for the kernels, from standard (p,) or base (b,) parameters in SI units.
-
-        Raises ValueError if ``theta`` has neither shape.
-        """
+        """Parameter arrays for the kernels, from standard (p,) or base (b,) parameters in SI units."""
         vector = np.asarray(theta, dtype=np.float64)
         if vector.shape == (len(self.names),):
             return values_of(self.columns, vector, self.smoothing)

@@ -1,7 +1,6 @@
 """Base parameters: the minimum set that the inverse dynamic model needs (thesis section A.3).
 
-Two methods find them: Khalil's rules in symbols, and the QR decomposition of a random regressor in numbers.
-Where they differ, the numerical result is used; the rules give the formulas.
+Khalil's rules find them in symbols and give the formulas; the QR decomposition of a random regressor decides.
 """
 
 from dataclasses import dataclass, replace
@@ -18,28 +17,17 @@ KEEP_FIRST = ("xx", "xy", "xz", "yz", "zz", "mx", "my", "m*", "fv", "fc", "off",
 """Priority of columns within a link, first kept first (tables B.2 and B.3); ``m*`` is the mass at a prismatic joint."""
 
 RANK_TOLERANCE = 1e-9
-"""Relative norm of the part orthogonal to the columns kept before; a column below it is dependent.
-
-Rounding errors are far smaller and physical effects far larger.
-"""
+"""Relative norm of a column's part orthogonal to those kept, below which it is dependent; rounding errors are far
+smaller, physical effects far larger."""
 
 
 @dataclass(frozen=True, eq=False)
 class BaseParameters:
     """Identifiable combinations of the standard parameters, ``theta_base = regroup @ theta_standard``.
 
-    Parameters
-    ----------
-    names
-        Names of the b base parameters, with an ``r`` where others were regrouped into them (table B.3).
-    independent
-        Standard column of each base parameter, shape (b,), increasing.
-    regroup
-        Coefficients of the combinations, shape (b, p).
-    formulas
-        Text of each base parameter in terms of the standard ones, with lengths as symbols ``d3, r4``.
-    eliminated, regrouped
-        Names of standard parameters without effect, and of those that act only through other base parameters.
+    ``names``: with an ``r`` where others were regrouped into them (table B.3). ``independent`` (b,): increasing
+    standard columns. ``regroup``: (b, p). ``formulas``: with lengths as symbols ``d3, r4``. ``eliminated``: without
+    effect; ``regrouped``: act only through other base parameters.
     """
 
     names: tuple[str, ...]
@@ -67,11 +55,7 @@ class BaseParameters:
 
 
 def with_terms(base: BaseParameters, names: tuple[str, ...]) -> BaseParameters:
-    """Append the parameters of model terms, which are never regrouped with others.
-
-    ``base``: base parameters (b,) of the rigid model; ``names``: names of the terms' linear parameters (e,). Result:
-    with b + e base and p + e standard parameters.
-    """
+    """Append the parameters of model terms, which are never regrouped with others."""
     if not names:
         return base
     b, p = base.regroup.shape
@@ -89,11 +73,7 @@ def with_terms(base: BaseParameters, names: tuple[str, ...]) -> BaseParameters:
 
 
 def base_parameters(robot: RobotConfig, chain: Chain, columns: Columns, names: tuple[str, ...]) -> BaseParameters:
-    """Find the base parameters by Khalil's rules and the dependences of a random regressor (thesis section A.3).
-
-    ``columns``: regressor columns of the standard parameters; ``names``: names of the standard parameters (p,). Returns
-    combinations by the rules, further regrouped where the regressor shows dependences that the rules miss.
-    """
+    """Find the base parameters by Khalil's rules and the dependences of a random regressor that they miss (A.3)."""
     forms = khalil_rules(robot, chain, names)
     lengths = lengths_of(chain)
     where = {name: k for k, name in enumerate(names)}
@@ -131,13 +111,8 @@ def independent_columns(
 ) -> tuple[Ints, Floats]:
     """Independent columns of a random regressor, and the dependence of the others on them (A.30 to A.35).
 
-    The QR decomposition takes the columns from base to tip, within a link in the order `KEEP_FIRST`. Of several
-    possible sets it therefore finds that of tables B.2 and B.3.
-
-    ``columns``: regressor columns of the standard parameters. ``names``: names of the standard parameters (p,).
-    ``candidates``: indices of the standard columns to examine; ``None``: all of them. ``seed``: seed of the random
-    motion. Returns ``kept``: indices of the independent standard columns, shape (b,), increasing; ``mixing``: shape (b,
-    len(candidates)), with ``theta_base = mixing @ theta[candidates]``.
+    QR decomposition from base to tip, within a link in the order `KEEP_FIRST`, finds the set of tables B.2 and B.3.
+    Returns ``kept`` (b,), increasing, and ``mixing`` with ``theta_base = mixing @ theta[candidates]``.
     """
     if candidates is None:
         candidates = np.arange(len(names), dtype=np.int64)

@@ -17,11 +17,9 @@ INERTIAL = ("xx", "xy", "xz", "yy", "yz", "zz", "mx", "my", "mz", "m")
 
 @structure("f8[::1], f8[::1], f8[::1], f8[::1], f8[::1], b1[::1], f8[::1]")
 class Chain(NamedTuple):
-    """Geometry of a serial chain in modified Denavit-Hartenberg notation (thesis section 2.1.1).
+    """Geometry of a serial chain in modified Denavit-Hartenberg notation (thesis section 2.1.1); m, rad.
 
-    ``cos_alpha``, ``sin_alpha``: cosine and sine of the twist angles alpha_j, (n,); ``d``, ``r``: distances d_j along x
-    and r_j along z, m, (n,); ``theta``: joint angles at position zero, rad, (n,); ``prismatic``: True for prismatic
-    joints, (n,); ``gravity``: gravity in the base frame, m/s^2, (3,).
+    Arrays (n,), ``theta`` at position zero; ``gravity`` (3,) in the base frame, m/s^2.
     """
 
     cos_alpha: Floats
@@ -37,16 +35,8 @@ class Chain(NamedTuple):
 class Columns(NamedTuple):
     """Regressor column of each parameter; -1 for a parameter without one.
 
-    Parameters
-    ----------
-    inertial
-        Columns of the inertial parameters in the order `INERTIAL`, (n, 10).
-    ia, fv, fc, off
-        Columns of rotor inertia, viscous friction, Coulomb friction and offset, (n,) each.
-    coupling_joints
-        Indices of the two joints of each coupling, (c, 2).
-    coupling
-        Columns of inertia, viscous and Coulomb friction of each coupling (thesis equation B.1), (c, 3).
+    ``inertial`` (n, 10): in the order `INERTIAL`. ``coupling_joints`` (c, 2): indices of the joints of each coupling.
+    ``coupling`` (c, 3): its inertia, viscous and Coulomb friction (thesis equation B.1). The others are (n,).
     """
 
     inertial: Ints
@@ -60,20 +50,9 @@ class Columns(NamedTuple):
 
 @structure("f8[:, ::1], f8[::1], f8[::1], f8[::1], f8[::1], i8[:, ::1], f8[:, ::1], f8[::1]")
 class Values(NamedTuple):
-    """Parameter values in SI units, one array per kind of parameter.
+    """Parameter values in SI units, with the shapes of `Columns`.
 
-    Parameters
-    ----------
-    inertial
-        Inertial parameters in the order `INERTIAL`, (n, 10).
-    ia, fv, fc, off
-        Rotor inertia, viscous friction, Coulomb friction and offset, (n,) each.
-    coupling_joints
-        Indices of the two joints of each coupling, (c, 2).
-    coupling
-        Inertia, viscous and Coulomb friction of each coupling, (c, 3).
-    smoothing
-        ``g`` of each joint's smoothed sign, s/rad or s/m, (n,); a coupling has the smaller one of its two joints.
+    ``smoothing``: ``g`` of each joint's smoothed sign (n,), s/rad or s/m; a coupling has the smaller of its joints.
     """
 
     inertial: Floats
@@ -118,10 +97,7 @@ def standard_names(robot: RobotConfig) -> tuple[str, ...]:
 
 
 def columns_of(robot: RobotConfig, names: tuple[str, ...]) -> Columns:
-    """Column numbers of the standard parameters listed in ``names``.
-
-    ``names``: standard parameter of each column. Result: with -1 for parameters that ``names`` does not list.
-    """
+    """Column numbers of the standard parameters in the list ``names``; -1 for those that it lacks."""
     where = {name: k for k, name in enumerate(names)}
     joints = range(1, robot.n + 1)
     index = {joint.name: k for k, joint in enumerate(robot.joints)}
@@ -146,11 +122,7 @@ def columns_of(robot: RobotConfig, names: tuple[str, ...]) -> Columns:
 
 
 def values_of(columns: Columns, theta: Floats, smoothing: Floats) -> Values:
-    """Parameter values by kind, from a parameter vector; parameters without a column are zero.
-
-    ``columns``: elements of ``theta`` by kind of parameter. ``theta``: parameters in SI units; further elements, for
-    instance those of terms, are not used. ``smoothing``: ``g`` of each joint's smoothed sign, s/rad or s/m, (n,).
-    """
+    """Parameter values by kind from a vector of SI units; 0 without a column, further elements are not used."""
     padded = np.append(np.asarray(theta, dtype=np.float64), 0.0)
     return Values(
         inertial=padded[columns.inertial],
@@ -165,10 +137,7 @@ def values_of(columns: Columns, theta: Floats, smoothing: Floats) -> Values:
 
 
 def link_frames(chain: Chain, q: Floats) -> Floats:
-    """Frames of the links in frame 0, homogeneous, shape (N, n + 1, 4, 4); the first one is frame 0.
-
-    ``chain``: geometry of the chain; ``q``: postures (N, n), rad or m.
-    """
+    """Frames of the links in frame 0, which is the first one, at postures (N, n): (N, n + 1, 4, 4)."""
     n, frames = chain.d.size, np.tile(np.eye(4), (q.shape[0], chain.d.size + 1, 1, 1))
     for j in range(n):
         theta = chain.theta[j] + (0.0 if chain.prismatic[j] else q[:, j])

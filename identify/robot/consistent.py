@@ -1,9 +1,8 @@
 """Physically consistent standard parameters nearest to a base estimate, by semidefinite programming.
 
 A link is physical if its pseudo-inertia matrix is positive semidefinite (Wensing, Kim and Slotine 2018; Sousa and
-Cortesao 2014). Rotor inertias and friction coefficients must not be negative. Torques determine only the base
-parameters ``theta_base = K theta`` (thesis section A.3). Many standard vectors therefore have the same base vector;
-for some base vectors none of them is physical.
+Cortesao 2014). Rotor inertias and friction must not be negative. Torques determine only ``theta_base = K theta`` (A.3):
+many standard vectors have the same base vector, and some base vectors have no physical one.
 """
 
 from collections.abc import Sequence
@@ -24,17 +23,12 @@ clarabel: Any = untyped_clarabel
 Identifiability = Literal["alone", "group", "no"]
 
 REGULARISATION = 1e-8
-"""Weight of a kilogram in the objective that minimises the distance, in units of the mean square t value.
-
-It is so small that it affects only parameters that data and constraints leave undetermined.
-"""
+"""Weight of a kilogram in the minimised distance, in units of the mean square t value: so small that it decides only
+what data and constraints leave open."""
 
 INDIFFERENCE = 0.1
-"""Increase of the squared distance, in standard deviations squared, allowed for a lighter arm.
-
-No data distinguish two arms that differ by so little. The nearest arm itself is often a limit case, in which bodies
-shrink to points of arbitrary mass.
-"""
+"""Increase of the squared distance, in standard deviations squared, allowed for a lighter arm. Data do not tell such
+arms apart; the nearest is often a limit case whose bodies shrink to points of arbitrary mass."""
 
 PRICE_STEP = 3.0
 """Factor between successive mass weights in the search for a lighter arm."""
@@ -57,36 +51,14 @@ NULL = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class ConsistentParameters:
-    """Physically consistent parameters and their distance from the estimate; SI, joint side.
+    """Physically consistent parameters (p,), their base parameters (b,) and distance from the estimate; SI, joint side.
 
-    Parameters
-    ----------
-    names, theta
-        Names and values of the standard parameters (p,).
-    base_names, theta_base
-        Names and values of the base parameters (b,) that belong to ``theta``.
-    identifiable
-        Identifiability of each standard parameter (p,). ``alone``: the torques determine it by itself; ``group``: only
-        together with others; ``no``: it does not affect the torques. The regularisation selects the values of
-        parameters that are not ``alone``.
-    groups
-        Names of the base parameters that contain each standard parameter (p,).
-    std
-        Standard deviations (p,) of the parameters determined ``alone``, NaN for the others. They are those of the
-        estimate before the physical constraints.
-    shifts
-        Change of each base parameter by the constraints, in its standard deviations (b,).
-    distance_std
-        Mahalanobis distance between the estimate and the nearest consistent base parameters, in standard deviations.
-    degrees
-        Degrees of freedom of the test: dimensions of the base space removed by the constraints that are active at the
-        nearest point; 0 if the estimate is consistent.
-    p_value
-        Probability of this distance or a larger one for the estimate of a physical arm.
-    compatible, verdict
-        True if the p value reaches the significance level; the result as a sentence.
-    smallest_eigenvalues
-        Smallest eigenvalue of the pseudo-inertia of each link (n,), kg or kg m^2.
+    ``identifiable``: determined ``alone``, in a ``group`` (values by the regularisation), or ``no`` effect on torques.
+    ``groups``: base parameters that contain each parameter. ``std``: of the estimate before the constraints; NaN if not
+    ``alone``. ``shifts``: changes of the base parameters, in their standard deviations. ``distance_std``: Mahalanobis
+    distance. ``degrees``: dimensions removed by the active constraints, 0 if the estimate is consistent. ``p_value``:
+    of this distance or more for a physical arm; ``compatible`` if it reaches the significance level.
+    ``smallest_eigenvalues``: of each link's pseudo-inertia (n,), kg or kg m^2.
     """
 
     names: tuple[str, ...]
@@ -133,37 +105,16 @@ class ConsistentParameters:
 def nearest_consistent(
     model: ArmModel, theta_base: ArrayLike, covariance: ArrayLike, smallest_link: Floats | None = None
 ) -> ConsistentParameters:
-    """Find the physically consistent parameters nearest to a base estimate.
+    """Find the physically consistent parameters nearest to a base estimate (b,) with covariance P.
 
-    Minimises ``(K theta - theta_base)' P^-1 (K theta - theta_base)`` over the standard parameters ``theta``. Their
-    pseudo-inertias must be positive semidefinite; rotor inertias, friction and coupling coefficients must not be
-    negative.
+    Minimises ``(K theta - theta_base)' P^-1 (K theta - theta_base)``. Of several solutions the lightest arm is
+    returned: the smallest sum of the traces of the pseudo-inertias, second moments over the square of the arm's mean
+    length. A consistent estimate keeps its base parameters; otherwise the squared distance may exceed its minimum by
+    `INDIFFERENCE`. ``smallest_link``: pseudo-inertia (4, 4) that every link contains: none is a point or a thin disc.
 
-    Of several solutions the lightest arm is returned. It has the smallest sum of the traces of the pseudo-inertias,
-    with second moments divided by the square of the arm's mean length. A consistent estimate keeps its base parameters.
-    For an inconsistent estimate the squared distance may exceed its minimum by ``INDIFFERENCE``. Raises DataError if
-    shapes are wrong, numbers are not finite, or the covariance is not positive definite; ArmidentError if the solver
-    fails.
-
-    Parameters
-    ----------
-    model
-        Arm with p standard and b base parameters.
-    theta_base
-        Estimate of the base parameters (b,), SI.
-    covariance
-        Covariance P of the estimate (b, b), positive definite.
-    smallest_link
-        Pseudo-inertia (4, 4) that every link contains, kg and kg m^2: the difference is positive semidefinite too, so
-        that no link is a point or a disc without thickness; ``None``: no such limit.
-
-    Notes
-    -----
-    Test of consistency: an estimate ``N(truth, P)`` of a physical arm is projected onto the convex set of base
-    parameters of physical arms. Given the face of the set that contains the projection, the squared distance is
-    stochastically at most chi-square. Its degrees of freedom are the codimension of the face (Wollan and Dykstra
-    1986). They are computed as the trace of ``I`` minus the derivative of the projection, which also holds for curved
-    faces.
+    Test: ``N(truth, P)`` of a physical arm is projected onto the convex set of physical base parameters. Given its
+    face, the squared distance is at most chi-square with the face's codimension (Wollan and Dykstra 1986). That is the
+    trace of ``I`` minus the derivative of the projection, also for curved faces.
     """
     theta, p = _checked(model, theta_base, covariance)
     std = np.sqrt(np.diag(p))
@@ -203,11 +154,7 @@ def nearest_consistent(
 
 @dataclass(frozen=True, eq=False)
 class NearestBase:
-    """Base parameters of the nearest physically consistent arm, without the choice among equal ones and without test.
-
-    ``theta``: base parameters (b,), SI; ``shifts``: their changes in standard deviations of the estimate (b,);
-    ``distance``: Mahalanobis distance from the estimate, standard deviations.
-    """
+    """Base parameters (b,) of the nearest physical arm, their shifts (b,) and Mahalanobis distance, in std."""
 
     theta: Floats
     shifts: Floats
@@ -215,12 +162,7 @@ class NearestBase:
 
 
 def nearest_base(model: ArmModel, theta_base: ArrayLike, covariance: ArrayLike) -> NearestBase:
-    """Find the base parameters of the nearest physically consistent arm: one semidefinite programme.
-
-    ``model``: arm with b base parameters; ``theta_base``: estimate of the base parameters (b,), SI; ``covariance``:
-    covariance of the estimate (b, b), positive definite. Raises DataError if shapes are wrong, numbers are not finite,
-    or the covariance is not positive definite; ArmidentError if the solver fails.
-    """
+    """Find the base parameters of the nearest physically consistent arm: one semidefinite programme."""
     theta, p = _checked(model, theta_base, covariance)
     std = np.sqrt(np.diag(p))
     factor = std[:, None] * linalg.cholesky(p / np.outer(std, std), lower=True)
@@ -232,11 +174,9 @@ def nearest_base(model: ArmModel, theta_base: ArrayLike, covariance: ArrayLike) 
 
 
 def identifiability(model: ArmModel) -> tuple[Identifiability, ...]:
-    """Identifiability of each standard parameter (p,) from torques: ``alone``, in a ``group``, or ``no``.
+    """Identifiability of each standard parameter (p,) from torques; it depends on the model only.
 
-    Parameter k is determined alone if its unit vector lies in the row space of the regrouping matrix K. Then it is
-    the same for all standard parameters with equal base parameters. The result depends on the model only, not on
-    parameter values or data.
+    ``alone``: its unit vector is in the row space of the regrouping matrix K: equal base parameters give it one value.
     """
     grouping = model.base.regroup
     outside = np.eye(grouping.shape[1]) - np.linalg.pinv(grouping) @ grouping
@@ -250,10 +190,7 @@ def identifiability(model: ArmModel) -> tuple[Identifiability, ...]:
 
 
 def pseudo_inertias(model: ArmModel, theta: ArrayLike) -> Floats:
-    """Pseudo-inertia matrices of the links: second moments (kg m^2), first moments (kg m) and mass (kg).
-
-    ``model``: arm with n joints; ``theta``: standard parameters (p,), SI. Result: shape (n, 4, 4).
-    """
+    """Pseudo-inertias (n, 4, 4) of the links: second moments (kg m^2), first moments (kg m) and mass (kg)."""
     xx, xy, xz, yy, yz, zz, mx, my, mz, m = model.values(theta).inertial.T
     inertia = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]).transpose(2, 0, 1)
     out = np.empty((model.n, 4, 4))
@@ -273,13 +210,8 @@ def non_negative(model: ArmModel) -> Ints:
 class _Projection:
     """Semidefinite programme for whitened base parameters, set up once and solved for several right sides.
 
-    Variables are the standard parameters and the whitened residual ``r = L^-1 (K theta - theta_base)``, in units of
-    ``scale`` standard deviations. Without this scale, t values of a thousand beside masses of one make the problem
-    badly conditioned.
-
-    ``model``: arm with p standard and b base parameters. ``factor``: lower Cholesky factor L (b, b) of the covariance
-    of the base estimate. ``scale``: unit of the residual, standard deviations. ``smallest_link``: pseudo-inertia (4, 4)
-    that every link contains; ``None``: zero.
+    Variables are the standard parameters and ``r = L^-1 (K theta - theta_base)``, with the Cholesky factor L, in units
+    of ``scale`` standard deviations: t values of a thousand beside masses of one are badly conditioned.
     """
 
     def __init__(self, model: ArmModel, factor: Floats, scale: float, smallest_link: Floats | None = None) -> None:
@@ -309,26 +241,14 @@ class _Projection:
         self._limits = np.concatenate([np.zeros(b + signed.size), np.tile(-smallest, model.n)])
 
     def nearest(self, whitened: Floats, price: float = REGULARISATION) -> tuple[Floats, Floats]:
-        """Solve the programme for one whitened base estimate.
-
-        ``whitened``: whitened base parameters ``L^-1 theta_base``, (b,), standard deviations; ``price``: weight of a
-        kilogram in the objective. Returns ``theta``, ``residual``: standard parameters (p,) of the nearest consistent
-        arm, SI, and the whitened residual (b,).
-        """
+        """Standard parameters and residual (b,) for ``L^-1 theta_base``; ``price``: weight of a kilogram."""
         right = self._limits.copy()
         right[: self._b] = whitened / self._scale
         x = minimise_in_cones(self._quadratic, price * self._weight, self._rows, right, self._cones)
         return x[: self._p], self._scale * x[self._p :]
 
     def lightest(self, whitened: Floats, nearest: Floats, distance: float) -> Floats:
-        """Find the lightest arm whose squared distance exceeds the minimum by at most ``INDIFFERENCE``.
-
-        The weight of a kilogram is increased in steps until the squared distance exceeds this limit.
-
-        ``whitened``: whitened base parameters (b,), standard deviations; ``nearest``: standard parameters (p,) of the
-        nearest consistent arm, SI; ``distance``: distance of that arm, standard deviations. Returns standard parameters
-        (p,), SI.
-        """
+        """Find the lightest arm (p,) within `INDIFFERENCE` of the minimum, by increasing the weight of a kilogram."""
         best, price = nearest, REGULARISATION
         while price < 1.0:
             price *= PRICE_STEP
@@ -350,12 +270,7 @@ class _Projection:
 
 
 def minimise_in_cones(quadratic: Floats, linear: Floats, rows: Floats, right: Floats, cones: Sequence[Any]) -> Floats:
-    """Minimise ``x'Qx/2 + c'x`` subject to ``right - rows x`` in the cones.
-
-    ``quadratic``, ``linear``: Q, (k, k), and c, (k,); ``rows``, ``right``: rows of all cones one after the other,
-    (m, k) and (m,); ``cones``: cones of the solver in the order of the rows. Returns the minimum x, (k,). Raises
-    ArmidentError if the solver finds no solution.
-    """
+    """Minimise ``x'Qx/2 + c'x`` subject to ``right - rows x`` in the solver's cones, one after the other."""
     settings = clarabel.DefaultSettings()
     settings.verbose = False
     settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = TOLERANCE
@@ -398,12 +313,9 @@ def _inside(model: ArmModel, theta: Floats, smallest_link: Floats | None = None)
 
 
 def triangles(length: float) -> Floats:
-    """Upper triangles of the pseudo-inertia of each unit inertial parameter, shape (10, 10).
+    """Upper triangles of the pseudo-inertia of each unit inertial parameter, lengths in ``length`` (m): (10, 10).
 
-    Lengths are in units of ``length`` (m). Triangles are stored column by column with off-diagonals times sqrt(2), an
-    isometry, in the format of the solver (`clarabel.PSDTriangleConeT`).
-
-    ``length``: unit of length, m.
+    Column by column with off-diagonals times sqrt(2), an isometry, as of `clarabel.PSDTriangleConeT`.
     """
     out = np.empty((10, 10))
     for k, ten in enumerate(np.eye(10)):
@@ -418,10 +330,7 @@ def triangles(length: float) -> Floats:
 
 
 def triangle(matrix: Floats, length: float) -> Floats:
-    """Upper triangle of a pseudo-inertia in the units and the order of `triangles`, shape (10,).
-
-    ``matrix``: pseudo-inertia, (4, 4), kg and kg m^2; ``length``: unit of length, m.
-    """
+    """Upper triangle (10,) of a pseudo-inertia (4, 4), in the units and the order of `triangles`."""
     scale = np.array([1 / length, 1 / length, 1 / length, 1.0])
     scaled = matrix * np.outer(scale, scale)
     return np.array([scaled[i, j] * (1.0 if i == j else np.sqrt(2.0)) for j in range(4) for i in range(j + 1)])
@@ -434,10 +343,7 @@ def mean_length(model: ArmModel) -> float:
 
 
 def _standard_deviations(model: ArmModel, p: Floats, identifiable: Sequence[Identifiability]) -> Floats:
-    """Standard deviations (p,) of the parameters determined alone, NaN elsewhere.
-
-    The unit vector of such a parameter is ``e_k = K' a``; its variance is ``a' P a``.
-    """
+    """Standard deviations (p,), NaN if not alone: the variance is ``a' P a`` where the unit vector is ``K' a``."""
     combinations = np.linalg.pinv(model.base.regroup)
     std = np.sqrt(np.einsum("ki,ij,kj->k", combinations, p, combinations))
     return np.where(np.array(identifiable) == "alone", std, np.nan)

@@ -11,18 +11,11 @@ from armident.identify.robot.chain import Floats
 
 @dataclass(frozen=True, eq=False)
 class DiscreteController:
-    """One linear controller per motor, with saturation.
+    """One linear controller per motor, with saturation of the output ``nu``.
 
     ``nu(k) = sum_i error_taps[:, i] eps(k-i) + sum_i position_taps[:, i] q_motor(k-i)
-    + sum_i output_taps[:, i] nu(k-1-i)``.
-
-    Here ``eps = R (q_ref - q)`` and ``q_motor = R q``, with the transmission matrix R. The output ``nu`` is limited
-    to ``saturation``; later samples use the limited value.
-
-    ``error_taps``, ``position_taps``: coefficients of the tracking error (n, m) and of the motor position (n, m2),
-    N m/rad or N/m. ``output_taps``: coefficients of earlier outputs, shape (n, m3), without unit. ``saturation``:
-    largest absolute motor torque, shape (n,), N m or N; ``inf``: no limit. Raises ValueError if the shapes differ in n,
-    a coefficient is not finite, or ``saturation`` or ``dt`` is not positive.
+    + sum_i output_taps[:, i] nu(k-1-i)`` with ``eps = R (q_ref - q)``, ``q_motor = R q`` and the transmission matrix R.
+    Later samples use the limited ``nu``. Taps: (n, m), N m/rad or N/m, of outputs without unit; ``saturation``: (n,).
     """
 
     error_taps: Floats
@@ -67,21 +60,8 @@ class DiscreteController:
     ) -> Self:
         """Position loop around a velocity loop: ``nu = gain kv (kp eps - qd_motor)`` (thesis section B.3).
 
-        The velocity is the difference of the motor position over ``velocity_samples`` periods. Raises ValueError if
-        ``velocity_samples`` is not positive.
-
-        Parameters
-        ----------
-        kp
-            Position gains (n,), 1/s.
-        kv
-            Velocity gains (n,), units of the drive's signal per rad/s or m/s of the motor.
-        gain
-            Drive gains (n,), motor torque (N m) or force (N) per unit of the drive's signal.
-        saturation
-            Largest absolute motor torque, scalar or (n,), N m or N; ``None``: no limit.
-        velocity_samples
-            Number of periods, at least 1; 2 is the mean of the last two backward differences.
+        ``kp``: 1/s. ``kv``: drive's signal per rad/s or m/s. ``gain``: motor torque per unit of the drive's signal.
+        ``qd_motor`` is the difference over ``velocity_samples`` periods; 2: mean of the last two backward differences.
         """
         if velocity_samples < 1:
             raise ValueError(f"velocity_samples: expected at least 1, got {velocity_samples}")
@@ -102,11 +82,7 @@ class DiscreteController:
 
     @classmethod
     def fir(cls, taps: ArrayLike, dt: float, saturation: ArrayLike | None = None) -> Self:
-        """Controller of finite impulse responses from the tracking error to the motor torque (CRC, thesis section 5.2).
-
-        ``taps``: impulse responses (n, m), N m/rad or N/m. ``saturation``: largest absolute motor torque, scalar or
-        (n,), N m or N; ``None``: no limit.
-        """
+        """Controller of impulse responses (n, m) from the tracking error to the motor torque (CRC, thesis 5.2)."""
         taps = np.atleast_2d(np.asarray(taps, dtype=np.float64))
         empty = np.zeros((taps.shape[0], 0))
         return cls(taps, empty, empty, _limits(saturation, taps.shape[0]), dt)

@@ -1,8 +1,7 @@
 """Sine, cosine and arctangent of short arrays, in a form that the compiler turns into vector instructions.
 
-A simulated sample needs about a dozen of each. With one call of the C library per number they would take most of the
-computing time of a sample. The polynomials and range reductions are those of Moshier's Cephes library (double
-precision). The code has no branches; errors are a few units in the last place for arguments up to 1e5.
+Calls of the C library would take most of the time of a simulated sample. Polynomials and range reductions are those of
+Moshier's Cephes library. No branches; errors are a few units in the last place for arguments up to 1e5.
 """
 
 import numpy as np
@@ -57,11 +56,7 @@ def sines_cosines(angle: Floats, sine: Floats, cosine: Floats) -> None:
 
 @inlined
 def arctangents(x: Floats, out: Floats, slope: Floats) -> None:
-    """Compute arctangents of an array and their derivatives ``1 / (1 + x^2)``.
-
-    ``x``: arguments, (m,); ``out``, ``slope``: output arrays of the arctangents (rad) and of the derivatives, (m,)
-    each.
-    """
+    """Compute arctangents of an array, rad, and their derivatives ``1 / (1 + x^2)``."""
     for i in range(x.size):
         t = abs(x[i])
         large = t > _TAN_3_PI_8

@@ -1,8 +1,7 @@
 """Compiled recursions over the chain: regressor, inverse dynamics, mass matrix and bias forces.
 
-Newton-Euler recursion in modified Denavit-Hartenberg frames (thesis equations A.22 to A.26). Gravity enters as the
-acceleration ``-g`` of the base. Vectors of link j are expressed in frame j; each component is a scalar variable.
-Sizes: N samples, n joints.
+Newton-Euler recursion in modified Denavit-Hartenberg frames (A.22 to A.26); gravity is the acceleration ``-g`` of the
+base. Vectors of link j are in frame j, one scalar variable a component. Sizes: N samples, n joints.
 """
 
 import numpy as np
@@ -16,42 +15,27 @@ TWO_OVER_PI = 2.0 / np.pi
 
 @inlined
 def smooth_sign(x: float, smoothing: float) -> float:
-    """``sign(x)``, or ``(2/pi) atan(smoothing x)`` if ``smoothing`` is positive (thesis section B.2).
-
-    ``x``: velocity, rad/s or m/s. ``smoothing``: ``g`` of the smoothed sign, s/rad or s/m; 0: the sharp sign.
-    """
+    """``sign(x)``, or ``(2/pi) atan(smoothing x)`` if ``smoothing`` is positive (thesis section B.2)."""
     return TWO_OVER_PI * np.arctan(smoothing * x) if smoothing > 0.0 else float(np.sign(x))
 
 
 @inlined
 def into_child(ca: float, sa: float, c: float, s: float, x: float, y: float, z: float) -> tuple[float, float, float]:
-    """Transform the components of a vector from frame j-1 to frame j (rotation only).
-
-    ``ca``, ``sa``: cosine and sine of the twist angle alpha_j; ``c``, ``s``: cosine and sine of the joint angle
-    theta_j; ``x``, ``y``, ``z``: components of the vector in frame j-1.
-    """
+    """Rotate a vector from frame j-1 to frame j; cosines and sines of the twist alpha_j and of theta_j."""
     t = ca * y + sa * z
     return c * x + s * t, c * t - s * x, ca * z - sa * y
 
 
 @inlined
 def into_parent(ca: float, sa: float, c: float, s: float, x: float, y: float, z: float) -> tuple[float, float, float]:
-    """Transform the components of a vector from frame j to frame j-1 (rotation only).
-
-    ``ca``, ``sa``: cosine and sine of the twist angle alpha_j; ``c``, ``s``: cosine and sine of the joint angle
-    theta_j; ``x``, ``y``, ``z``: components of the vector in frame j. Returns components in frame j-1.
-    """
+    """Rotate a vector from frame j to frame j-1; cosines and sines of the twist alpha_j and of theta_j."""
     t = s * x + c * y
     return c * x - s * y, ca * t - sa * z, sa * t + ca * z
 
 
 @inlined
 def turn(n: int, chain: Chain, q: Floats, angle: Floats, sine: Floats, cosine: Floats) -> None:
-    """Compute the joint angles of one sample, with their sines and cosines.
-
-    ``chain``: geometry of the chain; ``q``: joint positions (n,), rad or m; ``angle``, ``sine``, ``cosine``: output
-    arrays of `padded` length: angles in rad, their sines and cosines.
-    """
+    """Compute joint angles, rad, sines and cosines of one sample (n,) into arrays of `padded` length."""
     for j in range(n):
         angle[j] = chain.theta[j] + (0.0 if chain.prismatic[j] else q[j])
     sines_cosines(angle, sine, cosine)
@@ -61,21 +45,9 @@ def turn(n: int, chain: Chain, q: Floats, angle: Floats, sine: Floats, cosine: F
 def fill_regressor(
     chain: Chain, columns: Columns, smoothing: Floats, q: Floats, qd: Floats, qdd: Floats, out: Floats
 ) -> None:
-    """Compute the regressor of the inverse dynamic model (thesis equation 2.8).
+    """Compute the regressor of the inverse dynamic model (thesis equation 2.8); column -1: left out.
 
-    Parameters
-    ----------
-    chain
-        Geometry of the chain.
-    columns
-        Regressor column of each parameter; -1: the parameter is left out.
-    smoothing
-        ``g`` (n,) of each joint's smoothed sign, s/rad or s/m; 0: the sharp sign.
-    q, qd, qdd
-        Positions, velocities, accelerations, each (N, n); rad or m, s.
-    out
-        Output array (N, n, columns), N m or N per unit of the parameter. It holds zeros, or an earlier result of the
-        same ``columns``.
+    ``out`` (N, n, columns) holds zeros, or an earlier result of the same ``columns``. ``smoothing`` 0: the sharp sign.
     """
     n = chain.d.size
     lin = np.empty((n, 3))
@@ -175,12 +147,7 @@ def fill_regressor(
 
 @inlined
 def add_friction(values: Values, smoothing: Floats, qd: Floats, tau: Floats) -> None:
-    """Add friction, offsets and coupled friction of one sample to its torques (thesis equations 2.7, B.1).
-
-    ``values``: parameter values by kind, SI. ``smoothing``: ``g`` (n,) of each joint's smoothed sign, s/rad or s/m; 0:
-    the sharp sign. ``qd``: joint velocities (n,), rad/s or m/s. ``tau``: joint torques (n,), N m or N, changed in
-    place.
-    """
+    """Add friction, offsets and coupled friction of one sample to ``tau`` in place (thesis equations 2.7, B.1)."""
     for j in range(qd.size):
         tau[j] += values.fv[j] * qd[j] + values.off[j]
         if values.fc[j] != 0.0:
@@ -207,20 +174,7 @@ def rigid_torque(
 ) -> None:
     """Compute the torques of the rigid chain, without friction and rotors, for one sample (A.22 to A.26).
 
-    Parameters
-    ----------
-    chain
-        Geometry of the chain.
-    values
-        Parameter values by kind, SI.
-    q, qd, qdd
-        Positions, velocities, accelerations, each (n,); rad or m, s.
-    sine, cosine
-        Sines and cosines of the joint angles, of `padded` length, from `turn`.
-    work
-        Scratch array (n, 6): force and moment of each link.
-    tau
-        Output array of the joint torques (n,), N m or N.
+    ``sine``, ``cosine``: of `padded` length, from `turn`. ``work`` (n, 6): scratch of each link's force and moment.
     """
     wx = wy = wz = bx = by = bz = 0.0
     ax, ay, az = -chain.gravity[0], -chain.gravity[1], -chain.gravity[2]
@@ -286,12 +240,7 @@ def rigid_torque(
 def fill_mass_matrix(
     n: int, chain: Chain, values: Values, q: Floats, sine: Floats, cosine: Floats, mass: Floats
 ) -> None:
-    """Compute the mass matrix of one posture, with rotors and couplings, by the composite rigid body method.
-
-    ``chain``: geometry of the chain; ``values``: parameter values by kind, SI; ``q``: joint positions (n,), rad or m;
-    ``sine``, ``cosine``: sines and cosines of the joint angles, of `padded` length, from `turn`; ``mass``: output array
-    (n, n), kg m^2, kg m or kg.
-    """
+    """Compute the mass matrix of one posture, with rotors and couplings, by the composite rigid body method."""
     xx = xy = xz = yy = yz = zz = hx = hy = hz = m = 0.0
     for j in range(n - 1, -1, -1):
         p = values.inertial[j]
@@ -368,12 +317,7 @@ def fill_mass_matrix(
 def fill_inverse_dynamics(
     chain: Chain, values: Values, smoothing: Floats, q: Floats, qd: Floats, qdd: Floats, out: Floats
 ) -> None:
-    """Compute the joint torques along a motion, with friction, rotors and couplings.
-
-    ``chain``: geometry of the chain. ``values``: parameter values by kind, SI. ``smoothing``: ``g`` (n,) of each
-    joint's smoothed sign, s/rad or s/m; 0: the sharp sign. ``q``, ``qd``, ``qdd``: positions, velocities,
-    accelerations, each (N, n); rad or m, s. ``out``: output array of the joint torques (N, n), N m or N.
-    """
+    """Compute the joint torques along a motion (N, n), with friction, rotors and couplings."""
     n = chain.d.size
     work = np.empty((n, 6))
     angle, sine, cosine = np.zeros(padded(n)), np.empty(padded(n)), np.empty(padded(n))
@@ -391,11 +335,7 @@ def fill_inverse_dynamics(
 
 @compiled("Chain, Values, f8[:, ::1], f8[:, :, ::1]", **ARITHMETIC)
 def fill_mass_matrices(chain: Chain, values: Values, q: Floats, out: Floats) -> None:
-    """Compute the mass matrices of several postures; see `fill_mass_matrix`.
-
-    ``chain``: geometry of the chain; ``values``: parameter values by kind, SI; ``q``: postures (N, n), rad or m;
-    ``out``: output array (N, n, n), kg m^2, kg m or kg.
-    """
+    """Compute the mass matrices (N, n, n) of several postures; see `fill_mass_matrix`."""
     n = chain.d.size
     angle, sine, cosine = np.zeros(padded(n)), np.empty(padded(n)), np.empty(padded(n))
     for k in range(q.shape[0]):
@@ -405,11 +345,9 @@ def fill_mass_matrices(chain: Chain, values: Values, q: Floats, out: Floats) -> 
 
 @inlined
 def cholesky(matrix: Floats, factor: Floats, n: int) -> bool:
-    """Factor a symmetric matrix as ``L D L'``.
+    """Factor a symmetric matrix, of which only the lower triangle is read, as ``L D L'``.
 
-    ``matrix``: symmetric matrix (n, n); only its lower triangle is read. ``factor``: output array (n, n): L below the
-    diagonal, the inverse of D on it, ``D L'`` above it. ``n``: size of the matrix. Returns ``False`` if the matrix is
-    not positive definite; ``factor`` is then incomplete.
+    ``factor`` (n, n): L below the diagonal, the inverse of D on it, ``D L'`` above. ``False``: not positive definite.
     """
     for j in range(n):
         pivot = matrix[j, j]
@@ -431,11 +369,7 @@ def cholesky(matrix: Floats, factor: Floats, n: int) -> bool:
 
 @inlined
 def solve_factored(factor: Floats, n: int, x: Floats) -> None:
-    """Solve ``L D L' x = b`` in place with the factors of `cholesky`.
-
-    ``factor``: factors (n, n) from `cholesky`; ``n``: size of the system; ``x``: right side b (n,) at entry, solution
-    at return.
-    """
+    """Solve ``L D L' x = b`` in place with the factors of `cholesky`."""
     for i in range(n):
         value = x[i]
         for k in range(i):
@@ -452,25 +386,7 @@ def solve_factored(factor: Floats, n: int, x: Floats) -> None:
 def fill_forward_dynamics(
     chain: Chain, values: Values, smoothing: Floats, q: Floats, qd: Floats, tau: Floats, out: Floats
 ) -> int:
-    """Compute the joint accelerations of the direct dynamic model (thesis equation 2.9).
-
-    Returns the first sample whose mass matrix is not positive definite, or -1.
-
-    Parameters
-    ----------
-    chain
-        Geometry of the chain.
-    values
-        Parameter values by kind, SI.
-    smoothing
-        ``g`` (n,) of each joint's smoothed sign, s/rad or s/m; 0: the sharp sign.
-    q, qd
-        Positions and velocities, each (N, n); rad or m, s.
-    tau
-        Joint torques (N, n), N m or N.
-    out
-        Output array of the accelerations (N, n), rad/s^2 or m/s^2.
-    """
+    """Compute joint accelerations (2.9); return the first sample whose mass matrix is not positive definite, or -1."""
     n = chain.d.size
     work = np.empty((n, 6))
     angle, sine, cosine = np.zeros(padded(n)), np.empty(padded(n)), np.empty(padded(n))

@@ -1,13 +1,10 @@
 """Khalil's rules: which standard parameters are eliminated or regrouped, in symbols (thesis section A.3).
 
-Every parameter of link j is a linear form in the standard parameters; its coefficients are polynomials in the lengths
-``d_j`` and ``r_j``. From tip to base, the rules regroup parameters of link j with those of link j-1 if they have no
-separate effect on the torques.
-
-Rule 3 is printed with ``zz`` of link j, which rule 2 regroups with link j-1. Here rule 3 adds to link j-1 directly.
-Rule 7, on rotor inertias of prismatic joints, is used in its general form. Its conditions: the earlier revolute joints
-are parallel to the prismatic joint and the earlier prismatic joints orthogonal. Gravity then adds a constant to
-``off``.
+A parameter is a linear form in the standard ones with polynomials in the lengths ``d_j``, ``r_j`` as coefficients. From
+tip to base, parameters of link j without a separate effect on the torques are regrouped with those of link j-1. Rule 3
+is printed with ``zz`` of link j, which rule 2 regroups; here it adds to link j-1 directly. Rule 7, on rotor inertias of
+prismatic joints, is used in its general form: earlier revolute joints are parallel to the joint, earlier prismatic ones
+orthogonal. Gravity then adds a constant to ``off``.
 """
 
 from collections.abc import Iterable, Mapping
@@ -26,11 +23,7 @@ PARALLEL = 1e-9
 
 
 def khalil_rules(robot: RobotConfig, chain: Chain, names: tuple[str, ...]) -> dict[str, Form]:
-    """Derive the base parameters as linear forms in the standard ones by Khalil's rules (thesis section A.3).
-
-    ``names``: names of the standard parameters (p,). Returns the linear form of each remaining parameter, in the order
-    of ``names``. A form maps standard parameters to polynomials in the lengths.
-    """
+    """Derive the base parameters as linear forms by Khalil's rules (thesis section A.3), in the order of ``names``."""
     forms: dict[str, Form] = {name: {name: {(): 1.0}} for name in names}
     axes, origins = _axes(chain)
     n = chain.d.size
@@ -74,11 +67,7 @@ def khalil_rules(robot: RobotConfig, chain: Chain, names: tuple[str, ...]) -> di
 
 
 def evaluate(form: Form, lengths: Mapping[str, float], names: tuple[str, ...]) -> Floats:
-    """Evaluate the coefficients of a linear form at given lengths.
-
-    ``form``: linear form in the standard parameters; ``lengths``: values of the symbols, m, from `lengths_of`;
-    ``names``: names of the standard parameters (p,). Returns coefficients, shape (p,).
-    """
+    """Coefficients (p,) of a linear form at given lengths, m, from `lengths_of`."""
     row = np.zeros(len(names))
     for k, name in enumerate(names):
         for monomial, coefficient in form.get(name, {}).items():
@@ -92,11 +81,7 @@ def lengths_of(chain: Chain) -> dict[str, float]:
 
 
 def text_of(name: str, form: Form, names: tuple[str, ...]) -> str:
-    """Text of a linear form as in thesis table B.3; parameters with equal coefficients share a bracket.
-
-    ``name``: parameter that stands first; ``form``: linear form in the standard parameters, with ``name`` among them;
-    ``names``: names of the standard parameters, the order of the other terms.
-    """
+    """Text of a linear form as in thesis table B.3, ``name`` first; equal coefficients share a bracket."""
     groups: dict[str, list[str]] = {}
     polynomials: dict[str, Polynomial] = {}
     for parameter in (name, *(other for other in names if other in form and other != name)):
@@ -150,7 +135,7 @@ def _add(target: Form, source: Form, factor: Polynomial) -> None:
 def _regroup(forms: dict[str, Form], name: str, j: int, rows: Mapping[str, Polynomial], still: bool = False) -> None:
     """Regroup parameter ``name`` of link j+1 with those of its parent link; drop it if the parent is the base.
 
-    With ``still``, terms in the length ``r`` of joint j+1 are omitted: displacements along the only axis of rotation.
+    ``still`` omits terms in the length ``r`` of joint j+1: displacements along the only axis of rotation.
     """
     form = forms.pop(name)
     own_length = f"r{j + 1}"
@@ -165,8 +150,7 @@ def _regroup(forms: dict[str, Form], name: str, j: int, rows: Mapping[str, Polyn
 def _transfer(chain: Chain, j: int) -> dict[str, dict[str, Polynomial]]:
     """Contribution of each parameter of link j+1 to the parameters of its parent link.
 
-    For a revolute joint the combinations that do not depend on the joint angle are ``xx + yy``, ``mz`` and ``m``;
-    the entry ``yy`` is that of the sum. Lengths of zero do not appear.
+    At a revolute joint ``xx + yy`` (entry ``yy``), ``mz`` and ``m`` do not depend on the joint angle.
     """
     ca, sa = float(chain.cos_alpha[j]), float(chain.sin_alpha[j])
     c, s = cos_sin(float(chain.theta[j])) if chain.prismatic[j] else (1.0, 0.0)

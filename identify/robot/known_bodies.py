@@ -28,15 +28,10 @@ INSIDE = -1e-12
 
 
 def nearest_to_known(model: ArmModel, theta: Floats, known: Floats, smallest_link: Floats) -> Floats:
-    """Return the consistent standard parameters nearest to known ones, with the same base parameters.
+    """Return the consistent standard parameters nearest to known ones (p,), with the same base parameters.
 
-    Base parameters determine the torques; the other combinations of standard parameters are free. Distances are in
-    kilograms: first moments are divided by the arm's mean length, moments of inertia by its square.
-
-    ``model``: arm with p standard and b base parameters. ``theta``: consistent standard parameters (p,), SI; every link
-    contains ``smallest_link``. ``known``: known standard parameters (p,), SI, for example of the maker; only those of
-    links count. ``smallest_link``: pseudo-inertia (4, 4) that every link contains, kg and kg m^2. Result: shape (p,);
-    ``theta`` itself where the solver finds nothing nearer.
+    Distances in kg: first moments over the arm's mean length, moments of inertia over its square; only links count.
+    Every link contains ``smallest_link`` (4, 4). If nothing is nearer, the result is ``theta``.
     """
     free = linalg.null_space(model.base.regroup)
     if not free.shape[1]:

@@ -242,10 +242,9 @@ class Motion:
         return self._slopes[key]
 
     def _smooth(self, links: bool) -> tuple[Array, Array]:
-        """Predicted torques (N, n) and their derivatives with respect to the joint accelerations, (n, N, n).
+        """Predicted torques (N, n), and derivatives (n, N, n) by the accelerations of the joints on the first axis.
 
-        The first axis of the derivatives is the joint that accelerates. The sign of the friction is always smoothed:
-        a jump has no derivative.
+        The sign of the friction is always smoothed: a jump has no derivative.
         """
         if links not in self._still:
             theta = self.links if links else self._theta

@@ -17,12 +17,7 @@ MOST_HALVINGS = 30
 
 @dataclass(frozen=True, eq=False)
 class Damped:
-    """Physical iterate and the applied fraction of its step.
-
-    ``theta``: parameters, base (b,) or standard (p,) as given, SI. ``step``: applied fraction of the step from the
-    previous to the proposed iterate, 0 to 1. ``reason``: defects of the proposed iterate and their correction; empty if
-    there were none.
-    """
+    """Physical iterate, applied fraction of its step (0 to 1), and the corrected defects; empty if there were none."""
 
     theta: Floats
     step: float
@@ -30,14 +25,7 @@ class Damped:
 
 
 def damp_to_physical(model: ArmModel, theta: ArrayLike, theta_previous: ArrayLike, q_samples: ArrayLike) -> Damped:
-    """Reduce the step of an iteration until its parameters are physical.
-
-    Negative friction coefficients are set to zero. Then the step from ``theta_previous`` is halved until the mass
-    matrix is positive definite at all postures.
-
-    ``model``: arm model with n joints; ``theta``, ``theta_previous``: proposed parameters and those of the previous,
-    physical iterate, SI: both base (b,) or both standard (p,); ``q_samples``: postures, shape (N, n), rad or m.
-    """
+    """Set negative friction to zero, then halve the step until mass matrices at all postures are positive definite."""
     previous = np.asarray(theta_previous, dtype=np.float64)
     wanted = np.asarray(theta, dtype=np.float64)
     if not np.isfinite(wanted).all():

@@ -1,12 +1,10 @@
 """Closed-loop simulation of an arm whose model has additional terms, by waveform relaxation.
 
-The compiled simulation contains the rigid arm with friction. The torque of the terms is computed along the whole
-simulated motion and applied as a load in the next simulation. This repeats until the load no longer changes
-(Lelarasmee, Ruehli, Sangiovanni-Vincentelli 1982). Anderson mixing extrapolates each load from earlier loads and their
-results (Anderson 1965, J. ACM 12(4)). The iteration then also converges for terms that depend on accelerations and
-torques. The part of the load that is proportional to a joint's own acceleration acts as inertia. The compiled
-simulation includes it at every instant, whatever its size. To be simulated, an effect needs only its regressor columns,
-even with internal states.
+The torque of the terms along the whole simulated motion is the load of the next simulation, until it no longer changes
+(Lelarasmee, Ruehli, Sangiovanni-Vincentelli 1982). Anderson mixing extrapolates each load from earlier ones (Anderson
+1965, J. ACM 12(4)), so that terms of accelerations and torques converge, too. The part proportional to a joint's own
+acceleration acts as inertia, which the compiled simulation includes at every instant. An effect needs only its
+regressor columns, even with internal states.
 """
 
 from collections import deque
@@ -62,34 +60,9 @@ def simulate_with_terms(
 ) -> Simulation:
     """Simulate the closed loop with the terms of the model; see :func:`armident.identify.robot.simulation.simulate`.
 
-    Result: ``tau`` is the torque that the drives report: that of the rigid arm plus that of the terms.
-
-    Parameters
-    ----------
-    model
-        Arm model with n joints and e parameters of terms.
-    theta_base
-        Base (b,) or standard (p,) parameters, SI; the last e are those of the terms.
-    controller
-        Controller with the sampling period ``dt``.
-    q_ref
-        Reference positions (N, n), rad or m.
-    start
-        Time of the first sample since the beginning of the first recording, s.
-    disturbance
-        Additional motor torques (N, n), N m or N.
-    band_hz
-        Cut-off frequency of the low-pass for the torque of the terms, Hz. References that arrive in steps, two or
-        three times differentiated, would otherwise prevent convergence.
-    rounds
-        Most simulations.
-    tolerated
-        Difference between the torque of the terms and the applied load, over the torque of each joint, that ends the
-        iteration, too.
-    motion
-        Motion (N, n) close to that of the loop, at which the first load is computed; ``None``: begin without load.
-    **initial
-        Further arguments of ``simulate``: ``q0``, ``qd0``, ``max_velocity``.
+    ``band_hz``: low-pass for the torque of the terms: references in steps would prevent convergence. ``tolerated``:
+    difference of the terms' torque and the load, over each joint's torque, that suffices. ``motion``: for the first
+    load; ``None``: no load. ``tau`` of the result is what the drives report: rigid arm plus terms.
     """
     theta = np.asarray(theta_base, dtype=np.float64)
     values = theta[theta.size - model.e :]
@@ -178,11 +151,7 @@ class _Past:
         self._missing: deque[Floats] = deque(maxlen=MEMORY)
 
     def next(self, load: Floats, missing: Floats) -> Floats:
-        """Return the next load: the one of least difference in a linear model, plus ``STEP`` times that difference.
-
-        ``load``: load of the last simulation (N, n), N m or N; ``missing``: torque of the terms minus ``load`` (N, n),
-        N m or N.
-        """
+        """Return the next load (N, n): of least difference in a linear model, plus `STEP` times that difference."""
         self._loads.append(load)
         self._missing.append(missing)
         if len(self._loads) == 1:

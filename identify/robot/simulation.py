@@ -1,10 +1,9 @@
 """Closed-loop simulation of the auxiliary model: direct dynamics under a discrete controller.
 
-The thesis integrates with an explicit fixed-step method (ode3). At the sampling rate, the smoothed Coulomb friction of
-a small wrist joint is too stiff for it. The friction is therefore linearly implicit here. In each sampling period the
-mass matrix and the bias forces are extrapolated to its middle from the last two samples (second order). Then
-``M qd' = tau - bias - friction(qd)`` is integrated by the L-stable two-stage Rosenbrock method of order two (Shampine
-and Reichelt 1997, ``ode23s``). Steps are smaller while a joint passes through standstill.
+At the sampling rate the friction of a small wrist joint is too stiff for the thesis's explicit method (ode3): it is
+linearly implicit here. Mass matrix and bias are extrapolated to the middle of each period from the last two samples
+(second order). ``M qd' = tau - bias - friction(qd)`` is integrated by the L-stable two-stage Rosenbrock method of order
+two (Shampine and Reichelt 1997, ``ode23s``), in smaller steps where a joint passes standstill.
 """
 
 from dataclasses import dataclass
@@ -50,17 +49,8 @@ _SIGNATURE = (
 class Simulation:
     """Simulated motion; all arrays (N, n), SI, joint side, NaN from ``diverged_at`` on.
 
-    Parameters
-    ----------
-    q, qd
-        Positions and velocities at the samples, rad or m, s.
-    qdd
-        Accelerations at the samples: mean of the values immediately before and after the torque changes.
-    tau
-        Joint torque during ``[k, k + 1)``, N m or N.
-    diverged_at
-        Sample at which the simulation stopped; ``None`` if it reached the end. Reasons: a state that is not finite, a
-        velocity above its limit, or a mass matrix that is not positive definite.
+    ``qdd``: mean of the values just before and after the torque changes. ``tau``: held during ``[k, k + 1)``.
+    ``diverged_at``: state not finite, velocity above its limit or mass matrix not positive definite; ``None``: never.
     """
 
     q: Floats
@@ -83,32 +73,11 @@ def simulate(
     disturbance: ArrayLike | None = None,
     inertia: ArrayLike | None = None,
 ) -> Simulation:
-    """Simulate the arm under its controller along a reference (thesis equation 2.9, section B.3).
+    """Simulate the arm, without its terms, under its controller along a reference (thesis equation 2.9, section B.3).
 
-    Raises ValueError if numbers of joints, shapes or sampling periods differ.
-
-    Parameters
-    ----------
-    model
-        Arm model with n joints; its terms are not simulated.
-    theta_base
-        Base parameters (b,) or standard parameters (p,), SI; friction is smoothed.
-    controller
-        Controller that acts once per sample on the position at that sample; its torque is held for one period.
-    q_ref
-        Reference positions (N, n), rad or m.
-    dt
-        Sampling period, s; equal to that of the controller.
-    q0, qd0
-        State at the first sample, (n,), rad or m, s; by default that of the reference. Before the first sample the
-        tracking error was constant and the velocity ``qd0``.
-    max_velocity
-        Joint velocities, scalar or (n,), rad/s or m/s, above which the simulation counts as diverged; by default ten
-        times the limits of the configuration.
-    disturbance
-        Motor torques (N, n), N m or N, added to those of the controller after their saturation; ``tau`` contains them.
-    inertia
-        Additional inertia of the joints (n,), kg m^2 or kg.
+    A torque is held for one period. ``q0``, ``qd0``: first state (n,), by default that of the reference; before it,
+    tracking error and velocity were constant. ``max_velocity``: diverged above it, by default ten times the limits.
+    ``disturbance``: motor torques (N, n) added after saturation, part of ``tau``. ``inertia``: additional, joints (n,).
     """
     reference = np.ascontiguousarray(q_ref, dtype=np.float64)
     samples, n = reference.shape
@@ -176,22 +145,7 @@ def friction(
 ) -> None:
     """Compute friction torques and their derivatives with respect to velocity (thesis equations 2.7, B.1).
 
-    Parameters
-    ----------
-    n, pairs
-        Numbers of joints and of couplings.
-    values
-        Parameter values by kind, SI.
-    v
-        Joint velocities (n,), rad/s or m/s.
-    x, bend, steep
-        Scratch arrays of length ``padded(n + pairs)``: arguments of the arctangent, its values and its derivatives.
-    force
-        Output array of the friction torques with offsets (n,), N m or N.
-    slope
-        Output array of the diagonal of the derivative (n,), N m s/rad or N s/m.
-    pair_slope
-        Output array of the off-diagonal derivative of each coupling (pairs,).
+    ``x``, ``bend``, ``steep``: scratch, ``padded(n + pairs)``: argument, value and derivative of the arctangent.
     """
     g = values.smoothing
     for j in range(n):
@@ -218,11 +172,7 @@ def friction(
 
 @inlined
 def divisions(n: int, pairs: int, values: Values, v: Floats, a: Floats, dt: float) -> int:
-    """Number of integration steps in one sample: more while a joint with Coulomb friction passes standstill.
-
-    ``n``, ``pairs``: numbers of joints and of couplings; ``values``: parameter values by kind, SI; ``v``, ``a``: joint
-    velocities and accelerations (n,), rad or m, s.
-    """
+    """Number of integration steps in one sample: more while a joint with Coulomb friction passes standstill."""
     most = 1
     for j in range(n):
         x, dx = values.smoothing[j] * v[j], values.smoothing[j] * a[j] * dt
@@ -241,23 +191,7 @@ def divisions(n: int, pairs: int, values: Values, v: Floats, a: Floats, dt: floa
 def stiffen(
     n: int, pairs: int, mass: Floats, step: float, coupled: Ints, slope: Floats, pair_slope: Floats, stiff: Floats
 ) -> None:
-    """Compute the matrix of the implicit stages, ``mass + GAMMA step F`` with the friction derivative F.
-
-    Parameters
-    ----------
-    n, pairs
-        Numbers of joints and of couplings.
-    mass
-        Mass matrix (n, n); only its lower triangle is read.
-    step
-        Integration step, s.
-    coupled
-        Indices of the two joints of each coupling (pairs, 2).
-    slope, pair_slope
-        Derivatives of the friction from `friction`, (n,) and (pairs,).
-    stiff
-        Output array (n, n); only its lower triangle is written.
-    """
+    """Lower triangle of the matrix of the implicit stages, ``mass + GAMMA step F`` with the friction derivative F."""
     for i in range(n):
         for j in range(i):
             stiff[i, j] = mass[i, j]
@@ -291,31 +225,8 @@ def run(
 ) -> int:
     """Simulate the closed loop; fill ``q, qd, qdd, tau`` from the state in the first row of ``q`` and ``qd``.
 
-    The length of a tuple is known when the kernel is compiled: with ``joints`` and ``couplings`` the compiler unrolls
-    the short loops. Returns the sample at which the simulation stopped, or -1 if it reached the end.
-
-    Parameters
-    ----------
-    chain
-        Geometry of the chain.
-    values
-        Parameter values by kind, SI.
-    transmission, inverse_transmission
-        Matrix (n, n) from joint to motor positions, and its inverse.
-    error_taps, position_taps, output_taps, saturation
-        Coefficients and limits of the controller; see `DiscreteController`.
-    memory
-        Number of samples that the controller uses.
-    reference
-        Reference positions of the motors (N, n), rad or m.
-    disturbance
-        Additional motor torques (N, n), N m or N; shape (0, n): none.
-    max_velocity
-        Joint velocities (n,), rad/s or m/s, above which the simulation stops.
-    q, qd, qdd, tau
-        Output arrays (N, n), joint side, SI.
-    joints, couplings
-        Tuples with one entry per joint and per coupling; only their lengths are used.
+    Returns the sample at which the simulation stopped, or -1. The lengths of the tuples ``joints`` and ``couplings``
+    let the compiler unroll loops. ``memory``: samples that the controller uses. ``disturbance``: no rows if none.
     """
     samples, n = reference.shape[0], len(joints)
     coupled = values.coupling_joints

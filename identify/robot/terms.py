@@ -35,8 +35,4 @@ class ModelTerm(Protocol):
         """Return the torques (N m or N) of all n joints per unit of each linear parameter, (N, n, k)."""
 
     def add_torque(self, motion: Motion, values: NDArray[np.float64], torque: NDArray[np.float64]) -> None:
-        """Add the torque of the term.
-
-        ``motion``: the motion, N samples. ``values``: values of the linear parameters, (k,). ``torque``: torques of all
-        joints, (N, n), N m or N; changed in place.
-        """
+        """Add the torque of the term, with its linear parameters (k,), to that of all joints (N, n) in place."""

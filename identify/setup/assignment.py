@@ -18,8 +18,7 @@ OrderCriterion = Callable[[Array], float]
 def by_rows(bench: Bench, h: Hypothesis) -> Hypothesis:
     """Return the hypothesis with the signed assignment of torques that the rows of the model explain best.
 
-    Every row of the model is fitted alone to every recorded torque with either sign; the assignment with the least sum
-    of logarithmic residuals is taken (Kuhn 1955).
+    Each row is fitted to each torque of either sign; the least sum of logarithmic residuals decides (Kuhn 1955).
     """
     n = bench.n
     found = normal(bench, h)
@@ -50,10 +49,7 @@ def by_rows(bench: Bench, h: Hypothesis) -> Hypothesis:
 def by_friction(bench: Bench, h: Hypothesis) -> Array:
     """Return the signed permutation (n, n) from recorded torques to the recorded positions that they belong to.
 
-    Dry friction changes the torque of its own joint where that joint turns round, and of no other joint. Needs no
-    model of the arm.
-
-    ``h``: start; its assignments are not used.
+    Dry friction changes only the torque of its own joint where that joint turns round. Needs no model of the arm.
     """
     n = bench.n
     x = bench.rows(np.eye(n)).x
@@ -88,10 +84,7 @@ def orders(moving: NDArray[np.bool_]) -> Iterator[Array]:
 
 
 def usual_orders(moving: NDArray[np.bool_]) -> list[Array]:
-    """Orders from which a search by exchanges starts: as configured, reversed, and all rotations.
-
-    ``moving``: mask (n,) of the joints that move.
-    """
+    """Orders from which a search by exchanges starts: as configured, reversed, and all rotations."""
     own, chosen = np.eye(moving.size), np.flatnonzero(moving)
     made = []
     for order in (chosen, chosen[::-1], *(np.roll(chosen, k) for k in range(1, chosen.size))):
@@ -102,10 +95,7 @@ def usual_orders(moving: NDArray[np.bool_]) -> list[Array]:
 
 
 def exchanged(order: Array, first: int, second: int) -> Array:
-    """Return an order (n, n) with two joints exchanged.
-
-    ``order``: permutation matrix; ``first``, ``second``: indices of the joints.
-    """
+    """Return an order, a permutation matrix (n, n), with two joints exchanged."""
     other = order.copy()
     other[[first, second]] = other[[second, first]]
     return other

@@ -69,12 +69,7 @@ GENERIC = np.array([3.1, -5.3, -7.6])
 
 @dataclass(frozen=True)
 class Segment:
-    """Signals of one experiment at the working rate.
-
-    ``q``, ``qd``, ``qdd``: recorded positions and their derivatives, (W, n); rad or m, s. ``tau``: recorded torques,
-    (W, n), N m or N. ``dt``: working period, s. ``q_ref``: reference positions, (W, n), rad or m; ``None``: not
-    recorded.
-    """
+    """Signals (W, n) of one experiment at the working rate: rad or m, s, N m or N."""
 
     q: Array
     qd: Array
@@ -88,9 +83,8 @@ class Segment:
 class Rows:
     """Equations of all joints for one assignment of positions.
 
-    ``x``: regressors: base parameters without gravity, then free terms, (M, n, c); ``gravity``: what gravity along each
-    base axis adds to the regressors, per m/s^2, (3, M, n, c); ``physical``: rows whose product with the parameters must
-    not be negative: mean moment of inertia, and power of friction, (2 n, c).
+    ``x`` (M, n, c): base parameters without gravity, then free terms. ``gravity`` (3, M, n, c): added to ``x`` per
+    m/s^2 along base axes. ``physical`` (2 n, c): rows with non-negative products: mean inertia, friction power.
     """
 
     x: Array
@@ -102,24 +96,9 @@ class Rows:
 class Bench:
     """Signals of a set of recordings, and a cache of their equations.
 
-    Parameters
-    ----------
-    model
-        Rigid model, with base parameters for gravity in any direction.
-    segments
-        Signals of each experiment.
-    decimation
-        Filter from the working rate to the rows.
-    moving
-        Mask (n,) of the joints that move.
-    period
-        Sampling period of the recordings, s.
-    rows_kept
-        Largest number of instants.
-    at_rest
-        True for equations at all instants, False for those at which all joints move.
-    normals
-        Cache of `armident.identify.setup.fit.normal`.
+    ``model``: with base parameters for gravity in any direction. ``moving`` (n,): joints that move. ``period``: of the
+    recordings, s. ``rows_kept``: largest number of instants. ``at_rest``: equations at all instants instead of those at
+    which all joints move. ``normals``: cache of `armident.identify.setup.fit.normal`.
     """
 
     model: ArmModel
@@ -141,9 +120,9 @@ class Bench:
 
     @cached_property
     def instants_used(self) -> tuple[NDArray[np.int64], ...]:
-        """Instants after filtering, of each segment, of the equations; at most `rows_kept` of all.
+        """Instants of the equations in each segment, at most `rows_kept` of all, the same for all hypotheses.
 
-        All hypotheses use the same ones. All instants count where the joints seldom move at once.
+        All instants count where the joints seldom move at once.
         """
         moves = [
             np.all(np.abs(self.decimation(s.qd))[:, self.moving] > AT_REST * self._fastest[self.moving], axis=1)
@@ -186,27 +165,18 @@ class Bench:
         return Bench(self.model, self.robot, self.segments, self.decimation, self.moving, self.period, rows, at_rest)
 
     def column(self, name: str) -> int:
-        """Column of a standard parameter that is a base parameter, possibly with others regrouped into it.
-
-        ``name``: standard parameter.
-        """
+        """Column of a standard parameter that is a base parameter, possibly with others regrouped into it."""
         return list(self.model.base.independent).index(self.model.names.index(name))
 
     def torque(self, shift: Array) -> Array:
-        """Recorded torques at the instants of the rows, moved to earlier times, (M, n), N m or N.
-
-        ``shift``: time by which each torque is late, s, (n,).
-        """
+        """Recorded torques (M, n) at the instants of the rows, moved earlier by ``shift`` (n,), s."""
         key = np.round(shift, 9).tobytes()
         if key not in self._torques:
             self._torques[key] = self.kept([_shifted(s.tau, shift / s.dt) for s in self.segments])
         return self._torques[key]
 
     def rows(self, position: Array) -> Rows:
-        """Equations with the joint positions ``position @ q_recorded``.
-
-        ``position``: matrix (n, n): signs, permutation and scale.
-        """
+        """Equations with the joint positions ``position @ q_recorded``: signs, permutation and scale, (n, n)."""
         key = np.round(position, 9).tobytes()
         if key not in self._rows:
             if len(self._rows) >= MOST_KEPT:
@@ -215,10 +185,7 @@ class Bench:
         return self._rows[key]
 
     def kept(self, signals: Sequence[Array]) -> Array:
-        """Signals at the instants of the rows, filtered, (M, ...).
-
-        ``signals``: signals of each segment at the working rate, (W, ...).
-        """
+        """Signals (W, ...) of each segment at the instants of the rows, filtered, (M, ...)."""
         pairs = zip(signals, self.instants_used, strict=True)
         return np.concatenate([self.decimation(x)[instants] for x, instants in pairs])
 
@@ -268,11 +235,9 @@ def make_bench(
     working_rate: float = WORKING_RATE,
     model: ArmModel | None = None,
 ) -> Bench:
-    """Filter and differentiate the recordings.
+    """Filter and differentiate recordings (SI, joint side, one rate); DataError if they are too short.
 
-    ``experiments``: SI, joint side, one sampling rate. ``moving``: mask (n,) of the joints that move. ``working_rate``:
-    rate of the derivatives over the cut-off of the equations. ``model``: model of another bench of the same robot;
-    ``None``: made. Raises DataError if the recordings are too short for any comparison.
+    ``working_rate``: rate of the derivatives over the cut-off of the equations; ``model``: of another bench, if made.
     """
     dt = experiments[0].dt
     cutoff = min(CUTOFF * motion_bandwidth([e.q for e in experiments], dt), 0.45 / dt)

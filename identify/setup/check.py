@@ -49,9 +49,7 @@ TRIED = {
 def check_setup(experiments: Sequence[Experiment], robot: RobotConfig) -> SetupCheck:
     """Compare the set-up as configured with its possible mistakes, each with everything refitted.
 
-    ``experiments``: SI, joint side, of one robot at one sampling rate. ``robot``: the configuration; mistakes that its
-    ``effects`` correct are corrected first. Returns the mistakes with their probability and remedy. Raises DataError if
-    the recordings do not fit together or are too short.
+    Recordings: SI, joint side, one rate. Mistakes that ``effects`` of the configuration correct are corrected first.
     """
     _validate(experiments, robot)
     # The matrices are small: threads delay each other.
@@ -125,8 +123,7 @@ def _searched(
 def _with_exact_shift(experiments: Sequence[Experiment], bench: Bench, best: Step) -> Step:
     """Replace a common shift that the search has found, if it can be estimated to a factor of 2.
 
-    The search takes the shift that predicts best. This is too short where the torque of the closed loop follows
-    disturbances, and where a joint stops suddenly.
+    Prediction gives too short a shift where the closed loop follows disturbances, and where a joint stops suddenly.
     """
     common = float(np.median(best.h.shift[bench.moving]))
     found = long_torque_shift(experiments, bench, best.h, common, abs(common))
@@ -138,7 +135,7 @@ def _with_exact_shift(experiments: Sequence[Experiment], bench: Bench, best: Ste
 def _with_instrumented_shift(experiments: Sequence[Experiment], bench: Bench, best: Step) -> Step:
     """Add a common shift that the recorded references show and the search has not found, if two joints confirm it.
 
-    Prediction hardly gains by it where disturbances in the closed loop hide it; the instruments are free of them.
+    Disturbances in the closed loop may hide it from prediction, not from the instruments.
     """
     found = long_torque_shift(experiments, bench, best.h, 0.0, LONGEST_SHIFT_S)
     if found is None or not found.confirmed:

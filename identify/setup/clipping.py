@@ -1,7 +1,6 @@
 """Clipped torques behind noise: the model needs more than the largest recorded torque wherever that is reached.
 
-A drive whose torque saturates softly is no mistake of the set-up but an effect (`drive_gain_saturation`): both laws are
-fitted, and the better one decides.
+Soft saturation is no mistake but an effect (`drive_gain_saturation`): the better fit of both laws decides.
 """
 
 from dataclasses import dataclass
@@ -53,11 +52,7 @@ LEVEL_QUANTILE = 0.98
 
 @dataclass(frozen=True)
 class Clip:
-    """A clipped torque.
-
-    ``joint``: index of the recorded torque; ``level``: largest recorded torque, N m or N; ``share``: share of rows at
-    the level; ``needed``: median over the level of the torque that the model needs there.
-    """
+    """A clipped torque: level, N m or N, share of rows there, and median torque that the model needs there."""
 
     joint: int
     level: float
@@ -68,9 +63,7 @@ class Clip:
 def clipped_torques(bench: Bench, h: Hypothesis) -> list[Clip]:
     """Return the torques whose largest values lie where the model, fitted to the other rows, needs clearly more.
 
-    A torque of dry friction is also nearly constant over long times, but there the model needs no more than recorded.
-
-    ``h``: corrections of the signals.
+    Dry friction is also nearly constant over long times, but there the model needs no more than recorded.
     """
     x, y, physical = equations(bench.everywhere, h)
     found = []

@@ -31,10 +31,7 @@ CLOCK_WORDS = {1e-3: "ms", 1e-6: "us", 1e-9: "ns", 1e3: "ks"}
 
 @dataclass(frozen=True)
 class Described:
-    """Findings of a search, and what a configuration can express of their corrections.
-
-    ``robot``: configuration with the corrections; ``None`` if there are none that it can express.
-    """
+    """Findings of a search, and the configuration with their corrections as far as it can express any."""
 
     findings: tuple[SetupFinding, ...]
     robot: RobotConfig | None
@@ -171,10 +168,7 @@ def _order(
 
 
 def transpositions(order: NDArray[np.int64]) -> list[tuple[int, int]]:
-    """Return exchanges that, one after the other, bring recorded column ``order[j]`` to joint j.
-
-    ``order``: recorded column of each joint, (n,).
-    """
+    """Return exchanges that, one after the other, bring recorded column ``order[j]`` to joint j."""
     current = list(range(len(order)))
     pairs = []
     for j, wanted in enumerate(order):

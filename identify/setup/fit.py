@@ -31,11 +31,9 @@ BLOCKS = 24
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
-    """Corrections of the recorded signals and of the configuration.
+    """Corrections ``position``, ``torque`` (n, n) of the recorded signals, and of the configuration.
 
-    ``position``, ``torque``: matrices (n, n) that turn recorded joint positions and torques into the true ones;
-    ``gravity``: gravity in the base frame, m/s^2, (3,); ``shift``: time by which each recorded torque is late, s, (n,);
-    ``clock``: True over recorded duration.
+    ``gravity`` (3,): base frame, m/s^2. ``shift`` (n,): lateness of torques, s. ``clock``: true over recorded duration.
     """
 
     position: Array
@@ -47,11 +45,7 @@ class Hypothesis:
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """Result of the physical fit of a hypothesis.
-
-    ``shares``: residual share of the power of every recorded torque, in sample, (n,); ``residual``: residuals of the
-    recorded torques, (M, n), N m or N; ``theta``: parameters (c,).
-    """
+    """Physical fit of a hypothesis: in-sample residual shares of power (n,), residuals (M, n), N m or N."""
 
     shares: Array
     residual: Array
@@ -62,9 +56,7 @@ class Fit:
 class Normal:
     """Normal equations of all rows of the model, for one assignment of positions and one gravity.
 
-    ``x``: regressors of the joint torques, (M, n, c); ``grams``: ``X_m' X_m`` of every row, (n, c, c); ``physical``:
-    constraints, (k, c); ``products``: ``X_m' y_k`` of row m and recorded torque k, (n, n, c), by the shifts of the
-    torques.
+    ``grams`` (n, c, c): ``X_m' X_m`` of ``x`` (M, n, c). ``products`` (n, n, c): ``X_m' y_k``, by shifts of torques.
     """
 
     x: Array
@@ -74,10 +66,7 @@ class Normal:
 
 
 def normal(bench: Bench, h: Hypothesis) -> Normal:
-    """Return the normal equations of a hypothesis; repeated calls return the same object.
-
-    ``h``: the hypothesis; its torques are not used.
-    """
+    """Return the normal equations of a hypothesis (not of its torques); repeated calls return the same object."""
     # Accelerations scale with the clock squared; only their proportion to gravity matters to the fit.
     gravity = h.gravity * h.clock**2
     key = np.round(np.concatenate([h.position.ravel(), gravity]), 12).tobytes()
@@ -117,10 +106,7 @@ def fit_shares(bench: Bench, h: Hypothesis) -> Array:
 
 
 def equations(bench: Bench, h: Hypothesis, *, free: bool = True) -> tuple[Array, Array, Array]:
-    """Regressors of the recorded torques (M, n, c), the torques (M, n), and the constraints (k, c).
-
-    ``free``: True to include the free friction terms and springs.
-    """
+    """Regressors (M, n, c) of the recorded torques, torques (M, n), constraints (k, c); ``free``: with free terms."""
     found = normal(bench, h)
     x, physical = (found.x, found.physical) if free else (found.x[..., : bench.rigid], found.physical[:, : bench.rigid])
     if not np.array_equal(h.torque, np.eye(bench.n)):
@@ -129,10 +115,7 @@ def equations(bench: Bench, h: Hypothesis, *, free: bool = True) -> tuple[Array,
 
 
 def fit(bench: Bench, h: Hypothesis, *, free: bool = True) -> Fit:
-    """Fit all parameters with non-negative mean inertias and friction that dissipates power.
-
-    ``free``: True to include the free friction terms and springs.
-    """
+    """Fit with non-negative mean inertias and dissipative friction; ``free``: with free friction and springs."""
     x, y, physical = equations(bench, h, free=free)
     grams, products, power = _normal(x, y)
     theta, shares = _solve(grams, products, power, physical, bench.moving)
@@ -140,20 +123,13 @@ def fit(bench: Bench, h: Hypothesis, *, free: bool = True) -> Fit:
 
 
 def fit_rows(x: Array, y: Array, used: NDArray[np.bool_], physical: Array, moving: NDArray[np.bool_]) -> Array:
-    """Return the parameters (c,) of a fit to some of the equations.
-
-    ``x``, ``y``: regressors (M, n, c) and torques (M, n); ``used``: mask (M, n) of the equations; ``physical``:
-    constraints, (k, c); ``moving``: mask (n,) of the joints that move.
-    """
+    """Parameters (c,) of a fit to equations ``used`` (M, n), with ``x`` (M, n, c) and ``y`` (M, n)."""
     theta, _ = _solve(*_normal(x * used[:, :, None], y * used), physical, moving)
     return theta
 
 
 def joint_errors(bench: Bench, h: Hypothesis, *, free: bool = False) -> tuple[Array, Array]:
-    """Relative error of the rigid model at every joint, and the correlation of neighbouring residuals, (n,) each.
-
-    ``h``: corrections of the signals; ``free``: True to include the free friction terms and springs.
-    """
+    """Relative error (n,) of the rigid model at every joint, and correlation (n,) of neighbouring residuals."""
     residual = fit(bench, h, free=free).residual @ h.torque.T
     torque = bench.torque(h.shift) @ h.torque.T
     power = np.maximum((residual**2).sum(axis=0), 1e-300)
@@ -198,8 +174,6 @@ def physical_least_squares(gram: Array, right: Array, physical: Array) -> Array:
     """``min theta' gram theta / 2 - right' theta`` subject to ``physical theta >= 0``, through the dual problem.
 
     Lawson, Hanson, Solving Least Squares Problems, 1974, chapter 23.
-
-    ``gram``, ``right``: normal equations, (c, c) and (c,); ``physical``: constraints, (k, c).
     """
     scale = np.sqrt(np.diag(gram))
     scale[scale <= 1e-12 * scale.max(initial=0.0)] = np.inf

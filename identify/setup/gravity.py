@@ -30,14 +30,9 @@ SHIFTS_S = (1e-3, 2e-3, 4e-3, 8e-3, 16e-3, 32e-3, 64e-3)
 
 
 def best_direction(h: Hypothesis, criterion: Criterion) -> Hypothesis:
-    """Return the hypothesis with the direction of gravity that fits best.
+    """Return the hypothesis with the best direction of gravity, of the same magnitude.
 
-    ``h``: start; the magnitude of its gravity is kept. ``criterion``: misfit to minimise.
-
-    Notes
-    -----
-    Opposite directions fit equally well where the first moments of the links change sign with gravity and show in
-    nothing else. Of equal directions the one nearest to the configured direction is the likeliest.
+    Opposite directions fit equally where first moments change sign, too: the one nearest to the configured one wins.
     """
     size = float(np.linalg.norm(h.gravity)) or STANDARD
     tried = sorted(DIRECTIONS, key=lambda d: criterion(replace(h, gravity=size * d)))
@@ -76,11 +71,7 @@ def without_gravity(h: Hypothesis) -> Hypothesis:
 
 
 def best_shift(h: Hypothesis, criterion: Criterion, dt: float, mask: NDArray[np.bool_]) -> Hypothesis:
-    """Return the hypothesis with the best common shift of some torques.
-
-    ``criterion``: misfit to minimise; ``dt``: sampling period, s: longer shifts than 1000 samples are not tried;
-    ``mask``: torques that are late by the same time, (n,).
-    """
+    """Return the hypothesis with the best common shift, up to 1000 samples, of the torques in ``mask``."""
 
     def late(shift: float) -> Hypothesis:
         return replace(h, shift=h.shift + shift * mask)

@@ -22,11 +22,9 @@ LEAST_SPREAD = 0.01
 
 @dataclass(frozen=True)
 class Move:
-    """One mistake: what to do to the corrections found so far.
+    """One mistake; all members of a ``family`` share its prior probability.
 
-    ``family``: kind of the mistake, for the prior: all members of a family share its probability. ``position``,
-    ``torque``: matrices (n, n) that multiply the corrections; ``None``: no change. ``drives``: True if raw numbers of
-    two drives are exchanged, with the scales of both.
+    ``position``, ``torque`` (n, n) multiply the corrections. ``drives``: raw numbers and scales of drives exchanged.
     """
 
     family: str
@@ -62,9 +60,7 @@ def _signs(robot: RobotConfig, joints: Sequence[int], where: str = "") -> Iterat
 def set_moves(robot: RobotConfig, joints: Sequence[int]) -> Iterator[Move]:
     """The same mistake of sign, unit or side at every set of two and more joints.
 
-    The joints of an arm are coupled: one of such mistakes, corrected alone, may improve nothing.
-
-    ``joints``: indices of the joints that move.
+    Joints are coupled: one of such mistakes, corrected alone, may improve nothing.
     """
     for size in range(2, len(joints) + 1):
         for chosen in combinations(joints, size):
@@ -73,10 +69,7 @@ def set_moves(robot: RobotConfig, joints: Sequence[int]) -> Iterator[Move]:
 
 
 def exchange_moves(robot: RobotConfig, joints: Sequence[int]) -> Iterator[Move]:
-    """Two joints exchanged: as columns in SI units, and as raw numbers of the drives where that differs.
-
-    ``joints``: indices of the joints that move.
-    """
+    """Two joints exchanged: as columns in SI units, and as raw numbers of the drives where that differs."""
     names = [joint.name for joint in robot.joints]
     ratios = robot.transmission_matrix
     counts, rated = raw_scales(robot)

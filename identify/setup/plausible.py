@@ -78,12 +78,9 @@ def log_plausibility(bench: Bench, h: Hypothesis) -> float:
 
 
 def worst_change(bench: Bench, old: Hypothesis, new: Hypothesis) -> float:
-    """Smallest change over the moving joints of the logarithm of the plausibility of each joint's own signals.
+    """Smallest change over the moving joints of the log plausibility of their own signals; negative if one gets worse.
 
-    A wrong unit of one joint hardly changes the mean over all joints. A correction that makes the signals of the joint
-    itself implausible gives a negative number.
-
-    ``old``, ``new``: corrections before and after.
+    A wrong unit of one joint hardly changes the mean over all joints.
     """
 
     def each(h: Hypothesis) -> Array:

@@ -24,11 +24,9 @@ WIRING = ("position_sign", "torque_sign", "exchange", "assignment", "order")
 
 
 def cost(families: tuple[str, ...], made: tuple[tuple[Array, Array, bool], ...], n: int) -> float:
-    """Negative logarithm of the prior of a hypothesis, nats.
+    """Negative logarithm of the prior of a hypothesis, nats; ``made``: changes, see `search.Step`.
 
-    Permutations and signs are judged by their product, so that two ways to the same wiring cost the same.
-
-    ``families``: kind of each mistake; ``made``: changes of each mistake, see `armident.identify.setup.search.Step`.
+    Permutations and signs are judged by their product: two ways to the same wiring cost the same.
     """
     total, position, torque = 0.0, np.eye(n), np.eye(n)
     for family, (of_position, of_torque, raw) in zip(families, made, strict=True):
@@ -49,10 +47,7 @@ def _place_cost(position: Array, torque: Array) -> float:
 
 
 def wiring_cost(position: Array, torque: Array) -> float:
-    """Negative logarithm of the prior of signed permutations of positions and torques, nats.
-
-    ``position``, ``torque``: signed permutation matrices, (n, n).
-    """
+    """Negative logarithm of the prior of signed permutations (n, n) of positions and torques, nats."""
     n = position.shape[0]
     own = np.arange(n)
     orders = [np.abs(m).argmax(axis=1) for m in (position, torque)]

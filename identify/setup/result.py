@@ -33,22 +33,10 @@ MOST_UNCERTAIN = 0.25
 class SetupFinding:
     """One mistake of the set-up.
 
-    Parameters
-    ----------
-    kind
-        ``position_sign``, ``torque_sign``, ``joint_order``, ``position_unit``, ``torque_unit``, ``time_unit``,
-        ``gear_ratio``, ``side``, ``gravity_direction``, ``gravity_missing``, ``time_shift``, ``torque_clipped``,
-        ``rate_too_slow``, ``standstill`` or ``joint_at_rest``.
-    joints
-        Names of the joints concerned.
-    probability
-        Posterior share of the hypothesis among those tried, 0 to 1.
-    message
-        One sentence with figures.
-    remedy
-        Line of the configuration, or option of a command, that corrects it.
-    decisive
-        True if results without the correction are unusable.
+    ``kind``: ``position_sign``, ``torque_sign``, ``joint_order``, ``position_unit``, ``torque_unit``, ``time_unit``,
+    ``gear_ratio``, ``side``, ``gravity_direction``, ``gravity_missing``, ``time_shift``, ``torque_clipped``,
+    ``rate_too_slow``, ``standstill`` or ``joint_at_rest``. ``probability``: share among the hypotheses tried.
+    ``remedy``: correcting configuration line or option. ``decisive``: results are unusable without it.
     """
 
     kind: str
@@ -61,18 +49,9 @@ class SetupFinding:
 
 @dataclass(frozen=True)
 class TorqueShift:
-    """Time by which all torques together are late against the positions, beyond the torque held until the next sample.
+    """Samples by which torques are late against positions, beyond a torque held until the next sample; negative: early.
 
-    Parameters
-    ----------
-    samples, std
-        Common estimate and its standard deviation, samples; negative: early.
-    by_joint
-        Estimate and standard deviation of every joint that moves, samples.
-    odds
-        Likelihood of a torque of the instant of the sample over that of a torque held until the next sample.
-    instrumented
-        True if recorded references gave instruments that no disturbance of the loop affects.
+    ``odds``: torque of the sample's instant over a held one. ``instrumented``: references gave undisturbed instruments.
     """
 
     samples: float
@@ -86,8 +65,7 @@ class TorqueShift:
     def correction(self) -> float:
         """Shift that is corrected, samples; 0 for none, and if the estimate is too uncertain.
 
-        It is that of a sampling convention, if one agrees with the estimate: no estimate is as exact. Otherwise it is
-        the estimate, if that is no longer than a sample.
+        That of an agreeing sampling convention, which is more exact; else the estimate up to one sample.
         """
         if not self.determined:
             return 0.0
@@ -120,7 +98,7 @@ class TorqueShift:
     def confirmed(self) -> bool:
         """True if it exceeds one sample; at least two joints confirm it, none contradicts it.
 
-        Without instruments it never is: friction and elasticity that the model lacks look like a shift, too.
+        Never without instruments: friction and elasticity that the model lacks look like a shift, too.
         """
         size = abs(self.samples)
         telling = [(own, std) for own, std in self.by_joint.values() if SIGNIFICANT * std <= size]
@@ -152,25 +130,9 @@ class TorqueShift:
 class SetupCheck:
     """Result of `armident.identify.setup.check.check_setup`.
 
-    Parameters
-    ----------
-    findings
-        Mistakes of the set-up; empty if it is right.
-    relative_error_pct
-        Norm of the torque residual of the rigid model as configured over that of the torque, percent, (n,).
-    corrected_error_pct
-        The same with the corrections, (n,).
-    joints_not_understood
-        Joints of which the rigid model, even with a spring and free friction, leaves more than a third of the torque,
-        and no hypothesis explains it.
-    tried
-        Hypotheses tried, in words.
-    corrected_robot
-        Configuration with the corrections that a configuration can express; ``None`` if there are none.
-    clock
-        True over recorded duration: the sampling period has to be multiplied by it.
-    torque_shift
-        Common shift of the torques by less than a sample or two; ``None``: not estimated.
+    ``relative_error_pct``, ``corrected_error_pct`` (n,): norm of the rigid model's torque residual over the torque,
+    before and after correction. ``joints_not_understood``: over a third of the torque left, with no explanation.
+    ``clock``: true over recorded duration. ``torque_shift``: common shift by less than a sample or two.
     """
 
     findings: tuple[SetupFinding, ...]
@@ -184,10 +146,7 @@ class SetupCheck:
 
 
 def with_torque_shift(experiments: Sequence[Experiment], shift: TorqueShift | None) -> Sequence[Experiment]:
-    """Return the experiments with a shift of their torques that the equations of motion allow for.
-
-    ``shift``: common shift; ``None``, or one that is not applied: no change.
-    """
+    """Return the experiments with the common shift of their torques, if it is applied."""
     if shift is None or not shift.applied:
         return experiments
     return mapped(lambda e: replace(e, torque_shift=e.torque_shift + shift.correction), experiments)

@@ -30,18 +30,13 @@ WIDEST = float(np.log(1e3))
 """Largest logarithm of a factor over its start: three decades."""
 
 LEAST_TORQUE = 3.0
-"""Least factor of a single torque for a finding: up to it, a torque constant may differ from its data sheet.
-
-Below, the factor is an effect of the drive (`drive_gain_error`): corrected for the search, and not reported.
-"""
+"""Least factor of a single torque for a finding; a smaller one is an effect of the drive (`drive_gain_error`)."""
 
 
 def scale_moves(robot: RobotConfig, joint: int, h: Hypothesis, criterion: Criterion) -> Iterator[Move]:
     """Best factor of one joint for its gear ratio, its torque alone and its position alone.
 
     A wrong gear ratio scales the position by ``f`` and the torque by ``1 / f``: their power stays.
-
-    ``joint``: index of the joint; ``h``: corrections so far; ``criterion``: misfit to minimise.
     """
     n, name = robot.n, robot.joints[joint].name
 
@@ -63,9 +58,7 @@ def scale_moves(robot: RobotConfig, joint: int, h: Hypothesis, criterion: Criter
 def torque_scales(h: Hypothesis, criterion: Criterion, starts: Sequence[Array]) -> Array | None:
     """Best factors (n,) of all torques together, or ``None`` if none of them is far from the others.
 
-    The torques of joints that carry the same links determine the proportions; the common factor is free.
-
-    ``h``: corrections so far; ``criterion``: misfit to minimise; ``starts``: factors (n,) from which the search starts.
+    Joints that carry the same links determine the proportions; the common factor is free.
     """
 
     def misfit(logs: Array) -> float:
@@ -106,8 +99,5 @@ def _best(made: Callable[[float], Move], h: Hypothesis, criterion: Criterion) ->
 
 
 def with_clock(h: Hypothesis, factor: float) -> Hypothesis:
-    """Return the hypothesis with another unit of time.
-
-    ``h``: corrections so far; ``factor``: True over recorded duration.
-    """
+    """Return the hypothesis with another unit of time; ``factor``: true over recorded duration."""
     return replace(h, clock=h.clock * factor)

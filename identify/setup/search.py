@@ -35,8 +35,7 @@ LEAST_DROP_EARLY = 2.0
 LEAST_TOGETHER = 1.5
 """Least factor by which the structured residual shares of all joints together must fall.
 
-A hypothesis that improves one joint of small torque at the expense of the others is no explanation: the exchange of two
-wrist joints of a measured KUKA LWR4+ reaches 1.3, mistakes made on purpose 2 and more.
+Exchanging two wrist joints of a measured KUKA LWR4+ reaches 1.3 (no explanation), deliberate mistakes 2 and more.
 """
 
 LEAST_TOGETHER_LATE = 1.2
@@ -89,24 +88,11 @@ CLOCKS = (1e-3, 1e-6, 1e-9, 1e3)
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """A hypothesis with the mistakes that lead to it.
+    """A hypothesis with the mistakes that lead to it: kind, words and changes of each.
 
-    Parameters
-    ----------
-    families, words
-        Kind and description of each mistake.
-    made
-        Changes of each mistake: matrices of positions and torques (n, n), and True for an exchange of raw numbers.
-    rank
-        Criterion of the ranking, in sample, nats per row: lower is better.
-    rivals
-        For each mistake, others of the same kind that explain the recordings equally well.
-    probability
-        Posterior share of each mistake.
-    shift_std
-        Standard deviation of a common shift of the torques, s; NaN if it is that of the best prediction.
-    shift_decisive
-        True if the prediction gains by that shift enough to be a mistake of the set-up.
+    ``made``: position and torque matrices (n, n); True if raw numbers are exchanged. ``rank``: criterion, in-sample
+    nats per row: lower is better. ``rivals``, ``probability``: of each mistake. ``shift_std``: of a common torque
+    shift, s; NaN if from the best prediction. ``shift_decisive``: prediction gains enough by it for a mistake.
     """
 
     h: Hypothesis
@@ -122,10 +108,7 @@ class Step:
 
 @dataclass(eq=False)
 class Search:
-    """Search over the hypotheses of one set of recordings.
-
-    ``tried``: families of hypotheses that were tried, in words, filled by the search.
-    """
+    """Search over the hypotheses of one set of recordings; ``tried``: counts of families tried, in words."""
 
     bench: Bench
     tried: dict[str, int] = field(default_factory=dict)
@@ -217,10 +200,9 @@ class Search:
         return replace(best, rivals=rivals, probability=(*step.probability, share))
 
     def _material(self, old: Hypothesis, new: Hypothesis, least: float) -> bool:
-        """True if a correction makes no joint implausible, and the structured residual shares fall by a factor.
+        """True if a correction makes no joint implausible, and reduces the structured residual shares by a factor.
 
-        They fall with the free terms and without them. Without them a wrong set-up leaves most: a correction that only
-        helps the free terms to explain an effect that the model lacks is no mistake of the set-up.
+        With and without the free terms: helping these alone only fits an effect that the model lacks.
         """
         if worst_change(self.bench, old, new) < -LEAST_ODDS:
             return False
@@ -397,11 +379,9 @@ def _same_kind(a: Step, b: Step) -> bool:
 
 
 def independent_rows(residual: Array) -> Array:
-    """Number of independent rows with the serial correlation of the residuals, (n,).
+    """Number (n,) of independent rows with the serial correlation of residuals (M, n), at least 4.
 
-    ``M (1 - r) / (1 + r)`` for the correlation r of neighbouring rows (Bartlett 1946), at least 4.
-
-    ``residual`` (M, n).
+    ``M (1 - r) / (1 + r)`` for the correlation r of neighbouring rows (Bartlett 1946).
     """
     power = np.maximum((residual**2).sum(axis=0), 1e-300)
     r = np.clip((residual[1:] * residual[:-1]).sum(axis=0) / power, 0.0, 0.99)

@@ -17,7 +17,7 @@ STILL_SHARE = 1e-3
 """Share of its position range below which a joint counts as not moving."""
 
 HELD_SHARE = 0.01
-"""Motion of a joint over that of the joint that moves most, in shares of their ranges, below which it is held.
+"""Motion over that of the joint that moves most, in shares of ranges, below which a joint is held.
 
 A held joint gives way to the torques of the others by less than a percent of their motion.
 """
@@ -74,10 +74,7 @@ def moving_joints(experiments: Sequence[Experiment], robot: RobotConfig) -> NDAr
 
 
 def rest_findings(moving: NDArray[np.bool_], robot: RobotConfig) -> list[SetupFinding]:
-    """Return a finding if nothing moves, or if single joints are at rest.
-
-    ``moving``: mask (n,) of the joints that move.
-    """
+    """Return a finding if nothing moves, or if single joints are at rest."""
     names = tuple(joint.name for joint in robot.joints)
     if not moving.any():
         message = "no joint moves in these recordings, so that they determine no parameter"
@@ -93,10 +90,7 @@ def rest_findings(moving: NDArray[np.bool_], robot: RobotConfig) -> list[SetupFi
 def clipped_findings(
     experiments: Sequence[Experiment], robot: RobotConfig, moving: NDArray[np.bool_]
 ) -> list[SetupFinding]:
-    """Return the torques that stay at an extreme value, or never change.
-
-    ``experiments``: SI, joint side; ``moving``: mask (n,) of the joints that move.
-    """
+    """Return the torques that stay at an extreme value, or never change."""
     findings = []
     to_motors = np.linalg.inv(robot.transmission_matrix)
     at_motors = [e.tau @ to_motors for e in experiments]
@@ -166,10 +160,7 @@ def rate_findings(experiments: Sequence[Experiment], robot: RobotConfig) -> list
 
 
 def velocity_frequency(q: Array, dt: float) -> Array:
-    """Return the frequency (Hz) below which `POWER_SHARE` of each joint's velocity power lies, (n,).
-
-    ``q``: positions (N, n), rad or m.
-    """
+    """Return the frequency (n,), Hz, below which `POWER_SHARE` of each joint's velocity power lies."""
     frequency, power = signal.periodogram(np.diff(q, axis=0) / dt, 1 / dt, window="hann", axis=0)
     frequency, power = frequency[1:], power[1:]
     position = power / (2 - 2 * np.cos(2 * np.pi * frequency * dt))[:, None]

@@ -1,15 +1,8 @@
 """Time shift between all torques and the positions, in fractions of a sample, estimated with instruments (thesis 2.33).
 
-Drives and importers differ in when a torque is sampled against the position. At low rates half a sample changes the
-residual of the rigid model as much as an effect does. A recorded torque that is late by ``s`` is, to first order,
-``phi theta - s d(phi theta)/dt``: one more parameter of each joint, beside all others.
-
-Two errors would enter such an estimate, and have terms or instruments of their own:
-
-- A disturbance moves the arm first and the torque of the closed loop afterwards. The instruments are therefore the
-  regressors of the motion that a linear filter makes of the recorded references.
-- Dry friction does not change where the velocity does: a joint stops suddenly, and leaves standstill slowly. The
-  change of the friction with time has free factors, so that inertia and gravity alone determine the shift.
+At low rates half a sample changes the residual as much as an effect. A torque that is late by ``s`` is, to first order,
+``phi theta - s d(phi theta)/dt``. A disturbance moves the arm before the torque of the closed loop, so instruments are
+regressors of filtered references. A joint stops suddenly, and leaves standstill slowly: the change of friction is free.
 """
 
 from collections.abc import Sequence
@@ -73,10 +66,7 @@ BREAKAWAY = 0.1
 
 @dataclass(frozen=True, eq=False)
 class _Columns:
-    """Regressors of one joint at the rows and at the working rate, for all segments.
-
-    ``rows``: filtered and decimated, (M, c) per segment; ``fine``: at the working rate, (W, c) per segment.
-    """
+    """Regressors of one joint per segment: filtered and decimated (M, c), and ``fine`` at the working rate (W, c)."""
 
     rows: list[Array]
     fine: list[Array]
@@ -85,13 +75,9 @@ class _Columns:
 def long_torque_shift(
     experiments: Sequence[Experiment], bench: Bench, h: Hypothesis, first_s: float, reach_s: float
 ) -> TorqueShift | None:
-    """Estimate a common shift of many samples; ``None`` where none is determined within reach.
+    """Estimate a common shift of many samples; ``None`` where none is determined within ``reach_s`` of ``first_s``.
 
-    `torque_shift` is linear in the shift. Its estimate is repeated with the torques moved by the value of the round
-    before, until it changes no more.
-
-    ``bench``: bench of the same recordings. ``h``: corrections of the signals; its shift is not used. ``reach_s``:
-    largest difference of the result from it, s.
+    `torque_shift` is linear: it is repeated with torques moved by the last value until that changes no more.
     """
     first, reach = first_s / bench.period, reach_s / bench.period
     shift = first
@@ -114,10 +100,9 @@ def long_torque_shift(
 
 
 def torque_shift(bench: Bench, h: Hypothesis, reach: float = RANGE) -> TorqueShift:
-    """Estimate the common shift of the torques, and that of every joint.
+    """Estimate the common shift of the torques, up to ``reach`` samples, and that of every joint.
 
-    ``bench``: signals, made with the working rate `SHIFT_RATE`. ``h``: corrections of the signals; its shift is not
-    used. ``reach``: largest shift, samples. Raises numpy.linalg.LinAlgError if the motion determines no shift.
+    ``bench`` has the working rate `SHIFT_RATE`. Raises numpy.linalg.LinAlgError if the motion determines no shift.
     """
     segments = _shortened(bench)
     joints = [int(j) for j in np.flatnonzero(bench.moving)]

@@ -12,12 +12,9 @@ from armident.configs import DataError
 def butterworth(
     x: NDArray[np.float64], dt: float, cutoff_hz: float, order: int = 4, padlen: int | None = None
 ) -> NDArray[np.float64]:
-    """Zero-phase Butterworth low-pass along the first axis, in second-order sections.
+    """Zero-phase Butterworth low-pass along the first axis, in second-order sections; -6 dB at the cut-off.
 
-    ``x``: signal, shape (N,) or (N, n). ``cutoff_hz``: cut-off frequency of one pass, Hz; forward and reverse pass
-    together have -6 dB there. ``order``: filter order of one pass. ``padlen``: number of samples of odd extension at
-    each end; ``None``: ``3 * order``. Raises DataError if the cut-off is not below the Nyquist frequency or the signal
-    is not longer than the padding.
+    ``padlen``: samples of odd extension at each end, by default ``3 * order`` (of one pass).
     """
     if cutoff_hz * dt >= 0.5:
         raise DataError(f"cut-off {cutoff_hz:g} Hz is not below half the sampling rate ({0.5 / dt:g} Hz)")
@@ -37,8 +34,5 @@ def _sections(order: int, cutoff: float) -> NDArray[np.float64]:
 
 
 def central_difference(x: NDArray[np.float64], dt: float) -> NDArray[np.float64]:
-    """Derivative ``(x(k+1) - x(k-1)) / (2 dt)`` along the first axis, one-sided at both ends.
-
-    ``x``: signal, shape (N,) or (N, n). Result: shape of ``x``, in its unit per s.
-    """
+    """Derivative ``(x(k+1) - x(k-1)) / (2 dt)`` along the first axis, one-sided at both ends."""
     return np.gradient(x, dt, axis=0)

@@ -23,12 +23,10 @@ PERIODS = 50.0
 
 
 def motion_bandwidth(q: Sequence[NDArray[np.float64]], dt: float) -> float:
-    """Bandwidth (Hz) for the choice of filters: ``MARGIN`` times that of the fastest joint's velocity.
+    """Bandwidth (Hz) for the choice of filters: `MARGIN` times that of the fastest joint's velocity.
 
-    The noise floor of the encoder is estimated from the upper half of the position's spectrum. For slow motion the
-    bandwidth is increased to ``PERIODS`` per shortest experiment: decimation would otherwise leave too few equations.
-
-    ``q``: measured positions of each experiment, (N, n), rad or m. Raises DataError if no joint moves.
+    The encoder's noise floor is that of the upper half of the spectrum. At least `PERIODS` per shortest experiment:
+    decimation would otherwise leave too few equations.
     """
     highest = max((_velocity_bandwidth(positions, dt) for positions in q), default=0.0)
     if highest == 0:
@@ -56,10 +54,7 @@ def _velocity_bandwidth(q: NDArray[np.float64], dt: float) -> float:
 
 
 def position_noise(q: NDArray[np.float64], dt: float) -> NDArray[np.float64]:
-    """Standard deviation of the white noise of measured positions, rad or m, (n,).
-
-    ``q``: measured positions, (N, n), rad or m.
-    """
+    """Standard deviation (n,) of the white noise of measured positions (N, n), rad or m."""
     frequency, _, position = _spectra(q, dt)
     noise: NDArray[np.float64] = np.sqrt(_noise_floor(frequency, position, dt) * 0.5 * dt)
     return noise
@@ -73,9 +68,6 @@ def _spectra(q: NDArray[np.float64], dt: float) -> tuple[NDArray[np.float64], ND
 
 
 def _noise_floor(frequency: NDArray[np.float64], position: NDArray[np.float64], dt: float) -> NDArray[np.float64]:
-    """Density (n,) of white noise, from the upper half of the spectrum of positions over ``dt``.
-
-    The power of white noise at one frequency is exponentially distributed: its median is log(2) times its mean.
-    """
+    """White noise density (n,) over ``dt`` from the spectrum's upper half, whose median is log(2) of its mean."""
     floor: NDArray[np.float64] = np.median(position[frequency >= 0.25 / dt], axis=0) / np.log(2)
     return floor

@@ -21,13 +21,9 @@ _ROWS = 8
 
 @dataclass(frozen=True, eq=False)
 class Decimation:
-    """Linear-phase low-pass of finite length followed by decimation.
+    """Linear-phase low-pass with symmetric ``taps`` (m,), m odd, that keeps one sample of ``factor``.
 
-    The filter is symmetric and centred, so that it has zero phase. It is finite and needs no initial state. Samples
-    whose window extends beyond the record are dropped.
-
-    ``factor``: decimation factor: one sample of ``factor`` is kept; ``taps``: symmetric impulse response, odd length,
-    shape (m,).
+    Centred, so zero-phase; finite, so without initial state. Samples with an incomplete window are dropped.
     """
 
     factor: int
@@ -62,27 +58,17 @@ class Decimation:
         return self.margin + self.factor * np.arange(self.count(samples), dtype=np.int64)
 
     def rows_of(self, begin: int, end: int) -> slice:
-        """Output rows that depend on the input samples ``begin .. end - 1``, for a record without end.
-
-        ``begin``, ``end``: first input sample, and the one after the last.
-        """
+        """Output rows that depend on the input samples ``begin .. end - 1``, for a record without end."""
         return slice(max(0, -(-(begin - self.taps.size + 1) // self.factor)), (end - 1) // self.factor + 1)
 
     def weights(self, rows: slice, begin: int, end: int) -> NDArray[np.float64]:
-        """Filter coefficients of the input samples ``begin .. end - 1`` in output rows.
-
-        ``rows``: output rows, with ``start`` and ``stop``; ``begin``, ``end``: first input sample, and the one after
-        the last. Result: shape (rows, samples).
-        """
+        """Filter coefficients (rows, samples) of the input samples ``begin .. end - 1`` in output rows."""
         tap = np.arange(begin, end) - self.factor * np.arange(rows.start, rows.stop)[:, None]
         inside = (tap >= 0) & (tap < self.taps.size)
         return np.where(inside, self.taps[np.where(inside, tap, 0)], 0.0)
 
     def __call__(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Filter and decimate along the first axis: (N, ...) to (M, ...).
-
-        Raises DataError if the record is shorter than the filter.
-        """
+        """Filter and decimate (N, ...) to (M, ...); DataError if the record is shorter than the filter."""
         count = self.count(x.shape[0])
         if count == 0:
             raise DataError(f"decimation by {self.factor} needs at least {self.taps.size} samples, got {x.shape[0]}")
@@ -92,11 +78,9 @@ class Decimation:
 
 
 def design(dt: float, cutoff_hz: float, factor: int | None = None) -> Decimation:
-    """Design a low-pass with cut-off ``cutoff_hz`` and the decimation factor that it allows.
+    """Design a low-pass with half-amplitude frequency ``cutoff_hz`` (thesis: ``w_Fp >= 2 w_dyn``) and its decimation.
 
-    ``cutoff_hz``: half-amplitude frequency, Hz (thesis: ``w_Fp >= 2 w_dyn``). ``factor``: decimation factor; 1 gives
-    the identity. ``None``: the largest factor whose Nyquist frequency is not below ``cutoff_hz``, which is the thesis's
-    ``n_d = w_nyq / w_Fp``.
+    ``factor``: 1: identity; ``None``: the largest with Nyquist frequency from the cut-off on, ``n_d = w_nyq / w_Fp``.
     """
     if factor is None:
         factor = max(1, int(0.5 / (dt * cutoff_hz) + 1e-9))

@@ -19,19 +19,10 @@ NVR_BY_HAND = 1e-5
 
 @dataclass(frozen=True, eq=False)
 class Derivatives:
-    """Positions and their derivatives at the sampling instants.
+    """Positions and their derivatives (N, n) at the sampling instants; rad or m, s.
 
-    Parameters
-    ----------
-    q, qd, qdd
-        Positions, velocities, accelerations, shape (N, n) each; rad or m, s.
-    nvr
-        Noise-variance ratios: shape (n, 2) for ``irwsm`` (first and second pass), (n, 1) for ``irwsm2``, ``None`` for
-        ``bandpass``.
-    dt
-        Sampling period, s; model terms may depend on it.
-    start
-        Time of the first sample since the beginning of the first recording, s; model terms may depend on it.
+    ``nvr``: noise-variance ratios (n, 2) for ``irwsm`` (first and second pass), (n, 1) for ``irwsm2``, else ``None``.
+    ``start``: time since the first recording began, s; like ``dt``, for model terms.
     """
 
     q: NDArray[np.float64]
@@ -52,39 +43,16 @@ def differentiate(
     q_ref: NDArray[np.float64] | None = None,
     resolution: float | Sequence[float] | NDArray[np.float64] | None = None,
 ) -> Derivatives:
-    """Differentiate measured positions twice.
+    """Differentiate measured positions (N, n) twice.
 
-    Raises DataError if a series is too short or not finite, or ``nvr`` is neither positive nor a rule. ``bandpass``: if
-    the bandwidth is missing. ``tracking-error``: if the reference or the resolution is missing, or a joint has no
-    tracking error.
+    ``irwsm``: level-slope smoother applied twice; ``irwsm2``: three states at once; ``bandpass``: zero-phase
+    Butterworth of order 4 at five times ``bandwidth_hz``, then central differences. ``nvr``: ratios, or their rule:
+    ``automatic`` (as ``None``), ``cross-validation``, ``likelihood`` (thesis 5.21) or ``tracking-error`` (5.26, 5.27),
+    which needs ``q_ref`` and ``resolution`` (:func:`encoder_resolution`).
 
-    Parameters
-    ----------
-    q
-        Measured positions, shape (N, n), rad or m.
-    derivatives
-        ``irwsm``: IRWSM 1, the level-slope smoother applied twice; ``irwsm2``: IRWSM 2, three states at once;
-        ``bandpass``: zero-phase Butterworth of order 4 at five times ``bandwidth_hz``, then central differences.
-    nvr
-        Noise-variance ratio, scalar or (n,), or the rule that determines it: ``automatic`` (the same as ``None``, see
-        :func:`armident.identify.signals.irwsm.automatic_nvr`), ``cross-validation``, ``likelihood`` (thesis 5.21) or
-        ``tracking-error`` (5.26, 5.27).
-    bandwidth_hz
-        Closed-loop bandwidth, Hz; needed by ``bandpass``.
-    q_ref
-        Reference positions, shape (N, n), rad or m; needed by ``tracking-error``.
-    resolution
-        Encoder resolution on the joint side, scalar or (n,), rad or m; needed by ``tracking-error``, see
-        :func:`encoder_resolution`.
-
-    Notes
-    -----
-    The slope state is the forward difference of the level: it belongs to the instant half a sample later. IRWSM 1
-    therefore yields velocities midway between samples. Their smoothed difference is the acceleration at the sample;
-    the mean of two neighbours is the velocity at the sample.
-
-    The second pass of IRWSM 1 uses the ratio of the first pass: the noise after the first pass is not white, so that
-    its ratio cannot be estimated. Only ``likelihood`` estimates a ratio for each pass, as the thesis does.
+    The slope is the forward difference of the level, half a sample later. IRWSM 1 therefore yields velocities midway
+    between samples: their smoothed difference is the acceleration at the sample, the mean of two the velocity. Noise is
+    not white after the first pass: the second uses its ratio. Only ``likelihood`` estimates both, as the thesis.
     """
     if derivatives == "bandpass":
         if bandwidth_hz is None:
@@ -109,12 +77,10 @@ def differentiate(
 def tracking_error_nvr(
     error: NDArray[np.float64], order: int, resolution: float | Sequence[float] | NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Noise-variance ratios approximated from the tracking error (thesis 5.25 to 5.27), shape (n,).
+    """Noise-variance ratios (n,) approximated from the tracking error ``q_ref - q`` (N, n) (thesis 5.25 to 5.27).
 
-    ``error``: tracking error ``q_ref - q``, shape (N, n), rad or m. ``order``: 2: variance of its difference
-    (5.26, IRWSM 1); 3: of its second difference (5.27, IRWSM 2). ``resolution``: encoder resolution: joint displacement
-    per count, scalar or (n,), rad or m. Raises DataError if a resolution is not positive, or a joint has no tracking
-    error.
+    Order 2: variance of its difference (5.26, IRWSM 1); 3: of its second difference (5.27, IRWSM 2). ``resolution``:
+    joint displacement per count. Raises DataError if a joint has no tracking error.
     """
     step = np.broadcast_to(np.asarray(resolution, dtype=np.float64), (error.shape[1],))
     if not (step > 0).all():
@@ -130,11 +96,7 @@ def tracking_error_nvr(
 
 
 def encoder_resolution(robot: RobotConfig) -> NDArray[np.float64]:
-    """Joint displacement per count of the motor encoders, shape (n,), rad or m.
-
-    If several motors move a joint, their resolutions add as the square root of the sum of squares. Raises DataError if
-    the configuration of a drive has no encoder resolution.
-    """
+    """Joint displacement per count of the motor encoders (n,); several motors of a joint add as root sum of squares."""
     steps = []
     for joint in robot.joints:
         if joint.drive.counts_per_unit is None:

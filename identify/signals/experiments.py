@@ -12,24 +12,11 @@ from armident.configs import DataError
 
 @dataclass(frozen=True)
 class Experiment:
-    """Signals of a recording as the estimators use them: SI units, joint side, no gaps.
+    """Signals (N, n) of a recording as the estimators use them: SI units, joint side, no gaps.
 
-    Parameters
-    ----------
-    q
-        Measured joint positions, shape (N, n), rad or m.
-    tau
-        Joint torques from the drives' signals, shape (N, n), N m or N. Sample k is the torque held
-        over ``[k, k + 1)`` sampling periods, as a digital drive applies it.
-    q_ref
-        Reference positions, shape (N, n), or ``None`` where none was recorded.
-    start
-        Time of the first sample since the recordings began, s, for friction that depends on temperature.
-    torque_shift
-        Samples by which all torques are late against this convention; negative: early. The equations of motion are
-        aligned with it, and everything else takes the torque as recorded.
-    source
-        Path of the recording; empty where there is no file.
+    ``tau``: sample k is held over ``[k, k + 1)``, as a digital drive applies it. ``start``: time since the recordings
+    began, s, for friction that depends on temperature. ``torque_shift``: samples by which all torques are late
+    (negative: early); only the equations of motion are aligned with it. ``source``: path, or empty.
     """
 
     q: NDArray[np.float64]
@@ -46,10 +33,7 @@ RATE_TOLERANCE = 1e-6
 
 
 def check_one_rate(experiments: Sequence[Experiment]) -> None:
-    """Refuse experiments of different sampling rates, with the commands that resample their recordings.
-
-    ``experiments``: experiments to use together. Raises DataError if the sampling rates differ.
-    """
+    """Raise DataError, with the commands that resample, if experiments have different sampling rates."""
     lowest = max(e.dt for e in experiments)
     if all(lowest - e.dt <= RATE_TOLERANCE * lowest for e in experiments):
         return

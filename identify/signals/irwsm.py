@@ -1,19 +1,13 @@
 """Integrated-random-walk smoother (IRWSM) in its exact banded form (thesis section 5.1.2).
 
-The fixed-interval smoother of an integrated random walk of order ``d`` minimises
-``sum (y - x)^2 + (1/NVR) sum (D x)^2``. ``D`` is the d-th difference. The solution is ``x = y - D' V^-1 D y`` with the
-banded ``V = NVR I + D D'``. The concentrated likelihood (5.16, 5.21) needs only the factors of ``V``. All computations
-are O(N).
+The fixed-interval smoother of an integrated random walk of order ``d`` minimises ``sum (y - x)^2 + (1/NVR) sum (D
+x)^2`` with the d-th difference D. The solution is ``x = y - D' V^-1 D y`` with the banded ``V = NVR I + D D'``. The
+concentrated likelihood (5.16, 5.21) needs only the factors of ``V``. All computations are O(N).
 
-The likelihood assumes a random walk: accelerations with white increments. The accelerations of a robot are smoother:
-their spectrum falls faster. At a signal-to-noise ratio of 100 dB the ratio of maximum likelihood is therefore too
-large. The smoother then passes noise far above the frequency at which the noise exceeds the motion (as in thesis
-section 5.3.1).
-
-Cross-validation selects the smoother that predicts a left-out sample best. It needs white noise, but no model of the
-motion (Craven and Wahba 1979; Wahba 1985 compares the two criteria with a wrong prior). :func:`automatic_nvr` takes the
-smaller of the ratios from cross-validation and from the likelihood of the third order. The error of each of them is
-too little smoothing.
+The likelihood assumes accelerations with white increments. Those of a robot are smoother: at a signal-to-noise ratio of
+100 dB its ratio is too large and passes noise (as in thesis section 5.3.1). Cross-validation needs white noise, but no
+model of the motion (Craven and Wahba 1979; Wahba 1985 compares the two). Both err towards too little smoothing:
+:func:`automatic_nvr` takes the smaller of the ratios from cross-validation and from the likelihood of third order.
 """
 
 from collections.abc import Callable
@@ -36,11 +30,9 @@ _STENCIL = {2: np.array([1.0, -2.0, 1.0]), 3: np.array([-1.0, 3.0, -3.0, 1.0])}
 
 @dataclass(frozen=True)
 class Smoothed:
-    """Smoothed series and its first difference.
+    """Smoothed series ``level`` (N,), its first difference ``slope`` (N - 1,) per sample, and the ratio ``nvr`` used.
 
-    ``level``: smoothed series, shape (N,), in the unit of the series. ``slope``: first difference of ``level``, shape
-    (N - 1,), per sample. Element k is the slope state of sample k: the forward difference, which belongs to the instant
-    k + 1/2. ``nvr``: noise-variance ratio used.
+    Element k of ``slope`` belongs to the instant k + 1/2.
     """
 
     level: NDArray[np.float64]
@@ -49,11 +41,9 @@ class Smoothed:
 
 
 def irwsm(y: NDArray[np.float64], order: int, nvr: float) -> Smoothed:
-    """Smooth a series with the integrated random walk of a given order.
+    """Smooth a series (N,), N > 2 ``order``, with the ratio ``nvr = var(kappa) / var(e)``.
 
-    ``y``: series, shape (N,), N > 2 ``order``. ``order``: 2: level and slope (IRWSM 1, 5.23); 3: level, slope and
-    curvature (IRWSM 2, 5.24). ``nvr``: noise-variance ratio ``var(kappa) / var(e)``, positive. Raises DataError if the
-    series is too short or not finite; ValueError if ``order`` or ``nvr`` is out of range.
+    ``order`` 2: level and slope (IRWSM 1, 5.23); 3: and curvature (IRWSM 2, 5.24). Raises DataError if it is too short.
     """
     y = _checked(y, order)
     if not nvr > 0:
@@ -63,12 +53,9 @@ def irwsm(y: NDArray[np.float64], order: int, nvr: float) -> Smoothed:
 
 
 def negative_log_likelihood(w: NDArray[np.float64], order: int, nvr: float) -> float:
-    """Concentrated ``-2 log L`` of the noise-variance ratio, up to a constant (thesis 5.16, 5.21).
+    """Concentrated ``-2 log L`` of the noise-variance ratio, up to a constant (thesis 5.16, 5.21); diffuse start.
 
-    Equals ``(N - order) log(s2) + sum log nu(k)`` of a Kalman filter started from a diffuse state.
-
-    ``w``: differences of the series, ``numpy.diff(y, n=order)``, shape (N - order,); ``order``: 2 or 3, see
-    :func:`irwsm`; ``nvr``: noise-variance ratio, positive.
+    It is ``(N - order) log(s2) + sum log nu(k)``. ``w``: ``numpy.diff(y, n=order)``, shape (N - order,).
     """
     return float(_profile(w, _band(order, nvr), _transient(order, nvr)))
 
@@ -76,12 +63,8 @@ def negative_log_likelihood(w: NDArray[np.float64], order: int, nvr: float) -> f
 def optimal_nvr(y: NDArray[np.float64], order: int, tolerance: float = 0.02) -> float:
     """Noise-variance ratio of maximum likelihood, by a bounded search on ``log10(NVR)`` (thesis 5.16, 5.21).
 
-    On measured positions the likelihood may follow the noise too closely (thesis section 5.3.1: modelling
-    error and vibration count as dynamics). See :func:`automatic_nvr`.
-
-    ``y``: series, shape (N,). ``order``: 2 or 3, see :func:`irwsm`. ``tolerance``: width of the final bracket, decades;
-    near its optimum the likelihood is flat over a few hundredths. Returns the ratio; 1.0 for a series whose differences
-    are all zero: it determines no ratio.
+    It may follow the noise of measured positions too closely (5.3.1); see :func:`automatic_nvr`. ``tolerance``: final
+    bracket, decades; the optimum is flat over a few hundredths. 1.0 for a series whose differences are all zero.
     """
     w = _scaled_differences(y, order)
     if w is None:
@@ -90,27 +73,20 @@ def optimal_nvr(y: NDArray[np.float64], order: int, tolerance: float = 0.02) -> 
 
 
 def cross_validation(w: NDArray[np.float64], order: int, nvr: float) -> float:
-    """Logarithm of the generalised cross-validation score of a noise-variance ratio, up to a constant.
+    """Logarithm of the generalised cross-validation score of a noise-variance ratio (Craven and Wahba 1979).
 
-    ``log(|y - x|^2 / N) - 2 log(tr(I - A) / N)`` with the smoother ``x = A y``. For white noise the score is, up to a
-    constant, the mean square error of predicting each sample from all others. The trace is that of a long series.
-    Source: Craven and Wahba 1979.
-
-    ``w``: differences of the series, ``numpy.diff(y, n=order)``, shape (N - order,); ``order``: 2 or 3, see
-    :func:`irwsm`; ``nvr``: noise-variance ratio, positive.
+    ``log(|y - x|^2 / N) - 2 log(tr(I - A) / N)`` with ``x = A y`` and the trace of a long series. For white noise: the
+    mean square error of predicting each sample from the others, up to a constant. ``w`` as in
+    :func:`negative_log_likelihood`.
     """
     squares = float(_residual_sum(w, _band(order, nvr), _STENCIL[order], _transient(order, nvr)))
     return float(np.log(squares) - 2 * np.log(1 - kept_share(order, nvr)))
 
 
 def cross_validated_nvr(y: NDArray[np.float64], order: int, tolerance: float = 0.02) -> float:
-    """Noise-variance ratio of least generalised cross-validation score, by a bounded search on ``log10(NVR)``.
+    """Noise-variance ratio of least generalised cross-validation score; the search is that of :func:`optimal_nvr`.
 
-    The criterion assumes white measurement noise and nothing about the motion. Quantisation noise is white if the
-    position changes by several counts per sample.
-
-    ``y``: series, shape (N,); ``order``: 2 or 3, see :func:`irwsm`; ``tolerance``: width of the final bracket, decades.
-    Returns the ratio; 1.0 for a series whose differences are all zero: it determines no ratio.
+    It assumes white measurement noise: quantisation noise is, if the position changes by several counts per sample.
     """
     w = _scaled_differences(y, order)
     if w is None:
@@ -121,12 +97,8 @@ def cross_validated_nvr(y: NDArray[np.float64], order: int, tolerance: float = 0
 def automatic_nvr(y: NDArray[np.float64], order: int, tolerance: float = 0.02) -> float:
     """Noise-variance ratio for positions with unknown noise: the smaller of those of two criteria.
 
-    Cross-validation is optimal for white measurement noise; for coloured noise its ratio is too large. The likelihood
-    of the third-order random walk depends less on the colour; for white noise its ratio is slightly too large. For
-    order 2 the ratio of the third order is converted to the same half-power frequency, ``NVR^(1 / (2 order))``.
-
-    ``y``: series, shape (N,); ``order``: 2 or 3, see :func:`irwsm`; ``tolerance``: width of the final bracket, decades.
-    Returns the ratio; 1.0 for a series whose differences are all zero: it determines no ratio.
+    Cross-validation is optimal for white noise, and too large for coloured noise. The likelihood of the third-order
+    random walk depends less on the colour. Order 2 has its half-power frequency, ``NVR^(1 / (2 order))``.
     """
     validated = cross_validated_nvr(y, order, tolerance)
     likeliest = optimal_nvr(y, 3, tolerance)
@@ -136,9 +108,7 @@ def automatic_nvr(y: NDArray[np.float64], order: int, tolerance: float = 0.02) -
 def kept_share(order: int, nvr: float) -> float:
     """Degrees of freedom per sample of the smoother ``x = A y`` for a long series, ``tr(A) / N``.
 
-    This is the mean over frequency of ``NVR / (NVR + (2 - 2 cos w)^order)``, computed by partial fractions.
-
-    ``order``: 2 or 3, see :func:`irwsm`; ``nvr``: noise-variance ratio, positive.
+    It is the mean over frequency of ``NVR / (NVR + (2 - 2 cos w)^order)``, by partial fractions.
     """
     poles = nvr ** (1 / order) * np.exp(1j * np.pi * (2 * np.arange(order) + 1) / order)
     return float(np.sum(-poles / (np.sqrt(-poles) * np.sqrt(4 - poles))).real / order)
@@ -197,10 +167,7 @@ def _transient(order: int, nvr: float) -> int:
 
 @compiled()
 def _row(band, d, low, i, p):  # type: ignore[no-untyped-def]
-    """Row i of ``V = L diag(d) L'``: fill ``low[i % (p + 1)]`` (distances 1..p) and return d_i.
-
-    ``low`` and ``d`` are ring buffers of length p + 1.
-    """
+    """Row i of ``V = L diag(d) L'``: fill ``low[i % (p + 1)]`` (distances 1..p), return d_i; ring buffers of p + 1."""
     for j in range(min(p, i), 0, -1):
         value = band[j]
         for k in range(j + 1, min(p, i) + 1):

@@ -1,10 +1,8 @@
 """Online estimation of velocities and accelerations: a causal Kalman filter on measured positions.
 
-The model is the kinematic form of that of the smoother (thesis section 5.1.2). White noise drives the highest
-derivative. The state holds position and derivatives at the sampling instant, so that no shift by half a sample is
-needed. The unit of time is one sample, the unit of variance that of the measurement noise. The only parameter left is
-the noise-variance ratio. It has the same meaning as in :mod:`armident.identify.signals.irwsm`: the spectrum is
-``NVR / w^(2 order)`` in both.
+White noise drives the highest derivative, as in the smoother (thesis section 5.1.2). The state is that at the sampling
+instant: no shift by half a sample. The units are one sample and the measurement noise, so that the noise-variance ratio
+is the only parameter, the same as in :mod:`armident.identify.signals.irwsm`: the spectrum is ``NVR / w^(2 order)``.
 """
 
 from dataclasses import dataclass
@@ -23,11 +21,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class LiveDerivatives:
-    """Filtered positions and derivatives of a batch; NaN before the first measurement of a joint.
-
-    ``q``, ``qd``, ``qdd``: positions, velocities, accelerations, shape (M, n) each; rad or m, s. ``qdd`` is NaN for
-    order 2.
-    """
+    """Filtered positions and derivatives (M, n); NaN before a joint's first measurement, ``qdd`` also for order 2."""
 
     q: Array
     qd: Array
@@ -36,17 +30,9 @@ class LiveDerivatives:
 
 @dataclass(frozen=True)
 class LiveState:
-    """State of the filter after the last sample; all arrays of shape (n,).
+    """State of the filter after the last sample (n,); NaN as in `LiveDerivatives`.
 
-    Parameters
-    ----------
-    q, qd, qdd
-        Position, velocity and acceleration at the last sample, rad or m, s. ``qdd`` is NaN for a filter of order 2;
-        all are NaN before the first measurement.
-    q_std, qd_std, qdd_std
-        Their standard deviations, from the innovations so far (5.16); NaN up to ``order`` measurements.
-    measured
-        Number of measurements processed.
+    Standard deviations are those of the innovations so far (5.16); NaN up to ``order`` measurements.
     """
 
     q: Array
@@ -61,14 +47,8 @@ class LiveState:
 class VelocityFilter:
     """Causal filter for velocities and accelerations of n joints, sample by sample or batch by batch.
 
-    ``nvr``: noise-variance ratio, scalar or (n,): the same number as for the smoother of this order, for instance
-    ``automatic_nvr(q[:, j], order)`` of an earlier recording. ``order``: 2: position and velocity; 3: acceleration as
-    well, and no lag while it is constant. Raises DataError if ``dt`` or a ratio is not positive, or ``order`` neither 2
-    nor 3.
-
-    Notes
-    -----
-    ``F``, ``H``, ``Q`` and ``R`` are the matrices of the model in filterpy's notation; the unit of time is one sample.
+    ``nvr``: as for the smoother, for instance ``automatic_nvr(q[:, j], order)`` of an earlier recording. ``order`` 3:
+    acceleration too, no lag while it is constant. ``F``, ``H``, ``Q``, ``R``: filterpy's notation, time in samples.
     """
 
     _saved = ("_x", "_p", "_squares", "_measured")
@@ -113,12 +93,7 @@ class VelocityFilter:
         self._measured = np.zeros(self.n, dtype=np.int64)
 
     def handle(self, samples: ArrayLike) -> LiveDerivatives:
-        """Process measured positions and return their filtered values and derivatives.
-
-        ``samples``: one sample (n,) or a batch (M, n), rad or m, in the order of time. NaN: the measurement is missing
-        and its value is predicted. Raises DataError if the shape does not fit the number of joints, or a position is
-        infinite.
-        """
+        """Filter one sample (n,) or a batch (M, n) in the order of time; NaN: not measured, its value is predicted."""
         y = np.atleast_2d(np.asarray(samples, dtype=np.float64))
         if y.ndim != 2 or y.shape[1] != self.n:
             raise DataError(f"positions of shape {y.shape} for a velocity filter of {self.n} joints")

@@ -7,10 +7,7 @@ Array = NDArray[np.float64]
 
 
 def hann_window(samples: int) -> Array:
-    """Symmetric Hann window of unit norm, so that windowed white noise keeps its power; shape (N,).
-
-    ``samples``: length N of the window.
-    """
+    """Symmetric Hann window (N,) of unit norm, so that windowed white noise keeps its power."""
     window = np.hanning(samples)
     return np.asarray(window / np.sqrt(window @ window))
 
@@ -18,11 +15,7 @@ def hann_window(samples: int) -> Array:
 def periodogram(windowed: Array, padding: int = 1) -> Array:
     """``|DFT|^2`` of a windowed record at the frequencies ``k / (padding N dt)`` from zero to the Nyquist frequency.
 
-    White noise of variance v has the expected level v at every frequency. Multiplied by ``2 dt`` the result is the
-    one-sided power density.
-    scipy.signal.periodogram is not used: its one-sided density has half of this at the Nyquist frequency.
-
-    ``windowed``: record multiplied by :func:`hann_window`, shape (N,); ``padding``: zero-padding factor: the length of
-    the DFT is ``padding N``. Result: shape (padding N // 2 + 1,), in the squared unit of the record.
+    White noise of variance v has the level v everywhere; times ``2 dt`` it is the one-sided power density.
+    scipy.signal.periodogram has half of this at the Nyquist frequency.
     """
     return np.asarray(np.abs(np.fft.rfft(windowed, padding * windowed.size)) ** 2)

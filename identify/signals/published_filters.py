@@ -10,15 +10,10 @@ from armident.configs import DataError
 def chebyshev_decimate(
     x: NDArray[np.float64], factor: int, order: int, ripple_db: float, padlen: int
 ) -> NDArray[np.float64]:
-    """Decimate with a zero-phase Chebyshev low-pass at 0.8 of the new Nyquist frequency.
+    """Decimate with a zero-phase Chebyshev low-pass (type I) at 0.8 of the new Nyquist frequency.
 
-    The filter is in second-order sections: as one transfer function it fails numerically for a ``factor`` above about
-    30. The samples kept are those of MATLAB's ``decimate``, with the last one among them.
-
-    ``x``: signal, shape (N, ...); ``factor``: decimation factor: one sample of ``factor`` is kept; ``order``: order of
-    the Chebyshev filter (type I) of one pass; ``ripple_db``: passband ripple of one pass, dB; ``padlen``: number of
-    samples of odd extension at each end. Result: shape (M, ...), one row per index of :func:`kept_samples`. Raises
-    DataError if the signal does not have more than ``padlen`` samples.
+    Second-order sections: one transfer function fails numerically for a ``factor`` above about 30. The samples kept are
+    those of MATLAB's ``decimate``. ``padlen``: samples of odd extension at each end.
     """
     if x.shape[0] <= padlen:
         raise DataError(f"decimating needs more than {padlen} samples, got {x.shape[0]}")
@@ -28,9 +23,6 @@ def chebyshev_decimate(
 
 
 def kept_samples(samples: int, factor: int) -> NDArray[np.int64]:
-    """Indices of the samples that MATLAB's ``decimate`` keeps, shape (M,).
-
-    ``samples``: number N of samples before decimation; ``factor``: decimation factor.
-    """
+    """Indices (M,) of the samples that MATLAB's ``decimate`` keeps."""
     first = factor - (factor * (-(-samples // factor)) - samples) - 1
     return np.arange(first, samples, factor, dtype=np.int64)

@@ -33,11 +33,7 @@ class Streamed(Sequence[T]):
 
 
 class OnDisk(Streamed[T]):
-    """Items in a file without a name, which disappears with the sequence or the process.
-
-    ``items``: the items; one after the other is written, and may then be freed. Raises ConfigError if the file cannot
-    be written.
-    """
+    """Items in a file without a name, which disappears with the sequence or the process; each is written and freed."""
 
     def __init__(self, items: Iterable[T]) -> None:
         folder = scratch_folder()
@@ -77,10 +73,7 @@ class OnDisk(Streamed[T]):
 
 
 class Mapped(Streamed[T]):
-    """Results of a function of the items of other sequences, computed whenever they are asked for.
-
-    ``sequences``: sequences of the same length.
-    """
+    """Results of a function of the items of other sequences of one length, computed whenever they are asked for."""
 
     def __init__(self, function: Callable[..., T], *sequences: Sequence[Any]) -> None:
         self._function, self._sequences = function, sequences
@@ -93,29 +86,19 @@ class Mapped(Streamed[T]):
 
 
 def kept(items: Iterable[T], like: Sequence[Any]) -> Sequence[T]:
-    """Return the items as a list, or on disk where they belong to streamed ones.
-
-    ``items``: consumed at once; ``like``: sequence that they belong to, such as the experiments. Raises ConfigError if
-    the file cannot be written.
-    """
+    """Return the items, consumed at once, as a list, or on disk where ``like`` (the experiments) is streamed."""
     return OnDisk(items) if isinstance(like, Streamed) else list(items)
 
 
 def mapped(function: Callable[..., T], *sequences: Sequence[Any]) -> Sequence[T]:
-    """Return the results of a function as a list, or computed again at every use where a sequence is streamed.
-
-    ``function``: function of one item of each sequence; ``sequences``: sequences of the same length.
-    """
+    """Return the results of a function as a list, or computed again at every use where a sequence is streamed."""
     if any(isinstance(sequence, Streamed) for sequence in sequences):
         return Mapped(function, *sequences)
     return [function(*items) for items in zip(*sequences, strict=True)]
 
 
 def chosen(items: Sequence[T], numbers: Sequence[int]) -> Sequence[T]:
-    """Return some of the items as a list, or read again at every use where the sequence is streamed.
-
-    ``numbers``: numbers of those to choose, from 0.
-    """
+    """Return the items of these numbers as a list, or read again at every use where the sequence is streamed."""
     if isinstance(items, Streamed):
         return Mapped(items.__getitem__, numbers)
     return [items[k] for k in numbers]

@@ -47,6 +47,7 @@ if TYPE_CHECKING:
     from armident.identify.api import design_trajectory as design_trajectory
     from armident.identify.api import diagnose as diagnose
     from armident.identify.api import effects as effects
+    from armident.identify.api import identify as identify
     from armident.identify.api import load_identification as load_identification
     from armident.identify.api import predict as predict
     from armident.virtual_robot.api import simulate_recording as simulate_recording

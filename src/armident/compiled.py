@@ -1,9 +1,9 @@
 """Compilation of the kernels by numba, before they are used; their machine code is kept on disk.
 
-``python -m armident.compiled`` compiles what the kernels declare; `make install` and the build of a wheel run it. The
-file of a machine code is named by a hash of all that it depends on: bytecode and constants of the kernel and of what it
-calls in any module, types of the arguments, options, processor, versions of Python and numba. So no code is stale, and
-no folder has to be writable. What is not declared is compiled when it is first called, and kept as well.
+``python -m armident.compiled`` compiles what the kernels declare; `make install` and the build of a wheel run it. A
+file is named by a hash of all that it depends on: bytecode and constants of the kernel and of what it calls in any
+module, types, options, processor, versions of Python and numba. So no code is stale, and no folder has to be writable.
+What is not declared is compiled when it is first called, and kept as well.
 """
 
 import hashlib
@@ -54,10 +54,9 @@ _TYPES: dict[str, Any] = dict(vars(numba.types))
 
 
 def compiled(*signatures: str, kept: bool = False, nogil: bool = True, **options: Any) -> Callable[[F], F]:
-    """Compile a kernel that Python calls with arguments of the ``signatures``, or kernels only: then without any.
+    """Compile a kernel that Python calls with arguments of the ``signatures``; without any, one that kernels call.
 
-    A signature lists numba's types, ``f8[:, ::1], i8``, and named tuples that `structure` declares. ``kept``: keep the
-    machine code of a kernel that is compiled when it is first called.
+    Signatures list numba's types, ``f8[:, ::1], i8``, and tuples of `structure`. ``kept``: keep code of first calls.
     """
 
     def decorate(function: F) -> F:
@@ -73,10 +72,7 @@ def compiled(*signatures: str, kept: bool = False, nogil: bool = True, **options
 
 
 def inlined(function: F) -> F:
-    """Compile a helper that allocates no memory, inlined into every kernel that calls it.
-
-    In the caller the compiler sees which arrays are distinct and which loops are short; a call would hide both.
-    """
+    """Compile a helper, no allocation, into its callers, where the compiler sees distinct arrays and short loops."""
     return compiled(nogil=False, **ARITHMETIC, **_UNCOUNTED)(function)
 
 

@@ -17,10 +17,7 @@ EXTRAS: dict[str, tuple[str, ...]] = {
 
 
 def needed_extra(error: ImportError, package: str = "") -> str | None:
-    """Return the extra that brings the module which an import did not find, ``None`` if none does.
-
-    ``package``: package that imports; ``virtual_robot`` needs extra ``virtual``.
-    """
+    """Return the extra that brings the module missing in ``error``, if any; ``virtual_robot`` needs ``virtual``."""
     module = (error.name or "").partition(".")[0]
     found = [extra for extra, modules in EXTRAS.items() if module in modules]
     if "virtual" in found and "virtual_robot" in package:
@@ -29,20 +26,13 @@ def needed_extra(error: ImportError, package: str = "") -> str | None:
 
 
 def install_line(what: str, extras: Iterable[str]) -> str:
-    """Return the line that names the missing extras and the command that installs them.
-
-    ``what``: what needs them, for example a command.
-    """
+    """Return the line that names the missing extras of ``what`` and the command that installs them."""
     return f"{what} needs extra packages: pip install 'armident[{','.join(extras)}]'"
 
 
 @contextmanager
 def named_extra(what: str, package: str) -> Iterator[None]:
-    """Give the error of an import that lacks an extra the command that installs it.
-
-    ``what``: what is imported, for example a function of the public API. Raises ImportError with the command, if a
-    module of an extra is missing.
-    """
+    """Give the error of an import of ``what`` that lacks an extra the command that installs it."""
     try:
         yield
     except ImportError as error:
@@ -53,11 +43,7 @@ def named_extra(what: str, package: str) -> Iterator[None]:
 
 
 def require(what: str, *extras: str) -> None:
-    """Check that the modules of extras can be found, without importing them.
-
-    ``what``: what needs them, for example a command. Raises ConfigError if modules are missing; names the command that
-    installs all the extras that lack one.
-    """
+    """Raise ConfigError, with the install command, if modules of extras of ``what`` cannot be found; import nothing."""
     from importlib.util import find_spec
 
     from armident.configs.errors import ConfigError

@@ -64,37 +64,18 @@ def start_command(
     niceness: int = 0,
     own_session: bool = False,
     with_parent: bool = False,
-    stdin: bool = False,
     environment: Mapping[str, str] | None = None,
 ) -> "subprocess.Popen[bytes]":
-    """Start ``python -m module words...`` with this interpreter.
+    """Start ``python -m module words...`` with this interpreter, its output in the files ``out`` and ``err``.
 
-    Returns the started process.
-
-    Parameters
-    ----------
-    words
-        Arguments of the module.
-    out, err
-        Files of standard output and standard error.
-    module
-        Module to run.
-    niceness
-        Nice value added to that of this process.
-    own_session
-        Start a new session: signals of the terminal (Ctrl-C) then do not reach the process.
-    with_parent
-        Send SIGTERM to the process when the thread that started it ends, also by SIGKILL (Linux).
-    stdin
-        Connect standard input to a pipe instead of the null device.
-    environment
-        Variables added to the environment of this process.
+    ``own_session``: signals of the terminal (Ctrl-C) do not reach it. ``with_parent``: SIGTERM when the starting thread
+    ends, also by SIGKILL (Linux). ``environment``: variables added.
     """
     nice = ["nice", "-n", str(niceness)] if niceness else []
     parent = {PARENT_VARIABLE: str(os.getpid())} if with_parent else {}
     return subprocess.Popen(
         [*nice, sys.executable, "-m", module, *words],
-        stdin=subprocess.PIPE if stdin else subprocess.DEVNULL,
+        stdin=subprocess.DEVNULL,
         stdout=out,
         stderr=err,
         env={**os.environ, **parent, **(environment or {})},
@@ -123,22 +104,10 @@ class ProcessTimeout(ArmidentError):
 
 
 class CommandProcess:
-    """A child process whose output goes to files.
+    """A child process whose output goes to files, started and stopped as a context manager.
 
-    As a context manager it starts the process on entry and stops it on exit. Output remains readable after the end.
-
-    Parameters
-    ----------
-    words
-        Arguments, for example ``["capture", "--config", "cell.yaml"]``.
-    name
-        Name in error messages. Default: the first word.
-    log
-        File of standard error, to which the process appends. Default: a temporary file.
-    merge
-        Write standard output to the same file.
-    start
-        Function that starts the process; `start_command` with its options fixed, or a replacement in tests.
+    ``name``: in error messages, by default the first word. ``log``: file of standard error, appended to, by default a
+    temporary one; ``merge`` adds standard output. ``start``: `start_command` with options, or a replacement in tests.
     """
 
     def __init__(
@@ -216,10 +185,7 @@ class CommandProcess:
         return self._content(1).decode(errors="replace")
 
     def tail(self, lines: int = TAIL_LINES) -> str:
-        """Return the last lines of standard error, joined by ``" | "``.
-
-        ``lines``: largest number of lines; empty lines do not count.
-        """
+        """Return the last lines of standard error that are not empty, joined by ``" | "``."""
         text = [line.strip() for line in self.errors().splitlines() if line.strip()]
         return " | ".join(text[-lines:]) or "it printed nothing"
 
@@ -230,35 +196,13 @@ class CommandProcess:
         return (own or lines or [f"{self.name}: ended with exit code {self.exit_code}"])[-1]
 
     def failure(self, problem: str) -> ArmidentError:
-        """Return an error with the name, the problem, the log file and the end of standard error.
-
-        ``problem``: rest of the sentence that begins with the name, for example ``"ended with exit code 1"``.
-        """
+        """Return an error of name, problem (``"ended with exit code 1"``), log file and end of standard error."""
         return ArmidentError(self._message(problem))
 
-    def send_line(self, text: str) -> None:
-        """Write one line to standard input; needs ``start_command(..., stdin=True)``.
-
-        ``text``: the line, without its end. Raises ProcessEnded if the process has ended.
-        """
-        stdin = getattr(self.process, "stdin", None)
-        if stdin is None:
-            raise ArmidentError(f"{self.name} has no standard input")
-        try:
-            stdin.write(text.encode() + b"\n")
-        except BrokenPipeError as error:
-            with suppress(subprocess.TimeoutExpired):
-                self.process.wait(STOP_S)
-            raise ProcessEnded(self._message(f"ended with exit code {self.exit_code}")) from error
-
     def wait_for_line(self, text: str, timeout: float) -> str:
-        """Wait for the next line of standard output that begins with ``text``, and return it.
+        """Consume standard output up to the next line that begins with ``text``, and return that line.
 
-        Lines up to the returned one are consumed: the next call begins after it.
-
-        ``text``: beginning of the line; ``""`` for any line. ``timeout``: longest time to wait, s. Raises ProcessEnded
-        if the process ends before it prints such a line; ProcessTimeout if ``timeout`` passes before it prints such a
-        line.
+        Raises ProcessEnded or, after ``timeout`` (s), ProcessTimeout.
         """
         until = time.monotonic() + timeout
         expected = f"before it printed {text!r}" if text else "before it printed a line"
@@ -283,10 +227,7 @@ class CommandProcess:
             self.process.send_signal(number)
 
     def stop(self, timeout: float = STOP_S, number: signal.Signals = signal.SIGTERM) -> None:
-        """End the process: send a signal, wait, and kill it if it still runs.
-
-        ``timeout``: time between the signal and the kill, s.
-        """
+        """End the process: send a signal, wait ``timeout`` (s), and kill it if it still runs."""
         if self._process is None:
             return
         stdin = getattr(self._process, "stdin", None)
@@ -320,12 +261,3 @@ class CommandProcess:
         files, self._files = self._files, None
         for file in files:
             file.close()
-
-
-def resident_bytes(pid: int) -> int:
-    """Return the resident memory of a process, bytes; 0 after its end (Linux, proc(5), ``statm``)."""
-    try:
-        pages = Path(f"/proc/{pid}/statm").read_text(encoding="ascii").split()[1]
-    except (FileNotFoundError, ProcessLookupError):
-        return 0
-    return int(pages) * os.sysconf("SC_PAGE_SIZE")

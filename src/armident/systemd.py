@@ -8,8 +8,7 @@ import time
 class Notifier:
     """Sends states to the service manager, if there is one (``$NOTIFY_SOCKET``).
 
-    `progress` resets the watchdog. A service calls it when its work has advanced; no timer does. So systemd restarts
-    a service that hangs.
+    A service calls `progress` when its work has advanced, not by a timer: systemd restarts one that hangs.
     """
 
     def __init__(self) -> None:

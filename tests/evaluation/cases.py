@@ -1,20 +1,27 @@
-"""Cases of a suite: one simulated recording each, its hidden effects, and the expected findings."""
+"""Cases of the suites: recordings with hidden effects, and the findings that are right."""
 
 import hashlib
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
 from armident.configs import ConfigError
 from tests.evaluation.schema import LEVELS, Level, SuiteConfig, SuiteEffect
 
-Kind = Literal["clean", "clean_baseline", "effect", "pair", "outside"]
+Kind = Literal["clean", "clean_baseline", "effect", "pair", "outside", "setup"]
+Half = Literal["development", "reserve"]
 
 BASELINE_SEED = 9000
 """Noise seed of the healthy runs from which baselines are identified; no case has it."""
 CLEAN_BASELINE_SEED = 5000
 """First noise seed of the healthy runs that are diagnosed with a baseline, minus one."""
+VISIBLE = 1.05
+"""Visibility from which a random effect counts: the residual of the rigid model is 5 % larger (docs/diagnosis.md)."""
+SEEN, UNSEEN = "visible", f"below {VISIBLE}"
+"""Levels of random arms."""
+BLOCK: dict[Half, int] = {"development": 88, "reserve": 176}
+"""Random arms of a run where no number is given; every kind has its share of 88 cases."""
 
 
 @dataclass(frozen=True)
@@ -34,7 +41,7 @@ class InjectedEffect:
     hide
         ``False`` if the effect is part of the healthy arm already.
     arm
-        ``True`` for an effect of the whole arm: a finding at any joint is correct.
+        ``True`` for an effect of the whole arm: a finding at any joint is right.
     brings
         Names of side effects; findings of them are not wrong.
     rescales
@@ -56,20 +63,22 @@ class InjectedEffect:
 
 @dataclass(frozen=True)
 class Case:
-    """One recording and its diagnosis.
+    """One recording of a virtual robot, or a random arm with two, and its diagnosis.
 
     Parameters
     ----------
     kind
         Table of the case.
     level
-        Strength of the effects; ``None`` for healthy arms.
+        Strength of the effects, or visibility of those of random arms; ``None`` for healthy arms.
     robot
-        Name of the arm in the suite.
+        Name of the arm in the suite; half of the random arms.
     config, trajectory
-        Files of the robot configuration and of the trajectory.
+        Files of the robot configuration and of the trajectory; empty for random arms.
     repeats
         Number of runs of the trajectory in the recording.
+    seed
+        Seed of the noise; number of the random arm.
     parts
         Simulated effects.
     baseline
@@ -78,10 +87,12 @@ class Case:
         Part that is removed from the model.
     quick
         ``True`` for a case of the quick subset.
+    joints
+        Joints at which a finding is right, of random arms; empty for any.
     """
 
     kind: Kind
-    level: Level | None
+    level: str | None
     robot: str
     config: str
     trajectory: str
@@ -92,6 +103,12 @@ class Case:
     baseline: bool = False
     leave_out: str | None = None
     quick: bool = field(default=False, compare=False)
+    joints: tuple[str, ...] = ()
+
+    @property
+    def random(self) -> bool:
+        """``True`` for an arm drawn at random."""
+        return not self.config
 
     @property
     def name(self) -> str:
@@ -103,21 +120,49 @@ class Case:
     @property
     def label(self) -> str:
         """Row of the table: names of the effects."""
-        return " + ".join(p.names[0] for p in self.parts) or self.kind.replace("_", " against ")
+        names = (p.effect if self.random else p.names[0] for p in self.parts)
+        return " + ".join(names) or self.kind.replace("_", " against ")
 
     @property
     def key(self) -> str:
-        """Hash of all data that determine the result."""
-        content = {k: v for k, v in asdict(self).items() if k not in ("quick", "kind", "level")}
+        """Hash of all data that determine the result; half and number of a random arm, of which the rest follows."""
+        if self.random:
+            return f"{self.robot}-{self.seed:04d}"
+        content = {k: v for k, v in asdict(self).items() if k not in ("quick", "kind", "level", "joints")}
         content["parts"] = [
             {k: v for k, v in part.items() if k not in ("brings", "rescales")} for part in content["parts"]
         ]
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
 
     @property
-    def run(self) -> tuple[str, int]:
-        """Robot and seed: cases of one run share trajectory and noise."""
-        return self.robot, self.seed
+    def twin(self) -> "Case | None":
+        """Healthy robot with the same motion and noise and the whole model; a random arm is simulated with its twin."""
+        if self.random or not self.parts:
+            return None
+        return Case("clean", None, self.robot, self.config, self.trajectory, self.repeats, self.period, self.seed)
+
+
+def random_cases(half: Half, count: int | None) -> list[Case]:
+    """The first cases of a half; what is hidden in them is known when they have been simulated."""
+    return [Case("clean", None, half, "", "", 1, 0.0, number) for number in range(count or BLOCK[half])]
+
+
+def revealed(case: Case, hidden: Mapping[str, Any] | None) -> Case:
+    """A random case with what is hidden in it, see `tests.evaluation.plants.cases.Truth`; other cases as they are."""
+    if hidden is None:
+        return case
+    family, joints, names = hidden["family"], tuple(hidden["joints"]), tuple(hidden["accepted"])
+    if family == "healthy":
+        return case
+    # Mistakes count always: a torque in kN m leaves the same relative residual and is wrong all the same.
+    level = SEEN if family == "setup" or hidden["visibility"] >= VISIBLE else UNSEEN
+    joint, other = (*joints, "", "")[:2]
+    part = InjectedEffect(
+        hidden["kind"], joint, other or None, names, {}, {}, 1.0, arm=not joints,
+        # Errors with and without another scale of the torques are not comparable.
+        rescales=hidden["kind"] == "gain_error",
+    )  # fmt: skip
+    return Case(family, level, case.robot, "", "", 1, 0.0, case.seed, (part,), joints=joints)
 
 
 def all_cases(suite: SuiteConfig) -> list[Case]:
@@ -141,11 +186,9 @@ def all_cases(suite: SuiteConfig) -> list[Case]:
 def select_cases(
     cases: Iterable[Case], *, quick: bool = False, only: Sequence[str] = (), levels: Sequence[str] = ()
 ) -> list[Case]:
-    """Return the cases that match all given conditions.
+    """Return the cases of the quick subset, of effects or kinds (``only``), and of strengths; empty for all.
 
-    ``quick``: only cases of the quick subset. ``only``: names of effects, or ``clean``, ``clean_baseline``, ``pair``,
-    ``outside`` for all cases of a kind. ``levels``: strengths; healthy arms have none. Raises ConfigError if a name or
-    a strength does not exist.
+    Healthy arms have no strength. A name or a strength that does not exist is a ConfigError.
     """
     cases = list(cases)
     known = {c.kind for c in cases} | {p.effect for c in cases for p in c.parts}
@@ -163,11 +206,6 @@ def select_cases(
         return named and (not levels or case.level in levels) and (case.quick or not quick)
 
     return [case for case in cases if selected(case)]
-
-
-def healthy_twin(case: Case) -> Case:
-    """Return the case of the healthy arm with the same trajectory and noise and with the whole model."""
-    return Case("clean", None, case.robot, case.config, case.trajectory, case.repeats, case.period, case.seed)
 
 
 def _run(suite: SuiteConfig, robot: str, seed: int) -> dict[str, Any]:

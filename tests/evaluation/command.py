@@ -1,6 +1,5 @@
 """Command ``python -m tests.evaluation``."""
 
-import os
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -36,7 +35,8 @@ def suite(
         typer.Option("--half", help="Half of the random arms; of the reserve only totals are shown and kept."),
     ] = "development",
     cases: Annotated[
-        int | None, typer.Option("--cases", help="Number of random arms. [default: 88, reserve 176]", min=1)
+        int | None,
+        typer.Option("--cases", help="First cases only. [default: all; random 88, reserve 176]", min=1),
     ] = None,
     json: Annotated[bool, typer.Option("--json", help="Print only the result document on stdout.")] = False,
 ) -> None:
@@ -46,19 +46,16 @@ def suite(
 
     Random arms: python -m tests.evaluation --arms random --half development --out DIR
     """
-    if arms == "random":
-        from tests.evaluation.random_run import RandomOptions, run_random_suite
-
-        random_options = RandomOptions(half, out, cases, jobs or len(os.sched_getaffinity(0)), minutes=minutes)
-        run_random_suite(random_options, as_json=json)
-        return
-    from tests.evaluation.run import SuiteOptions, list_suite, run_suite
+    from tests.evaluation.run import SuiteOptions, run_suite
 
     def words(text: str) -> tuple[str, ...]:
         return tuple(word.strip() for word in text.split(",") if word.strip())
 
-    options = SuiteOptions(suite, out, quick, words(only), words(strength), jobs, minutes, any_version)
+    options = SuiteOptions(
+        out, arms, suite, half, cases, quick, words(only), words(strength), jobs, minutes, any_version
+    )
     if list_cases:
-        list_suite(options)
+        for case in options.selected():
+            print(case.key, case.name)
     else:
         run_suite(options, as_json=json)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from armident.identify.documents.diagnosis import Alternative, DetectionLimit, DiagnosisDocument, Finding, NotVisible
-from tests.evaluation.cases import Case, InjectedEffect
+from tests.evaluation.cases import UNSEEN, Case, InjectedEffect
 from tests.evaluation.store import CaseResult
 
 SIGMAS = 3.0
@@ -34,10 +34,10 @@ class Score:
     verdict
         Verdict of the diagnosis.
     first
-        All simulated effects are among the findings with the correct effect and joint; a single effect is the first
+        All simulated effects are among the findings with the right effect and joint; a single effect is the first
         finding. ``None`` where nothing in the catalogue is simulated.
     second
-        The same, with the closest alternative of each finding counted too.
+        The same, with the closest alternative of each finding counted too; of random arms, with all names.
     missed
         The verdict is ``no_gap`` although an effect is simulated.
     invisible
@@ -52,10 +52,12 @@ class Score:
     confidence
         Highest confidence of the findings; zero without findings.
     named
-        First finding, as ``effect joint``.
+        Findings with their joints, in their order.
     shown
         ``False`` if the held-out recording does not contain the injected gap, for example if the motion does not pass
         the position of a disturbance.
+    worse
+        There are findings, and the reported error is no smaller with them.
     """
 
     verdict: str
@@ -67,30 +69,31 @@ class Score:
     closed: float | None
     within: tuple[bool, ...]
     confidence: float
-    named: str | None
+    named: tuple[str, ...]
     shown: bool = True
+    worse: bool = False
 
 
-def score(case: Case, result: CaseResult, healthy: CaseResult | None) -> Score:
+def score(case: Case, result: CaseResult, healthy: DiagnosisDocument | None) -> Score:
     """Compare the diagnosis of a case with the simulated effects.
 
-    ``healthy``: result of its healthy twin, which has the torque error of the noise alone; ``None`` where nothing is
-    simulated.
+    ``healthy``: diagnosis of the healthy twin, which has the torque error of the noise alone; ``None`` without one.
     """
     document = result.diagnosis
     findings = [f for f in document.findings if f.effect != UNNAMED]
-    matched = [next((f for f in findings if matches(part, f)), None) for part in case.parts]
+    matched = [next((f for f in findings if matches(case, part, f)), None) for part in case.parts]
     known = bool(case.parts) and case.kind != "outside"
     first = second = None
     if known:
         first = all(f is not None for f in matched)
         if len(case.parts) == 1:
-            first = bool(findings) and matches(case.parts[0], findings[0])
-        second = all(_among(part, findings) for part in case.parts)
+            first = bool(findings) and matches(case, case.parts[0], findings[0])
+        second = all(_among(case, part, findings) for part in case.parts)
     truths = [*result.truth, *({} for _ in case.parts)]
     absent = [(p, truth) for p, truth, f in zip(case.parts, truths, matched, strict=False) if f is None]
-    extra = sum(not any(matches(part, f) or _is_side_effect(part, f) for part in case.parts) for f in findings)
+    extra = sum(not any(matches(case, part, f) or _is_side_effect(part, f) for part in case.parts) for f in findings)
     correct = [f for f in matched if f is not None] if known else []
+    gap = document.gap.validation
     return Score(
         verdict=document.verdict,
         first=first,
@@ -98,11 +101,12 @@ def score(case: Case, result: CaseResult, healthy: CaseResult | None) -> Score:
         missed=document.verdict == "no_gap" and bool(case.parts),
         invisible=bool(absent)
         and not case.baseline
+        and not case.random
         and not extra
         and document.verdict in ("no_gap", "explained")
-        and all(_below_limit(part, truth, document) for part, truth in absent),
+        and all(_below_limit(case, part, truth, document) for part, truth in absent),
         extra=extra,
-        closed=None if healthy is None else closed_share(case, document, healthy.diagnosis),
+        closed=None if healthy is None or case.level == UNSEEN else closed_share(case, document, healthy),
         within=tuple(
             ok
             for f, truth in zip(matched, result.truth, strict=False)
@@ -110,24 +114,27 @@ def score(case: Case, result: CaseResult, healthy: CaseResult | None) -> Score:
             for ok in within(f, truth)
         ),
         confidence=max((f.confidence for f in findings), default=0.0),
-        named=f"{findings[0].effect} {findings[0].joint}" if findings else None,
-        shown=healthy is None or _injected(case, document, healthy.diagnosis) >= LEAST_GAP,
+        named=tuple(" ".join(word for word in (f.effect, f.joint, f.other) if word) for f in findings),
+        shown=healthy is None or _injected(case, document, healthy) >= LEAST_GAP,
+        worse=bool(document.findings) and gap.after.all >= gap.before.all,
     )
 
 
-def matches(part: InjectedEffect, named: Named) -> bool:
-    """Return ``True`` if an entry of a document names a simulated effect at its joint; two joints in either order.
+def matches(case: Case, part: InjectedEffect, named: Named) -> bool:
+    """``True`` if a part of a document names a simulated effect at its joint; two joints in either order.
 
-    ``named``: a finding, an alternative, or an entry of ``not_visible`` or ``detection_limits``.
+    On random arms one of the joints of the truth is enough, and so is the whole arm.
     """
     if named.effect not in part.names:
         return False
     if part.arm:
         return True
     other = None if isinstance(named, Alternative | NotVisible) else named.other
+    found = {joint for joint in (named.joint, other) if joint}
+    if case.random:
+        return not found or bool(found & set(case.joints))
     expected = {part.joint, part.other} - {None}
-    found = {named.joint, other} - {None}
-    return found == expected or (other is None and found <= expected)
+    return found == expected or (len(found) == 1 and found <= expected)
 
 
 def closed_share(case: Case, document: DiagnosisDocument, healthy: DiagnosisDocument) -> float | None:
@@ -138,8 +145,7 @@ def closed_share(case: Case, document: DiagnosisDocument, healthy: DiagnosisDocu
     change by the findings is therefore the smaller of that at measured and that at simulated motion. The unit is N m or
     N: percentages depend on the torque, which an effect such as lost friction reduces.
 
-    ``healthy``: diagnosis of its healthy twin. Returns ``None`` without an injected gap, or if the reported torques are
-    scaled differently from the healthy arm's.
+    ``None`` without an injected gap, or if the reported torques are scaled differently from the healthy arm's.
     """
     if any(part.rescales for part in case.parts) and not case.baseline:
         return None
@@ -212,10 +218,7 @@ def _joints(case: Case, every: Iterable[str]) -> list[str]:
 
 
 def within(finding: Finding, truth: dict[str, float]) -> list[bool]:
-    """Compare the parameters that finding and truth share.
-
-    ``truth``: true values by name. Returns ``True`` for each parameter within three standard deviations of the truth.
-    """
+    """``True`` for each parameter of finding and truth within three standard deviations of the truth."""
     deviations = finding.evidence.get("std", {})
     out = []
     for name, value in truth.items():
@@ -229,14 +232,18 @@ def _is_side_effect(part: InjectedEffect, finding: Finding) -> bool:
     return finding.effect in part.brings and finding.joint == part.joint
 
 
-def _among(part: InjectedEffect, findings: Sequence[Finding]) -> bool:
-    return any(matches(part, f) or any(matches(part, other) for other in f.alternatives[:1]) for f in findings)
+def _among(case: Case, part: InjectedEffect, findings: Sequence[Finding]) -> bool:
+    """``True`` if the effect is named; on the two robots, as the closest alternative of a finding too."""
+    named: list[Named] = [*findings]
+    if not case.random:
+        named += [other for finding in findings for other in finding.alternatives[:1]]
+    return any(matches(case, part, each) for each in named)
 
 
-def _below_limit(part: InjectedEffect, truth: dict[str, float], document: DiagnosisDocument) -> bool:
+def _below_limit(case: Case, part: InjectedEffect, truth: dict[str, float], document: DiagnosisDocument) -> bool:
     """``True`` if the document calls an effect not visible, or its detection limits exceed the true parameters."""
-    if any(matches(part, entry) for entry in document.not_visible):
+    if any(matches(case, part, entry) for entry in document.not_visible):
         return True
-    limits = [entry.limits for entry in document.detection_limits if matches(part, entry)]
+    limits = [entry.limits for entry in document.detection_limits if matches(case, part, entry)]
     sizes = [[abs(value) < limit[name] for name, value in truth.items() if name in limit] for limit in limits]
     return any(bool(compared) and all(compared) for compared in sizes)

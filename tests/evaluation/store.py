@@ -27,7 +27,7 @@ NOT_DECIDING = (
     "armident.identify.report",
     *(
         f"tests.evaluation.{module}"
-        for module in ("__main__", "command", "markdown", "run", "score", "show", "store", "suite", "tables")
+        for module in ("__main__", "command", "report", "run", "score", "store", "suite", "tables")
     ),
 )
 """Packages and modules without influence on a result.
@@ -45,16 +45,16 @@ class CaseResult(BaseModel):
 
     Parameters
     ----------
-    key
-        `tests.evaluation.cases.Case.key`.
-    case
-        Name of the case.
+    key, case
+        Key and name of the case.
     effects
         Simulated effects with numeric parameters.
     truth
         True values of the linear parameters, one dictionary per effect.
-    document
-        The diagnosis; ``None`` after an error.
+    hidden
+        Truth of a random arm, see `tests.evaluation.plants.cases.Truth`.
+    document, twin
+        The diagnosis, and that of the healthy twin of a random arm; ``None`` after an error.
     seconds
         Times of ``simulate`` and ``diagnose``, s.
     error
@@ -69,23 +69,25 @@ class CaseResult(BaseModel):
     case: str = ""
     effects: list[dict[str, Any]] = []
     truth: list[dict[str, float]] = []
+    hidden: dict[str, Any] | None = None
     document: DiagnosisDocument | None = None
+    twin: DiagnosisDocument | None = None
     seconds: dict[str, float] = {}
     error: str | None = None
     code: str = ""
 
-    @field_validator("document", mode="before")
+    @field_validator("document", "twin", mode="before")
     @classmethod
     def _with_parts_not_stored(cls, value: Any) -> Any:
         return {**EMPTY, **value} if isinstance(value, Mapping) else value
 
-    @field_serializer("document")
+    @field_serializer("document", "twin")
     def _without_parts_not_stored(self, document: DiagnosisDocument | None) -> dict[str, Any] | None:
         return None if document is None else document.model_dump(mode="json", by_alias=True, exclude=set(NOT_STORED))
 
     @property
     def diagnosis(self) -> DiagnosisDocument:
-        """The diagnosis document. Raises DataError if the case failed."""
+        """The diagnosis document; a DataError if the case failed."""
         if self.document is None:
             raise DataError(f"{self.case}: no diagnosis: {self.error}")
         return self.document
@@ -96,10 +98,7 @@ class CaseResult(BaseModel):
 
 
 def code_version(packages: Mapping[str, Path] | None = None) -> str:
-    """Return a hash of the code and the data files that determine the results.
-
-    ``packages``: folder of each package by import name. Default: `DECIDING`, as imported.
-    """
+    """Hash of the code and the data files that determine the results; ``packages``: folders by import name."""
     if packages is None:
         packages = {name: _folder(name) for name in DECIDING}
     digest = hashlib.sha256()
@@ -119,11 +118,9 @@ def _folder(package: str) -> Path:
 
 
 class Store:
-    """File of results; it keeps the results of other versions of the code.
+    """File of results; it keeps the results of other versions of the code, and uses them with ``any_version``.
 
-    ``path``: the file; created with the first result. ``version``: `code_version` of the running code. ``any_version``:
-    use the results of other versions too. Raises DataError if a line is not a result. An incomplete last line is
-    removed: an interrupted run leaves one.
+    A line that is no result is a DataError. An incomplete last line is removed: an interrupted run leaves one.
     """
 
     def __init__(self, path: Path, version: str, *, any_version: bool = False) -> None:
@@ -155,10 +152,7 @@ class Store:
         return result if result is not None and result.error is not None else None
 
     def add(self, result: CaseResult) -> CaseResult:
-        """Append a result to the file, and return it with the version of the code.
-
-        ``result``: the result; the file contains it when this function returns.
-        """
+        """Append a result to the file, which contains it then, and return it with the version of the code."""
         result = result.model_copy(update={"code": self.version})
         line = result.to_line()
         with self._lock:

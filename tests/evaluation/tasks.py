@@ -1,4 +1,4 @@
-"""Tasks of the diagnosis process of the suite: diagnose or identify one recording."""
+"""Tasks of the process of diagnoses: diagnose or identify one recording."""
 
 import time
 from dataclasses import dataclass
@@ -16,9 +16,18 @@ from armident.identify.documents.identification import IdentificationDocument
 class DiagnosisTask:
     """Recording to diagnose, without information about the simulated effects.
 
-    ``robot``: name or file of the robot configuration. ``leave_out``: part that is removed from the model, see
-    `reduced_model`. ``joints``: joints of which the part is removed. ``baseline``: identification document of the
-    healthy arm; ``None`` to diagnose without one.
+    Parameters
+    ----------
+    robot
+        Name or file of the robot configuration.
+    leave_out
+        Part that is removed from the model, see `reduced_model`.
+    joints
+        Joints of which the part is removed.
+    baseline
+        Identification document of the healthy arm; ``None`` to diagnose without one.
+    validation
+        Recording to judge by, with the whole model; ``None``: the end of ``recording``.
     """
 
     recording: Path
@@ -26,18 +35,7 @@ class DiagnosisTask:
     leave_out: str | None = None
     joints: tuple[str, ...] = ()
     baseline: Path | None = None
-
-
-@dataclass(frozen=True)
-class ValidatedTask:
-    """Recording to diagnose and recording to judge by, without information about the simulated effects.
-
-    ``robot``: name or file of the robot configuration.
-    """
-
-    recording: Path
-    validation: Path
-    robot: str
+    validation: Path | None = None
 
 
 @dataclass(frozen=True)
@@ -58,11 +56,7 @@ class TimedDiagnosis:
 
 
 def reduced_model(robot: RobotConfig, leave_out: str | None, joints: tuple[str, ...]) -> RobotConfig:
-    """Return the robot configuration without one part of its model.
-
-    ``leave_out``: ``"rotor_inertia"``, ``"couplings"`` or ``None`` for the whole model; ``joints``: names of the joints
-    without rotor inertia. Raises ConfigError if ``leave_out`` is another name.
-    """
+    """Return the configuration without ``rotor_inertia`` of some joints, or ``couplings``; refuse any other name."""
     if leave_out is None:
         return robot
     if leave_out == "couplings":
@@ -79,16 +73,16 @@ def reduced_model(robot: RobotConfig, leave_out: str | None, joints: tuple[str, 
 
 
 def diagnose_file(task: DiagnosisTask) -> TimedDiagnosis:
-    """Diagnose a recording.
-
-    ``task``: recording and model. Raises ConfigError or DataError if the model or the recording does not support a
-    diagnosis.
-    """
+    """Diagnose a recording; a ConfigError or DataError if the model or the recording does not support it."""
     # Imported here: the process of the command line needs none of it.
+    from armident.identify import api
     from armident.identify.diagnosis.diagnose import run_diagnosis
     from armident.identify.identification.from_recording import experiments_from_recording
 
     begin = time.perf_counter()
+    if task.validation is not None:
+        found = api.diagnose(task.recording, task.robot, validate=task.validation)
+        return TimedDiagnosis(found.document, time.perf_counter() - begin)
     robot = reduced_model(load_robot(task.robot), task.leave_out, task.joints)
     recording = read_recording(task.recording)
     baseline = None if task.baseline is None else load_document(task.baseline, IdentificationDocument)
@@ -97,25 +91,8 @@ def diagnose_file(task: DiagnosisTask) -> TimedDiagnosis:
     return TimedDiagnosis(result.document, time.perf_counter() - begin)
 
 
-def diagnose_validated(task: ValidatedTask) -> TimedDiagnosis:
-    """Diagnose a recording, judged by another one, as ``armident diagnose --validate`` does.
-
-    ``task``: recordings and model. Raises ConfigError or DataError if the model or a recording does not support a
-    diagnosis.
-    """
-    from armident.identify.api import diagnose
-
-    begin = time.perf_counter()
-    found = diagnose(task.recording, task.robot, validate=task.validation)
-    return TimedDiagnosis(found.document, time.perf_counter() - begin)
-
-
 def identify_file(task: IdentificationTask) -> None:
-    """Identify a recording and write the identification document.
-
-    ``task``: recording, robot and file of the document. Raises ConfigError or DataError if the robot or the recording
-    does not support an identification.
-    """
+    """Identify a recording and write the identification document."""
     from armident.identify.identification.identify_recording import identify_recording
 
     document = identify_recording(read_recording(task.recording), load_robot(task.robot)).document

@@ -25,7 +25,7 @@ from tests.integration.test_several_buses_vcan import (
     wait_for_line,
 )
 
-pytestmark = [pytest.mark.vcan, pytest.mark.timeout(120)]
+pytestmark = pytest.mark.vcan
 
 
 def events_until(receiver: Receiver, kind: str) -> list[BusEvent]:
@@ -78,6 +78,7 @@ def test_error_frames_are_removed_counted_and_reported(vcan_bus: str) -> None:
         assert [event.kind for event in receiver.events()] == ["bus_off", "bus_restarted"]
 
 
+@pytest.mark.nightly
 def test_a_drive_that_reboots_is_configured_again_and_its_errors_are_logged(vcan_bus: str, tmp_path: Path) -> None:
     texts = {0xFF01: "encoder battery low"}
     session = session_file(tmp_path, "tx40_replay.yaml", [vcan_bus] * 6, sync=SLOW, emcy_texts=texts)

@@ -9,6 +9,8 @@ import threading
 import time
 import urllib.request
 from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,10 +22,11 @@ from armident.configs import config_path, load_robot
 from armident.configs.units import counts_per_si
 from armident.daq.capture.capture import capture, load_plan
 from armident.daq.matching.assembler import LATE_S
-from armident.daq.recording import read_recording
+from armident.daq.recording import Recording, join_parts, read_recording
+from armident.drivers.vcan import ensure_vcan, remove_vcan
 from tests.fixtures.processes import ForkedProcess, armident
 
-pytestmark = [pytest.mark.vcan, pytest.mark.timeout(240)]
+pytestmark = pytest.mark.vcan
 
 COUNTED = ("samples.expected", "samples.rows", "samples.in_gaps", "kernel_drops")
 
@@ -42,16 +45,23 @@ def session_file(folder: Path, bus: str, cell: str, **changes: Any) -> Path:
     return path
 
 
-@pytest.fixture
-def robot(vcan_bus: str, tmp_path: Path) -> Iterator[ForkedProcess]:
-    """The virtual arm on the bus, when it is ready."""
-    process = armident("robot", "--config", session_file(tmp_path, vcan_bus, "robot"))
+@contextmanager
+def ready_arm(session: Path) -> Iterator[ForkedProcess]:
+    """The virtual arm on the bus of a session."""
+    process = armident("robot", "--config", session)
     assert process.stdout is not None
     assert "ready" in process.stdout.readline()
     yield process
     if process.poll() is None:
         process.send_signal(signal.SIGTERM)
     process.communicate(timeout=60)
+
+
+@pytest.fixture
+def robot(vcan_bus: str, tmp_path: Path) -> Iterator[ForkedProcess]:
+    """The virtual arm on the bus, when it is ready."""
+    with ready_arm(session_file(tmp_path, vcan_bus, "robot")) as process:
+        yield process
 
 
 def wait_for_file(folder: Path, size: int, process: ForkedProcess) -> Path:
@@ -65,32 +75,82 @@ def wait_for_file(folder: Path, size: int, process: ForkedProcess) -> Path:
     raise AssertionError(f"no recording: {process.communicate(timeout=10)}")
 
 
-@pytest.mark.usefixtures("robot")
-def test_ten_seconds_at_5_khz_and_six_axes_lose_nothing(vcan_bus: str, tmp_path: Path) -> None:
-    """With set points, and marks at begin and end of the motion."""
-    session = session_file(tmp_path, vcan_bus, "ten_seconds")
-    process = armident("capture", "--config", session, "--out", tmp_path / "out", "--json")
-    out, err = process.communicate(timeout=200)
+@dataclass(frozen=True)
+class Captured:
+    """A capture of six axes at 5 kHz: its document, files, log, and two other recordings in their folder."""
+
+    document: dict[str, Any]
+    parts: list[Recording]
+    log: str
+    old: Path
+    young: Path
+
+
+@pytest.fixture(scope="module")
+def captured(tmp_path_factory: pytest.TempPathFactory) -> Captured:
+    """Two seconds with set points, in several files."""
+    folder, bus = tmp_path_factory.mktemp("captured"), f"vt{os.getpid() % 1_000_000}shared"
+    now = datetime.datetime.now(datetime.UTC)
+    old, young = (folder / f"tx40-{now - datetime.timedelta(days=days):%Y%m%dT%H%M%S}-000Z.mcap" for days in (100, 1))
+    for path in (old, young):
+        path.write_bytes(b"a recording")
+    moves = [{"to": [angle, 0.0, 1.57, 0.0, 0.0, 0.0], "duration": 0.6} for angle in (0.1, 0.0)]
+    options = {"rotate_minutes": 0.01, "keep_days": 30}
+    session = moving_session(folder, bus, "two_seconds", moves, 5, sync={"period_us": 200}, recording=options)
+    ensure_vcan(bus)
+    try:
+        with ready_arm(session):
+            process = armident("capture", "--config", session, "--out", folder, "--json")
+            out, err = process.communicate(timeout=200)
+    finally:
+        remove_vcan(bus)
     assert process.returncode == 0, err
     document = json.loads(out)
-    recording = read_recording(document["recording"])
+    return Captured(document, [read_recording(path) for path in document["recordings"]], err, old, young)
+
+
+def test_two_seconds_at_5_khz_and_six_axes_lose_nothing(captured: Captured) -> None:
+    recording, counters = join_parts(captured.parts), captured.document["counters"]
     assert recording.missing is None
-    assert recording.counters == document["counters"]
-    assert recording.counters["kernel_drops"] == 0
-    assert recording.counters["sync_seen"] == recording.counters["sync_sent"]
-    assert recording.counters["samples.rows"] == recording.counters["sync_sent"]
+    assert recording.counters == counters
+    assert counters["kernel_drops"] == 0
+    assert counters["sync_seen"] == counters["samples.rows"] == counters["sync_sent"] > 5000
     assert recording.gaps == ()
-    assert np.array_equal(recording.samples.sync, np.arange(recording.counters["sync_sent"]))
+    assert np.array_equal(recording.samples.sync, np.arange(counters["sync_sent"]))
+    assert recording.metadata["cell"] == "two_seconds"
+
+
+def test_marks_are_at_both_ends_of_the_motion(captured: Captured) -> None:
+    recording = join_parts(captured.parts)
     ((first, last),) = recording.experiments()
     assert (first + 1) % 5 == (last + 1) % 5 == 0
-    assert recording.metadata["cell"] == "ten_seconds"
-    # The trajectory begins and ends in the same posture, so the demands at both marks are equal.
+    # The motion begins and ends in the same posture, so the demands at both marks are equal.
     demand = recording.streams["demand"]
     ends = demand.raw["demand"][np.isin(demand.sync, [first, last])]
     assert np.array_equal(ends[0], ends[1])
+    assert np.ptp(demand.raw["demand"][:, 0]) > 1000
 
 
-@pytest.mark.proof
+def test_no_sample_is_lost_between_files(captured: Captured) -> None:
+    """Every SYNC is in exactly one file."""
+    # A file for every 0.6 s of recorded time, even if answers of a longer time came at once.
+    assert len(captured.parts) >= 3
+    assert all(part.missing is None for part in captured.parts)
+    for part in captured.parts:
+        demand = part.streams["demand"].sync
+        assert part.samples.sync[0] <= demand[0]
+        assert demand[-1] <= part.samples.sync[-1]
+    sync = np.concatenate([part.samples.sync for part in captured.parts])
+    assert np.array_equal(sync, np.arange(captured.document["counters"]["sync_sent"]))
+
+
+def test_an_old_recording_is_deleted_meanwhile(captured: Captured) -> None:
+    assert not captured.old.exists()
+    assert captured.young.exists()
+    assert f"deleted {captured.old} (retention)" in captured.log
+
+
+@pytest.mark.nightly
 @pytest.mark.usefixtures("robot")
 def test_sixty_seconds_at_5_khz_and_six_axes_lose_nothing(vcan_bus: str, tmp_path: Path) -> None:
     """On a busy machine the capture waits for drives that lag."""
@@ -106,6 +166,7 @@ def test_sixty_seconds_at_5_khz_and_six_axes_lose_nothing(vcan_bus: str, tmp_pat
     assert expected == rows == recording.counters["sync_sent"] >= 300_000, context
 
 
+@pytest.mark.nightly
 def test_the_end_waits_for_drives_that_are_stopped_for_seconds(
     vcan_bus: str, robot: ForkedProcess, tmp_path: Path
 ) -> None:
@@ -129,6 +190,7 @@ def test_the_end_waits_for_drives_that_are_stopped_for_seconds(
     assert expected == rows == 3000
 
 
+@pytest.mark.nightly
 def test_the_end_does_not_wait_for_dead_drives(vcan_bus: str, robot: ForkedProcess, tmp_path: Path) -> None:
     session = session_file(tmp_path, vcan_bus, "died", sync={"period_us": 1000}, setpoints=None)
     process = armident("capture", "--config", session, "--duration", "3", "--out", tmp_path / "out", "--json")
@@ -143,38 +205,7 @@ def test_the_end_does_not_wait_for_dead_drives(vcan_bus: str, robot: ForkedProce
     assert recording.counters["samples.rows"] + recording.counters["samples.in_gaps"] == 3000
 
 
-@pytest.mark.usefixtures("robot")
-def test_no_sample_is_lost_between_files(vcan_bus: str, tmp_path: Path) -> None:
-    """Every SYNC of 6 s at 5 kHz is in exactly one file; an old recording is deleted meanwhile."""
-    options = {"rotate_minutes": 0.02, "keep_days": 30}
-    session = session_file(tmp_path, vcan_bus, "rotated", setpoints=None, recording=options)
-    (tmp_path / "out").mkdir()
-    now = datetime.datetime.now(datetime.UTC)
-    old, young = (
-        tmp_path / "out" / f"tx40-{now - datetime.timedelta(days=days):%Y%m%dT%H%M%S}-000Z.mcap" for days in (100, 1)
-    )
-    for path in (old, young):
-        path.write_bytes(b"a recording")
-    process = armident("capture", "--config", session, "--duration", "6", "--out", tmp_path / "out", "--json")
-    out, err = process.communicate(timeout=200)
-    assert process.returncode == 0, err
-    document = json.loads(out)
-    parts = [read_recording(path) for path in document["recordings"]]
-    # A file for every 1.2 s of recorded time, even if answers of a longer time came at once.
-    assert len(parts) >= 5
-    assert all(part.missing is None for part in parts)
-    for part in parts:
-        demand = part.streams["demand"].sync
-        assert part.samples.sync[0] <= demand[0]
-        assert demand[-1] <= part.samples.sync[-1]
-    sync = np.concatenate([part.samples.sync for part in parts])
-    lost = {n for part in parts for g in part.gaps if g.stream == "samples" for n in range(g.first, g.last + 1)}
-    assert np.array_equal(np.sort(np.concatenate([sync, sorted(lost)])), np.arange(document["counters"]["sync_sent"]))
-    assert not old.exists()
-    assert young.exists()
-    assert f"deleted {old} (retention)" in err
-
-
+@pytest.mark.nightly
 @pytest.mark.usefixtures("robot")
 def test_a_trigger_writes_only_the_time_around_events(vcan_bus: str, tmp_path: Path) -> None:
     """SIGUSR1 saves the seconds before it; mark, save and stop are commands over Zenoh."""
@@ -220,7 +251,7 @@ def test_a_trigger_writes_only_the_time_around_events(vcan_bus: str, tmp_path: P
 
 
 @pytest.mark.usefixtures("robot")
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [pytest.param(signal.SIGINT, marks=pytest.mark.nightly), signal.SIGTERM])
 def test_a_signal_ends_the_capture_with_a_finished_file(vcan_bus: str, tmp_path: Path, number: signal.Signals) -> None:
     session = session_file(tmp_path, vcan_bus, "signal", sync={"period_us": 1000}, setpoints=None)
     process = armident("capture", "--config", session, "--out", tmp_path / "out")
@@ -236,15 +267,15 @@ def test_a_signal_ends_the_capture_with_a_finished_file(vcan_bus: str, tmp_path:
     assert drops == 0
 
 
-def moving_session(folder: Path, bus: str, cell: str, moves: list[dict[str, Any]]) -> Path:
+def moving_session(
+    folder: Path, bus: str, cell: str, moves: list[dict[str, Any]], every: int = 1, **changes: Any
+) -> Path:
     """Write a session that moves joint 1 from 0, at 500 Hz."""
-    motion = {"schema": "armident/trajectory/1", "start": [0.0, 0.0, 1.57, 0.0, 0.0, 0.0], "moves": moves}
-    (folder / f"{cell}_motion.yaml").write_text(yaml.safe_dump(motion))
-    session = session_file(folder, bus, cell, sync={"period_us": 2000})
-    data = yaml.safe_load(session.read_text())
-    data["setpoints"] |= {"trajectory": str(folder / f"{cell}_motion.yaml"), "every": 1, "settle_s": 0.1}
-    session.write_text(yaml.safe_dump(data))
-    return session
+    motion = folder / f"{cell}_motion.yaml"
+    start = [0.0, 0.0, 1.57, 0.0, 0.0, 0.0]
+    motion.write_text(yaml.safe_dump({"schema": "armident/trajectory/1", "start": start, "moves": moves}))
+    setpoints = {"rpdo": 1, "every": every, "trajectory": str(motion), "settle_s": 0.1}
+    return session_file(folder, bus, cell, **{"sync": {"period_us": 2000}, "setpoints": setpoints} | changes)
 
 
 class SlowEvent(threading.Event):
@@ -329,6 +360,7 @@ def test_a_bus_that_goes_down_ends_the_capture_with_a_finished_file_and_one_erro
     assert read_recording(path).missing is None
 
 
+@pytest.mark.nightly
 @pytest.mark.usefixtures("robot")
 def test_listen_only_records_the_same_and_sends_nothing(vcan_bus: str, tmp_path: Path) -> None:
     one = session_file(tmp_path, vcan_bus, "active", sync={"period_us": 1000}, setpoints=None)

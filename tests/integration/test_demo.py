@@ -101,7 +101,7 @@ def test_options_of_the_demo_reach_the_guest(tmp_path: Path) -> None:
 
 @pytest.mark.vcan
 @pytest.mark.slow
-@pytest.mark.proof
+@pytest.mark.nightly
 @pytest.mark.timeout(LONGEST_S + 20)
 def test_a_configured_arm_is_identified_and_its_hidden_effect_found(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "armident.daq.cli", "demo", "--config", str(PICKER), "--out", str(tmp_path)]

@@ -32,8 +32,6 @@ BLOCK = re.compile(
     re.MULTILINE | re.DOTALL,
 )
 LANGUAGES = {"sh", "python", "yaml", "toml", "json", "text", "ini"}
-LONG = ("diagnosis.md", "using-a-model.md")
-"""Pages that take 40 s and more and have commands that other tests run, too."""
 PAGE_S = 900.0
 """Time limit of a page, s: ten times what the slowest one takes on an idle machine."""
 TRAP = "trap 'code=$?; [ $code -eq 4 ] || { echo \"exit code $code: $BASH_COMMAND\" >&2; exit $code; }' ERR\n"
@@ -76,11 +74,9 @@ def read_page(path: Path) -> Page:
 RUNNING = [page for page in PAGES if (read := read_page(REPOSITORY / page)).commands or read.python]
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.timeout(PAGE_S + 20)
-@pytest.mark.parametrize(
-    "page", [pytest.param(p, marks=[pytest.mark.proof] if p.name in LONG else [], id=str(p)) for p in RUNNING]
-)
+@pytest.mark.parametrize("page", RUNNING, ids=str)
 def test_the_blocks_of_a_page_run(page: Path, tmp_path: Path) -> None:
     blocks = read_page(REPOSITORY / page)
     environment = {
@@ -112,7 +108,7 @@ def test_every_block_has_a_language_and_every_exception_a_reason(page: Path) -> 
     assert all(len(reason.split()) >= 4 for reason in blocks.reasons)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.timeout(PAGE_S + 20)
 def test_the_site_builds_without_warnings(tmp_path: Path) -> None:
     pytest.importorskip("sphinx")

@@ -1,6 +1,7 @@
 """Runs of the suite: simulated effects are found, and healthy arms have no findings."""
 
 import json
+import re
 import signal
 import subprocess
 import sys
@@ -15,7 +16,7 @@ import yaml
 from typer.testing import CliRunner, Result
 
 from armident.processes import CommandProcess, start_command
-from tests.evaluation.run import REPORT, RESULTS, SUMMARY, TABLE
+from tests.evaluation.run import REPORT, RESULTS, SUMMARY
 from tests.tools.command_line import NAME, laboratory
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]
@@ -69,7 +70,7 @@ def test_an_interrupted_run_continues_and_reports_findings_and_failures(small: P
     words = ("--suite", str(small), "--out", str(out), "--jobs", "2")
     stopped = in_process(*words, "--minutes", "0")
     assert stopped.exit_code == 0, stopped.stderr
-    assert "0 of 3 cases have been run" in stopped.stdout
+    assert "0 of 3 cases" in stopped.stdout
     interrupt(words, out)
 
     done = suite(*words)
@@ -84,8 +85,7 @@ def test_an_interrupted_run_continues_and_reports_findings_and_failures(small: P
     assert spring["closed"] > 0.9
     assert spring["within"] == 1.0
     assert result["healthy"][0]["alarms"] == 0
-    assert "joint_spring,obvious,1" in (out / TABLE).read_text(encoding="utf-8")
-    assert "| joint_spring | obvious | 1 |" in (out / REPORT).read_text(encoding="utf-8")
+    assert re.search(r"\| joint_spring +\| obvious +\| 1 +\|", (out / REPORT).read_text(encoding="utf-8"))
 
     # Without the case that fails nothing is left to run.
     lines = (out / RESULTS).read_text(encoding="utf-8")
@@ -148,7 +148,7 @@ LEAST = {
 """Limits for the quick subset (one run per effect): two binomial standard deviations below its results or more."""
 
 
-@pytest.mark.proof
+@pytest.mark.nightly
 def test_most_of_the_quick_subset_is_named_and_no_healthy_arm_is_blamed(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -158,7 +158,7 @@ def test_most_of_the_quick_subset_is_named_and_no_healthy_arm_is_blamed(
     assert done.returncode == 0, done.stderr
     result = json.loads((tmp_path / SUMMARY).read_text(encoding="utf-8"))
     assert result["not_run"] == 0
-    assert f"{result['run']} of {result['run']} cases have been run" in done.stdout
+    assert f"{result['run']} of {result['run']} cases" in done.stdout
     reached = {aim["what"]: aim["value"] for aim in result["aims"]}
     assert {what: reached[what] for what, least in LEAST.items() if reached[what] < least} == {}
     assert sum(row["n"] for row in result["healthy"] if row["label"].endswith(", all")) >= 12

@@ -5,19 +5,14 @@ from pathlib import Path
 import pytest
 
 REPOSITORY = Path(__file__).resolve().parents[2]
-EXAMPLES = {
-    "emps": pytest.mark.proof,
-    "tx40": pytest.mark.proof,
-    "kuka_lwr4": pytest.mark.proof,
-    "panda": pytest.mark.slow,
-}
-"""Names of the notebooks; three of them take 40 s and more."""
+EXAMPLES = ("emps", "tx40", "kuka_lwr4", "panda")
+"""Names of the notebooks."""
 LONGEST_CELL_S = 900
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.timeout(1800)
-@pytest.mark.parametrize("name", [pytest.param(name, marks=mark) for name, mark in EXAMPLES.items()])
+@pytest.mark.parametrize("name", EXAMPLES)
 def test_an_example_runs(name: str, shared_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     nbclient, nbformat = pytest.importorskip("nbclient"), pytest.importorskip("nbformat")
     if not (shared_data / name).is_dir():

@@ -111,7 +111,7 @@ def resident() -> int:
     return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGESIZE")
 
 
-@pytest.mark.parametrize("seconds", [SECONDS, pytest.param(6.0, marks=pytest.mark.proof)])
+@pytest.mark.parametrize("seconds", [SECONDS, pytest.param(6.0, marks=pytest.mark.nightly)])
 @pytest.mark.parametrize("roles", [("frozen", "slow"), ("hostile", "hostile")])
 def test_a_listener_changes_nothing_in_the_recording(roles: tuple[str, ...], seconds: float, tmp_path: Path) -> None:
     cell = "hostile_" + ("_".join(roles) or "none")

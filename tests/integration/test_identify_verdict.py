@@ -10,15 +10,15 @@ from typer.testing import CliRunner
 from armident.daq.cli import application
 from armident.daq.recording import Recording, write_recording
 from armident.identify.estimators.methods import METHODS, Method, estimator
-from tests.fixtures.arms import FAST, recording
+from tests.fixtures.arms import recording
 
 pytestmark = pytest.mark.slow
 
 
 def turned(healthy: Recording) -> Recording:
-    """The recording with the sign of every current changed in its scale."""
+    """The recording with the sign of every voltage changed in its scale."""
     samples = healthy.samples
-    name = samples.named("current")
+    name = samples.named("voltage")
     assert name is not None
     field = samples.fields[name]
     wrong = replace(field, scale=tuple(-scale for scale in field.scale))
@@ -29,7 +29,7 @@ def turned(healthy: Recording) -> Recording:
 @pytest.fixture(scope="module")
 def files(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     folder = tmp_path_factory.mktemp("verdict")
-    healthy = recording("tx40", "tx40_excitation", 1, repeats=1, period=FAST)
+    healthy = recording("emps", "emps_excitation", 1)
     good, bad = folder / "good.mcap", folder / "bad.mcap"
     write_recording(healthy, good)
     write_recording(turned(healthy), bad)

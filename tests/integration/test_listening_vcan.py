@@ -19,7 +19,7 @@ from armident.drivers.canopen.objects import COB_EMCY
 from tests.fixtures.processes import armident
 from tests.integration.test_several_buses_vcan import session_file
 
-pytestmark = [pytest.mark.vcan, pytest.mark.timeout(120)]
+pytestmark = pytest.mark.vcan
 
 PERIOD_S = 0.005
 SYNC = {"role": "producer", "period_us": 5000, "counter": 240}
@@ -100,6 +100,7 @@ def test_streams_of_the_session_are_recorded_and_nothing_is_sent(vcan_bus: str, 
     assert recording.counters["emcy"] == len([mark for mark in recording.marks if mark.kind == "emcy"]) >= 1
 
 
+@pytest.mark.nightly
 def test_a_capture_ends_after_its_duration_although_sync_has_stopped(vcan_bus: str, tmp_path: Path) -> None:
     with UnknownDrives(vcan_bus, 8, syncs=1500):
         code, out, err = listening(vcan_bus, tmp_path, "--duration", "9")
@@ -111,6 +112,7 @@ def test_a_capture_ends_after_its_duration_although_sync_has_stopped(vcan_bus: s
     assert 200 <= recording.counters["samples.rows"] <= 1500
 
 
+@pytest.mark.nightly
 def test_sync_without_a_counter_is_noted_where_streams_are_slower(vcan_bus: str, tmp_path: Path) -> None:
     """The session expects a counter; all streams but one are sent on every SYNC."""
     streams = {
@@ -144,6 +146,7 @@ def test_the_default_mapping_of_an_eds_is_discovered_and_nothing_is_sent(vcan_bu
     assert recording.counters["samples.rows"] >= 300
 
 
+@pytest.mark.nightly
 def test_an_unknown_mapping_is_refused_and_nothing_is_sent(vcan_bus: str, tmp_path: Path) -> None:
     with checked_silence(vcan_bus, 5):
         code, _, err = listening(vcan_bus, tmp_path, "--sniff", "1")
@@ -153,6 +156,7 @@ def test_an_unknown_mapping_is_refused_and_nothing_is_sent(vcan_bus: str, tmp_pa
     assert not list((tmp_path / "out").glob("*"))
 
 
+@pytest.mark.nightly
 def test_a_tpdo_of_another_length_than_mapped_is_detected(vcan_bus: str, tmp_path: Path) -> None:
     with checked_silence(vcan_bus, 6):
         code, out, err = listening(vcan_bus, tmp_path)

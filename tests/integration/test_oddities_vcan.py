@@ -21,7 +21,7 @@ from armident.virtual_robot.oddities import ODDITIES
 from tests.fixtures.processes import ForkedProcess, armident
 from tests.integration.test_capture_vcan import session_file
 
-pytestmark = [pytest.mark.vcan, pytest.mark.timeout(120)]
+pytestmark = [pytest.mark.vcan, pytest.mark.nightly]
 
 ODD = "node 3 (joint_3): "
 PERIOD_US = 4000

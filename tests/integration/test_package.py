@@ -118,6 +118,7 @@ def _run(command: list[str], folder: Path) -> "subprocess.CompletedProcess[str]"
     )
 
 
+@pytest.mark.nightly
 def test_a_source_distribution_holds_the_files_and_no_links(built: Built) -> None:
     with tarfile.open(built.sdist) as archive:
         members = archive.getmembers()
@@ -128,6 +129,7 @@ def test_a_source_distribution_holds_the_files_and_no_links(built: Built) -> Non
     assert {"setup.py", "pyproject.toml", "LICENSE", "README.md"} <= names
 
 
+@pytest.mark.nightly
 def test_the_base_runs_what_a_capture_machine_needs(base: Path, tmp_path: Path) -> None:
     command = str(base / "armident")
     assert "capture" in _run([command, "--help"], tmp_path).stdout
@@ -151,12 +153,14 @@ def test_the_base_runs_what_a_capture_machine_needs(base: Path, tmp_path: Path) 
     assert done.returncode == 2
 
 
+@pytest.mark.nightly
 def test_the_base_imports_nothing_of_the_extras(base: Path, tmp_path: Path) -> None:
     modules = sorted({module for names in EXTRAS.values() for module in names})
     script = f"import importlib.util\nprint([name for name in {modules!r} if importlib.util.find_spec(name)])"
     assert _run([str(base / "python"), "-c", script], tmp_path).stdout == "[]\n"
 
 
+@pytest.mark.nightly
 def test_the_wheel_holds_the_machine_code_of_every_kernel(built: Built, base: Path, tmp_path: Path) -> None:
     found = {name.rpartition("/")[2] for name in built.names if name.endswith(".code")}
     subprocess.run([sys.executable, "-m", "armident.compiled"], check=True, timeout=600)
@@ -171,7 +175,7 @@ def test_the_wheel_holds_the_machine_code_of_every_kernel(built: Built, base: Pa
 
 
 @pytest.mark.vcan
-@pytest.mark.proof
+@pytest.mark.nightly
 def test_the_base_captures_six_axes_at_5_khz_without_a_loss(base: Path, vcan_bus: str, tmp_path: Path) -> None:
     session = tmp_path / "cell.yaml"
     session.write_text(config_path("tx40_cell.yaml").read_text().replace("vcan0", vcan_bus))
@@ -186,11 +190,13 @@ def test_the_base_captures_six_axes_at_5_khz_without_a_loss(base: Path, vcan_bus
     assert counters["samples.rows"] == counters["samples.expected"] == counters["sync_sent"] > 40_000
 
 
+@pytest.mark.nightly
 def test_a_wheel_holds_armident_and_nothing_else_at_top_level(wheel: list[str]) -> None:
     top = {name.partition("/")[0] for name in wheel}
     assert {name for name in top if not name.endswith(".dist-info")} == {"armident"}
 
 
+@pytest.mark.nightly
 def test_a_wheel_holds_every_file_that_the_packages_need(wheel: list[str]) -> None:
     there = [name for name in _git("ls-files", *FOLDERS[:-1]) if (REPOSITORY / name).exists()]
     missing = {f"armident/{name}" for name in there} - set(wheel)

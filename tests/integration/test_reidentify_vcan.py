@@ -21,7 +21,7 @@ from armident.drivers.canopen.objects import COB_EMCY, DriveState, drive_state
 from tests.fixtures.processes import ForkedProcess, armident
 from tests.statistics.weeks import WORN, cell_file
 
-pytestmark = [pytest.mark.vcan, pytest.mark.timeout(280)]
+pytestmark = pytest.mark.vcan
 
 QUICK: dict[str, Any] = {"sync": {"period_us": 2000}}
 
@@ -60,6 +60,7 @@ def one_line(err: str) -> str:
 
 
 @pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.timeout(600)
 def test_an_unchanged_arm_and_a_worn_arm_are_distinguished(vcan_bus: str, tmp_path: Path) -> None:
     """First run, second run, a tenth more friction in joint 2: exit codes, words, history and diagnosis."""
@@ -108,8 +109,9 @@ SCENARIOS = {
 
 
 @pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.timeout(900)
-@pytest.mark.parametrize("robot", [pytest.param("tx40", marks=pytest.mark.proof), "emps"])
+@pytest.mark.parametrize("robot", ["tx40", "emps"])
 def test_every_shipped_scenario_is_found_in_one_run(vcan_bus: str, tmp_path: Path, robot: str) -> None:
     """One healthy run, then one run of each scenario: exit code 4, and the findings name the joint."""
     assert {path.stem for path in config_path("scenarios/tx40_miswired.yaml").parent.glob("*.yaml")} == SCENARIOS.keys()
@@ -173,6 +175,7 @@ def test_ctrl_c_stops_the_arm_and_ends_with_one_line(vcan_bus: str, tmp_path: Pa
     print(f"last stop order {(stops[-1] - sent) * 1e-6:.2f} ms after the signal")
 
 
+@pytest.mark.nightly
 def test_missing_drives_are_one_error_line(vcan_bus: str, tmp_path: Path) -> None:
     config = cell_file(tmp_path, vcan_bus, "nobody", sdo_timeout_s=0.2)
     _, err = finished(job(config, tmp_path), 2)

@@ -18,7 +18,7 @@ from tests.fixtures.processes import ForkedProcess, armident
 from tests.integration.test_capture_vcan import robot, session_file, wait_for_file
 
 __all__ = ["robot"]
-pytestmark = [pytest.mark.vcan, pytest.mark.timeout(240)]
+pytestmark = [pytest.mark.vcan, pytest.mark.nightly]
 
 COUNTED = ("samples.expected", "samples.rows", "samples.in_gaps", "kernel_drops")
 

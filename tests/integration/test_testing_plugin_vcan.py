@@ -10,7 +10,7 @@ import pytest
 REPOSITORY = Path(__file__).resolve().parents[2]
 EXAMPLE = REPOSITORY / "docs" / "examples" / "integration_test"
 
-pytestmark = [pytest.mark.vcan, pytest.mark.timeout(280)]
+pytestmark = pytest.mark.vcan
 
 FIXTURES = """
 import pytest
@@ -41,6 +41,7 @@ def run_pytest(folder: Path, *words: str) -> "subprocess.CompletedProcess[str]":
     return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
 
 
+@pytest.mark.nightly
 def test_the_worked_example_runs_in_another_repository(tmp_path: Path) -> None:
     folder = tmp_path / "other_repository"
     shutil.copytree(EXAMPLE, folder, ignore=shutil.ignore_patterns("__pycache__"))

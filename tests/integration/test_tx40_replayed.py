@@ -14,7 +14,7 @@ from armident.daq.recording import read_recording
 from tests.fixtures.processes import armident
 from tests.tx40_reference import TABLE_B4, published_estimate
 
-pytestmark = [pytest.mark.vcan, pytest.mark.slow, pytest.mark.timeout(280)]
+pytestmark = [pytest.mark.vcan, pytest.mark.nightly, pytest.mark.slow]
 
 PLAYED_S = 7.6
 """The arm stands still from 7.5 s on."""

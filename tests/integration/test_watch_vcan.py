@@ -15,7 +15,7 @@ from tests.fixtures.processes import ForkedProcess, armident
 from tests.integration.test_capture_vcan import session_file
 from tests.integration.test_reidentify_vcan import arm
 
-pytestmark = [pytest.mark.vcan, pytest.mark.slow, pytest.mark.proof, pytest.mark.timeout(600)]
+pytestmark = [pytest.mark.vcan, pytest.mark.slow, pytest.mark.nightly, pytest.mark.timeout(600)]
 
 WORN = "joint_2"
 SEEN_WITHIN_S = 60.0

@@ -20,6 +20,7 @@ from armident.daq.streaming.codec import end_content, start_content
 from armident.identify.documents.files import load_document
 from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.identification.identify_recording import identify_recording
+from armident.identify.monitoring.worker import worker as module
 from armident.identify.monitoring.worker.ledger import FILE, Ledger
 from armident.identify.monitoring.worker.recorded import Captured
 from armident.identify.monitoring.worker.stream_buffer import (
@@ -30,7 +31,6 @@ from armident.identify.monitoring.worker.stream_buffer import (
     drop_oldest,
 )
 from armident.identify.monitoring.worker.worker import Worker
-from armident.identify.monitoring.worker.worker import worker as module
 from armident.identify.report.robot_file import write_identification
 from tests.fixtures import arms
 from tests.integration.test_worker import LONGEST_S, in_a_cell, publish

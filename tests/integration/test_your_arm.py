@@ -14,7 +14,7 @@ from scipy.signal import savgol_filter
 
 from tests.fixtures.mujoco_arm import LINKS, column, write_table, write_urdf
 
-pytestmark = [pytest.mark.slow, pytest.mark.proof]
+pytestmark = [pytest.mark.slow, pytest.mark.nightly]
 
 WINDOW, ORDER = 61, 4
 """Samples and order of the polynomials that differentiate the positions for MuJoCo, 1 kHz."""

@@ -40,7 +40,9 @@ def sent(rng: np.random.Generator, count: int, stalls: int) -> list[Frames]:
     return out
 
 
-@pytest.mark.parametrize("seeds", [range(6), pytest.param(range(6, 100), marks=pytest.mark.proof)], ids=["few", "many"])
+@pytest.mark.parametrize(
+    "seeds", [range(6), pytest.param(range(6, 100), marks=pytest.mark.nightly)], ids=["few", "many"]
+)
 @pytest.mark.parametrize("stalls", [1, 4, 20])
 def test_buses_of_a_delayed_master_get_equal_numbers(stalls: int, seeds: range) -> None:
     for seed in seeds:

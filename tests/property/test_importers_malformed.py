@@ -90,7 +90,7 @@ def test_a_damaged_file_is_read_or_refused_in_one_line(
     check(suffix, damaged(valid(suffix), changes, cut))
 
 
-@pytest.mark.proof
+@pytest.mark.nightly
 @pytest.mark.parametrize("suffix", list(FORMATS))
 @settings(max_examples=3000, suppress_health_check=list(HealthCheck), deadline=None)
 @given(changes=edits, cut=st.floats(0, 1))

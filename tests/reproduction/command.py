@@ -14,7 +14,7 @@ from tests.reproduction.cached_estimates import Laboratory
 from tests.reproduction.claims import Claim, judged
 from tests.reproduction.context import SIMULATIONS, SIMULATIONS_QUICK, Bench, TableFunction
 from tests.reproduction.recordings import EMPS_SESSION, measured_emps, measured_recording, virtual_recording
-from tests.reproduction.render import document, markdown, print_tables
+from tests.reproduction.render import document, markdown
 from tests.reproduction.tables import Table
 
 TABLES: dict[str, TableFunction] = {**chapter4.TABLES, **chapter5.TABLES, **chapter6.TABLES}
@@ -43,12 +43,12 @@ def reproduce(
         raise ConfigError(f"{out}: cannot be created: {error.strerror}") from error
     text = document(found, claims, quick=quick)
     write_atomically(out / "reproduce.json", text)
-    write_atomically(out / "reproduce.md", markdown(found, claims))
+    page = markdown(found, claims)
+    write_atomically(out / "reproduce.md", page)
     if json:
         sys.stdout.write(text)
         return
-    print_tables(found, claims)
-    print(f"result: {out / 'reproduce.json'}\nreport: {out / 'reproduce.md'}")
+    print(f"{page}\nresult: {out / 'reproduce.json'}\nreport: {out / 'reproduce.md'}")
 
 
 def chosen_tables(tables: str | None, *, quick: bool) -> list[str]:

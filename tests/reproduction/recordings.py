@@ -137,16 +137,16 @@ def measured_recording(folder: Path) -> Recorded:
     if position.shape != torque.shape:
         raise DataError(f"{folder}: {len(position)} rows of positions, {len(torque)} of torques")
     ratios = robot.transmission_matrix
-    q = np.asarray(np.linalg.solve(ratios, position.T).T, dtype=np.float64)
+    q = np.ascontiguousarray(np.linalg.solve(ratios, position.T).T, dtype=np.float64)
     return Recorded(robot, Experiment(q=q, tau=torque @ ratios, q_ref=None, dt=MEASURED_PERIOD), {})
 
 
-def measured_emps(folder: Path) -> Recorded | None:
-    """Read the measured EMPS, an axis with reference; ``None`` if ``folder/emps/DATA_EMPS.mat`` is absent.
+def measured_emps(folder: Path, name: str = EMPS_FILE) -> Recorded | None:
+    """Read the measured EMPS, an axis with reference; ``None`` if ``folder/emps/name`` is absent.
 
-    Raises DataError if the file cannot be read.
+    A file that cannot be read is a DataError.
     """
-    file = folder / "emps" / EMPS_FILE
+    file = folder / "emps" / name
     if not is_file(file):
         return None
     robot = load_robot("emps")

@@ -1,4 +1,4 @@
-"""Output of tables and claims: terminal, Markdown and JSON."""
+"""Tables and claims as Markdown and JSON."""
 
 import json
 import math
@@ -6,17 +6,13 @@ from collections.abc import Sequence
 from importlib.metadata import version
 from typing import Any
 
-from rich.console import Console
-from rich.table import Table as Grid
-
 from tests.reproduction.claims import Claim
 from tests.reproduction.tables import Cell, Column, Source, Table
+from tests.tools.markdown import table as markdown_table
 
 SCHEMA = "armident/reproduction/1"
 SOURCES: tuple[Source, ...] = ("thesis", "virtual", "measured", "arm")
 HEADINGS = {"thesis": "thesis", "virtual": "ours", "measured": "ours, measured arm", "arm": "virtual arm"}
-PLAIN_WIDTH = 250
-"""Characters per line where stdout is no terminal."""
 
 
 def side_by_side(table: Table) -> list[Column]:
@@ -34,30 +30,6 @@ def text_of(cell: Cell | None) -> str:
     return value if cell.std_pct is None else f"{value} ({cell.std_pct:.3g} %)"
 
 
-def print_tables(tables: Sequence[Table], claims: Sequence[Claim]) -> None:
-    """Print tables, then claims. ``tables``: reproduced tables; ``claims``: tested claims."""
-    console = Console()
-    if not console.is_terminal:
-        console = Console(width=PLAIN_WIDTH)
-    for table in tables:
-        grid = Grid(title=f"Table {table.number}: {table.title}", title_justify="left")
-        grid.add_column("")
-        columns = side_by_side(table)
-        for column in columns:
-            grid.add_column(f"{column.name}\n{HEADINGS[column.source]}", justify="right")
-        for label in table.labels:
-            grid.add_row(label, *(text_of(column.cells.get(label)) for column in columns))
-        console.print(grid)
-        for note in table.notes:
-            console.print(f"  {note}", highlight=False)
-    for claim in claims:
-        console.print(f"Claim {claim.number} {_verdict(claim.holds)}: {claim.text}", highlight=False, soft_wrap=True)
-        for finding in claim.findings:
-            console.print(f"  {_verdict(finding.holds)}: {finding.text}", highlight=False, soft_wrap=True)
-        if claim.remark and not claim.holds:
-            console.print(f"  why: {claim.remark}", highlight=False, soft_wrap=True)
-
-
 def markdown(tables: Sequence[Table], claims: Sequence[Claim]) -> str:
     """Return tables and claims as a Markdown page. ``tables``: reproduced tables; ``claims``: tested claims."""
     lines = ["# Tables of the thesis and their reproduction", ""]
@@ -72,11 +44,14 @@ def markdown(tables: Sequence[Table], claims: Sequence[Claim]) -> str:
     for table in tables:
         columns = side_by_side(table)
         lines += [f"## Table {table.number}: {table.title}", ""]
-        lines.append("| | " + " | ".join(f"{c.name}, {HEADINGS[c.source]}" for c in columns) + " |")
-        lines.append("| --- |" + " ---: |" * len(columns))
-        for label in table.labels:
-            lines.append(f"| {label} | " + " | ".join(text_of(c.cells.get(label)) for c in columns) + " |")
-        lines += ["", *(f"- {note}" for note in table.notes), *([""] if table.notes else [])]
+        headings = ["", *(f"{c.name}, {HEADINGS[c.source]}" for c in columns)]
+        rows = ([label, *(text_of(c.cells.get(label)) for c in columns)] for label in table.labels)
+        lines += [
+            markdown_table(headings, rows),
+            "",
+            *(f"- {note}" for note in table.notes),
+            *([""] if table.notes else []),
+        ]
     return "\n".join(lines)
 
 

@@ -19,7 +19,6 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.io import loadmat
 
 from armident.configs import RobotConfig, load_robot
 from armident.configs.loading import parse
@@ -28,10 +27,8 @@ from armident.identify.diagnosis.diagnose import DiagnosisResult, run_diagnosis
 from armident.identify.identification.from_recording import experiments_from_recording
 from armident.identify.signals.experiments import Experiment
 from tests.conftest import REPOSITORY
-
-FORCE_PER_VOLT = 35.15065
-STANDSTILL_S = 7.5
-TX40_DT = 2e-4
+from tests.reproduction.recordings import measured_emps, measured_recording
+from tests.tools.markdown import table as markdown_table
 
 MOST_CPU_S = 60.0
 """Most CPU time of a diagnosis, s: one that takes longer is not repeated while a person waits."""
@@ -72,20 +69,9 @@ class Measured:
 
 def emps(data: Path, name: str) -> Experiment:
     """EMPS, force in N."""
-    file = loadmat(data / "emps" / name)
-    columns = {k: v.astype(float).reshape(-1, 1) for k, v in file.items() if not k.startswith("__")}
-    return Experiment(q=columns["qm"], tau=FORCE_PER_VOLT * columns["vir"], q_ref=columns["qg"], dt=1e-3)
-
-
-def tx40(data: Path, robot: RobotConfig) -> Experiment:
-    """Staubli TX40 until it stands still, joint side."""
-    q, tau = (
-        np.loadtxt(data / "tx40" / name, delimiter=",", skiprows=1)[: round(STANDSTILL_S / TX40_DT)]
-        for name in ("pos_read_data.csv", "curr_data.csv")
-    )
-    ratios = robot.transmission_matrix
-    q = np.ascontiguousarray(np.linalg.solve(ratios, q.T).T)
-    return Experiment(q=q, tau=tau @ ratios, q_ref=None, dt=TX40_DT)
+    found = measured_emps(data, name)
+    assert found is not None, name
+    return found.experiment
 
 
 def kuka(data: Path, robot: RobotConfig, number: int) -> Experiment:
@@ -116,7 +102,7 @@ def _emps(data: Path, training: str, validation: str | None) -> Measured:
 
 def _tx40(data: Path, *, coupled: bool) -> Measured:
     robot = load_robot("tx40")
-    seen = tx40(data, robot)
+    seen = measured_recording(data).experiment
     return Measured(robot if coupled else robot.model_copy(update={"couplings": ()}), (seen,))
 
 
@@ -234,13 +220,15 @@ def alone(name: str, data: Path) -> Row:
 
 
 def table(rows: list[Row]) -> str:
-    """Markdown table of the results. ``rows``: results of the machines."""
-    lines = ["| machine | CPU, s | memory, GB | held-out error, % | flags |", "| --- | --- | --- | --- | --- |"]
-    lines += [
-        f"| {r.title} | {r.cpu_s:.0f} | {r.memory_gb:.2f} | {r.before:.2f} -> {r.after:.2f} | {'; '.join(r.flags)} |"
-        for r in rows
-    ]
-    return "\n".join(lines)
+    """Markdown table of the results."""
+    headings = ["machine", "CPU, s", "memory, GB", "held-out error, %", "flags"]
+    return markdown_table(
+        headings,
+        (
+            [r.title, f"{r.cpu_s:.0f}", f"{r.memory_gb:.2f}", f"{r.before:.2f} -> {r.after:.2f}", "; ".join(r.flags)]
+            for r in rows
+        ),
+    )
 
 
 def main() -> int:

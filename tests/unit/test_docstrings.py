@@ -137,9 +137,11 @@ def _places() -> Iterator[Place]:
         for node in body:
             if isinstance(node, ast.ClassDef | ast.FunctionDef):
                 yield Place(path, (node.name,), node)
-            for member in node.body if isinstance(node, ast.ClassDef) else []:
+            if not isinstance(node, ast.ClassDef):
+                continue
+            for member in node.body:
                 if isinstance(member, ast.FunctionDef):
-                    above = frozenset(inherited(node, member.name)) if isinstance(node, ast.ClassDef) else frozenset()
+                    above = frozenset(inherited(node, member.name))
                     yield Place(path, (node.name, member.name), member, above)
 
 

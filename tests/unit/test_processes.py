@@ -12,9 +12,8 @@ from typing import IO, Any
 import pytest
 
 from armident.configs import ArmidentError
-from armident.processes import CommandProcess, ProcessEnded, ProcessTimeout, resident_bytes, start_command
+from armident.processes import CommandProcess, ProcessEnded, ProcessTimeout, start_command
 
-ECHO = "import sys\nfor line in sys.stdin: print('got', line.strip(), flush=True)"
 DEAF = "import signal, time\nsignal.signal(signal.SIGTERM, signal.SIG_IGN)\nprint('ready', flush=True)\ntime.sleep(60)"
 
 
@@ -78,34 +77,12 @@ def test_a_process_that_ignores_the_signal_is_killed() -> None:
     assert process.exit_code == -signal.SIGKILL
 
 
-def test_lines_reach_standard_input_until_the_process_ends() -> None:
-    def start(words: Sequence[str], out: IO[bytes], err: IO[bytes]) -> "Popen[bytes]":
-        return Popen([sys.executable, "-c", ECHO], stdin=-1, stdout=out, stderr=err, bufsize=0)
-
-    with CommandProcess([], name="echo", start=start) as process:
-        for word in ("one", "two"):
-            process.send_line(word)
-            assert process.wait_for_line("", 20) == f"got {word}"
-        process.send_signal(signal.SIGKILL)
-        process.process.wait(20)
-        with pytest.raises(ProcessEnded, match="echo ended with exit code -9"):
-            process.send_line("three")
-
-
 def test_a_command_runs_with_the_interpreter_and_the_environment_that_were_given() -> None:
     start = partial(start_command, module="platform", niceness=1, own_session=True, environment={"TERM": "dumb"})
     with CommandProcess(["terse"], start=start) as process:
         assert process.wait_for_line("", 20).startswith("Linux")
         process.process.wait(20)
     assert process.exit_code == 0
-
-
-def test_the_memory_of_a_process_is_known_until_its_end() -> None:
-    process = python("input()").start()
-    pid = getattr(process.process, "pid", 0)
-    assert resident_bytes(pid) > 0
-    process.stop()
-    assert resident_bytes(pid) == 0
 
 
 def test_a_process_ends_when_the_process_that_started_it_is_killed() -> None:

@@ -295,7 +295,7 @@ def test_the_examples_of_the_docstrings_run(module: str) -> None:
     assert [e.name for e in examples if doctest.DocTestRunner(optionflags=doctest.ELLIPSIS).run(e).failed] == []
 
 
-@pytest.mark.proof
+@pytest.mark.nightly
 def test_the_example_of_a_diagnosis_runs() -> None:
     """The Python of the README has the same calls for another seed."""
     (example,) = doctest.DocTestFinder().find(armident.diagnose, DIAGNOSE)

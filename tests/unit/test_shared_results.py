@@ -60,3 +60,17 @@ def test_without_a_folder_results_stay_in_the_process(monkeypatch: pytest.Monkey
     square = store.shared(slow_square)
     assert square(5.0) == square(5.0) == 25.0
     assert calls == [(5.0,)]
+
+
+def test_a_kept_result_outlives_its_run_until_a_source_changes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    source = tmp_path / "source.py"
+    monkeypatch.setattr(store, "REPOSITORY", tmp_path)
+    monkeypatch.setattr(store, "SOURCES", ("source.py",))
+    monkeypatch.setattr(store, "KEPT", tmp_path / "kept")
+    monkeypatch.setattr(store, "kept_folder", store.kept_folder.__wrapped__)
+    for text, computed in (("a", 1), ("a", 1), ("b", 2), ("a", 2), ("c", 3), ("b", 4)):
+        source.write_text(text)
+        # Another wrapper, as in another run.
+        assert store.kept(slow_square)(3.0) == 9.0
+        assert len(calls) == computed
+    assert len(list((tmp_path / "kept").iterdir())) == 2

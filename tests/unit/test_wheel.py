@@ -4,11 +4,15 @@ from importlib.metadata import distribution
 
 import grimp
 
+from armident.identify.estimators.methods import METHODS
+
 
 def test_every_module_of_the_wheel_is_used_by_an_entry_point_or_the_public_api() -> None:
     graph = grimp.build_graph("armident", cache_dir=None)
-    entries = {point.module for point in distribution("armident").entry_points}
-    roots = {"armident", *entries, *(module for module in graph.modules if module.endswith(".__main__"))}
+    roots = {"armident", *(point.module for point in distribution("armident").entry_points)}
+    roots |= {module for module in graph.modules if module.endswith(".__main__")}
+    # An estimator is imported by the name of its method.
+    roots |= {f"armident.identify.estimators.{method.replace('-', '_')}" for method in METHODS}
     used = roots.union(*(graph.find_upstream_modules(module) for module in roots))
     packages = {module for module in graph.modules if graph.find_children(module)}
     assert graph.modules - used - packages == set()

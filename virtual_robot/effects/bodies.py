@@ -67,12 +67,7 @@ EFFECTS: dict[str, EffectSpec] = {
 
 
 def change_bodies(model: Any, hidden: Sequence[Hidden]) -> None:
-    """Add payloads and vessels to a Pinocchio model, and tilt its gravity; in place.
-
-    A swinging mass is an additional joint after those of the arm.
-
-    ``model``: Pinocchio model with n joints; ``hidden``: hidden effects.
-    """
+    """Add payloads and vessels to a Pinocchio model (swinging masses as last joints) and tilt its gravity, in place."""
     for h in hidden:
         if h.effect == "payload":
             placement = pin.SE3(np.eye(3), np.array([h["x"], h["y"], h["z"]]))
@@ -88,11 +83,7 @@ def change_bodies(model: Any, hidden: Sequence[Hidden]) -> None:
 
 
 def rest_angles(model: Any, hidden: Sequence[Hidden], q: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Rest angles of the swinging masses.
-
-    ``model``: Pinocchio model with the swinging masses; ``hidden``: hidden effects; ``q``: posture of the arm,
-    rad or m, shape (n,). Returns angles, rad, in Pinocchio's order, shape (S,).
-    """
+    """Rest angles (S,), rad, of the swinging masses in Pinocchio's order, at a posture (n,), rad or m."""
     data = model.createData()
     swinging = [h for h in hidden if h.effect == "slosh_payload"]
     zero = np.concatenate([q, np.zeros(len(swinging))])
@@ -105,11 +96,7 @@ def rest_angles(model: Any, hidden: Sequence[Hidden], q: NDArray[np.float64]) ->
 
 
 def hinge_damping(hidden: Sequence[Hidden], gravity: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Viscous coefficients of the swinging masses' hinges.
-
-    ``hidden``: hidden effects; ``gravity``: acceleration of gravity, m/s^2, shape (3,). Returns coefficients, N m
-    s/rad, shape (S,).
-    """
+    """Viscous coefficients (S,), N m s/rad, of the swinging masses' hinges."""
     out = []
     for h in hidden:
         if h.effect == "slosh_payload":
@@ -119,11 +106,9 @@ def hinge_damping(hidden: Sequence[Hidden], gravity: NDArray[np.float64]) -> NDA
 
 
 def add_rotors(rotor: NDArray[np.float64], hidden: Sequence[Hidden], links: NDArray[np.float64]) -> None:
-    """Add hidden rotor inertias to the rotors' matrix, in place.
+    """Add hidden rotor inertias to ``rotor`` (n, n), joint side, in place.
 
-    ``rotor``: rotor inertias, joint side, shape (n, n), changed in place; ``hidden``: hidden effects; ``links``: mass
-    matrix of the links at the start, shape (n, n). Raises ConfigError if the resulting mass matrix is not positive
-    definite.
+    Raises ConfigError if the mass matrix, with that of the ``links`` (n, n) at the start, is not positive definite.
     """
     for h in hidden:
         if h.effect == "rotor_inertia":
@@ -136,11 +121,7 @@ def add_rotors(rotor: NDArray[np.float64], hidden: Sequence[Hidden], links: NDAr
 
 
 def tilted(gravity: NDArray[np.float64], tilt: float, azimuth: float) -> NDArray[np.float64]:
-    """Gravity in the frame of a tilted base.
-
-    ``gravity``: acceleration of gravity, m/s^2, shape (3,); ``tilt``: angle of the tilt, rad; ``azimuth``: angle of the
-    horizontal axis of the tilt from the base's x axis, rad. Returns the acceleration of gravity, m/s^2, shape (3,).
-    """
+    """Gravity (3,), m/s^2, in the frame of a base tilted, rad, about a horizontal axis at an azimuth from x, rad."""
     one, two = _horizontal(gravity)
     axis = math.cos(azimuth) * one + math.sin(azimuth) * two
     out: NDArray[np.float64] = pin.exp3(tilt * axis) @ gravity
@@ -148,11 +129,7 @@ def tilted(gravity: NDArray[np.float64], tilt: float, azimuth: float) -> NDArray
 
 
 def base_vibrations(hidden: Sequence[Hidden], gravity: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Vibrations of the base.
-
-    ``hidden``: hidden effects; ``gravity``: acceleration of gravity, m/s^2, shape (3,). Returns the amplitude vector
-    (m/s^2) and angular frequency (rad/s) of each vibration, shape (V, 4).
-    """
+    """Amplitude vector (m/s^2) and angular frequency (rad/s) of each vibration of the base, shape (V, 4)."""
     one, two = _horizontal(gravity)
     rows = []
     for h in hidden:

@@ -41,10 +41,7 @@ EFFECTS: dict[str, EffectSpec] = {
 
 @compiled("f8[::1], f8", **PLAIN)
 def sliding_level(row, qd):  # type: ignore[no-untyped-def]
-    """Magnitude of the friction (N m) when sliding, and its slope over ``abs(qd)``.
-
-    ``row``: row of `bristle_table`, shape (COLUMNS,); ``qd``: velocity of the joint, rad/s or m/s.
-    """
+    """Friction (N m) of a row of `bristle_table` when sliding at a velocity, and its slope over ``abs(qd)``."""
     speed = abs(qd)
     ratio = (speed / row[3]) ** row[4]
     bump = row[2] * math.exp(-ratio)
@@ -53,11 +50,7 @@ def sliding_level(row, qd):  # type: ignore[no-untyped-def]
 
 @compiled(**PLAIN)
 def bristle_rate(row, z, qd):  # type: ignore[no-untyped-def]
-    """Rate of a bristle's deflection, ``qd - abs(qd) z stiffness / g(qd)``, and its slopes over ``z`` and ``qd``.
-
-    ``row``: row of `bristle_table`, shape (COLUMNS,); ``z``: deflection, rad or m; ``qd``: velocity of the joint, rad/s
-    or m/s.
-    """
+    """Rate of a bristle's deflection, ``qd - abs(qd) z stiffness / g(qd)``, and its slopes over ``z`` and ``qd``."""
     level, fall = sliding_level(row, qd)
     pull = row[5] / level
     side = math.copysign(1.0, qd)
@@ -67,12 +60,10 @@ def bristle_rate(row, z, qd):  # type: ignore[no-untyped-def]
 def bristle_table(
     hidden: Sequence[Hidden], robot: RobotConfig, friction: NDArray[np.float64], inertia: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Parameters of the bristles; Stribeck and presliding friction of one joint share a bristle.
+    """Rows (B, COLUMNS) of the bristles; Stribeck and presliding friction of one joint share a bristle.
 
-    ``hidden``: hidden effects; ``friction``: fv, fc and offset of the healthy arm (further columns are ignored), shape
-    (n, 3 or more); ``inertia``: inertia about each joint at the start, for the critical damping, shape (n,). Returns
-    one row per bristle, shape (B, COLUMNS). Raises ConfigError if a joint has no Coulomb friction for a bristle to
-    replace.
+    ``friction`` (n, 3 or more): fv, fc, offset of the healthy arm. ``inertia`` (n,): at the start, for critical
+    damping. Raises ConfigError for a joint without Coulomb friction.
     """
     rows: list[NDArray[np.float64]] = []
     mine = [h for h in hidden if h.target == "bristle"]

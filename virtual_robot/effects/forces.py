@@ -38,22 +38,8 @@ def _random(seed, cell):  # type: ignore[no-untyped-def]
 def effect_torque(code, p, q, qd, motor, other, load, t, smoothing):  # type: ignore[no-untyped-def]
     """Torque against the joint (N m) and its slope over ``qd`` (N m s/rad).
 
-    Parameters
-    ----------
-    code
-        Index of the effect in ``CODES``.
-    p
-        Parameters of its row in `force_table`, shape (PARAMETERS,).
-    q, qd
-        Position and velocity of the joint, rad or m.
-    motor
-        Angle of its motor, rad.
-    other
-        Velocity of the other joint, rad/s or m/s.
-    load
-        Torque that the gear transmits to the links, N m.
-    smoothing
-        ``g`` in ``sign(qd) -> (2/pi) atan(g qd)``, s/rad or s/m.
+    ``code`` is in ``CODES``; ``p``: parameters of its row in `force_table`. ``motor``: angle, rad. ``other``: velocity
+    of the other joint. ``load``: of the gear on the links, N m. ``smoothing``: ``g``, s/rad or s/m.
     """
     side = 2.0 / math.pi * math.atan(smoothing * qd)
     side_slope = 2.0 / math.pi * smoothing / (1.0 + (smoothing * qd) ** 2)
@@ -278,10 +264,9 @@ LOAD_CODE = CODES.index("load_dependent_friction")
 
 
 def force_table(hidden: Sequence[Hidden], robot: RobotConfig, friction: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Table of hidden torques for `effect_torque`.
+    """Code, joint, other joint (-1: none) and parameters of each torque of `effect_torque`, (E, 3 + PARAMETERS).
 
-    ``friction``: fv, fc and offset of the healthy arm (further columns are ignored), shape (n, 3 or more). Returns the
-    code, joint, other joint (-1: none) and parameters of each torque, shape (E, 3 + PARAMETERS).
+    ``friction`` (n, 3 or more): fv, fc and offset of the healthy arm.
     """
     mine = [h for h in hidden if h.effect in CODES]
     table = np.zeros((len(mine), 3 + PARAMETERS))

@@ -59,11 +59,7 @@ def _press(way, rounding):  # type: ignore[no-untyped-def]
 
 @compiled("f8[::1], f8, f8", **PLAIN)
 def gear_torque(row, twist, rate):  # type: ignore[no-untyped-def]
-    """Torque between motor and link (N m), and its slopes over twist and rate.
-
-    ``row``: row of `gear_rows`, shape (COLUMNS,); ``twist``, ``rate``: position of the motor relative to the link
-    (rad or m), and its rate.
-    """
+    """Torque between motor and link (N m) by a row of `gear_rows`, and its slopes over twist and rate of the motor."""
     if row[4] == 0.0:
         return row[2] * twist + row[3] * rate, row[2], row[3]
     one, share = _press(twist - 0.5 * row[4], row[5])
@@ -73,10 +69,7 @@ def gear_torque(row, twist, rate):  # type: ignore[no-untyped-def]
 
 
 def twist_under(row: NDArray[np.float64], torque: float) -> float:
-    """Twist (rad or m) of a gear at rest under a torque.
-
-    ``row``: row of `gear_rows`, shape (COLUMNS,); ``torque``: transmitted torque, N m or N.
-    """
+    """Twist (rad or m) of a gear at rest under a torque, N m or N."""
     end = torque / float(row[2]) + math.copysign(float(row[4]), torque)
     low, high = min(0.0, end), max(0.0, end)
     for _ in range(80):
@@ -95,13 +88,10 @@ def gear_rows(
     mass: NDArray[np.float64],
     least: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Parameters of the elastic gears; the link of gear e has coordinate n + e.
+    """Rows (G, COLUMNS) of the elastic gears, and the inertia (G,) of the links that is assigned to each motor.
 
-    ``hidden``: hidden effects; ``rotor``: rotor inertias, joint side, shape (n, n); ``mass``: mass matrix of the links
-    alone at the start, shape (n, n); ``least``: least inertia at each joint if all others are free, over the postures,
-    shape (n,). Returns ``rows``: one row per elastic gear, shape (G, COLUMNS); ``moved``: inertia of the links that is
-    assigned to the motor, by gear, shape (G,). Raises ConfigError if the inertia of the motor exceeds that of motor and
-    link together.
+    The link of gear e has coordinate n + e. ``mass`` (n, n): of the links alone at the start; ``least`` (n,): least
+    inertia if all other joints are free. Raises ConfigError if a motor has more inertia than motor and link.
     """
     rows, moved = [], []
     mine = [h for h in hidden if h.target == "gear"]

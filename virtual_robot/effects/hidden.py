@@ -9,11 +9,7 @@ from armident.virtual_robot.effects.spec import Hidden, ParameterSpec
 
 
 def hidden_effects(scenario: Scenario | None, robot: RobotConfig, where: str = "scenario") -> tuple[Hidden, ...]:
-    """Validate the effects of a scenario.
-
-    ``scenario``: the scenario; ``None``: no effects. Raises ConfigError if an entry is invalid; names the entry and the
-    expected value.
-    """
+    """Validate the effects of a scenario; raises ConfigError, with entry and expected value, if one is invalid."""
     out: list[Hidden] = []
     for k, entry in enumerate(() if scenario is None else scenario.effects):
         checked = _checked(entry, robot, f"{where}: effects[{k}]")

@@ -166,17 +166,9 @@ def _rewired(own, origin, sign, low, high, out):  # type: ignore[no-untyped-def]
 
 
 class Signals:
-    """Hidden errors of positions and signals, applied once per control period.
+    """Hidden errors of positions and signals (target ``drive`` or ``report``), applied once per control period.
 
-    ``hidden``: hidden effects; only those with target ``drive`` or ``report`` are used. ``robot``: transmission and
-    drives.
-
-    Attributes
-    ----------
-    acts
-        ``True`` if there is any such effect.
-    swapped
-        ``True`` if positions, demands or signals are recorded under other names or signs.
+    ``acts``: there are any; ``swapped``: something is recorded under another name or sign.
     """
 
     def __init__(self, hidden: Sequence[Hidden], robot: RobotConfig, period: float) -> None:
@@ -242,18 +234,12 @@ class Signals:
         return out
 
     def applied(self, signal: Vector) -> Vector:
-        """Joint torques of the motors over the next period, N m or N, shape (n,).
-
-        ``signal``: signals of the drives, A, V or N m, shape (n,).
-        """
+        """Joint torques (n,) of the motors over the next period, N m or N, from signals (n,), A, V or N m."""
         out: Vector = _applied(signal, self._level, self._knee, self._lag, self._lagging, self._period, self._torque)
         return out
 
     def reported(self, signal: Vector) -> Vector:
-        """Reported signals at the present time, without noise, in the drives' own order, shape (n,).
-
-        ``signal``: signals of the drives, A, V or N m, shape (n,).
-        """
+        """Signals (n,), A, V or N m, as reported now, without noise, in the drives' own order."""
         newest = -self._periods % len(self._past)
         out: Vector = _reported(
             signal, self._past, newest, self._delay, self._leak, self._ripples, self._periods * self._period
@@ -262,25 +248,15 @@ class Signals:
         return out
 
     def on_the_bus(self, signal: Vector, noise: Vector, permille: Vector, out: NDArray[np.int16]) -> None:
-        """Write the reported signals with noise as numbers of the bus.
-
-        ``signal``, ``noise``: signals of the drives, and their noise, shape (n,); ``permille``: numbers per unit of the
-        signal, shape (n,); ``out``: numbers of the bus, int16, shape (n,), written in place.
-        """
+        """Write the reported signals (n,) with noise as int16 numbers of the bus; ``permille``: numbers per unit."""
         _permille(self.reported(signal), noise, permille, out)
 
     def rewired_torque(self, own: NDArray[np.int16], out: NDArray[np.int16]) -> None:
-        """Write the torque signals under the names and signs of the recording.
-
-        ``own``: numbers in the drives' own order, shape (n,); ``out``: recorded numbers, shape (n,), written in place.
-        """
+        """Write torque signals (n,), in the drives' order, under the names and signs of the recording."""
         _rewired(own, self.torque_from, self.torque_sign, -32768, 32767, out)
 
     def rewired_position(self, own: NDArray[np.int32], out: NDArray[np.int32]) -> None:
-        """Write positions or demands under the names and signs of the recording.
-
-        ``own``: counts in the drives' own order, shape (n,); ``out``: recorded counts, shape (n,), written in place.
-        """
+        """Write positions or demands (n,), counts, under the names and signs of the recording."""
         _rewired(own, self.position_from, self.position_sign, -(2**31), 2**31 - 1, out)
 
 

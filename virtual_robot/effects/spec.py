@@ -20,9 +20,8 @@ Target = Literal["force", "bristle", "gear", "body", "drive", "report"]
 class ParameterSpec:
     """Parameter of an effect, joint side.
 
-    ``unit``: at a revolute joint; at a prismatic one N for N m, m for rad. ``default``: ``None``: required; ``AUTO``:
-    derived from the robot as ``meaning`` describes. ``above``: True if ``low`` itself is excluded. ``only``: type of
-    joint that has the parameter; ``None``: both.
+    ``unit``: prismatic joints have N for N m, m for rad. ``default``: ``None`` if required, ``AUTO`` if derived from
+    the robot. ``above``: ``low`` is excluded. ``only``: type of joint.
     """
 
     unit: str
@@ -38,11 +37,9 @@ class ParameterSpec:
 class EffectSpec:
     """Effect that can be hidden in the virtual arm.
 
-    ``other``: second joint. ``first_joint``: True if it concerns the base and is given at the first joint.
-    ``group``: ``armident diagnose`` finds a member of the catalogue by name and must report one outside it as
-    unexplained; a change of parameters leaves no error after a new identification. ``repeatable``: one joint may
-    have it several times. ``row``: parameters of a force for `effect_torque`, from the entry, the robot, and fv and fc
-    of the joint.
+    ``first_joint``: it concerns the base. ``group``: ``armident diagnose`` must name a member of the catalogue and
+    report one outside as unexplained; after a new identification a change of parameters leaves no error. ``row``:
+    parameters of a force for `effect_torque`.
     """
 
     target: Target
@@ -72,10 +69,7 @@ PITCH = ParameterSpec("m", "travel of a prismatic joint per turn of its motor", 
 
 @dataclass(frozen=True)
 class Hidden:
-    """Validated hidden effect of a joint, and of another one if ``other`` is not -1.
-
-    ``values``: all parameters; ``AUTO`` (NaN): derived from the robot. ``where``: name of the entry in messages.
-    """
+    """Validated hidden effect of a joint, and of another one if ``other`` is not -1; ``AUTO`` (NaN): from the robot."""
 
     effect: str
     joint: int

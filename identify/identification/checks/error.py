@@ -17,8 +17,7 @@ CHECK = "check the set-up first: armident check RECORDING; then look for a missi
 def error(judged: Judged, criteria: IdentificationCriteria) -> list[Reason]:
     """Return a reason if the model leaves more than a third of the torque of a joint.
 
-    It is unusable, unless least squares leaves as much and the rest is white noise: then the torque of the joint itself
-    is mostly noise.
+    It is unusable, unless least squares leaves as much and the rest is white: then most of the joint's torque is noise.
     """
     joints, blocks, theta = judged.prepared.model.robot.joints, judged.ls.blocks, judged.found.estimate.theta
     errors, ls_errors = (relative_torque_errors(blocks, at)[1] for at in (theta, judged.ls.estimate.theta))

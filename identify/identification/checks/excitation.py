@@ -60,10 +60,7 @@ def motion_postures(experiments: Sequence[Experiment], count: int = EXAMINED_POS
 
 
 def workspace_postures(robot: RobotConfig, recorded: Array, count: int = EXAMINED_POSTURES) -> Array:
-    """Random postures between the position limits, shape (count, n), rad or m; the same in every call.
-
-    The range of the recorded postures (N, n) replaces the limits of an endless joint.
-    """
+    """Random postures (count, n) between the limits, rad or m, always the same; endless joints: ``recorded`` range."""
     limits = np.array([joint.limits.position for joint in robot.joints], dtype=np.float64).T
     seen = np.stack([recorded.min(axis=0), recorded.max(axis=0)])
     low, high = np.where(np.abs(limits).max(axis=0) < FARTHEST, limits, seen)
@@ -73,8 +70,7 @@ def workspace_postures(robot: RobotConfig, recorded: Array, count: int = EXAMINE
 def joint_uncertainty(model: ArmModel, theta: Array, covariance: Array, q: Array) -> tuple[Array, Array]:
     """Uncertainty of inertia and gravity torque (n,) of each joint at postures q (N, n), without terms.
 
-    Relative standard deviation of the diagonal of the mass matrix, median of the postures; standard deviation of the
-    gravity torque, mean of the postures, N m or N.
+    Relative, of the diagonal of the mass matrix, median of the postures; and of the gravity torque, mean, N m or N.
     """
     rigid = model.base.b - model.e
     if not np.isfinite(covariance).all():

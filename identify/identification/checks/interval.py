@@ -27,10 +27,7 @@ def interval_reason(line: str) -> Reason:
 def doubts_of_least_squares(
     prepared: Prepared, options: Options, ls: LeastSquares, bandwidth: float
 ) -> tuple[str, ...]:
-    """Warnings if derivatives and encoder noise bias IDIM-LS, or if serial correlation understates its intervals.
-
-    Equations of a published fit are not examined.
-    """
+    """Warnings if noise biases IDIM-LS, or serial correlation understates its intervals; none for a published fit."""
     if ls.published:
         return ()
     name = options.derivatives or "irwsm"

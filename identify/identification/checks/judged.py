@@ -12,10 +12,9 @@ from armident.identify.identification.support import Support
 
 @dataclass(frozen=True)
 class Judged:
-    """Parts of an identification that its verdict depends on.
+    """Parts of an identification that its verdict depends on; errors are measured in the equations of ``ls``.
 
-    ``ls``: IDIM-LS, in whose equations errors are measured; ``found``: the estimate of the method; ``solution``:
-    ``None`` for IDIM-LS; ``reasons``: defects that the checks before have found.
+    ``solution`` is ``None`` for IDIM-LS; ``reasons`` are of the checks before.
     """
 
     prepared: Prepared

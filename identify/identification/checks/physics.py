@@ -26,12 +26,8 @@ USE_NEAREST = (
 def physics(judged: Judged, criteria: IdentificationCriteria) -> list[Reason]:
     """Return a reason if no physical arm has these parameters within their uncertainty.
 
-    Small impossible values come from small model errors: then a possible arm explains the torques nearly as well, and
-    the result is doubtful. Where the nearest possible arm leaves more than a third of a joint's torque, which the
-    estimate explains, the signals themselves are wrong, and the result is unusable.
-
-    Without the nearest physically consistent parameters, the distance is tested with b degrees of freedom, more than
-    there are, which is conservative.
+    The result is doubtful if a possible arm explains the torques nearly as well. It is unusable if that arm leaves more
+    than a third of a joint's torque, which the estimate explains: then signals are wrong.
     """
     model, experiments, blocks = judged.prepared.model, judged.prepared.experiments, judged.ls.blocks
     theta, covariance = judged.found.estimate.theta, judged.found.estimate.covariance
@@ -73,12 +69,9 @@ def physics(judged: Judged, criteria: IdentificationCriteria) -> list[Reason]:
 def impossible_values(
     model: ArmModel, q: Array, theta: Array, covariance: Array, criteria: IdentificationCriteria
 ) -> list[str]:
-    """Return the values of an estimate that are significantly impossible, as parts of a sentence.
+    """Parts of a sentence on impossible values: negative friction or rotor inertia, mass matrix not positive definite.
 
-    They are negative friction and rotor inertias, and a mass matrix that is not positive definite.
-
-    ``q``: postures (N, n) at which the mass matrix is computed, rad or m; ``theta``, ``covariance``: base estimate (b,)
-    and its covariance (b, b), SI.
+    Only what is significant counts. ``q``: postures (N, n), rad or m; ``theta`` (b,) and ``covariance`` (b, b): SI.
     """
     return [*_negative(model, theta, covariance, criteria), *_indefinite(model, q, theta, covariance, criteria)]
 
@@ -104,8 +97,7 @@ def _indefinite(
 ) -> list[str]:
     """Mass matrix that is significantly not positive definite at one of some postures.
 
-    With the eigenvector v of the smallest eigenvalue, ``v' M v`` is linear in theta, so its standard deviation follows
-    from the covariance.
+    With its smallest eigenvector v, ``v' M v`` is linear in theta, so the covariance gives its standard deviation.
     """
     rigid = model.base.b - model.e
     arm, c, still = model.without_terms(), covariance[:rigid, :rigid], np.zeros_like(q)

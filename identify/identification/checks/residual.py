@@ -13,9 +13,8 @@ DIAGNOSE = "look for a missing effect: armident diagnose RECORDING"
 def residual(judged: Judged, criteria: IdentificationCriteria) -> list[Reason]:
     """Return one reason for the residuals that are not noise, and one for standard deviations that are too small.
 
-    A variance that depends on speed or torque is reported by the tests, but is no defect: it biases nothing. Joints at
-    rest are not judged. An autoregressive model of the rows may absorb what depends on the motion, which finer
-    equations show.
+    A variance that depends on speed or torque biases nothing and is no defect. Joints at rest are not judged. An
+    autoregressive model may absorb what depends on the motion; finer equations show it.
     """
     if judged.unusable:
         return []

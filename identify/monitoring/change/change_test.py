@@ -40,18 +40,9 @@ _NAME = re.compile(r"([a-z]+?)(m?\d+)r?(?:_\d+)?$")
 
 @dataclass(frozen=True)
 class Group:
-    """Parameters of one joint or coupling, tested together because their estimates are correlated.
+    """Parameters of one joint or coupling (``place``), tested together because their estimates are correlated.
 
-    Parameters
-    ----------
-    kind
-        ``friction`` or ``masses``.
-    place
-        End of their names: number of the joint, or name of the coupling.
-    chi_square, degrees
-        Chi-square statistic of their differences with all other parameters free, and its degrees of freedom.
-    p_value
-        Probability of such a statistic without a change, corrected as in `ParameterChangeTest`.
+    ``chi_square`` is of their differences with all other parameters free; ``p_value`` as in `ParameterChangeTest`.
     """
 
     kind: Literal["friction", "masses"]
@@ -64,27 +55,11 @@ class Group:
 
 @dataclass(frozen=True)
 class ParameterChangeTest:
-    """Result of the test: differences of the parameters of two identifications.
+    """Differences (k,) of the parameters of two identifications, later less ``before``.
 
-    Parameters
-    ----------
-    parameters
-        Parameters of the later one, (k,).
-    before, difference, std
-        Earlier values, later values less these, and the standard deviations of the differences, (k,) each.
-    p_values
-        Probability of such a difference in each parameter without a change, (k,), corrected for all parameters and
-        groups (Holm 1979).
-    chi_square, degrees, p_joint
-        ``d' C^-1 d`` with the covariance C of the difference, its degrees of freedom, and the probability of a larger
-        one without a change.
-    false_alarms
-        False-alarm rate of all tests; `share` is that of each.
-    groups
-        Friction and masses of each joint: viscous and Coulomb friction are correlated, so that a change may be
-        significant in both together and in neither alone.
-    residuals
-        Test of the residuals for a change of structure.
+    ``p_values`` are without a change, corrected for all parameters and groups (Holm 1979). ``chi_square`` is ``d' C^-1
+    d`` with the covariance C of the difference. ``false_alarms`` is the rate of all tests, `share` that of each.
+    ``groups``: friction and masses of each joint, as correlated parameters may change significantly together only.
     """
 
     parameters: tuple[Parameter, ...]
@@ -172,15 +147,10 @@ class ParameterChangeTest:
 def compare(
     baseline: IdentificationDocument, now: IdentificationDocument, false_alarms: float = FALSE_ALARMS
 ) -> ParameterChangeTest:
-    """Test two identifications of an arm for a change of its parameters.
+    """Test two identifications of an arm with the same model for a change of its parameters.
 
-    The runs are independent, so the covariance of the difference is the sum of both. All base parameters are tested;
-    those that are not essential have little weight due to their large standard deviations.
-
-    ``baseline``, ``now``: two identifications of one robot with the same model; ``false_alarms``: probability of the
-    result "changed" without a change. Returns differences, p-values corrected by Holm's method, the joint test, and the
-    test of the residuals. Raises DataError if they are of different robots or models; Inconclusive if one of them is
-    unusable or did not converge, or is far less precise than the other.
+    Runs are independent, so that covariances add. All base parameters are tested. Raises DataError for different robots
+    or models; Inconclusive if one is unusable, did not converge, or is far less precise than the other.
     """
     for name, document in (("the baseline", baseline), ("the identification", now)):
         if not document.converged:

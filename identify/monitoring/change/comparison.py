@@ -23,11 +23,9 @@ def compare_models(
     common: bool = False,
     false_alarms: float = FALSE_ALARMS,
 ) -> ComparisonDocument:
-    """Test two identifications of a robot for a change.
+    """Test two identifications of a robot for a change; ``common``: compare only parameters that both have.
 
-    ``common``: compare only the parameters that both have, instead of refusing different base parameters;
-    ``false_alarms``: probability of the verdict ``changed`` without a change. Raises DataError if they are of different
-    robots or models, or cannot confirm or exclude a change.
+    Raises DataError if they are of different robots or models, or cannot confirm or exclude a change.
     """
     (first, first_path), (second, second_path) = baseline, now
     left_out = _different(baseline, now)
@@ -151,11 +149,7 @@ def _compared(
 
 
 def joint_of(parameter: str, joints: Sequence[str], couplings: Sequence[str] = ()) -> str:
-    """Return the joint or coupling of a parameter by the end of its name; the name itself if that is neither.
-
-    ``parameter``: name of a base parameter or of a parameter of an effect, for example ``zz1r``, ``iam6`` or
-    ``fva2_2``; ``joints``, ``couplings``: names of the joints in order, and of the couplings.
-    """
+    """Joint or coupling at the end of a parameter's name (``zz1r``, ``iam6``, ``fva2_2``); else the name itself."""
     name = re.sub(r"_\d+$", "", parameter)
     for coupling in couplings:
         if re.fullmatch(rf"(ia|fv|fc){re.escape(coupling)}r?", name):

@@ -43,11 +43,9 @@ class HistoryRun:
 
 
 class History:
-    """Identifications in a database; missing tables are created, and those of a former version upgraded.
+    """Identifications in a database (SQLAlchemy URL); missing or former tables are created or upgraded.
 
-    ``url``: SQLAlchemy URL, for example ``sqlite:///history.sqlite``, ``postgresql://USER:PASSWORD@HOST/NAME``. Raises
-    ConfigError if there is no such database, its driver is not installed, or it is locked, damaged or of a newer
-    version.
+    Raises ConfigError if the database or its driver is missing, or it is locked, damaged or of a newer version.
     """
 
     def __init__(self, url: str = DEFAULT) -> None:
@@ -61,11 +59,7 @@ class History:
             raise ConfigError(f"{self.url}: cannot be used as history: {reason(error)}{hint}") from error
 
     def add(self, document: IdentificationDocument, recorded: datetime.datetime) -> bool:
-        """Add an identification.
-
-        ``recorded``: time of its recording; see `recorded_at`. Returns False if the history has an identification of
-        this recording already, which stays. Raises ConfigError if the database cannot be written.
-        """
+        """Add an identification; False if its recording is known. Raises ConfigError if it cannot be written."""
         text = to_json(document)
         digest = _digest(document)
         source = document.recording
@@ -119,11 +113,7 @@ class History:
 
     @staticmethod
     def began(facts: Mapping[str, Any], document: IdentificationDocument, file: Path) -> datetime.datetime:
-        """Return the start of a recording.
-
-        ``facts``: metadata of the recording; its start is there unless it was imported. ``document``, ``file``:
-        identification and its file, otherwise see `recorded_at`.
-        """
+        """Start of a recording by its metadata or, if it was imported, by `recorded_at`."""
         started = facts["facts"].get("started_utc")
         return recorded_at(document, file) if started is None else datetime.datetime.fromisoformat(started)
 
@@ -134,11 +124,7 @@ class History:
     def judge(
         self, document: IdentificationDocument, baseline: IdentificationDocument, drift: ParameterChangeTest
     ) -> None:
-        """Add the result of a comparison.
-
-        ``document``: identification of a recording that was added before; ``baseline``: identification that it was
-        compared with.
-        """
+        """Add the comparison of an identification, added before, with its baseline."""
         same = (runs.c.robot == document.robot) & (runs.c.sha256 == document.recording.sha256) & (repeated == 0)
         number = sa.select(runs.c.id).where(same).scalar_subquery()
         row = {
@@ -164,18 +150,14 @@ class History:
             raise ConfigError(f"{self.url}: the history cannot be written: {reason(error)}") from error
 
     def first(self, robot: str, cell: str | None = None) -> HistoryRun | None:
-        """Return the oldest converged identification of an arm, or ``None``.
-
-        ``cell``: cell of the robot; ``None``: all. Runs whose cell the history does not know are included.
-        """
+        """Oldest converged identification of an arm; runs whose cell the history does not know are included."""
         found = self._read(_of(robot, cell).where(runs.c.converged).limit(1))
         return found[0] if found else None
 
     def runs(self, robot: str | None = None, cell: str | None = None) -> list[HistoryRun]:
-        """Return identifications in the order of their recordings.
+        """Return identifications in the order of their recordings, of all robots and cells by default.
 
-        ``robot``: name of the robot; ``None``: all. ``cell``: cell of the robot, as arms of one type often share a
-        name; ``None``: all. Runs whose cell the history does not know are included.
+        Arms of one type often share a name. Runs whose cell the history does not know are included.
         """
         return self._read(_of(robot, cell))
 
@@ -225,10 +207,7 @@ def _digest(document: IdentificationDocument) -> str:
 
 
 def recorded_at(document: IdentificationDocument, file: Path) -> datetime.datetime:
-    """Return the time of a recording: from its name, otherwise that of the result's file.
-
-    ``file``: file of the document.
-    """
+    """Return the time of a recording: from its name, otherwise that of the result's file."""
     found = _STAMP.search(document.recording.path or "")
     if found is not None:
         # A name that only looks like a time is none.

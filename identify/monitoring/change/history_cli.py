@@ -29,25 +29,8 @@ def history_command(
 ) -> int:
     """Carry out ``armident history``: add documents, compare runs with the first one, plot parameters.
 
-    Returns the exit code: 0, or `DRIFTED`. Raises ConfigError if the database, robot, cell, a parameter or the plot is
-    wrong; DataError if a document is wrong, or the runs are of different models.
-
-    Parameters
-    ----------
-    documents
-        ``identification.json`` files to add.
-    database
-        SQLAlchemy URL.
-    robot, cell
-        Arm to list; ``None``: that of the documents, or the only one.
-    parameters
-        Names of parameters to show.
-    plot
-        File of a plot over time, or ``None``.
-    false_alarms
-        Probability of a false alarm per run.
-    as_json
-        Print JSON instead of a table.
+    ``robot``: default that of the documents, or the only one. Returns 0 or `DRIFTED`. Raises ConfigError if an option
+    or the database is wrong, DataError if a document is wrong or of another model.
     """
     loaded = [(load_document(path, IdentificationDocument), path) for path in documents]
     history = History(database)

@@ -1,7 +1,6 @@
-"""Tables of the history, their versions, and their upgrade from former versions.
+"""Tables of the history, their versions, and their upgrade; databases of version 0.1 have the number 0.
 
-The version is ``PRAGMA user_version`` of a SQLite file, and a row of ``armident_history_version`` in other databases.
-Databases of version 0.1 have the number 0 and all tables of version 1.
+The version is ``PRAGMA user_version`` of SQLite, or a row of ``armident_history_version``.
 """
 
 import sqlite3
@@ -107,10 +106,7 @@ MIGRATIONS: tuple[Callable[[sa.Connection], None], ...] = (_create_tables, _one_
 
 
 def engine_for(url: str) -> sa.Engine:
-    """Return the engine of a database, whose transactions on SQLite wait for other processes.
-
-    ``url``: SQLAlchemy URL.
-    """
+    """Return the engine of a database, whose transactions on SQLite wait for other processes."""
     if not url.startswith("sqlite"):
         try:
             return _server_engine(sa.make_url(url))
@@ -150,20 +146,13 @@ def _begin(connection: sa.Connection) -> None:
 
 @contextmanager
 def writing(engine: sa.Engine) -> Iterator[sa.Connection]:
-    """Yield a connection in a transaction that writes; it is committed at the end of the block.
-
-    ``engine``: engine of the database.
-    """
+    """Yield a connection in a transaction that writes; it is committed at the end of the block."""
     with engine.connect().execution_options(writes=True) as connection, connection.begin():
         yield connection
 
 
 def upgrade(engine: sa.Engine) -> None:
-    """Create the tables, or bring those of a former version to the present one.
-
-    ``engine``: engine of the database. Any number of processes may upgrade it at once. Raises ConfigError if the
-    database is of a newer version.
-    """
+    """Create or upgrade the tables, safely in many processes; raises ConfigError if the database is newer."""
     with engine.connect() as connection:
         if _version(connection) == len(MIGRATIONS):
             return
@@ -200,10 +189,7 @@ def _set_version(connection: sa.Connection, version: int) -> None:
 
 
 def reason(error: Exception) -> str:
-    """Return one line that says why a database cannot be used, without the words of the library for known causes.
-
-    ``error``: error of SQLAlchemy or of the file system.
-    """
+    """Return one line that says why a database cannot be used, without the words of the library for known causes."""
     cause = getattr(error, "orig", None) or error
     if isinstance(cause, ImportError):
         return f"the Python package {cause.name} is not installed"
@@ -223,11 +209,7 @@ def reason(error: Exception) -> str:
 
 
 def wait_and_try(action: Callable[[], None], seconds: float, say: Callable[[str], None]) -> bool:
-    """Try an action again while the database refuses it; return False if the time is over.
-
-    ``action``: writes to the history; ``seconds``: time after which it is not tried again, s; ``say``: takes a line for
-    each reason of a failure.
-    """
+    """Try an action for some seconds while the database refuses it, each reason once; False if the time is over."""
     until, wait, said = time.monotonic() + seconds, 1.0, ""
     while True:
         try:

@@ -22,10 +22,7 @@ TYPICAL_SHARE = 0.5
 def model_differences(
     baseline: IdentificationDocument, now: IdentificationDocument, std: Mapping[str, float]
 ) -> list[str]:
-    """Return one line for each kind of difference between two models of a robot that may look like a change.
-
-    ``std``: standard deviation of the difference of each parameter that is compared.
-    """
+    """One line per kind of difference between two models that may look like a change; ``std``: of the differences."""
     lines = [_smoothing(baseline, now, std)]
     if baseline.configuration is not None and now.configuration is not None:
         lines += [
@@ -38,10 +35,9 @@ def model_differences(
 
 
 def _smoothing(baseline: IdentificationDocument, now: IdentificationDocument, std: Mapping[str, float]) -> str:
-    """Return the line on joints whose Coulomb friction is shifted by more than one standard deviation.
+    """Line on joints whose Coulomb friction is shifted by more than one standard deviation.
 
-    At a velocity ``v`` the smoothed sign lacks ``2 / (pi g v)`` (`armident.identify.identification.sign_smoothing`), so
-    that another ``g`` shifts Coulomb friction by that share.
+    The smoothed sign lacks ``2 / (pi g v)`` at a velocity ``v``; another ``g`` shifts Coulomb friction by that share.
     """
     one, other = baseline.sign_smoothing or {}, now.sign_smoothing or {}
     values = {p.name: p.value for p in now.parameters}

@@ -1,7 +1,6 @@
-"""Test of the residuals of an identification against those of the baseline.
+"""Test of the residuals of an identification against those of the baseline, which describe what the model lacks.
 
-Parameters describe what the model has; the residuals describe what it lacks. The free functions of the motion are
-tested with the difference of their coefficients, the bands of frequency with the ratio of their powers.
+Free functions of the motion are tested by the difference of coefficients, bands of frequency by the ratio of powers.
 """
 
 from collections.abc import Sequence
@@ -34,18 +33,9 @@ NOT_COMPARED = (
 
 @dataclass(frozen=True)
 class ResidualChange:
-    """Test of one property of the residuals of one joint.
+    """Test of one property of the residuals of one joint, by chi-square or, of ``power``, by a ratio of powers.
 
-    Parameters
-    ----------
-    kind
-        ``position`` (and direction), ``velocity``, or ``power`` in a frequency band.
-    statistic, degrees
-        Chi-square statistic and its degrees of freedom, or ratio of the powers and those of the later one.
-    p_value
-        Probability of such a statistic without a change, corrected by Holm's method for all joints and kinds.
-    band_hz
-        Frequency band of ``power``, Hz; ``None`` otherwise.
+    ``p_value``: probability without a change, corrected by Holm's method for all joints and kinds.
     """
 
     joint: str
@@ -73,10 +63,7 @@ class ResidualChange:
 
 @dataclass(frozen=True)
 class ResidualTest:
-    """Result of the test; without tests, ``reason`` says why.
-
-    ``tests``: all joints and kinds. ``reason``: why structure is not compared, for all joints or some; empty: compared.
-    """
+    """Test of all joints and kinds; ``reason``: why structure is not compared, for all joints or some."""
 
     tests: tuple[ResidualChange, ...] = ()
     reason: str = ""
@@ -87,10 +74,7 @@ class ResidualTest:
 
 
 def compare_residuals(baseline: IdentificationDocument, now: IdentificationDocument) -> ResidualTest:
-    """Test the residuals of two identifications of an arm for a change.
-
-    ``baseline``, ``now``: identifications with the same motion.
-    """
+    """Test the residuals of two identifications of an arm with the same motion for a change."""
     if baseline.residual_statistics is None:
         return ResidualTest(reason=NOT_COMPARED)
     if now.residual_statistics is None:
@@ -154,10 +138,9 @@ def _tests(old: ResidualStatistics, new: ResidualStatistics) -> list[ResidualCha
 
 
 def _functions(old: ResidualStatistics, new: ResidualStatistics, part: slice) -> tuple[float, int]:
-    """Return chi-square of the difference of the coefficients of some functions, and its degrees of freedom.
+    """Chi-square of the difference of the coefficients of some functions, and its degrees of freedom.
 
-    The noise of the baseline is that of both: the noise model of a changed arm absorbs a part of its model error, which
-    would hide the change.
+    The noise of the baseline counts for both: a noise model of a changed arm would absorb a part of the change.
     """
     information = [np.array(each.information)[part, part] for each in (old, new)]
     score = [np.array(each.score)[part] for each in (old, new)]

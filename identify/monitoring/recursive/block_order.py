@@ -9,14 +9,9 @@ LONGEST_HOLD_S = 1.0
 
 
 class BlockOrder:
-    """Hands over blocks in the order of their sequence numbers, each once.
+    """Hands over blocks in the order of sequence numbers, each once; a missing one is given up after `LONGEST_HOLD_S`.
 
-    A block that is missing is waited for. After `LONGEST_HOLD_S` it is given up.
-
-    Attributes
-    ----------
-    lost
-        Number of blocks that were given up, those before the first one of a capture included.
+    ``lost`` counts the blocks that were given up, those before the first one of a capture included.
     """
 
     def __init__(self) -> None:
@@ -26,11 +21,7 @@ class BlockOrder:
         self._held: dict[int, tuple[float, Block]] = {}
 
     def add(self, block: Block, now_s: float) -> Iterator[Block]:
-        """Take a block, and yield those whose turn has come.
-
-        ``block``: a block of any capture. The first one of another capture releases those that wait. ``now_s``: time on
-        a monotonic clock, s.
-        """
+        """Take a block, and yield those whose turn has come; the first of another capture releases all that wait."""
         if block.capture != self._capture:
             yield from self._released(float("inf"))
             self._capture, self._next = block.capture, 0
@@ -39,10 +30,7 @@ class BlockOrder:
         yield from self._released(now_s)
 
     def overdue(self, now_s: float) -> Iterator[Block]:
-        """Yield blocks that have waited long enough, and those after them whose turn has come.
-
-        ``now_s``: time on a monotonic clock, s.
-        """
+        """Yield blocks that have waited long enough, and those after them whose turn has come."""
         yield from self._released(now_s)
 
     def _released(self, now_s: float) -> Iterator[Block]:

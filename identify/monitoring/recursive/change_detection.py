@@ -20,13 +20,9 @@ LEVEL_STD = 0.01
 class FrictionTest:
     """Two CUSUMs per joint: more friction, and less, than the slow level of the joint.
 
-    With relative change c of a window, its standard deviation s, level l, tolerated change a and sought change b, the
-    sum grows by ``(b - a) / s^2 (c - l - (a + b) / 2)``, which is the log-likelihood ratio of b against a. Growth per
-    window is limited, so that several windows are needed. The mean number of windows to a false alarm is at least
-    ``exp(h)`` for the threshold h, because the ratio has a mean of at most one while the friction is healthy
-    (Lorden 1971).
-
-    ``settings``: changes, false-alarm rate and memories.
+    For a change c with standard deviation s, level l, tolerated a and sought b, each grows by the log-likelihood ratio
+    ``(b - a) / s^2 (c - l - (a + b) / 2)``, limited, so that an alarm needs several windows. The mean number of windows
+    to a false alarm is at least ``exp(h)`` for the threshold h (Lorden 1971).
     """
 
     _saved = ("sums", "level", "spread", "spread_weight", "last", "last_std", "alarm", "alarm_change", "windows")
@@ -48,12 +44,7 @@ class FrictionTest:
         self.windows = 0
 
     def add(self, change: Array, std: Array, instant: int, valid: NDArray[np.bool_]) -> None:
-        """Add the estimate of a window.
-
-        ``change``, ``std``: relative change of each joint's friction and its standard deviation, (n,), 1. ``instant``:
-        number of the decimated instant at its end; it dates an alarm. ``valid``: mask (n,) of the joints with enough
-        excitation; the others raise no alarm.
-        """
+        """Add a window, dated by ``instant``: relative change and std (n,), 1; only ``valid`` joints raise alarms."""
         self.windows += 1
         known = np.isfinite(change) & np.isfinite(std)
         self._add_spread(change, std, known)

@@ -29,10 +29,9 @@ EARLIER = 2
 
 @dataclass(frozen=True)
 class Instant:
-    """Equations of all joints at one decimated instant.
+    """Equations of all joints at one decimated instant; ``moving`` (n,): share of the low-pass window.
 
-    ``x``, ``z``: filtered regressor at the measured motion, and at the motion that the reference predicts, (n, b) each;
-    ``y``: filtered torques (n,), N m or N; ``moving``: share (n,) of the low-pass window in which each joint moves, 1.
+    ``x``, ``z`` (n, b): regressor, measured and predicted by the reference; ``y`` (n,): torques, N m or N.
     """
 
     x: Array
@@ -44,24 +43,9 @@ class Instant:
 class StreamEquations:
     """Turns rows of the stream into equations; a gap starts the filters anew.
 
-    Velocities and accelerations of measured and of reference positions come from the same live filter, so that both
-    have the same delay. Position, velocity and torque are delayed by the delay of the acceleration. The drives follow
-    their reference with a first-order lag, which is estimated per joint from the following error. Raises DataError if
-    the sampling rate is too low for the bandwidth.
-
-    Parameters
-    ----------
-    model
-        The arm, n joints and b base parameters, without additional terms.
-    bandwidth_hz
-        Closed-loop bandwidth, Hz.
-    with_reference
-        True if the rows have reference positions; without them the instruments are the measured regressor.
-    take
-        Called with each `Instant`.
-    lead
-        Number of samples by which the torque leads the position, from -1 to `EARLIER`: recorded torque k belongs to
-        the instant ``k + lead``. A drive that holds its torque until the next sample has 0.5.
+    Measured and reference positions pass the same live filter, whose delay all quantities get. A first-order lag behind
+    the reference is estimated per joint; without a reference the regressor is the instrument. ``lead``: torque k
+    belongs to ``k + lead`` samples, 0.5 if held. Raises DataError if the rate is too low.
     """
 
     _saved = (
@@ -125,10 +109,7 @@ class StreamEquations:
         return np.clip(lag, 0.0, SLOWEST_LAG_S)
 
     def add(self, sync: NDArray[np.int64], values: Array) -> None:
-        """Take over rows; complete pieces are computed.
-
-        ``sync``: SYNC numbers (N,); ``values``: position, torque and reference, (N, w).
-        """
+        """Take over SYNC numbers (N,) and values (N, w): position, torque, reference; compute complete pieces."""
         begin = 0
         if sync.size and int(sync[0]) != self.next_sync >= 0:
             self._cut()
@@ -251,12 +232,9 @@ def slow_velocity(model: ArmModel, settings: RecursiveSettings) -> Array:
 
 
 def acceleration_delay(nvr: float) -> float:
-    """Delay of the acceleration of the live filter at low frequencies, samples.
+    """Delay of the acceleration of the live filter of order 3 at low frequencies, samples.
 
-    The steady state of the filter follows ``k^3 / 6``, whose acceleration is k, with a constant delay; its velocity
-    and position then have errors, but no delay of first order.
-
-    ``nvr``: noise-variance ratio of a filter of order 3.
+    In steady state it follows ``k^3 / 6`` with a constant delay of the acceleration, but none of velocity and position.
     """
     length = int(40 / nvr ** (1 / 6)) + 40
     k = np.arange(length, dtype=np.float64)

@@ -30,42 +30,11 @@ NOMINAL_BANDWIDTH_HZ = 10.0
 class RecursiveResult:
     """State of the estimator after the last block; joints in the order of the robot, n of them, and b parameters.
 
-    Parameters
-    ----------
-    sync
-        SYNC number of the last sample; -1 before the first.
-    motion_s
-        Time in which at least one joint moved and was used, s.
-    raw, raw_std
-        Relative change of each joint's friction since the reference by the last window alone, and its standard
-        deviation, (n,), 1; NaN before the first window.
-    filtered, filtered_std
-        The same by the recursive estimate, (n,), 1.
-    valid
-        ``filtered`` where there was enough excitation, otherwise NaN, (n,).
-    information, needed_information
-        Fisher information of each joint's relative friction in the recent data, (n,), 1, and the amount that makes
-        its values valid. Its inverse square root is the standard deviation by the data alone.
-    level
-        Slow level of each joint that the test compares with, (n,), 1.
-    evidence, threshold
-        Log-likelihood ratio of a change of each joint, (n,), and that of an alarm, nats.
-    alarm
-        Mask (n,) of the joints in alarm.
-    alarm_s, alarm_change
-        Time of the motion at the alarm, s, and relative change, (n,); NaN without alarm.
-    names
-        Names of the base parameters.
-    reference, parameters_raw, parameters_filtered, parameters_std
-        Values of the reference, of the last window, of the recursive estimate, and its standard deviations, (b,), SI.
-    parameters_valid
-        ``parameters_filtered`` where valid: friction with its joint, other parameters with all joints; (b,).
-    noise_std
-        Standard deviation of each joint's residual torque, with the allowance for serial correlation, (n,), N m or N.
-    lag_s
-        Lag of each joint behind its reference, (n,), s.
-    gaps, without_reference, repeated
-        Number of gaps at which the filters started anew; samples without reference; repeated samples.
+    ``sync`` is -1 before the first sample; ``motion_s`` is the time in which a joint moved, s. ``raw``, ``filtered``,
+    ``level`` (n,), 1: relative change of friction by the last window, by the recursive estimate, and its slow level.
+    ``valid`` is NaN without enough Fisher ``information``. ``evidence``: log-likelihood ratio against ``threshold``,
+    nats. ``parameters_*`` (b,), SI: friction is valid with its joint, others with all joints. ``noise_std`` (n,), N m
+    or N, allows for serial correlation.
     """
 
     sync: int
@@ -99,19 +68,10 @@ class RecursiveResult:
 class RecursiveEstimator:
     """Tracks the base parameters of an arm on its stream and tests the friction of every joint for a change.
 
-    The parameters are a random walk around an earlier identification. The filter is Young's symmetric recursive
-    instrumental-variable estimator: a Kalman filter whose gain and covariance have the instruments in place of the
-    regressor. Results do not depend on how the stream is cut into blocks.
-
-    ``robot``: configuration of the arm, n joints. ``reference``: identification of the healthy arm. ``sample_rate_hz``:
-    rate of SYNC, 1/s. ``with_reference``: True if reference positions are recorded. Without them the instruments are
-    the measured regressor. ``settings``: widths, thresholds and memories. Raises ConfigError if the configuration has
-    effects; DataError if the reference is of another robot or unusable, or the sampling rate is too low.
-
-    Notes
-    -----
-    Source: thesis sections 3.2.2 and 7.3.3; P. C. Young, Recursive Estimation and Time-Series Analysis, 2011, for the
-    symmetric gain. The live filter is `armident.identify.signals.live.VelocityFilter`.
+    A random walk around an earlier identification, filtered by Young's symmetric recursive instrumental-variable
+    estimator (thesis sections 3.2.2 and 7.3.3; P. C. Young, Recursive Estimation and Time-Series Analysis, 2011). Cuts
+    into blocks do not matter. Raises ConfigError for effects in the configuration, DataError for an unsuitable
+    reference or rate.
     """
 
     _saved = (
@@ -173,20 +133,15 @@ class RecursiveEstimator:
         self.speed_error = np.zeros((2, n))
 
     def handle(self, block: SampleBlock) -> None:
-        """Process a block of any stream of the capture.
+        """Process a block of any stream: repeated rows are skipped, missing ones start the filters anew.
 
-        ``block``: consecutive rows; later blocks of a stream follow earlier ones. Repeated rows are skipped, and
-        missing ones start the filters anew. Raises DataError if the block has other joints than the robot, or lacks
-        position or torque.
+        Raises DataError if the block has other joints than the robot, or lacks position or torque.
         """
         if self.matcher.add(block):
             self.start_capture(begun=True)
 
     def handle_instant(self, instant: Instant) -> None:
-        """Process the equations of a decimated instant, which `handle` makes of the stream: noise, gates, update.
-
-        ``instant``: regressors, instruments and torques.
-        """
+        """Process the equations of a decimated instant, which `handle` makes of the stream: noise, gates, update."""
         reference, s = self.reference, self.settings
         moving = instant.moving >= s.moving_share
         residual = instant.y - _rows_times(instant.x, reference.theta)
@@ -210,10 +165,7 @@ class RecursiveEstimator:
             self._close_window()
 
     def start_capture(self, *, begun: bool = False) -> None:
-        """Expect the blocks of another capture: filters start anew, estimates stay.
-
-        ``begun``: True if its first block has been taken over already.
-        """
+        """Expect another capture, whose first block may have ``begun``: filters start anew, estimates stay."""
         if not begun:
             self.matcher.start_capture()
         self.equations.restart()
@@ -262,11 +214,7 @@ class RecursiveEstimator:
         write_state(path, state_of(self), self._identity)
 
     def load(self, path: Path) -> None:
-        """Continue from a saved state, to the last bit as if it had not been interrupted.
-
-        Raises ConfigError if there is no such file; DataError if the state is of another version, robot, reference or
-        setting.
-        """
+        """Continue from a saved state to the last bit; raises ConfigError or DataError if it does not suit."""
         restore_state(self, read_state(path, self._identity))
 
     @property

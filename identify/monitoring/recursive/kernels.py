@@ -10,10 +10,7 @@ Array = NDArray[np.float64]
 
 @compiled("f8[:, ::1], f8[:, ::1], f8[:, ::1]")
 def to_joint_side(raw: Array, factor: Array, out: Array) -> None:
-    """Multiply every row by a matrix.
-
-    ``raw``: rows (N, n); ``factor``: matrix (n, n): ``out[k] = factor @ raw[k]``; ``out``: output array (N, n).
-    """
+    """Multiply every row by a matrix: ``out[k] = factor @ raw[k]``, shapes (N, n) and (n, n)."""
     for k in range(raw.shape[0]):
         for i in range(raw.shape[1]):
             total = 0.0
@@ -24,11 +21,7 @@ def to_joint_side(raw: Array, factor: Array, out: Array) -> None:
 
 @compiled("f8[:, ::1], f8[::1], f8[::1]")
 def first_order_lag(x: Array, share: Array, state: Array) -> None:
-    """Filter every column with a first-order lag, in place.
-
-    ``x``: signals (N, n). ``share``: share (n,) of the difference that the output makes up per sample, 1. ``state``:
-    last output (n,); changed in place.
-    """
+    """Filter columns (N, n) by a first-order lag, in place; ``share`` (n,) is made up per sample."""
     for k in range(x.shape[0]):
         for j in range(x.shape[1]):
             state[j] += share[j] * (x[k, j] - state[j])
@@ -37,11 +30,9 @@ def first_order_lag(x: Array, share: Array, state: Array) -> None:
 
 @compiled("f8[:, ::1], f8[::1], i8, i8, i8, f8[:, ::1]")
 def low_pass(data: Array, taps: Array, factor: int, seen: int, done: int, rows: Array) -> None:
-    """Add the contribution of further samples to the decimated rows that are not complete.
+    """Add the contribution of further samples to the decimated rows that are not complete, in place.
 
-    ``data``: samples (N, c), the first of them number ``seen``. ``taps``: impulse response (m,). ``factor``: decimation
-    factor. ``seen``: number of samples before these. ``done``: number of the decimated row that ``rows`` begins with.
-    ``rows``: incomplete rows (r, c); changed in place.
+    Samples (N, c) follow ``seen`` others; row ``done`` is the first of ``rows`` (r, c).
     """
     for k in range(data.shape[0]):
         at = seen + k
@@ -58,14 +49,9 @@ def low_pass(data: Array, taps: Array, factor: int, seen: int, done: int, rows: 
 def update(
     state: Array, covariance: Array, x: Array, z: Array, y: Array, variance: Array, use: NDArray[np.bool_]
 ) -> None:
-    """Measurement update of the random walk with instruments, one equation after the other.
+    """Measurement update of the random walk with instruments, equation by equation; a Kalman filter if ``z = x``.
 
-    With ``z = x`` it is the update of a Kalman filter. Young's symmetric form: the gain and the covariance have the
-    instruments, the innovation has the measured regressor.
-
-    ``state``: estimate (b,); changed in place. ``covariance`` (b, b); changed in place. ``x``, ``z``: regressor and
-    instruments, (n, b) each. ``y``: torques (n,). ``variance``: variance of each equation, (n,). ``use``: mask (n,) of
-    the equations to use.
+    Young's symmetric form: gain and ``covariance`` (b, b) have the instruments, the innovation the regressor (n, b).
     """
     b = state.size
     gain = np.empty(b)
@@ -97,11 +83,7 @@ def update(
 def add_products(
     sums: Array, squares: Array, right: Array, x: Array, z: Array, y: Array, variance: Array, use: NDArray[np.bool_]
 ) -> None:
-    """Add the weighted products ``z' x``, ``z' z`` and ``z' y`` of an instant.
-
-    ``sums``, ``squares``: sums of ``z' x`` and of ``z' z``, (b, b) each; changed in place. ``right``: sum of ``z' y``,
-    (b,); changed in place. ``x``, ``z``, ``y``, ``variance``, ``use``: as in `update`.
-    """
+    """Add the weighted products ``z' x``, ``z' z`` and ``z' y`` of an instant to the three sums; see `update`."""
     for j in range(y.size):
         if not use[j]:
             continue
@@ -118,11 +100,7 @@ def add_products(
 
 @compiled("f8[:, ::1], f8[:, ::1]")
 def solve(matrix: Array, right: Array) -> bool:
-    """Solve ``matrix x = right`` by elimination with partial pivoting, in place.
-
-    ``matrix`` (b, b); overwritten. ``right``: right sides (b, r); overwritten by the solutions. Returns ``False`` if
-    the matrix is singular.
-    """
+    """Solve ``matrix x = right``, (b, b) and (b, r), by pivoted elimination in place; return ``False`` if singular."""
     b = matrix.shape[0]
     for i in range(b):
         pivot = i
@@ -162,20 +140,9 @@ def add_residuals(
     sums: Array,
     counts: Array,
 ) -> None:
-    """Add an instant to the running autocovariances of the residuals.
+    """Add an instant's residuals (n,), N m or N, to the running autocovariances, in place; ``keep``: share that stays.
 
-    Parameters
-    ----------
-    residual
-        Residuals (n,), N m or N.
-    use
-        Mask (n,) of the residuals that count.
-    keep
-        Share of the sums that remains per instant, 1.
-    past, known
-        The last L residuals and their masks, latest first, (L, n); changed in place.
-    sums, counts
-        Weighted sums of the products at lags 0 to L, and of their weights, (L + 1, n); changed in place.
+    ``past``, ``known`` (L, n): last residuals and masks, latest first; ``sums``, ``counts`` (L + 1, n): by lag.
     """
     lags, n = past.shape
     for j in range(n):

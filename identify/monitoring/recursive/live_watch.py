@@ -37,10 +37,7 @@ WAITING_BYTES = 256 << 20
 
 
 class Watch:
-    """Hands blocks to the estimator, and results to a listener every `SHOWN_S` of the stream.
-
-    ``rate_hz``: rate of SYNC, 1/s; ``show``: takes each result.
-    """
+    """Hands blocks to the estimator, and results to a listener every `SHOWN_S` of the stream; rate of SYNC, 1/s."""
 
     def __init__(self, estimator: RecursiveEstimator, rate_hz: float, show: Callable[[RecursiveResult], None]) -> None:
         self._estimator, self._show = estimator, show
@@ -97,11 +94,7 @@ class LiveWatch:
         self, stop: threading.Event, show: Callable[[RecursiveResult], None], save: Callable[[], None],
         duration: float | None = None,
     ) -> None:  # fmt: skip
-        """Process blocks until a stop.
-
-        ``stop``: set to end. ``show``: takes each result. ``save``: called every `SAVED_S`. ``duration``: time after
-        which to end, s; ``None``: only at the stop.
-        """
+        """Process blocks until a stop or the end of ``duration``, s; ``save`` is called every `SAVED_S`."""
 
         def publish(result: RecursiveResult) -> None:
             self._last = json.dumps(document(result, self._robot)).encode()

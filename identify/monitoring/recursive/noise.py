@@ -14,10 +14,7 @@ Array = NDArray[np.float64]
 class RunningNoise:
     """Long-run variance of each joint's residuals, by Newey and West's estimator with exponential forgetting.
 
-    A friction torque is nearly constant within a move. Slow residuals therefore disturb its estimate as a white noise
-    of this long-run variance does. It is never below the variance itself.
-
-    ``settings``: memory, and the least amount of motion.
+    Slow residuals disturb friction, nearly constant within a move, as white noise of this variance does.
     """
 
     _saved = ("past", "known", "sums", "counts", "seen")
@@ -45,10 +42,7 @@ class RunningNoise:
         self.known[:] = False
 
     def add(self, residual: Array, use: NDArray[np.bool_]) -> None:
-        """Add the residuals of an instant.
-
-        ``residual`` (n,), N m or N; ``use``: mask (n,) of the residuals that count.
-        """
+        """Add the residuals (n,), N m or N, of an instant, and the mask (n,) of those that count."""
         self.seen += use
         add_residuals(residual, use, self._keep, self.past, self.known, self.sums, self.counts)
 

@@ -36,24 +36,9 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, eq=False)
 class Reference:
-    """Parameters that friction is compared with, and how far they may move.
+    """Parameters that friction is compared with, and how far they may move; SI. -1 in an index: none.
 
-    Parameters
-    ----------
-    model
-        The arm with the sign smoothing of the reference, b base parameters.
-    theta, covariance
-        Values (b,) and their covariance (b, b), SI.
-    walk
-        Variance (b,) that the random walk adds to each parameter per second of motion.
-    window_precision
-        Precision (b, b) of the prior of one window.
-    friction
-        Viscous and Coulomb friction of each joint, indices (n, 2); -1 where the arm has none.
-    place
-        Joint of each friction parameter, (b,); -1 for other parameters.
-    torque_lead
-        Number of samples by which the torque leads the position.
+    ``walk`` (b,): variance per second of motion; ``window_precision`` (b, b): prior of a window; ``friction`` (n, 2).
     """
 
     model: ArmModel
@@ -78,12 +63,10 @@ class Reference:
 
 
 def torque_lead(document: IdentificationDocument) -> float:
-    """Return the number of samples by which the torque leads the position, of all joints together.
+    """Number of samples by which the torque leads the position, of all joints together.
 
-    The limits are those of the check of the set-up: a drive holds its torque until the next sample (0.5), unless joints
-    that know it to a quarter of a sample agree on another lead, by 0.1 to 1 sample, within three standard deviations.
-
-    ``document``: identification of the arm.
+    Torque is held (0.5), unless joints agree, within three standard deviations, on a lead that differs by 0.1 to 1. The
+    joints that count know it to a quarter; the limits are those of the check of the set-up.
     """
     found = np.array(list((document.torque_delay_samples or {}).values())).reshape(-1, 2)
     samples, std = found[np.isfinite(found).all(axis=1) & (found[:, 1] <= KNOWN_LEAD) & (found[:, 1] > 0)].T
@@ -102,12 +85,7 @@ def torque_lead(document: IdentificationDocument) -> float:
 
 
 def reference_from(document: IdentificationDocument, robot: RobotConfig, settings: RecursiveSettings) -> Reference:
-    """Return the reference of an identification document.
-
-    ``document``: identification of the arm; ``settings``: widths of the random walk. Raises ConfigError if the
-    configuration has effects, which the stream does not compute; DataError if the document is unusable, of another
-    robot, or has other parameters.
-    """
+    """Reference of an identification; ConfigError for effects in the configuration, DataError if it does not suit."""
     if robot.effects:
         raise ConfigError(f"robot {robot.name!r} has effects: armident watch needs a configuration without them")
     if document.robot != robot.name:

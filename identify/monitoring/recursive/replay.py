@@ -12,10 +12,7 @@ from armident.daq.recording import Recording, StreamLayout
 
 @dataclass(frozen=True)
 class RecordedBlock:
-    """Consecutive rows of one recorded stream.
-
-    ``sync``: SYNC numbers (N,); ``t_ns``: receive times (N,), ns UTC; ``raw``: raw values of every field, (N, n) each.
-    """
+    """Consecutive rows (N,) of one recorded stream: SYNC numbers, receive times in ns UTC, raw values (N, n)."""
 
     layout: StreamLayout
     sync: NDArray[np.int64]

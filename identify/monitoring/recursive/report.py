@@ -16,10 +16,7 @@ DRIFTED = 0.06
 
 
 def joint_states(result: RecursiveResult) -> list[str]:
-    """State of each joint: ``alarm``, ``drifted``, ``unchanged``, ``too little motion`` or ``no motion``.
-
-    ``result``: state of the estimator.
-    """
+    """State of each joint: ``alarm``, ``drifted``, ``unchanged``, ``too little motion`` or ``no motion``."""
     states = []
     for j in range(result.valid.size):
         if result.alarm[j]:
@@ -32,10 +29,7 @@ def joint_states(result: RecursiveResult) -> list[str]:
 
 
 def document(result: RecursiveResult, robot: RobotConfig) -> dict[str, Any]:
-    """Return the document that ``armident watch`` publishes and prints; values that are not valid are null.
-
-    ``result``: state of the estimator.
-    """
+    """Return the document that ``armident watch`` publishes and prints; values that are not valid are null."""
     states = joint_states(result)
     joints = [
         {

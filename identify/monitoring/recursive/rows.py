@@ -39,17 +39,10 @@ class SampleBlock(Protocol):
 
 
 class RowMatcher:
-    """Collects blocks in any cutting and hands over rows with position, torque and reference, in the order of SYNC.
+    """Hands over rows with position, torque and reference in the order of SYNC, from blocks in any cutting.
 
-    Parameters
-    ----------
-    robot
-        Configuration with transmission and drive gains, n joints.
-    with_reference
-        True if reference positions are recorded; each sample then waits for the report after it.
-    take
-        Called with the SYNC numbers (N,) and values (N, w) of further rows: position, torque and, with a reference,
-        its position, n columns each; joint side, SI.
+    ``take``: SYNC numbers (N,) and values (N, w), n columns each, joint side, SI; a reference waits for the next
+    report.
     """
 
     _saved = (
@@ -84,10 +77,9 @@ class RowMatcher:
         self.without_reference, self.repeated = 0, 0
 
     def add(self, block: SampleBlock) -> bool:
-        """Take over a block; rows that are complete are handed over.
+        """Take over a block of any stream; True if another capture begins: SYNC numbers begin anew at a later time.
 
-        ``block``: a block of any stream. Returns True if the block begins another capture: its SYNC numbers begin anew
-        at a later time. Raises DataError if the block has other joints than the robot, or lacks position or torque.
+        Raises DataError if the block has other joints than the robot, or lacks position or torque.
         """
         layout = block.layout
         names = tuple(joint.name for joint in self._robot.joints)

@@ -19,10 +19,7 @@ SCHEMA = "armident/recursive-state/1"
 
 @runtime_checkable
 class HasState(Protocol):
-    """Object whose attribute ``_saved`` names the attributes that are its whole state.
-
-    They are arrays, integers, floats, or other such objects.
-    """
+    """Object whose whole state is in the attributes that ``_saved`` names: arrays, numbers, or other such objects."""
 
     @property
     def _saved(self) -> tuple[str, ...]: ...
@@ -41,11 +38,7 @@ def state_of(owner: HasState, prefix: str = "") -> dict[str, NDArray[Any]]:
 
 
 def restore_state(owner: HasState, arrays: dict[str, NDArray[Any]], prefix: str = "") -> None:
-    """Give an object a state.
-
-    ``arrays``: arrays of `state_of`; ``prefix``: beginning of every name. Raises DataError if an array is missing or
-    has another number of dimensions.
-    """
+    """Give an object the state of `state_of`; raises DataError if an array is missing or of another dimension."""
     for name in owner._saved:
         value = getattr(owner, name)
         if isinstance(value, HasState):
@@ -58,10 +51,7 @@ def restore_state(owner: HasState, arrays: dict[str, NDArray[Any]], prefix: str 
 
 
 def write_state(path: Path, arrays: dict[str, NDArray[Any]], identity: dict[str, str]) -> None:
-    """Write a state so that a reader sees all of it or none.
-
-    ``path``: file to write (NumPy ``.npz``); ``identity``: robot and reference that it belongs to.
-    """
+    """Write a state (NumPy ``.npz``) of a robot and reference so that a reader sees all of it or none."""
     buffer = io.BytesIO()
     head = np.frombuffer(json.dumps({"schema": SCHEMA, **identity}).encode(), dtype=np.uint8)
     np.savez(buffer, head=head, **{f"state:{name}": value for name, value in arrays.items()})  # type: ignore[arg-type]
@@ -79,11 +69,7 @@ def write_state(path: Path, arrays: dict[str, NDArray[Any]], identity: dict[str,
 
 
 def read_state(path: Path, identity: dict[str, str]) -> dict[str, NDArray[Any]]:
-    """Read a state that `write_state` wrote.
-
-    ``identity``: robot and reference that the state must belong to. Raises ConfigError if the file is missing;
-    DataError if it is no state, or one of another version, robot or reference.
-    """
+    """Read a state of `write_state`; raises ConfigError if it is missing, DataError if it is of another identity."""
     try:
         with np.load(path, allow_pickle=False) as content:
             head = json.loads(content["head"].tobytes())

@@ -15,10 +15,7 @@ TOLERANCE = 1e-9
 
 @cache
 def check_update() -> None:
-    """Compare the compiled update with filterpy on a small case, once per process.
-
-    Raises ArmidentError if they differ: the compiled code of this machine is wrong.
-    """
+    """Compare the compiled update with filterpy once per process; raises ArmidentError if the machine code is wrong."""
     from filterpy.kalman import KalmanFilter
 
     make: Any = KalmanFilter

@@ -33,12 +33,7 @@ REPLAY_SYNCS = 1000
 
 @dataclass(frozen=True)
 class WatchOptions:
-    """Options of ``armident watch``.
-
-    ``reference``: identification of the healthy arm. ``state``: file of the saved state; ``None``: none is kept.
-    ``as_json``: one JSON document per line in place of the table. ``duration``: time after which a live watch ends, s;
-    ``None``: at a signal.
-    """
+    """Options of ``armident watch``: result of the healthy arm, file of the state, duration of a live watch, s."""
 
     reference: Path
     state: Path | None
@@ -47,10 +42,7 @@ class WatchOptions:
 
 
 class Screen:
-    """Shows results: JSON lines, a table that is renewed on a terminal, or one line per change of state.
-
-    ``as_json``: print JSON lines.
-    """
+    """Shows results: JSON lines, a table that is renewed on a terminal, or one line per change of state."""
 
     def __init__(self, robot: RobotConfig, as_json: bool) -> None:
         self._robot, self._as_json = robot, as_json
@@ -92,11 +84,9 @@ class Screen:
 
 
 def watch_recordings(paths: Sequence[Path], config: Path | None, options: WatchOptions) -> int:
-    """Carry out ``armident watch RECORDING``.
+    """Carry out ``armident watch RECORDING``; 4 after an alarm, 3 if no joint had enough excitation, otherwise 0.
 
-    ``paths``: recordings of one robot in the order of time. ``config``: robot configuration; ``None``: that of the
-    first recording. Returns 4 after an alarm, 3 if no joint had enough excitation, otherwise 0. Raises ConfigError or
-    DataError if a file is wrong, or the reference does not fit.
+    Raises ConfigError or DataError if a file is wrong, or the reference does not fit.
     """
     reference = load_document(options.reference, IdentificationDocument)
     first = read_recording(paths[0])
@@ -139,10 +129,9 @@ def _load_state(estimator: RecursiveEstimator, path: Path | None) -> None:
 
 
 def watch_cell(config: Path | None, options: WatchOptions) -> int:
-    """Carry out ``armident watch --config SESSION`` until SIGTERM or SIGINT.
+    """Carry out ``armident watch --config SESSION`` until SIGTERM or SIGINT; 4 after an alarm, otherwise 0.
 
-    ``config``: session configuration. Returns 4 after an alarm, otherwise 0. Raises ConfigError or DataError if a file
-    is wrong, or the reference does not fit.
+    Raises ConfigError or DataError if a file is wrong, or the reference does not fit.
     """
     if config is None:
         raise ConfigError("give a RECORDING, or --config SESSION for the live stream of a cell")

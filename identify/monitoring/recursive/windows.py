@@ -14,11 +14,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class WindowEstimate:
-    """Estimate of one window.
-
-    ``difference``: parameters less the reference, (b,), SI. ``change``, ``std``: relative change of each joint's
-    friction and its standard deviation, (n,), 1; NaN and infinite where the joint has no friction or did not move.
-    """
+    """Parameters (b,) of one window less the reference, SI, and relative change of friction (n,), 1; no motion: NaN."""
 
     difference: Array
     change: Array
@@ -41,11 +37,7 @@ class Window:
         self.instants = 0
 
     def add(self, instant: Instant, residual: Array, variance: Array, use: NDArray[np.bool_]) -> None:
-        """Add the equations of an instant.
-
-        ``instant``: regressor and instruments; ``residual``: torques less those of the reference, (n,), N m or N;
-        ``variance``: variance of each equation, (n,); ``use``: mask (n,) of the equations to use.
-        """
+        """Add the equations of an instant; ``residual`` (n,), N m or N: torques less those of the reference."""
         add_products(self.sums, self.squares, self.right, instant.x, instant.z, residual, variance, use)
         self.instants += 1
 
@@ -66,14 +58,9 @@ class Window:
 
 
 def friction_change(reference: Reference, difference: Array, covariance: Array) -> tuple[Array, Array]:
-    """Relative change of each joint's friction: the factor common to viscous and Coulomb friction.
+    """Relative change (n,) of each joint's friction, viscous and Coulomb, and its standard deviation, 1; else NaN.
 
-    The generalised least-squares estimate of c in ``d = c f`` from the differences d of both parameters, their
-    covariance V and the reference f: ``c = f' V^-1 d / f' V^-1 f``, with the variance ``1 / f' V^-1 f``.
-
-    ``reference``: reference with n joints; ``difference``: parameters less the reference, (b,), SI; ``covariance``:
-    covariance of the parameters, (b, b). Returns ``change``, ``std``: (n,) each, 1; NaN and infinite where the
-    reference has no friction.
+    Generalised least squares of ``d = c f``, covariance V: ``c = f' V^-1 d / f' V^-1 f``, variance ``1 / f' V^-1 f``.
     """
     n = reference.friction.shape[0]
     change, std = np.full(n, np.nan), np.full(n, np.inf)

@@ -26,11 +26,9 @@ class Baseline:
 
 
 def baseline_of(file: Path | None, history: History | None, robot: str, cell: str) -> Baseline:
-    """Return the baseline of the robot in a cell.
+    """Baseline of the robot in a cell: the file, else the first run in the history.
 
-    ``file``: baseline given by the user; ``None``: the first run in the history. ``history``: database of
-    identifications; ``None`` if it cannot be read, with a file that exists. Raises ConfigError if ``file`` is missing
-    although the history has runs of this arm: probably a misspelt name; DataError if it is of another robot.
+    Raises ConfigError if the history has runs but the file is missing (a misspelt name), DataError if it does not fit.
     """
     first = None if history is None else history.first(robot, cell)
     if file is None:

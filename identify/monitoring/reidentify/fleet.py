@@ -21,6 +21,7 @@ from armident.identify.monitoring.change.change_test import ParameterChangeTest,
 from armident.identify.monitoring.change.history import History
 from armident.identify.monitoring.reidentify.reidentify_options import ReidentifyOptions
 from armident.identify.monitoring.reidentify.summary import change_lines
+from armident.identify.monitoring.worker.worker import options_of
 from armident.identify.report.robot_file import write_identification
 
 if TYPE_CHECKING:
@@ -57,14 +58,10 @@ class Row:
 
 
 def fleet_command(pattern: str, asked: ReidentifyOptions, *, as_json: bool) -> int:
-    """Carry out ``armident reidentify --recordings``.
+    """Carry out ``armident reidentify --recordings``; a failed recording does not stop the others.
 
-    Recordings are compared in the order of their names: with the baseline, or with the first run of the arm (robot and
-    cell) in the history. A failed recording does not stop the others.
-
-    ``pattern``: glob pattern of the recordings; ``as_json``: print JSON on stdout. Returns the exit code: 0, `DRIFTED`
-    or `FAILED`. Raises ConfigError if nothing matches, the scheduler does not answer, or neither it nor workers are
-    given.
+    Each is compared with the baseline, or the first run of the arm (robot and cell). Returns 0, `DRIFTED` or `FAILED`.
+    Raises ConfigError if nothing matches, or there are no workers.
     """
     paths = [Path(name).resolve() for name in sorted(glob.glob(pattern, recursive=True))]
     if not paths:
@@ -94,11 +91,7 @@ def fleet_command(pattern: str, asked: ReidentifyOptions, *, as_json: bool) -> i
 
 @contextmanager
 def cluster(scheduler: str | None, workers: int | None) -> "Iterator[Client]":
-    """Yield a client of a Dask scheduler, or of a local cluster.
-
-    ``scheduler``: address of a scheduler; ``workers``: number of local processes, without a scheduler. Raises
-    ConfigError if Dask is not installed, the scheduler does not answer, or both or none are given.
-    """
+    """Yield a client of a Dask scheduler, or of a local cluster; raises ConfigError unless exactly one is usable."""
     if scheduler is None and workers is None:
         raise ConfigError("--recordings: needs --scheduler ADDRESS, or --workers N for processes on this machine")
     if scheduler is not None and workers is not None:
@@ -123,11 +116,7 @@ def cluster(scheduler: str | None, workers: int | None) -> "Iterator[Client]":
 
 
 def identify_one(path: str, robot: RobotConfig | None, out: str) -> Identified:
-    """Identify one recording on a worker of the cluster.
-
-    ``robot``: configuration; ``None``: that of the recording. Raises ArmidentError for any failure, as other exceptions
-    may not be picklable.
-    """
+    """Identify one recording on a worker; raises ArmidentError for any failure, as others may not be picklable."""
     try:
         recording = read_recording(Path(path))
         done = identify_recording(recording, robot, _options(recording))
@@ -144,7 +133,7 @@ def identify_one(path: str, robot: RobotConfig | None, out: str) -> Identified:
 def _options(recording: Recording) -> Options:
     """Return the identification options of the recording's session."""
     session = recording.session
-    return Options() if session is None else Options(**session.identification.model_dump())
+    return Options() if session is None else options_of(session)
 
 
 def _judged(

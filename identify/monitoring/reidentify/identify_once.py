@@ -43,12 +43,7 @@ class _NotPublished(Exception):
 
 @dataclass
 class _Recorded:
-    """Recording that is to be identified and announced once.
-
-    ``digest``, ``name``: hash of the recording and its name, without suffix; ``identify``: returns its identification,
-    from the file if there is one; ``publisher``: publishes results and failures; ``published``: True if the result or
-    the failure was published by this process.
-    """
+    """Recording that is to be identified and announced once; ``identify`` reads the result's file if there is one."""
 
     digest: str
     name: str
@@ -79,11 +74,8 @@ def identify_once(
 ) -> OnceIdentified:
     """Identify a recording and announce the result, unless a worker does it; then wait for its result.
 
-    Without a ledger that can be written the result is announced all the same.
-
-    ``out``: folder of the results, with the ledger that the workers use; ``publisher``: publishes the result, or the
-    reason why there is none; ``say``: takes lines of progress. Raises DataError if the recording cannot be identified;
-    ArmidentError if the result cannot be written.
+    Without a writable ledger the result is announced all the same. Raises DataError if it cannot be identified,
+    ArmidentError if it cannot be written.
     """
     path = recording.path
     beside = [] if path is None else captured_in((path.parent,), robot.name)

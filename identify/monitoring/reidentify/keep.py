@@ -18,11 +18,7 @@ RETRY_S = 60.0
 
 
 def history_or_reason(store: str, needed: bool) -> tuple[History | None, str | None]:
-    """Return the history, or ``None`` and the reason why it cannot be opened.
-
-    ``store``: SQLAlchemy URL of the history; ``needed``: True if the run needs the history: no other baseline is given.
-    Raises ConfigError if it is needed and cannot be opened.
-    """
+    """Return the history, or ``None`` and the reason; raises ConfigError if it is needed and cannot be opened."""
     try:
         return History(store), None
     except ConfigError as error:
@@ -33,11 +29,7 @@ def history_or_reason(store: str, needed: bool) -> tuple[History | None, str | N
 
 @dataclass(frozen=True)
 class HistoryEntry:
-    """A run and its comparison, to be entered in the history.
-
-    ``store``: SQLAlchemy URL of the history; ``baseline``, ``drift``: baseline and result of the comparison, if there
-    was one.
-    """
+    """A run and its comparison, if there was a baseline, to be entered in the history (SQLAlchemy URL)."""
 
     store: str
     recording: Recording
@@ -47,10 +39,7 @@ class HistoryEntry:
     drift: ParameterChangeTest | None = None
 
     def write(self) -> None:
-        """Write the entry; what the history has already is not written again.
-
-        Raises ConfigError if the database cannot be written.
-        """
+        """Write the entry unless the history has it; raises ConfigError if the database cannot be written."""
         history = History(self.store)
         facts = History.facts(self.recording)
         history.describe(facts)
@@ -59,19 +48,13 @@ class HistoryEntry:
             history.judge(self.document, self.baseline, self.drift)
 
     def write_or_say(self, say: Say, seconds: float = 0.0) -> bool:
-        """Write the entry; if the database refuses it, say why and return False.
-
-        ``say``: takes lines of progress; ``seconds``: time for which a refused entry is tried again, s.
-        """
+        """Write the entry; if the database refuses it for that time, s, say why and return False."""
         return wait_and_try(self.write, seconds, say)
 
 
 @contextmanager
 def kept(entry: HistoryEntry, say: Say) -> Iterator[None]:
-    """Write an entry before the block, and try a refused one again after it, also if it ends with an error.
-
-    ``say``: takes lines of progress.
-    """
+    """Write an entry before the block, and try a refused one again after it, also if it ends with an error."""
     written = entry.write_or_say(say)
     try:
         yield

@@ -20,10 +20,7 @@ LINGER_S = 1.0
 
 
 class StatusPublisher:
-    """Publishes status and results of one job.
-
-    It listens on the port of the worker if no worker runs, and on a free port otherwise.
-    """
+    """Publishes status and results of one job, on the port of the worker if no worker runs, else on a free port."""
 
     def __init__(self, session: SessionConfig, robot: RobotConfig) -> None:
         self._keys = Keys(session.cell, robot.name)

@@ -28,12 +28,7 @@ Say = Callable[[str], None]
 
 
 def start_process(words: Sequence[str], out: IO[bytes], err: IO[bytes]) -> Process:
-    """Start an armident command in a session of its own; it stops the arm and ends if this process is killed.
-
-    Signals of the terminal then reach this process only, which signals the guard before the capture.
-
-    ``out``, ``err``: files of standard output and standard error.
-    """
+    """Start a command in a session of its own, away from the terminal; it stops the arm if this process is killed."""
     return start_command(words, out, err, own_session=True, with_parent=True)
 
 
@@ -44,11 +39,9 @@ class Interrupted(ArmidentError):
 
 
 def record_run(config: Path, out: Path, say: Say, start: Start = start_process) -> Recording:
-    """Play the set points of a session once under a guard and return the recording.
+    """Play the set points of a session once under a guard and return the recording, which is always kept.
 
-    ``config``: session configuration, checked; ``say``: takes lines of progress; ``start``: starts guard and capture.
-    Raises ConfigError if bus or drives are missing, or not as configured. Raises ArmidentError if the guard stopped the
-    arm, or a drive failed. The recording is kept. Raises Interrupted on SIGINT and SIGTERM.
+    Raises ConfigError if the bus is not as configured, ArmidentError if guard or drive stopped, or Interrupted.
     """
     # The guard runs from before the first motion until after the last.
     with _interruptible(), _command(["guard", "--config", str(config)], start) as guard:

@@ -26,7 +26,6 @@ from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.effects.terms import arm_model
 from armident.identify.excitation.point_to_point import sample_trajectory
 from armident.identify.excitation.previous_estimate import previous_estimate
-from armident.identify.identification.options import Options
 from armident.identify.monitoring.change.change_test import Inconclusive, ParameterChangeTest, compare
 from armident.identify.monitoring.reidentify.baseline import Baseline, baseline_of
 from armident.identify.monitoring.reidentify.identify_once import identify_once
@@ -35,6 +34,7 @@ from armident.identify.monitoring.reidentify.publish import StatusPublisher
 from armident.identify.monitoring.reidentify.record_run import Say, record_run, start_process
 from armident.identify.monitoring.reidentify.reidentify_options import ReidentifyOptions
 from armident.identify.monitoring.reidentify.summary import change_lines, finding_lines
+from armident.identify.monitoring.worker.worker import options_of
 from armident.processes import Start
 
 DRIFTED = 4
@@ -80,11 +80,9 @@ class Outcome:
 
 
 def reidentify_command(asked: ReidentifyOptions, *, as_json: bool) -> int:
-    """Carry out ``armident reidentify`` without ``--recordings``.
+    """Carry out ``armident reidentify`` without ``--recordings``; returns 0 or `DRIFTED`.
 
-    ``as_json``: print the result as JSON. Returns the exit code: 0, or `DRIFTED`. Raises ConfigError or DataError or
-    ArmidentError: before the motion: if configuration, trajectory, baseline or history are wrong. Later: if bus, drives
-    or guard end the motion, or the recording cannot be identified.
+    Raises ConfigError, DataError or ArmidentError if an input is wrong, or motion or identification fail.
     """
     for option, given in (("--scheduler", asked.scheduler), ("--workers", asked.workers)):
         if given is not None:
@@ -107,12 +105,9 @@ def reidentify_command(asked: ReidentifyOptions, *, as_json: bool) -> int:
 
 
 def prepare(config: Path, baseline: Path | None, store: str, out: Path | None, false_alarms: float) -> Job:
-    """Load and check the inputs of a job.
+    """Load and check the inputs of a job; by default the first run in the history is the baseline.
 
-    ``config``: session configuration. ``baseline``: identification to compare with; ``None``: the first run in the
-    history. ``store``: SQLAlchemy URL of the history. ``out``: folder of recordings and results; ``None``: that of the
-    session. ``false_alarms``: probability of a false alarm. Raises ConfigError if the session has no set points, or the
-    trajectory exceeds the limits of the robot; DataError if the baseline is of another robot or model.
+    Raises ConfigError if set points are missing or beyond limits, DataError if the baseline does not fit.
     """
     session = load_session(config)
     robot = load_robot(session.robot)
@@ -134,12 +129,9 @@ def prepare(config: Path, baseline: Path | None, store: str, out: Path | None, f
 
 
 def check_trajectory(session: SessionConfig, robot: RobotConfig, baseline: Baseline) -> None:
-    """Check a trajectory against the limits of position, velocity, acceleration and, with a baseline, of torque.
+    """Check a trajectory against the limits of motion and, predicted with a baseline, of torque.
 
-    Torques are predicted with the parameters of the baseline; without one only the guard checks them.
-
-    ``session``: names the trajectory. Raises ConfigError if a limit is exceeded; the message names joint and limit.
-    Raises DataError if the baseline is of another model.
+    Raises ConfigError with joint and limit if one is exceeded, DataError if the baseline is of another model.
     """
     assert session.setpoints is not None
     name = str(session.setpoints.trajectory)
@@ -158,12 +150,7 @@ def check_trajectory(session: SessionConfig, robot: RobotConfig, baseline: Basel
 
 
 def carry_out(job: Job, announcer: StatusPublisher, say: Say, start: Start = start_process) -> Outcome:
-    """Carry out a job, store its result in the history, and publish it.
-
-    ``job``: result of `prepare`; ``announcer``: publisher on Zenoh; ``say``: takes lines of progress; ``start``: starts
-    guard and capture. Returns the identification, comparison and diagnosis. Raises ArmidentError if the motion was
-    stopped, or the recording cannot be identified or compared.
-    """
+    """Carry out a job, store its result in the history, and publish it; raises ArmidentError if it fails."""
     say(f"{job.robot.name} in cell {job.session.cell}; baseline: {job.baseline.name}")
     if job.warning is not None:
         say(f"warning: {job.warning}; the run goes on with the baseline that is given")
@@ -172,7 +159,7 @@ def carry_out(job: Job, announcer: StatusPublisher, say: Say, start: Start = sta
     recording = record_run(job.config, job.out, say, start)
     say(f"recorded {recording.path}")
     announcer.status("identifying", recording=str(recording.path))
-    options = Options(**job.session.identification.model_dump())
+    options = options_of(job.session)
     done = identify_once(recording, job.robot, options, job.out, announcer, say)
     document, path = done.document, done.path
     for reason in document.reasons:
@@ -228,7 +215,7 @@ def _unexpected(
     announcer: StatusPublisher,
     say: Say,
 ) -> Outcome:
-    """Return the outcome of a run that cannot be compared: changed if the diagnosis against the baseline finds why.
+    """Outcome of a run that cannot be compared: changed if the diagnosis against the baseline finds why.
 
     The same motion gave a usable baseline. Exchanged signals, for example, leave no usable parameters at all.
     """

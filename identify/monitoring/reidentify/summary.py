@@ -28,12 +28,7 @@ _MEANINGS = {
 
 
 def change_lines(drift: ParameterChangeTest, robot: RobotConfig) -> list[str]:
-    """Return one line per changed parameter, group, and property of the residuals, the most significant first.
-
-    A single line if only all parameters together have changed; none without a change.
-
-    ``robot``: names of the joints.
-    """
+    """One line per changed parameter, group and residual, the most significant first, or one for all together."""
     lines = [_line(drift, name, robot) + f", p = {_p_text(_p_value(drift, name))}" for name in drift.changed]
     for group in drift.changed_groups:
         rest = [name for name in group.members if name not in drift.changed]
@@ -88,10 +83,7 @@ def finding_lines(diagnosis: DiagnosisDocument) -> list[str]:
 
 
 def place_of(name: str, robot: RobotConfig) -> str:
-    """Return the joint, or the two joints of a coupling, of a base parameter.
-
-    ``name``: base parameter; ``robot``: names of joints and couplings.
-    """
+    """Return the joint, or the two joints of a coupling, of a base parameter."""
     for coupling in robot.couplings:
         if name in {kind + coupling.name for kind in _SHARED}:
             return " and ".join(coupling.joints)

@@ -11,13 +11,9 @@ COMPONENTS = ("worker", "reidentify")
 
 
 class Announcements:
-    """Announces the entries of a ledger.
+    """Announces the entries of a ledger; an entry and its announcement are one transaction.
 
-    An entry and its announcement are one transaction. A worker that is killed after the announcement and before the
-    end of the transaction leaves an entry that counts as not announced. Other workers have heard the announcement,
-    and enter it.
-
-    ``keys``: keys of the robot; ``link``: Zenoh session of the worker.
+    A worker killed between both leaves an entry not announced, which others that heard the announcement enter.
     """
 
     def __init__(self, keys: Keys, link: WorkerLink) -> None:
@@ -26,11 +22,9 @@ class Announcements:
         self._sent: set[str] = set()
 
     def make(self, ledger: Ledger, sha256: str) -> bytes | None:
-        """Announce the result or the failure of a recording, and return the document that was announced.
+        """Announce the result or the failure of a claimed recording, and return the document that was announced.
 
-        ``ledger``: ledger of the worker, which has a claim on the recording. Raises LinkDown if the session is missing,
-        too new, or fails. Raises LedgerError if the ledger cannot be written; the announcement is not repeated when
-        this is called again.
+        Raises LinkDown, or LedgerError: then the next call does not repeat the announcement.
         """
         entry = ledger.entry(sha256)
         if entry is None or entry.announced or entry.state == "waiting":
@@ -52,11 +46,7 @@ class Announcements:
         return document if mine else None
 
     def enter_heard(self, ledger: Ledger) -> None:
-        """Enter the announcements that other workers have made, but not entered.
-
-        ``ledger``: ledger that the workers share. Raises LedgerError if the ledger cannot be read or written; what was
-        heard is kept for the next call.
-        """
+        """Enter announcements of other workers that they did not enter; on LedgerError they are kept."""
         self._heard |= self._link.receiver.take_heard()
         if not self._heard:
             return

@@ -16,12 +16,7 @@ log = logging.getLogger(__name__)
 
 
 class Intake:
-    """Enters recordings that have ended in the ledger, each once.
-
-    ``folder_of``: gives the folder of the result of a recording by its name; ``buffer``, ``lock``: streams of the
-    captures under way, and the lock that protects them; ``refused``: takes a stream that cannot be used: name of the
-    capture, message and exit code.
-    """
+    """Enters recordings that have ended in the ledger, each once; ``refused`` takes streams that cannot be used."""
 
     def __init__(
         self,
@@ -39,10 +34,7 @@ class Intake:
         """Streams without a file that wait for their identification, by the hash of the recording."""
 
     def take_stream(self, ledger: Ledger, assembly: Assembly) -> None:
-        """Enter the files of a capture that has ended; without them the stream itself.
-
-        ``ledger``: ledger of the worker; ``assembly``: events and blocks of the capture.
-        """
+        """Enter the files of a capture that has ended; without them the stream itself."""
         found = captured_as(assembly.files)
         if any(not captured.finished for captured in found):
             with self._lock:
@@ -72,11 +64,7 @@ class Intake:
     def add_files(
         self, ledger: Ledger, found: Sequence[Captured], streamed: str | None = None, *, announced: bool = False
     ) -> None:
-        """Enter finished recordings of this cell that the ledger does not know.
-
-        ``ledger``: ledger of the worker; ``streamed``: hash of the stream of these files, if it was received;
-        ``announced``: True for files that were announced on the keys of this cell.
-        """
+        """Enter finished recordings of this cell that the ledger does not know; ``streamed``: hash of their stream."""
         for captured in found:
             try:
                 stamp = captured.stamp

@@ -1,9 +1,8 @@
 """Ledger of a worker: the recordings of its cell, who works on them, their results and announcements (SQLite).
 
-The ledger outlives the workers. A recording is known by its hash. It is claimed by one worker with a lease, which the
-worker renews; after a crash the lease ends, and another worker takes over. The result is written before it is entered,
-and entered before it is announced. The announcement and its entry are one transaction. An announcement that a
-process has made, but not entered before its end, is entered by the others, which have heard it.
+A recording, known by its hash, is claimed with a lease that its worker renews; after a crash another takes over. The
+result is written, then entered, then announced. The announcement and its entry are one transaction; one that was made
+but not entered is entered by the others, which have heard it.
 """
 
 import json
@@ -69,24 +68,9 @@ class LedgerUnusable(ArmidentError):
 
 @dataclass(frozen=True)
 class LedgerEntry:
-    """Recording in the ledger.
+    """Recording in the ledger: ``waiting``, ``done`` or ``failed``; without files it exists in the stream only.
 
-    Parameters
-    ----------
-    sha256
-        Hash of its samples.
-    name
-        Name of the recording, without suffix and number of the part.
-    paths
-        Its files in order; empty if it exists in the stream only.
-    state
-        ``waiting`` for a result, ``done`` or ``failed``.
-    attempts
-        Number of claims for its identification, this one included.
-    message
-        Verdict of the result, or reason of the failure.
-    announced
-        True if the result was announced.
+    ``sha256``: of its samples; ``attempts``: claims, this one included; ``message``: verdict or reason of failure.
     """
 
     sha256: str
@@ -108,10 +92,8 @@ _FREE = "(owner IS NULL OR boot IS NOT :boot OR lease_until < :now OR owner = :o
 class Ledger:
     """Ledger in a file, shared by all processes that work on the recordings of a folder.
 
-    ``path``: the file; created if it is missing. It must be on a local disk (SQLite's write-ahead log). ``owner``: name
-    of this process in its claims. ``lease_s``: time after which a claim ends that is not renewed, s. ``clock``: clock
-    of the leases, s; the default is not set by anyone and counts from the start of the machine. Raises LedgerError if
-    the file is locked or the disk is full; LedgerUnusable if the file is damaged or of a newer version.
+    It is on a local disk (SQLite's write-ahead log). ``lease_s``: end of a claim that is not renewed, s. ``clock``: one
+    that nobody sets. Raises LedgerError if locked or full, LedgerUnusable if damaged or newer.
     """
 
     def __init__(
@@ -135,11 +117,7 @@ class Ledger:
                 db.execute(f"PRAGMA user_version = {number}")
 
     def add(self, sha256: str, name: str, paths: Sequence[Path]) -> bool:
-        """Enter a recording, and return True if the ledger did not know it.
-
-        ``sha256``: hash of its samples. ``paths``: its files; empty if it exists in the stream only. They complete an
-        entry that has none.
-        """
+        """Enter a recording, or files of one without any; return True if the ledger did not know it."""
         row = {"sha256": sha256, "name": name, "paths": _texts(paths), "added": time.time()}
         with self._transaction() as db:
             fresh = db.execute(
@@ -156,10 +134,7 @@ class Ledger:
         return bool(fresh)
 
     def adopt(self, sha256: str, name: str, paths: Sequence[Path], result: Path, message: str) -> bool:
-        """Enter a recording whose result was announced before this ledger existed; return True if it is new.
-
-        ``sha256``, ``name``, ``paths``: as of `add`; ``result``, ``message``: file of the result, and its verdict.
-        """
+        """Enter a recording whose result was announced before this ledger existed; return True if it is new."""
         with self._transaction() as db:
             done = db.execute(
                 "INSERT INTO experiments (sha256, name, paths, added, state, result, message, finished, announced) "
@@ -175,10 +150,7 @@ class Ledger:
     ) -> LedgerEntry | None:
         """Claim a recording without a result or announcement, and return it; ``None`` if there is none.
 
-        The one with the fewest attempts comes first, so that a recording that ends its workers does not hold up others.
-
-        ``sha256``: claim this one, and no other; ``held``: recordings without files whose samples this process has in
-        memory; ``announce``: claim recordings that only lack the announcement, too.
+        Fewest attempts come first, so that one that ends its workers holds up no others. ``held``: streams in memory.
         """
         names = {f"h{k}": value for k, value in enumerate(held)}
         here = ", ".join(f":{name}" for name in names)
@@ -210,11 +182,7 @@ class Ledger:
             db.execute("UPDATE experiments SET owner = NULL WHERE owner = :owner", self._me())
 
     def finish(self, sha256: str, state: State, result: Path | None, message: str) -> bool:
-        """Enter a result; return False if the claim was lost to another worker, whose result counts.
-
-        ``state``: ``done`` or ``failed``; ``result``: file of the result, which is complete; ``message``: verdict of
-        the result, or reason of the failure.
-        """
+        """Enter a result or failure; False if the claim was lost to another worker, whose result counts."""
         values = {"sha256": sha256, "state": state, "result": None if result is None else str(result)}
         with self._transaction() as db:
             done = db.execute(
@@ -226,10 +194,7 @@ class Ledger:
 
     @contextmanager
     def announcement(self, sha256: str) -> Iterator[bool]:
-        """Enter an announcement that is made inside the block; yield False if it must not be made.
-
-        The entry counts if the block ends without an exception. The claim ends with it.
-        """
+        """Enter an announcement made inside the block, and end its claim; yield False if it must not be made."""
         with self._transaction() as db:
             done = db.execute(
                 "UPDATE experiments SET announced = 1, owner = NULL "
@@ -271,19 +236,13 @@ class Ledger:
         return None if row is None else Path(row[0])
 
     def file_hash(self, path: Path, stamp: str) -> tuple[str | None] | None:
-        """Return the hash that was entered for a file with this stamp; ``None`` if it was not entered.
-
-        ``stamp``: its size and time of change.
-        """
+        """Hash that was entered for a file of this stamp (size and time of change); ``None`` if it was not entered."""
         with self._transaction() as db:
             row = db.execute("SELECT sha256 FROM files WHERE path = ? AND stamp = ?", (str(path), stamp)).fetchone()
         return None if row is None else (row[0],)
 
     def enter_file(self, path: Path, stamp: str, sha256: str | None) -> None:
-        """Enter a file that was read.
-
-        ``path``, ``stamp``: as of `file_hash`. ``sha256``: hash of its recording; ``None`` if it is none of this cell.
-        """
+        """Enter a file that was read, and the hash of its recording; ``None`` if it is none of this cell."""
         with self._transaction() as db:
             db.execute("INSERT OR REPLACE INTO files VALUES (?, ?, ?)", (str(path), stamp, sha256))
 

@@ -17,10 +17,7 @@ _PART = re.compile(r"(?P<name>.+?)(?:\.\d{4,})?\.mcap")
 
 @dataclass(frozen=True)
 class Captured:
-    """Files of one capture.
-
-    ``name``: name without suffix and number of the part; ``paths``: the files in their order.
-    """
+    """Files of one capture in order; ``name``: without suffix and number of the part."""
 
     name: str
     paths: tuple[Path, ...]
@@ -37,10 +34,7 @@ class Captured:
 
     @property
     def stamp(self) -> str:
-        """Sizes and times of change of the files, by which a change of their contents is noticed.
-
-        Raises OSError if a file has vanished.
-        """
+        """Sizes and times of change of the files, to notice a change; raises OSError if a file has vanished."""
         stats = [path.stat() for path in self.paths]
         return ";".join(f"{path.name}:{s.st_size}:{s.st_mtime_ns}" for path, s in zip(self.paths, stats, strict=True))
 
@@ -50,11 +44,7 @@ class Captured:
 
 
 def captured_in(folders: Sequence[Path], robot: str) -> list[Captured]:
-    """Return the captures of a robot in folders, in the order of their names.
-
-    ``folders``: folders; those that do not exist hold nothing. Their subfolders are not searched. ``robot``: name of
-    the robot, with which the names of its recordings begin.
-    """
+    """Captures of a robot in existing folders, without their subfolders, in the order of their names."""
     found: dict[tuple[Path, str], list[Path]] = {}
     for folder in {folder.resolve(): None for folder in folders}:
         for path in folder.glob(f"{robot}-*.mcap") if folder.is_dir() else ():
@@ -66,10 +56,7 @@ def captured_in(folders: Sequence[Path], robot: str) -> list[Captured]:
 
 
 def captured_as(paths: Sequence[Path]) -> list[Captured]:
-    """Return the captures of these files, which are parts of one capture or of one event each.
-
-    ``paths``: files of recordings; others are left out.
-    """
+    """Return the captures of these files, which are parts of one capture or of one event each."""
     found: dict[str, list[Path]] = {}
     for path in paths:
         match = _PART.fullmatch(path.name)
@@ -79,10 +66,7 @@ def captured_as(paths: Sequence[Path]) -> list[Captured]:
 
 
 def is_of(recording: Recording, cell: str | None, robot: str) -> bool:
-    """Return True if a recording is of a robot in a cell.
-
-    ``cell``: name of the cell; ``None``: any. Raises DataError if it is of this robot, and empty.
-    """
+    """True if a recording is of a robot in a cell (``None``: any); raises DataError if it is, and empty."""
     session = None if recording.session is None else recording.session.cell
     found = recording.metadata.get("cell", session)
     if recording.robot.name != robot or (cell is not None and found != cell):
@@ -93,10 +77,7 @@ def is_of(recording: Recording, cell: str | None, robot: str) -> bool:
 
 
 def result_of(sha256: str, folder: Path) -> tuple[Path, IdentificationDocument] | None:
-    """Return the result of a recording in a folder, ``None`` if there is none or it is of another recording.
-
-    ``sha256``: hash of the recording.
-    """
+    """Result of a recording in a folder, ``None`` if there is none or it is of another recording."""
     path = folder / "identification.json"
     if not path.is_file():
         return None

@@ -4,16 +4,10 @@ import json
 
 
 def status(component: str, state: str, **more: object) -> bytes:
-    """Return a message for the key of the status.
-
-    ``component``, ``state``: name of the program and of its state; ``more``: further entries.
-    """
+    """Return a message for the key of the status."""
     return json.dumps({"component": component, "state": state, **more}).encode()
 
 
 def failure_status(component: str, message: str, name: str, sha256: str) -> bytes:
-    """Return the announcement that a recording cannot be identified.
-
-    ``component``: name of the program; ``name``, ``sha256``: name of the recording and its hash.
-    """
+    """Return the announcement that a recording cannot be identified."""
     return status(component, "failed", message=message, capture=name, sha256=sha256)

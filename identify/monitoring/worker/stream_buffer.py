@@ -38,11 +38,7 @@ LARGEST_EVENT = 16 << 20
 
 @dataclass
 class Assembly:
-    """Events and blocks of one capture, in any order of arrival.
-
-    ``start``, ``end``: start and end event, when received; ``nbytes``: memory of the blocks, bytes; ``touched``: time
-    of the last event or block, s; ``too_long``: True if blocks were given up for lack of memory.
-    """
+    """Events and blocks of one capture in any order; ``touched``: time of the last, s; ``too_long``: dropped."""
 
     capture: str
     start: Mapping[str, Any] | None = None
@@ -88,12 +84,9 @@ class Assembly:
 
 
 class StreamBuffer:
-    """Collects events and blocks by the name of their capture.
+    """Collects events and blocks by the name of their capture, up to ``most_bytes``; then its file is read.
 
-    Anybody may publish on the keys of a cell. Messages that are not of armident are counted and reported; the number of
-    captures and the memory of their blocks are bounded. A capture that was given up is read from its file.
-
-    ``most_bytes``: largest size of all blocks, bytes; ``clock``: monotonic clock, s.
+    Anybody may publish on the keys of a cell: foreign messages are counted and reported.
     """
 
     def __init__(self, most_bytes: int | None = None, clock: Callable[[], float] = time.monotonic) -> None:
@@ -108,10 +101,7 @@ class StreamBuffer:
         return sum(assembly.nbytes for assembly in self._captures.values())
 
     def take_event(self, data: bytes | None, size: int) -> Mapping[str, Any] | None:
-        """Take an encoded event; return it if it is the start or the end of a capture that is not finished.
-
-        ``data``: the event; ``None`` if it is too large to be decoded.
-        """
+        """Take an encoded event (``None``: too large); return it if it starts or ends a capture not yet finished."""
         try:
             if data is None:
                 raise DataError(f"an event of {size} bytes, more than {LARGEST_EVENT}")
@@ -155,10 +145,7 @@ class StreamBuffer:
             self._give_up(max(self._captures.values(), key=lambda each: each.nbytes))
 
     def take_ended(self) -> list[Assembly]:
-        """Return the captures whose end event has come, with all blocks or after `MAX_WAITING_S`, and forget them.
-
-        Blocks whose capture was not announced within that time are dropped, and reported.
-        """
+        """Return and forget ended captures that are complete or waited `MAX_WAITING_S`; drop unannounced blocks."""
         now = self._clock()
         ended = []
         for assembly in list(self._captures.values()):
@@ -172,19 +159,13 @@ class StreamBuffer:
         return ended
 
     def keep(self, assembly: Assembly) -> None:
-        """Keep a capture for another `MAX_WAITING_S`: its end was announced, but its file is still being written.
-
-        ``assembly``: the capture, as `take_ended` returned it.
-        """
+        """Keep a capture for another `MAX_WAITING_S`: its end was announced, but its file is still being written."""
         self._finished.pop(assembly.capture, None)
         assembly.end, assembly.ended = None, math.inf
         self._captures[assembly.capture] = assembly
 
     def refuse(self, kind: str, message: str) -> None:
-        """Report a message that cannot be used: the first one, the tenth, the hundredth of a kind, and so on.
-
-        ``kind``: kind of messages that are counted together.
-        """
+        """Report a message that cannot be used: the first one, the tenth, the hundredth of a kind, and so on."""
         number = self._reported[kind] = self._reported.get(kind, 0) + 1
         if math.log10(number).is_integer():
             log.warning("%s%s", message, f" ({number} times)" if number > 1 else "")
@@ -216,10 +197,7 @@ class StreamBuffer:
 
 
 def drop_oldest(streams: dict[str, Recording]) -> None:
-    """Remove the oldest streams while there are more than `MOST_STREAMS`, or several with more than `MOST_BYTES`.
-
-    ``streams``: captures without a file that wait for a worker, in the order in which they came.
-    """
+    """Remove the oldest streams while there are more than `MOST_STREAMS`, or several with more than `MOST_BYTES`."""
     sizes = {digest: _samples_nbytes(recording) for digest, recording in streams.items()}
     while len(sizes) > MOST_STREAMS or (len(sizes) > 1 and sum(sizes.values()) > MOST_BYTES):
         oldest = next(iter(sizes))

@@ -70,14 +70,10 @@ def options_of(session: SessionConfig) -> Options:
 
 
 class Worker:
-    """Identifies every recording of one robot in one cell.
+    """Identifies every recording of one robot in one cell, found by Zenoh's events and in the folders of the cell.
 
-    It finds recordings by the events on Zenoh and in the folders of the cell. A ledger in the folder of the results
-    says which have a result: a worker that was absent or killed continues there, and several workers share the work.
-
-    ``out``: folder of the results; each recording has a subfolder. The ledger is there. ``progress``: called every
-    second with the state, as long as the work advances; resets a watchdog. Raises ConfigError if Zenoh's configuration
-    is wrong.
+    The ledger in the folder of results lets several workers share the work, also after a crash. ``progress`` is called
+    every second while the work advances, for a watchdog. Raises ConfigError if Zenoh's configuration is wrong.
     """
 
     def __init__(
@@ -319,11 +315,7 @@ def _exit_code(state: State, message: str | None) -> int:
 
 
 def run_worker(config: Path, *, once: bool, out: Path | None) -> int:
-    """Carry out ``armident worker`` until SIGTERM or SIGINT.
-
-    ``config``: session configuration. ``once``: end after one recording with its exit code. ``out``: folder of the
-    results; ``None``: the recording directory of the session. Returns the exit code.
-    """
+    """Carry out ``armident worker`` until SIGTERM or SIGINT, or ``once``; return the exit code."""
     session = load_session(config, "identify")
     robot = load_robot(session.robot, "identify")
     stopped = threading.Event()

@@ -22,14 +22,10 @@ class LinkDown(ArmidentError):
 
 
 class WorkerLink:
-    """Subscriptions, answers and announcements of a worker.
+    """Subscriptions, answers and announcements of a worker, which works on with the files without a session.
 
-    The first worker of a cell listens on the port of its role. Others listen on a free port, and one of them takes the
-    port of the role when it is free again. Without a session the worker continues with the files.
-
-    ``keys``: keys of its robot; ``on_event``, ``on_block``: take an encoded message (``None`` if it is larger than the
-    limit) and its size, bytes; ``limits``: largest event and block that are passed on, bytes; ``answer``: returns the
-    last result, or ``None``. Raises ConfigError if Zenoh's configuration is wrong.
+    The first worker of a cell listens on the port of its role; others take it over when it is free. ``limits``: event
+    and block, bytes; larger ones are ``None``. Raises ConfigError if Zenoh's configuration is wrong.
     """
 
     def __init__(
@@ -79,10 +75,7 @@ class WorkerLink:
                 self._problem = str(error)
 
     def announce(self, *messages: tuple[str, bytes]) -> None:
-        """Publish a result or a failure; it has left the process when this returns.
-
-        ``messages``: key expressions and contents. Raises LinkDown if there is no session, it is too new, or it fails.
-        """
+        """Publish key expressions and contents, which have left the process on return; raises LinkDown on failure."""
         with self._lock:
             if self._announcer is None or not self.can_announce:
                 raise LinkDown("zenoh: no session yet")

@@ -24,14 +24,9 @@ Take = Callable[[bytes | None, int], None]
 
 
 class WorkerReceiver:
-    """Subscriptions of a worker.
+    """Subscriptions of a worker, up to ``limits`` of event and block, bytes; announcements of others by their hash.
 
-    They have a session of their own: the one that announces sends its messages in a single queue, and the captures
-    would have to do so, too. Blocks of samples that arrive in bursts would be lost more often.
-
-    The announcements of other workers are noted by the hash of their content.
-
-    ``keys``: keys of its robot; ``limits``: largest event and block that are passed on, bytes.
+    Their session is their own: one that announces sends in a single queue, and more bursts of blocks would be lost.
     """
 
     def __init__(

@@ -5,6 +5,7 @@ import json
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import yaml
@@ -66,6 +67,22 @@ def write_recordings(case: RandomCase, out: Path, prefix: str) -> dict[str, str]
     for part, arrays in zip(PARTS, case.recordings, strict=True):
         write_recording(as_recording(case.robot, arrays), paths[part])
     return {name: str(path) for name, path in paths.items()}
+
+
+def simulate(request: dict[str, Any]) -> dict[str, Any]:
+    """Simulate case ``index`` of a ``half``, with its healthy twin if asked to, and write both into folder ``out``.
+
+    The answer has the keys ``case``, ``twin`` (each with the paths ``robot``, ``a`` and ``b``), ``hidden``: the truth,
+    and ``seconds``.
+    """
+    begin, out = time.perf_counter(), Path(request["out"])
+    case = make_case(request["half"], request["index"], with_twin=request["twin"])
+    return {
+        "case": write_recordings(case, out, "case"),
+        "twin": None if case.twin is None else write_recordings(case.twin, out, "twin"),
+        "hidden": case.truth_document(),
+        "seconds": time.perf_counter() - begin,
+    }
 
 
 def main() -> None:

@@ -88,6 +88,24 @@ def test_a_torque_above_the_limit_is_detected_and_one_below_is_not(
     assert found[1].text.startswith(f"{robot.joints[joint].name}: torque")
 
 
+@pytest.mark.parametrize("joint", range(6))
+def test_the_following_error_is_that_of_the_demand_which_the_drives_send(
+    session: SessionConfig, robot: RobotConfig, joint: int
+) -> None:
+    """Set points that the drives do not follow yet are no following error of drives that send their demand."""
+    q = np.zeros(robot.n)
+    q[joint] = 1.02 * motion_limits_of(robot).following[joint]
+    ahead = np.rint(robot.transmission_matrix @ q * counts_per_si(robot)).astype(np.int64)
+    far = [int(count).to_bytes(4, "little", signed=True) for count in ahead]
+    still = on_the_bus(robot, np.zeros((10, robot.n)))
+    for cob, expected in ((rpdo_cob, None), (tpdo_cob, f"{robot.joints[joint].name}: following error")):
+        guard = monitor_of(session, robot)
+        assert guard.check(still, NOW) is None
+        moved = _frames([(cob(2 if cob is tpdo_cob else 1, j + 1), far[j]) for j in range(robot.n)])
+        alarm = guard.check(moved, NOW)
+        assert alarm is None if expected is None else alarm is not None and alarm.text.startswith(expected)
+
+
 def test_the_offending_frame_does_not_depend_on_the_batches(session: SessionConfig, robot: RobotConfig) -> None:
     """The offending frame is the first sample beyond the limit of joint 3."""
     q = np.zeros((400, robot.n))

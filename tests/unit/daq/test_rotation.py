@@ -227,6 +227,18 @@ def test_finished_recordings_of_a_clock_far_ahead_delete_nothing_until_they_are_
     assert third.exists()
 
 
+def test_recordings_that_are_written_or_in_the_future_make_no_other_older(tmp_path: Path) -> None:
+    """Ages count to the newest finished recording that is not in the future."""
+    kept = [made(tmp_path, "20261010T000000"), made(tmp_path, "20261015T000000")]
+    written, ahead = made(tmp_path, "20261119T000000"), made(tmp_path, "20261201T000000")
+    with written.open("rb") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        assert prune(tmp_path, "tx40", NOW, 30.0, None) == []
+    assert all(path.exists() for path in (*kept, ahead))
+    # Finished, it is the newest: the others are 35 and 40 days old.
+    assert prune(tmp_path, "tx40", NOW, 30.0, None) == kept
+
+
 def test_a_name_that_only_looks_like_a_time_is_of_no_capture(tmp_path: Path) -> None:
     odd = made(tmp_path, "20261399T000000")
     assert next_time(tmp_path, "tx40", NOW) == NOW

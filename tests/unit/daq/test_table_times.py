@@ -104,6 +104,7 @@ def test_missing_rows_are_gaps(tmp_path: Path, rate: float | None) -> None:
     kept[np.random.default_rng(4).integers(60, 190, 30)] = False
     found = import_recording(written(tmp_path / "a.csv", values[kept]), TX40, rate_hz=rate)
     assert np.array_equal(found.samples.sync, np.flatnonzero(kept))
+    assert found.sample_rate_hz == pytest.approx(1000.0, rel=1e-9), "missing rows do not lower the rate"
     assert same(found, values[kept])
     missing = [n for gap in found.gaps for n in range(gap.first, gap.last + 1)]
     assert missing == np.flatnonzero(~kept).tolist()

@@ -9,8 +9,8 @@ import yaml
 from armident.configs import ConfigError, load_robot, load_trajectory
 from armident.configs.schema.scenario import Scenario
 from armident.virtual_robot.effects import CATALOGUE, OUTSIDE, hidden_effects
-from tests.evaluation.cases import all_cases, healthy_twin, select_cases
-from tests.evaluation.plants.json_server import resolve_effect
+from tests.evaluation.cases import all_cases, select_cases
+from tests.evaluation.plants.two_robots import resolve_effect
 from tests.evaluation.schema import LEVELS, load_suite
 from tests.evaluation.schema import SUITE as SUITE_FILE
 
@@ -83,9 +83,10 @@ def test_a_twin_is_the_healthy_arm_of_the_same_run_and_one_of_the_clean_cases() 
     keys = {c.key for c in CASES if c.kind == "clean"}
     for case in CASES:
         if case.parts:
-            assert healthy_twin(case).run == case.run
-            assert not healthy_twin(case).parts
-            assert healthy_twin(case).key in keys
+            assert case.twin is not None
+            assert (case.twin.robot, case.twin.seed) == (case.robot, case.seed)
+            assert not case.twin.parts
+            assert case.twin.key in keys
 
 
 def test_the_quick_subset_has_every_effect_and_both_arms() -> None:

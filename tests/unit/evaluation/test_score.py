@@ -8,7 +8,7 @@ from scipy import stats
 
 from armident.identify.documents.diagnosis import DetectionLimit, DiagnosisDocument, Finding
 from tests.evaluation.cases import Case, InjectedEffect
-from tests.evaluation.markdown import report, shortfalls
+from tests.evaluation.report import report, shortfalls
 from tests.evaluation.score import Score, closed_share, matches, score, within
 from tests.evaluation.store import CaseResult
 from tests.evaluation.tables import clopper_pearson, tables
@@ -62,24 +62,24 @@ def result(
     return CaseResult(key="k", truth=list(truth), document=DiagnosisDocument.model_validate(content))
 
 
-def closed(of: Case, mine: CaseResult, healthy: CaseResult) -> float | None:
-    return closed_share(of, mine.diagnosis, healthy.diagnosis)
+def closed(of: Case, mine: CaseResult, healthy: DiagnosisDocument) -> float | None:
+    return closed_share(of, mine.diagnosis, healthy)
 
 
-HEALTHY = result(before=8.0, after=8.0, verdict="no_gap")
+HEALTHY = result(before=8.0, after=8.0, verdict="no_gap").diagnosis
 
 
 def test_a_finding_counts_with_the_right_name_at_the_right_place_only() -> None:
-    assert matches(SPRING, finding("joint_spring", "joint_2"))
-    assert not matches(SPRING, finding("joint_spring", "joint_1"))
-    assert not matches(SPRING, finding("cogging_torque", "joint_2"))
+    assert matches(case(SPRING), SPRING, finding("joint_spring", "joint_2"))
+    assert not matches(case(SPRING), SPRING, finding("joint_spring", "joint_1"))
+    assert not matches(case(SPRING), SPRING, finding("cogging_torque", "joint_2"))
 
 
 def test_a_pair_counts_in_either_order_and_an_arm_has_no_wrong_joint() -> None:
-    assert matches(SHAFT, finding("coupling_friction", "joint_5", "joint_4"))
-    assert not matches(SHAFT, finding("coupling_friction", "joint_5", "joint_6"))
-    assert matches(GRIPPER, finding("payload", "joint_1"))
-    assert matches(GRIPPER, finding("rotor_inertia", "joint_1"))
+    assert matches(case(SHAFT), SHAFT, finding("coupling_friction", "joint_5", "joint_4"))
+    assert not matches(case(SHAFT), SHAFT, finding("coupling_friction", "joint_5", "joint_6"))
+    assert matches(case(GRIPPER), GRIPPER, finding("payload", "joint_1"))
+    assert matches(case(GRIPPER), GRIPPER, finding("rotor_inertia", "joint_1"))
 
 
 def test_only_the_first_finding_is_the_name_of_a_single_effect() -> None:
@@ -150,7 +150,7 @@ def test_the_gap_is_evaluated_where_it_is_clearest() -> None:
         errors = {"torque_before": torque | {"joint_2": loop_before}, "torque_after": torque | {"joint_2": loop_after}}
         return result(finding("joint_spring", "joint_2"), simulated=errors, **gaps)
 
-    healthy = looped(6.0, 6.0, before=8.0, after=8.0)
+    healthy = looped(6.0, 6.0, before=8.0, after=8.0).diagnosis
     # A late torque: measured motion has the noise of a third derivative, the simulated loop shows the delay.
     late = looped(10.0, 6.0, before=8.1, after=9.0)
     assert closed(case(SPRING), late, healthy) == pytest.approx(1.0)
@@ -203,7 +203,7 @@ def test_parameters_are_compared_in_their_own_standard_deviations() -> None:
 def _score(**more: Any) -> Score:
     base: dict[str, Any] = {
         "verdict": "explained", "first": True, "second": True, "missed": False, "invisible": False, "extra": 0,
-        "closed": 1.0, "within": (True,), "confidence": 0.9, "named": "joint_spring joint_2",
+        "closed": 1.0, "within": (True,), "confidence": 0.9, "named": ("joint_spring joint_2",),
     }  # fmt: skip
     return Score(**{**base, **more})
 
@@ -254,8 +254,9 @@ def test_the_report_names_every_case_that_fell_short() -> None:
         ("named although outside the catalogue", "explained: joint_spring joint_2, 100% closed"),
         ("not detected", "no gap: joint_spring joint_2, 100% closed"),
     ]
-    text = report(tables(scored, []), scored, 20, {"abc": 10, "def": 1}, 1.25)
-    assert "11 of 20 cases, 1.2 core-hours, code abc (10 cases), def (1 cases)" in text
+    results = [CaseResult(key=str(k), seconds={"simulate": 100.0, "diagnose": 350.0}) for k in range(10)]
+    text = report("title", tables(scored, []), scored, [], 20, results, {"abc": 10, "def": 1}, names=True)
+    assert "11 of 20 cases, 0 failed, 1.2 core-hours, code abc (10 cases), def (1 cases)" in text
     # Every table has as many columns in each row as in its heading.
     for table in text.split("\n\n"):
         rows = [line for line in table.splitlines() if line.startswith("|")]

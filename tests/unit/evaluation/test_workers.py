@@ -13,11 +13,10 @@ import pytest
 
 from armident.configs import ArmidentError, ConfigError, DataError, load_robot
 from armident.identify.documents.diagnosis import DiagnosisDocument
-from tests.conftest import REPOSITORY
-from tests.evaluation import plant_process
+from tests.evaluation import workers
 from tests.evaluation.cases import Case
-from tests.evaluation.diagnosis_process import DiagnosisProcess
-from tests.evaluation.plant_process import PlantProcess
+from tests.evaluation.plants.two_robots import simulate
+from tests.evaluation.process import ByName, WorkerProcess
 from tests.evaluation.store import CaseResult, Store, code_version
 from tests.evaluation.tasks import DiagnosisTask, diagnose_file, reduced_model
 from tests.evaluation.workers import CaseRunner
@@ -37,70 +36,26 @@ def spring(stiffness: object) -> dict[str, object]:
 
 @pytest.fixture
 def refusing(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Replace the simulation by a server that starts faster, for tests of the process only."""
-    monkeypatch.setattr(plant_process, "SERVER", "tests.fixtures.refusing_plant")
-    paths = [str(REPOSITORY), *filter(None, [os.environ.get("PYTHONPATH")])]
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(paths))
+    """Replace the simulation by a plant that starts faster, for tests of the runner only."""
+    monkeypatch.setattr(workers, "VIRTUAL_ROBOT", ByName("tests.fixtures.refusing_plant:simulate"))
 
 
 @pytest.mark.slow
 def test_a_plant_simulates_recordings_and_evaluates_strengths_relative_to_its_joint(tmp_path: Path) -> None:
-    plant = PlantProcess(tmp_path / "plant.log")
-    try:
-        answer = plant.request({"id": 1, **EMPS, "effects": [spring("s * fc")], "out": str(tmp_path / "a.mcap")}, 240)
-        assert answer["truth"] == [{"ks": pytest.approx(2 * 20.3935)}]
-        assert Path(answer["recording"]).stat().st_size > 100_000
-        with pytest.raises(ArmidentError, match=r"joint_spring of joint_1: parameters.stiffness: 's \* fd': unknown"):
-            plant.request({"id": 2, **EMPS, "effects": [spring("s * fd")], "out": str(tmp_path / "b.mcap")}, 60)
-        assert not (tmp_path / "b.mcap").exists()
-        with pytest.raises(ArmidentError, match=r"plant: ConfigError: none\.yaml"):
-            plant.request(REFUSED, 60)
-    finally:
-        plant.close()
+    recording = tmp_path / "a.mcap"
+    answer = simulate({**EMPS, "effects": [spring("s * fc")], "out": str(recording)})
+    assert answer["truth"] == [{"ks": pytest.approx(2 * 20.3935)}]
+    assert recording.stat().st_size > 100_000
+    with pytest.raises(ConfigError, match=r"joint_spring of joint_1: parameters.stiffness: 's \* fd': unknown"):
+        simulate({**EMPS, "effects": [spring("s * fd")], "out": str(tmp_path / "b.mcap")})
+    assert not (tmp_path / "b.mcap").exists()
 
 
-REFUSED = {"id": 1, "robot": "none.yaml", "trajectory": "trajectories/emps_excitation.yaml"}
-
-
-@pytest.mark.usefixtures("refusing")
-def test_a_plant_that_dies_fails_one_request_and_is_restarted(tmp_path: Path) -> None:
-    plant = PlantProcess(tmp_path / "plant.log")
+def test_a_function_that_only_the_process_imports_is_called_by_its_name(tmp_path: Path) -> None:
+    plant = WorkerProcess("plant", tmp_path / "plant.log")
     try:
         with pytest.raises(ArmidentError, match=r"plant: ConfigError: none\.yaml"):
-            plant.request(REFUSED, 120)
-        assert plant.pid is not None
-        os.kill(plant.pid, signal.SIGSTOP)
-        killer = threading.Timer(0.2, os.kill, (plant.pid, signal.SIGKILL))
-        killer.start()
-        with pytest.raises(ArmidentError, match=r"plant ended with exit code -9 before it printed a line"):
-            plant.request(REFUSED, 60)
-        killer.join()
-        with pytest.raises(ArmidentError, match=r"none\.yaml"):
-            plant.request(REFUSED, 120)
-    finally:
-        plant.close()
-
-
-@pytest.mark.usefixtures("refusing")
-def test_a_plant_that_exceeds_its_memory_limit_answers_and_is_restarted(tmp_path: Path) -> None:
-    for limit, ended in ((1 << 20, True), (64 << 30, False)):
-        plant = PlantProcess(tmp_path / "plant.log", limit)
-        try:
-            for _ in range(2):
-                with pytest.raises(ArmidentError, match=r"none\.yaml"):
-                    plant.request(REFUSED, 120)
-                assert (plant.pid is None) == ended
-        finally:
-            plant.close()
-
-
-@pytest.mark.usefixtures("refusing")
-def test_a_plant_that_does_not_answer_in_time_is_ended(tmp_path: Path) -> None:
-    plant = PlantProcess(tmp_path / "plant.log")
-    try:
-        with pytest.raises(ArmidentError, match="plant: no answer within 0 s"):
-            plant.request(REFUSED, 0.0)
-        assert plant.pid is None
+            plant.run(ByName("tests.fixtures.refusing_plant:simulate"), {"robot": "none.yaml"}, 120)
     finally:
         plant.close()
 
@@ -115,7 +70,7 @@ def gone(pid: int) -> bool:
 
 @pytest.mark.slow
 def test_a_diagnosis_worker_that_dies_or_hangs_fails_one_task_and_is_replaced(tmp_path: Path) -> None:
-    diagnosis = DiagnosisProcess(tmp_path / "diagnosis.log")
+    diagnosis = WorkerProcess("diagnosis", tmp_path / "diagnosis.log")
     try:
         assert diagnosis.run(abs, -2, 120) == 2
         first = diagnosis.pid
@@ -145,7 +100,7 @@ def test_the_task_of_a_missing_recording_fails_with_its_name() -> None:
 
 def test_a_diagnosis_worker_that_exceeds_its_memory_limit_is_replaced_after_its_result(tmp_path: Path) -> None:
     for limit, ended in ((1 << 20, True), (64 << 30, False)):
-        diagnosis = DiagnosisProcess(tmp_path / "diagnosis.log", limit)
+        diagnosis = WorkerProcess("diagnosis", tmp_path / "diagnosis.log", limit)
         try:
             assert diagnosis.run(abs, -2, 120) == 2
             assert (diagnosis.pid is None) == ended
@@ -154,7 +109,7 @@ def test_a_diagnosis_worker_that_exceeds_its_memory_limit_is_replaced_after_its_
 
 
 def test_an_unexpected_error_of_a_task_is_its_result_and_its_trace_is_in_the_log(tmp_path: Path) -> None:
-    diagnosis = DiagnosisProcess(tmp_path / "diagnosis.log")
+    diagnosis = WorkerProcess("diagnosis", tmp_path / "diagnosis.log")
     try:
         with pytest.raises(ArmidentError, match="diagnosis: ValueError: math domain error"):
             diagnosis.run(math.sqrt, -1.0, 120)
@@ -165,7 +120,7 @@ def test_an_unexpected_error_of_a_task_is_its_result_and_its_trace_is_in_the_log
 
 
 def test_a_stopped_worker_fails_its_task_and_starts_no_other(tmp_path: Path) -> None:
-    diagnosis = DiagnosisProcess(tmp_path / "diagnosis.log")
+    diagnosis = WorkerProcess("diagnosis", tmp_path / "diagnosis.log")
     killer = threading.Timer(0.5, diagnosis.kill)
     killer.start()
     try:

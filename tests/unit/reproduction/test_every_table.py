@@ -122,7 +122,7 @@ def two_step_tables(bench: Bench) -> list[Table]:
     return [table_5_3(bench), table_5_4(bench)]
 
 
-@pytest.mark.proof
+@pytest.mark.nightly
 @pytest.mark.timeout(900)
 def test_words_stand_beside_numbers(two_step_tables: list[Table]) -> None:
     page = markdown(two_step_tables, [])
@@ -130,7 +130,7 @@ def test_words_stand_beside_numbers(two_step_tables: list[Table]) -> None:
     assert '"non-parametric, Wiener filter"' in document(two_step_tables, [], quick=True)
 
 
-@pytest.mark.proof
+@pytest.mark.nightly
 @pytest.mark.timeout(900)
 def test_identified_controllers_serve_idim_iv_as_the_actual_one_does(two_step_tables: list[Table]) -> None:
     found = ours(two_step_tables[0])
@@ -147,7 +147,7 @@ def test_identified_controllers_serve_idim_iv_as_the_actual_one_does(two_step_ta
         assert 0 < gains["RIV2"] < 2
 
 
-@pytest.mark.proof
+@pytest.mark.nightly
 @pytest.mark.timeout(900)
 def test_didim_fails_with_responses_from_the_tracking_error_where_drives_feed_back_the_velocity(
     two_step_tables: list[Table],
@@ -156,7 +156,7 @@ def test_didim_fails_with_responses_from_the_tracking_error_where_drives_feed_ba
     assert distance is None or distance > 3
 
 
-@pytest.mark.proof
+@pytest.mark.nightly
 @pytest.mark.timeout(900)
 def test_the_whole_loop_wants_a_parametric_controller_where_drives_feed_back_the_velocity(
     two_step_tables: list[Table],

@@ -298,7 +298,7 @@ def test_claims_are_computed_from_the_estimates(bench: Bench) -> None:
     assert found(moved, moved) == [False, True]
 
 
-@pytest.mark.parametrize("exact", [True, pytest.param(False, marks=pytest.mark.proof)])
+@pytest.mark.parametrize("exact", [True, pytest.param(False, marks=pytest.mark.nightly)])
 def test_impulse_responses_serve_idim_iv_always_and_didim_where_they_are_exact(bench: Bench, exact: bool) -> None:
     """Section 5.3.3, whose responses come from the tracking error alone; the EMPS below shows the inexact case too."""
     lab = bench.virtual if exact else bench.feedback
@@ -348,7 +348,7 @@ def test_degraded_encoders_bias_idim_ls_where_the_parallel_filter_is_rough(bench
         assert errors == sorted(errors, reverse=True)
 
 
-@pytest.mark.proof
+@pytest.mark.nightly
 def test_tables_of_the_controller_have_both_kinds_of_drives(bench: Bench) -> None:
     estimates = TABLES["5.13"](bench)
     assert figure(estimates, "virtual", "DIDIM (CRC), velocity feedback", "xx2r") < 1.2 * -0.48

@@ -27,7 +27,7 @@ def test_an_effect_changes_the_signals_of_any_arm(effect: str, arm: str, scara: 
     assert size > VISIBLE
 
 
-@pytest.mark.proof
+@pytest.mark.nightly
 @pytest.mark.parametrize("robot", sorted(set(ROBOTS) - set(PLACES)))
 @pytest.mark.parametrize("effect", sorted(EFFECTS))
 def test_an_effect_changes_the_signals_of_every_shipped_robot(effect: str, robot: str) -> None:

@@ -18,7 +18,7 @@ from tests.fixtures.diagnoses import diagnosis
 MOTION = "tx40_excitation"
 WORN = HiddenEffect(effect="asymmetric_viscous_friction", joint="joint_2", parameters={"fva": 0.2 * 5.5})
 
-RATES = [pytest.param(FAST, 1, id="1 kHz"), pytest.param(None, 3, id="5 kHz", marks=pytest.mark.proof)]
+RATES = [pytest.param(FAST, 1, id="1 kHz"), pytest.param(None, 3, id="5 kHz", marks=pytest.mark.nightly)]
 """One repetition at 1 kHz, and three at the rate of the drives."""
 
 
@@ -48,6 +48,7 @@ def test_a_worn_joint_is_named_and_its_size_is_right(period: float | None, repea
 
 
 @pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize(("period", "repeats"), RATES)
 def test_a_cogging_motor_is_named_with_its_harmonic(period: float | None, repeats: int) -> None:
     cogging = HiddenEffect(effect="cogging_torque", joint="joint_3", parameters={"amplitude": 1.2, "harmonic": 1.0})
@@ -123,7 +124,7 @@ def test_identifying_with_the_effect_inside_brings_the_torque_error_down(robot: 
 @pytest.mark.slow
 @pytest.mark.xfail(strict=True, reason="parameters that the lag spoils make noise: docs/diagnosis.md, What is missed")
 @pytest.mark.parametrize(
-    ("period", "repeats"), [(FAST, 2), pytest.param(None, 3, marks=pytest.mark.proof)], ids=["1 kHz", "5 kHz"]
+    ("period", "repeats"), [(FAST, 2), pytest.param(None, 3, marks=pytest.mark.nightly)], ids=["1 kHz", "5 kHz"]
 )
 def test_a_slow_drive_is_found_where_the_simulated_loop_does_not_tell(period: float | None, repeats: int) -> None:
     """The wrist's drives hardly follow their references, with and without the lag, also in simulation."""

@@ -12,7 +12,7 @@ from armident.identify.diagnosis.selection import StepwiseSelection
 from armident.identify.diagnosis.study import build_study
 from armident.identify.documents.diagnosis import Gap
 from tests.fixtures.diagnoses import measured_diagnosis
-from tests.statistics.measured import tx40
+from tests.reproduction.recordings import measured_recording
 
 pytestmark = pytest.mark.slow
 
@@ -35,7 +35,9 @@ def uncoupled_wrist(shared_data: Path) -> DiagnosisResult:
 def coupled_wrist(shared_data: Path) -> tuple[Gap, Gap]:
     """Errors of the model that knows it, on the same parts of the recording."""
     robot = load_robot("tx40")
-    state = with_report_part(StepwiseSelection(build_study([tx40(shared_data, robot)], [], robot)).start())
+    state = with_report_part(
+        StepwiseSelection(build_study([measured_recording(shared_data).experiment], [], robot)).start()
+    )
     return gap_of(state, held=False), gap_of(state, held=True)
 
 
@@ -76,7 +78,7 @@ def test_the_rest_of_the_emps_is_unexplained_and_only_convincing_effects_are_sta
     assert document.noise_floor.all < 0.85 * document.gap.validation.after.all
 
 
-@pytest.mark.proof
+@pytest.mark.nightly
 def test_the_uncoupled_wrist_of_the_tx40_is_named_first(uncoupled_wrist: DiagnosisResult) -> None:
     finding = uncoupled_wrist.document.findings[0]
     assert (finding.effect, finding.joint, finding.other) == ("coupling_friction", "joint_5", "joint_6")
@@ -87,7 +89,7 @@ def test_the_uncoupled_wrist_of_the_tx40_is_named_first(uncoupled_wrist: Diagnos
     assert finding.parameters["fcc"] == pytest.approx(1.93, abs=3 * std["fcc"])
 
 
-@pytest.mark.proof
+@pytest.mark.nightly
 def test_the_wrist_coupling_closes_the_gap_of_joints_5_and_6(
     uncoupled_wrist: DiagnosisResult, coupled_wrist: tuple[Gap, Gap]
 ) -> None:

@@ -43,7 +43,7 @@ def test_transitions_predict_the_torques_of_their_joints_better(base: ModelState
         assert entry.parameters["lead"] > 0.0
 
 
-@pytest.mark.parametrize("share", [0.004, 0.009, 0.017])
+@pytest.mark.parametrize("share", [0.004, *(pytest.param(s, marks=pytest.mark.nightly) for s in (0.009, 0.017))])
 def test_the_velocity_of_a_smooth_reversal_is_found_between_the_values_of_the_grid(share: float) -> None:
     """Dry friction ``fc tanh(v / (share top speed))``, without a lead."""
     robot = random_arm(3, 3)

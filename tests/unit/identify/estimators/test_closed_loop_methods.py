@@ -184,7 +184,7 @@ def test_wrong_gear_ratios_in_the_simulator_move_didim_and_not_idim_iv() -> None
     assert (np.abs(moved.theta - data.truth)[viscous] > 10 * moved.std[viscous]).all()
 
 
-@pytest.mark.parametrize("parameters", [[0, 3, 4], pytest.param(None, marks=pytest.mark.proof)], ids=["three", "all"])
+@pytest.mark.parametrize("parameters", [[0, 3, 4], pytest.param(None, marks=pytest.mark.nightly)], ids=["three", "all"])
 def test_position_is_far_less_sensitive_than_torque(parameters: list[int] | None) -> None:
     data = recorded()
     found = sensitivity(data.loop, data.truth, parameters=parameters)

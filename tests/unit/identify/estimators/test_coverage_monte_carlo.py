@@ -106,7 +106,7 @@ def test_runs_of_other_settings_are_not_taken_for_these() -> None:
     assert len({fingerprint("idim-piv", 1.0), fingerprint("idim-iv", 1.0), fingerprint("idim-piv", 2.0)}) == 3
 
 
-@pytest.mark.proof
+@pytest.mark.nightly
 @pytest.mark.timeout(600)
 def test_intervals_of_idim_piv_cover_the_truth_of_the_virtual_tx40(tmp_path: Path) -> None:
     count = 12

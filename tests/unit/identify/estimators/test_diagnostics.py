@@ -49,7 +49,7 @@ def drawn(
     return ExperimentEquations(y, x, np.ones((samples, 2), np.bool_), np.arange(float(samples))), z
 
 
-@pytest.fixture(params=[150, pytest.param(400, marks=pytest.mark.proof)])
+@pytest.fixture(params=[150, pytest.param(400, marks=pytest.mark.nightly)])
 def draws(request: pytest.FixtureRequest) -> int:
     """Recordings to draw."""
     count: int = request.param

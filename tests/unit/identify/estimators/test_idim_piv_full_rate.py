@@ -128,7 +128,7 @@ def test_no_chosen_decimation_is_wider_than_twice_the_band(cutoff_hz: float) -> 
     assert 0.5 / (0.0002 * factor) < 2.0 * cutoff_hz
 
 
-@pytest.mark.parametrize("name", ["emps", pytest.param("tx40", marks=pytest.mark.proof)])
+@pytest.mark.parametrize("name", ["emps", pytest.param("tx40", marks=pytest.mark.nightly)])
 def test_identification_at_the_recorded_rate_converges_without_a_warning(name: str) -> None:
     robot = load_robot(name)
     experiments, _ = experiments_from_recording(recording(name, f"{name}_excitation", 1), robot)

@@ -166,7 +166,7 @@ def test_encoders_a_hundred_times_as_coarse_still_give_the_parameters(method: It
     assert found.converged or found.stop_reason.startswith(("stopped after", "the equations of", "no step"))
 
 
-@pytest.mark.proof
+@pytest.mark.nightly
 @pytest.mark.timeout(600)
 def test_clie_equals_didim_and_cloe_feels_the_weakest_parameters_a_thousand_times_less() -> None:
     data = recorded(1.0)

@@ -54,7 +54,9 @@ def essential(result: IdentificationResult) -> list[int]:
     return [result.names.index(name) for name in ESSENTIAL]
 
 
-@pytest.mark.parametrize("method", ["idim-ls", "idim-iv", "idim-piv"])
+@pytest.mark.parametrize(
+    "method", [*(pytest.param(m, marks=pytest.mark.nightly) for m in ("idim-ls", "idim-iv")), "idim-piv"]
+)
 def test_without_noise_the_bias_is_far_below_what_noise_will_cost(method: Method) -> None:
     clean = identified(noise=0.0, method=method)
     noisy = identified()
@@ -95,7 +97,7 @@ def test_a_recording_without_reference_still_gives_the_parameters() -> None:
 
 @pytest.mark.parametrize(
     "seeds",
-    [3, pytest.param(20, marks=[pytest.mark.proof, pytest.mark.timeout(1800)])],
+    [3, pytest.param(20, marks=[pytest.mark.nightly, pytest.mark.timeout(1800)])],
     ids=lambda n: f"{n} seeds",
 )
 def test_essential_parameters_are_recovered_within_their_own_standard_deviations(seeds: int) -> None:

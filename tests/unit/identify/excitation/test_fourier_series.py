@@ -10,7 +10,8 @@ from armident.configs import ConfigError, RobotConfig, Trajectory, load_robot, l
 from armident.configs.schema.trajectory import Fourier
 from armident.identify.effects.terms import arm_model
 from armident.identify.excitation.design import design_trajectory, predict_precision
-from armident.identify.excitation.trajectory_command import TrajectoryOptions, trajectory_command
+from armident.identify.excitation.trajectory_command import trajectory_command
+from armident.identify.excitation.trajectory_options import TrajectoryOptions
 
 pytestmark = pytest.mark.slow
 

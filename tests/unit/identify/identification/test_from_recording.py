@@ -182,7 +182,7 @@ def test_without_a_demand_stream_there_is_no_reference_and_it_says_so(tx40: Robo
 
 def test_counters_that_disagree_with_the_rows_are_refused(tx40: RobotConfig) -> None:
     recording = replace(recording_of(tx40), counters={"samples.rows": 10_001})
-    with pytest.raises(DataError, match="10001 samples of 'samples', it holds 10000"):
+    with pytest.raises(DataError, match="holds 10000 samples of 'samples', its counter is 10001"):
         experiments_from_recording(recording, tx40)
 
 

@@ -103,7 +103,7 @@ def test_instruments_pass_the_bandpass_of_the_measured_positions(monkeypatch: py
     assert not seen
 
 
-@pytest.mark.proof
+@pytest.mark.nightly
 @pytest.mark.parametrize("setting", SETTINGS, ids=lambda s: s.name)
 @pytest.mark.parametrize("name", list(ROBOTS))
 def test_intervals_hold_or_are_called_doubtful_under_every_noise(name: str, setting: Setting) -> None:

@@ -35,24 +35,35 @@ def test_the_list_of_estimators_is_that_of_their_modules() -> None:
     assert sum(estimator(method).solve is None for method in METHODS) == 1
 
 
-@pytest.mark.parametrize("method", [m for m in METHODS if m not in {"clie", "cloe"}])
-def test_every_method_meets_the_arm(method: Method) -> None:
-    outcome = identified(options(method))
+OTHERS = [m for m in METHODS if m not in {"clie", "cloe", "idim-ls"}]
+
+
+@pytest.mark.parametrize(
+    ("robot_name", "noise_pct", "least", "method"),
+    [
+        *(("emps", 6.3, 4, m) for m in OTHERS),
+        # Least squares are biased by the noise of the EMPS.
+        ("tx40", 5.5, 25, "idim-ls"),
+        *(pytest.param("tx40", 5.5, 25, m, marks=pytest.mark.nightly) for m in OTHERS),
+    ],
+)
+def test_every_method_meets_the_arm(robot_name: str, noise_pct: float, least: int, method: Method) -> None:
+    outcome = identified(options(method), robot_name)
     robot = outcome.robot
     model = arm_model(robot)
     plant = plant_parameters(robot)
     truth = model.base.regroup @ np.array([plant[name] for name in model.names])
     result = outcome.result
     assert result.converged, result.stop_reason
-    assert result.relative_error_pct < 5.5
+    assert result.relative_error_pct < noise_pct
     chosen = result.essential & (np.abs(truth) > 0)
-    assert chosen.sum() >= 25
+    assert chosen.sum() >= least
     assert (np.abs(result.theta - truth)[chosen] < 5 * result.std[chosen]).all()
 
 
 # The noise alone is 6.1 % of the torque of the EMPS by every method, and 4.6 % of that of the TX40.
 @pytest.mark.parametrize(
-    ("robot", "noise_pct"), [("emps", 6.3), pytest.param("tx40", 5.5, marks=pytest.mark.proof)], ids=["emps", "tx40"]
+    ("robot", "noise_pct"), [("emps", 6.3), pytest.param("tx40", 5.5, marks=pytest.mark.nightly)], ids=["emps", "tx40"]
 )
 @pytest.mark.parametrize("method", ["clie", "cloe"])
 def test_output_errors_meet_the_arm_too(method: Method, robot: str, noise_pct: float) -> None:

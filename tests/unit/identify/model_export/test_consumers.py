@@ -9,9 +9,6 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from numpy.typing import NDArray
-from pydrake.multibody.parsing import Parser
-from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import MultibodyForces
 
 from armident.configs import load_robot
 from armident.identify.effects.terms import arm_model
@@ -169,6 +166,10 @@ def test_drake_computes_our_torques_from_the_sdf(model: ExportedModel, motion: M
 
 def drake_torque(file: Path, motion: Motion, frames: LinkFrames) -> Floats:
     """Inverse dynamics (N, n) by Drake, which reads SDF with the library of Gazebo."""
+    from pydrake.multibody.parsing import Parser
+    from pydrake.multibody.plant import MultibodyPlant
+    from pydrake.multibody.tree import MultibodyForces
+
     plant = MultibodyPlant(time_step=0.0)
     Parser(plant).AddModels(str(file))
     plant.mutable_gravity_field().set_gravity_vector(frames.gravity)

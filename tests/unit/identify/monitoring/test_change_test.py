@@ -58,7 +58,7 @@ def identified(
     [
         # At a rate of 0.025, fewer than 2 alarms of 300 have a probability of 0.4 %.
         (300, 2),
-        pytest.param(2000, 0.025 * 2000, marks=[pytest.mark.slow, pytest.mark.proof]),
+        pytest.param(2000, 0.025 * 2000, marks=[pytest.mark.slow, pytest.mark.nightly]),
     ],
 )
 def test_alarms_without_a_change_are_as_rare_as_promised(pairs: int, least: float) -> None:

@@ -6,12 +6,13 @@ import signal
 import sqlite3
 import time
 from pathlib import Path
+from typing import cast
 
 import pytest
 
 from armident.configs import ArmidentError
+from armident.identify.monitoring.worker import ledger as module
 from armident.identify.monitoring.worker.ledger import FILE, LEASE_S, Ledger, LedgerError
-from armident.identify.monitoring.worker.worker import ledger as module
 
 A, B = "a" * 64, "b" * 64
 
@@ -149,6 +150,28 @@ def test_a_ledger_that_is_locked_damaged_or_newer_is_one_line(tmp_path: Path, mo
     path.write_bytes(b"x" * 5000)
     with pytest.raises(ArmidentError, match="the ledger is damaged"):
         Ledger(path, "one")
+
+
+class Locked:
+    """A database that another process locks for the first calls."""
+
+    def __init__(self, calls: int) -> None:
+        self.left, self.executed = calls, list[str]()
+
+    def execute(self, statement: str) -> None:
+        if self.left > 0:
+            self.left -= 1
+            raise sqlite3.OperationalError("database is locked")
+        self.executed.append(statement)
+
+
+def test_the_journal_mode_waits_for_another_process_and_not_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
+    short, long = Locked(3), Locked(10**9)
+    module._use_write_ahead_log(cast(sqlite3.Connection, short))
+    assert short.executed == ["PRAGMA journal_mode = WAL", "PRAGMA synchronous = NORMAL"]
+    monkeypatch.setattr(module, "BUSY_S", 0.05)
+    with pytest.raises(sqlite3.OperationalError, match="locked"):
+        module._use_write_ahead_log(cast(sqlite3.Connection, long))
 
 
 def _open_and_add(path: Path, k: int) -> None:

@@ -279,7 +279,11 @@ def test_a_single_window_is_no_alarm_and_a_joint_without_excitation_has_none() -
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("joint", "motion", "period"),
-    [("joint_2", "tx40_1", 1e-3), ("joint_4", "tx40_2", 1e-3), ("joint_5", "tx40_3", 2e-4)],
+    [
+        pytest.param("joint_2", "tx40_1", 1e-3, marks=pytest.mark.nightly),
+        ("joint_4", "tx40_2", 1e-3),
+        pytest.param("joint_5", "tx40_3", 2e-4, marks=pytest.mark.nightly),
+    ],
 )
 def test_ten_percent_more_friction_is_seen_within_a_minute(joint: str, motion: str, period: float) -> None:
     seconds = seconds_to_alarm(joint, motion, 3, period=period)
@@ -288,10 +292,11 @@ def test_ten_percent_more_friction_is_seen_within_a_minute(joint: str, motion: s
 
 
 @pytest.mark.slow
-def test_minutes_of_healthy_life_raise_no_alarm() -> None:
-    life = healthy_life(0.05, 4, simulated=True)
+@pytest.mark.parametrize(("hours", "windows"), [(0.02, 8), pytest.param(0.05, 20, marks=pytest.mark.nightly)])
+def test_minutes_of_healthy_life_raise_no_alarm(hours: float, windows: int) -> None:
+    life = healthy_life(hours, 4, simulated=True)
     assert life.alarms == []
-    assert life.windows > 20
+    assert life.windows > windows
     assert life.largest_evidence < 0.5 * life.threshold
 
 
@@ -304,7 +309,7 @@ def test_a_life_of_repeated_motions_raises_no_alarm() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.proof
+@pytest.mark.nightly
 @pytest.mark.timeout(50 * 3600)
 def test_hours_of_healthy_life_raise_no_alarm() -> None:
     life = healthy_life(float(os.environ.get("ARMIDENT_HEALTHY_HOURS", "50")), 5)

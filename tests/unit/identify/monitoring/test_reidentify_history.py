@@ -16,8 +16,8 @@ from armident.identify.monitoring.reidentify import identify_once, keep, run
 from armident.identify.monitoring.reidentify.baseline import Baseline
 from armident.identify.monitoring.reidentify.publish import StatusPublisher
 from armident.identify.monitoring.reidentify.run import Job, carry_out
+from armident.identify.monitoring.worker import ledger as ledger_module
 from armident.identify.monitoring.worker.ledger import FILE, Ledger
-from armident.identify.monitoring.worker.worker import ledger as ledger_module
 from tests.fixtures import arms
 
 pytestmark = pytest.mark.slow

@@ -58,7 +58,7 @@ def test_power_in_bands_has_the_degrees_of_freedom_of_its_scatter() -> None:
 
 @pytest.mark.slow
 @pytest.mark.timeout(200)
-@pytest.mark.parametrize(("runs", "most"), [(19, 6), pytest.param(39, 10, marks=pytest.mark.proof)])
+@pytest.mark.parametrize(("runs", "most"), [(19, 6), pytest.param(39, 10, marks=pytest.mark.nightly)])
 def test_healthy_arms_have_no_small_p_values(runs: int, most: int) -> None:
     """The smallest corrected p-value of each run is below 0.1 as often as chance permits."""
     first = healthy("emps", 1)

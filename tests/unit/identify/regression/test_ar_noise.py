@@ -77,7 +77,7 @@ def test_widening_is_two_of_akaikes_factors_and_leaves_filter_and_white_noise_al
 # 60 runs the standard deviation is 0.016, hence both are bounded at three of these.
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("runs", "most", "unwidened"), [(60, 0.054, 0.016), pytest.param(300, 0.035, 0.035, marks=pytest.mark.proof)]
+    ("runs", "most", "unwidened"), [(60, 0.054, 0.016), pytest.param(300, 0.035, 0.035, marks=pytest.mark.nightly)]
 )
 def test_errors_of_parameters_are_as_large_as_said_although_the_noise_model_is_an_estimate(
     runs: int, most: float, unwidened: float

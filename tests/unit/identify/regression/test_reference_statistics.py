@@ -1,15 +1,12 @@
-"""Statistics agree with independent implementations: scipy, statsmodels, and closed forms."""
+"""Statistics agree with independent implementations: scipy, statsmodels, and closed forms.
+
+The tests import statsmodels themselves: it takes seconds, and most test processes run none of them.
+"""
 
 import numpy as np
 import pytest
-import statsmodels.api as sm
 from numpy.typing import NDArray
 from scipy import linalg, signal, stats
-from statsmodels.sandbox.regression.gmm import IV2SLS
-from statsmodels.stats.diagnostic import acorr_ljungbox, het_breuschpagan
-from statsmodels.stats.multitest import multipletests
-from statsmodels.stats.sandwich_covariance import S_hac_simple
-from statsmodels.tsa.stattools import levinson_durbin as reference_levinson_durbin
 
 from armident.identify.diagnosis.spectral_lines import SpectralLine
 from armident.identify.estimators.instrument_tests import LAGS_PER_ROOT_SAMPLE, instrument_relevance
@@ -38,6 +35,8 @@ def autocovariances(x: Array, lags: int) -> Array:
 
 @pytest.mark.parametrize("order", [1, 2, 7, 30, 60])
 def test_levinson_durbin_solves_the_yule_walker_equations(order: int) -> None:
+    from statsmodels.tsa.stattools import levinson_durbin as reference_levinson_durbin
+
     r = autocovariances(ar_process(3000, 1), order)
     coefficients, variances = levinson_durbin(r)
     assert coefficients.shape == (order + 1, order)
@@ -56,6 +55,9 @@ def test_levinson_durbin_stops_at_an_exact_model() -> None:
 @pytest.mark.filterwarnings("ignore:yule_walker currently returns:FutureWarning")
 @pytest.mark.parametrize("seed", range(4))
 def test_ar_model_is_the_yule_walker_estimate_of_lowest_aic(seed: int) -> None:
+    import statsmodels.api as sm
+    from statsmodels.tsa.stattools import levinson_durbin as reference_levinson_durbin
+
     x = ar_process(2000, seed)
     model = fit_ar([x], 30)
     rho, sigma = sm.regression.yule_walker(x, order=model.order, method="mle", demean=False)
@@ -68,6 +70,8 @@ def test_ar_model_is_the_yule_walker_estimate_of_lowest_aic(seed: int) -> None:
 
 def test_whitening_is_that_of_generalised_least_squares() -> None:
     """Filter and parameters are those of statsmodels' GLSAR."""
+    import statsmodels.api as sm
+
     rng = np.random.default_rng(5)
     x = rng.standard_normal((800, 3))
     y = x @ np.array([1.0, -2.0, 0.5]) + ar_process(800, 6)
@@ -83,6 +87,8 @@ def test_whitening_is_that_of_generalised_least_squares() -> None:
 
 @pytest.mark.parametrize("lags", [0, 1, 20, 90])
 def test_newey_west_is_the_bartlett_sandwich(lags: int) -> None:
+    from statsmodels.stats.sandwich_covariance import S_hac_simple
+
     x = np.stack([ar_process(700, seed) for seed in range(3)], axis=1)
     expected = np.diag(S_hac_simple(x, nlags=lags))
     np.testing.assert_allclose(newey_west([x], lags), expected, rtol=1e-10)
@@ -91,6 +97,8 @@ def test_newey_west_is_the_bartlett_sandwich(lags: int) -> None:
 
 
 def test_newey_west_of_a_mean_is_its_hac_covariance() -> None:
+    import statsmodels.api as sm
+
     x = 3.0 + ar_process(500, 8)
     fit = sm.OLS(x, np.ones(x.size)).fit(cov_type="HAC", cov_kwds={"maxlags": 20, "use_correction": False})
     variance = float(newey_west([x - x.mean()], 20)) / x.size**2
@@ -107,6 +115,8 @@ def test_newey_west_adds_experiments_and_skips_lags_beyond_them() -> None:
 
 
 def test_first_stage_f_is_the_hac_wald_statistic_of_the_first_stage() -> None:
+    import statsmodels.api as sm
+
     rng = np.random.default_rng(9)
     z = rng.standard_normal(900)
     x = 0.1 * z + ar_process(900, 10)
@@ -121,6 +131,8 @@ def test_first_stage_f_is_the_hac_wald_statistic_of_the_first_stage() -> None:
 
 
 def test_instrumental_variables_are_two_stage_least_squares() -> None:
+    from statsmodels.sandbox.regression.gmm import IV2SLS
+
     rng = np.random.default_rng(11)
     z = rng.standard_normal((400, 4))
     x = z @ rng.standard_normal((4, 4)) + 0.3 * rng.standard_normal((400, 4))
@@ -130,6 +142,8 @@ def test_instrumental_variables_are_two_stage_least_squares() -> None:
 
 @pytest.mark.parametrize("seed", range(2))
 def test_holm_is_that_of_statsmodels(seed: int) -> None:
+    from statsmodels.stats.multitest import multipletests
+
     p = np.random.default_rng(seed).uniform(size=25) ** 3
     p[3] = p[7]
     for alpha in (0.01, 0.05):
@@ -156,6 +170,8 @@ def test_fishers_combination_of_two_p_values(train: float, held: float) -> None:
 
 @pytest.mark.parametrize("fitted", [0, 3])
 def test_ljung_box_is_that_of_statsmodels(fitted: int) -> None:
+    from statsmodels.stats.diagnostic import acorr_ljungbox
+
     x = np.random.default_rng(12).standard_normal(600)
     x -= x.mean()
     expected = acorr_ljungbox(x, lags=[20], model_df=fitted)
@@ -166,6 +182,9 @@ def test_ljung_box_is_that_of_statsmodels(fitted: int) -> None:
 
 
 def test_breusch_pagan_is_koenkers_form_of_statsmodels() -> None:
+    import statsmodels.api as sm
+    from statsmodels.stats.diagnostic import het_breuschpagan
+
     rng = np.random.default_rng(13)
     magnitudes = np.abs(rng.standard_normal((500, 2)))
     residuals = rng.standard_normal(500) * (0.5 + magnitudes[:, 0])

@@ -193,7 +193,7 @@ def test_standard_deviations_of_parameters_determined_alone_are_those_of_the_est
 
 
 # With a true share of 5 %, the binomial bounds of probability 0.999 are 21 of 200 draws and 5 of 20.
-@pytest.mark.parametrize("runs", [20, pytest.param(200, marks=pytest.mark.proof)])
+@pytest.mark.parametrize("runs", [20, pytest.param(200, marks=pytest.mark.nightly)])
 def test_the_verdict_calls_five_percent_of_physical_arms_at_the_edge_of_physics_incompatible_at_most(runs: int) -> None:
     model, standard = small_arm(20)
     rng = np.random.default_rng(4)

@@ -1,4 +1,4 @@
-"""Process that diagnoses the recordings of the suite: a process pool of one worker with limits of time and memory."""
+"""Process of plants or of diagnoses: a process pool of one worker with limits of time and memory."""
 
 import multiprocessing
 import os
@@ -10,18 +10,32 @@ from collections.abc import Callable
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
-from typing import Generic, TypeVar, cast
+from typing import Any, Generic, TypeVar, cast
 
 from armident.configs import ArmidentError
-from armident.processes import resident_bytes
-from tests.evaluation.plant_process import MEMORY_LIMIT, ONE_THREAD
 
 TASKS_PER_PROCESS = 200
 """Number of tasks after which a worker process is replaced at any memory size."""
+MEMORY_LIMIT = 2 << 30
+"""Resident memory above which a process is replaced, bytes: the allocator returns little of arrays of many sizes."""
+ONE_THREAD = {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+"""Environment of a process that computes with one thread: each processor runs one case."""
 
 T = TypeVar("T")
 R = TypeVar("R")
+
+
+@dataclass(frozen=True)
+class ByName:
+    """Function ``module:function`` whose module only the worker process imports: plants and diagnosis share no code."""
+
+    name: str
+
+    def __call__(self, task: Any) -> Any:
+        module, _, function = self.name.partition(":")
+        return getattr(import_module(module), function)(task)
 
 
 @dataclass(frozen=True)
@@ -33,18 +47,16 @@ class _Outcome(Generic[R]):
     memory: int
 
 
-class DiagnosisProcess:
-    """Runs tasks in a process pool of one worker, one at a time.
+class WorkerProcess:
+    """Runs tasks in a process pool of one worker, one at a time; errors begin with the process's name.
 
-    The worker is started at the first task. It is replaced after its end, after a task without a result in time, and
-    after `TASKS_PER_PROCESS` tasks. It is also replaced after a task with which its memory exceeds ``memory_limit``. A
-    pool of one worker confines the end of the worker to one case: a shared pool loses all running tasks with it.
-
-    ``log``: file to which the worker appends its output; ``memory_limit``: resident memory, bytes.
+    The worker is started at the first task, and appends its output to ``log``. It is replaced after its end, after a
+    task without a result in time, after `TASKS_PER_PROCESS` tasks, and where its memory exceeds ``memory_limit``,
+    bytes. A pool of one worker confines the end of the worker to one case: a shared pool loses all running tasks.
     """
 
-    def __init__(self, log: Path, memory_limit: int = MEMORY_LIMIT) -> None:
-        self.log, self.memory_limit = log, memory_limit
+    def __init__(self, name: str, log: Path, memory_limit: int = MEMORY_LIMIT) -> None:
+        self.name, self.log, self.memory_limit = name, log, memory_limit
         self._pool: ProcessPoolExecutor | None = None
         self._killed = False
 
@@ -55,10 +67,9 @@ class DiagnosisProcess:
         return processes[0].pid if processes else None
 
     def run(self, function: Callable[[T], R], task: T, timeout: float) -> R:
-        """Run ``function(task)`` in the worker and return the result.
+        """Run ``function(task)`` in the worker and return the result; wait ``timeout`` s at most.
 
-        ``function``: function of a module; ``timeout``: longest time to wait for the result, s. Raises ArmidentError if
-        the function raises, the worker ends, or there is no result in time.
+        Raises ArmidentError if the function raises, the worker ends, or there is no result in time.
         """
         if self._pool is None:
             self.log.parent.mkdir(parents=True, exist_ok=True)
@@ -74,14 +85,14 @@ class DiagnosisProcess:
         except TimeoutError as error:
             self._kill_worker()
             self.close()
-            raise ArmidentError(f"diagnosis: no result within {timeout:.0f} s") from error
+            raise ArmidentError(f"{self.name}: no result within {timeout:.0f} s") from error
         except BrokenProcessPool as error:
             self.close()
-            raise ArmidentError(f"diagnosis: the worker process ended; see {self.log}") from error
+            raise ArmidentError(f"{self.name}: the worker process ended; see {self.log}") from error
         if outcome.memory > self.memory_limit:
             self.close()
         if outcome.error is not None:
-            raise ArmidentError(f"diagnosis: {outcome.error}")
+            raise ArmidentError(f"{self.name}: {outcome.error}")
         # Without an error there is a result, which is None for some functions.
         return cast(R, outcome.result)
 
@@ -135,4 +146,5 @@ def _run(function: Callable[[T], R], task: T) -> _Outcome[R]:
         if not isinstance(error, ArmidentError):
             traceback.print_exc()
         message = f"{type(error).__name__}: {' '.join(str(error).split())}"
-    return _Outcome(result, message, resident_bytes(os.getpid()))
+    pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
+    return _Outcome(result, message, pages * os.sysconf("SC_PAGE_SIZE"))

@@ -1,4 +1,4 @@
-"""Virtual arm on a vcan bus, driven by the project's master and SYNC producer."""
+"""Virtual arm on a bus, driven by the project's master and SYNC producer."""
 
 import os
 import signal
@@ -11,20 +11,21 @@ from pathlib import Path
 import canopen
 import numpy as np
 import pytest
+import yaml
 from numpy.typing import NDArray
 
 from armident.configs import SessionConfig, Trajectory, load_robot, load_session
+from armident.configs.schema.session import Bus
 from armident.configs.schema.trajectory import Move
 from armident.daq.recording import write_recording
-from armident.drivers.can.frames import STANDARD_ID_MASK, frames
+from armident.drivers.can.frames import STANDARD_ID_MASK, FrameBus, frames
 from armident.drivers.can.socketcan import RawSocket
+from armident.drivers.can.udp import open_bus, open_python_can
 from armident.drivers.canopen.master import DriveMaster
 from armident.drivers.canopen.objects import COB_SYNC, Control, DriveState, NmtCommand, drive_state
 from armident.drivers.canopen.sync_producer import SetpointPlan, SyncProducer
 from armident.virtual_robot.offline import simulate_recording
 from tests.fixtures.processes import armident
-
-pytestmark = [pytest.mark.vcan, pytest.mark.timeout(120)]
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 
@@ -53,16 +54,28 @@ def robot_process(config: Path, *options: object) -> Iterator[Output]:
         output.code = process.returncode
 
 
-@pytest.fixture
-def config(vcan_bus: str, tmp_path: Path) -> Path:
-    """The session file of the demonstration cell, on the bus of this test."""
+def demonstration_cell(folder: Path, bus: Bus) -> Path:
+    """The session file of the demonstration cell, on a bus."""
     text = (REPOSITORY / "configs" / "cells" / "tx40_cell.yaml").read_text()
-    path = tmp_path / "cell.yaml"
-    path.write_text(text.replace("vcan0", vcan_bus))
+    path = folder / "cell.yaml"
+    data = yaml.safe_load(text) | {"bus": {"interface": bus.interface, "channel": bus.channel}}
+    path.write_text(yaml.safe_dump(data))
     return path
 
 
-def collect(bus: RawSocket, seconds: float, sync: SyncProducer | None = None) -> NDArray[np.void]:
+@pytest.fixture
+def config(vcan_bus: str, tmp_path: Path) -> Path:
+    """The demonstration cell on vcan."""
+    return demonstration_cell(tmp_path, Bus(channel=vcan_bus))
+
+
+@pytest.fixture
+def slow_config(udp_bus: Bus, tmp_path: Path) -> Path:
+    """The demonstration cell on UDP, for tests without SYNC."""
+    return demonstration_cell(tmp_path, udp_bus)
+
+
+def collect(bus: FrameBus, seconds: float, sync: SyncProducer | None = None) -> NDArray[np.void]:
     """All frames of the next seconds."""
     batch, out, end = frames(4096), [], time.monotonic() + seconds
     while time.monotonic() < end:
@@ -102,6 +115,7 @@ def setpoint_rows(session: SessionConfig, start: list[int], seconds: float) -> N
     return rows
 
 
+@pytest.mark.vcan
 def test_every_sync_is_answered_by_every_drive_and_set_points_are_followed(config: Path) -> None:
     session = load_session(config)
     robot = load_robot(session.robot)
@@ -109,14 +123,14 @@ def test_every_sync_is_answered_by_every_drive_and_set_points_are_followed(confi
         master.configure()
         master.start()
         start = master.positions()
-        rows = setpoint_rows(session, start, 1.0)
+        rows = setpoint_rows(session, start, 0.3)
         cobs = tuple(0x200 + drive.node_id for drive in session.drives)
         sync = SyncProducer(session.bus, session.sync.period_us, session.sync.counter, SetpointPlan(rows, cobs, 5))
         with RawSocket(
             session.bus.channel, filters=((COB_SYNC, STANDARD_ID_MASK), (0x180, 0x780), (0x280, 0x780))
         ) as bus:
             sync.start()
-            log = collect_answers(bus, sync, 6500)
+            log = collect_answers(bus, sync, 2000)
             assert bus.dropped == 0
         events = master.supervise()
         master.stop()
@@ -138,6 +152,7 @@ def test_every_sync_is_answered_by_every_drive_and_set_points_are_followed(confi
         assert np.abs(position[4::5][: demand.size] - demand).max() < 12_000
 
 
+@pytest.mark.vcan
 def test_lagging_drives_act_on_a_stop_at_the_same_sync(config: Path) -> None:
     """Frames that waited while the process was stopped are read at once; the stop takes effect between them."""
     session = load_session(config)
@@ -163,11 +178,12 @@ def test_lagging_drives_act_on_a_stop_at_the_same_sync(config: Path) -> None:
     assert set(states[before + 1 :]) == {DriveState.QUICK_STOP_ACTIVE}
 
 
-def test_mappings_are_refused_as_cia_301_prescribes(config: Path) -> None:
-    session = load_session(config)
-    with robot_process(config):
+def test_mappings_are_refused_as_cia_301_prescribes(slow_config: Path) -> None:
+    session = load_session(slow_config)
+    with robot_process(slow_config):
         network = canopen.Network()
-        network.connect(interface="socketcan", channel=session.bus.channel)
+        network.bus = open_python_can(session.bus)
+        network.connect()
         try:
             node = network.add_node(1, str(session.drives[0].eds))
             node.sdo.RESPONSE_TIMEOUT = 2.0
@@ -195,14 +211,14 @@ def test_mappings_are_refused_as_cia_301_prescribes(config: Path) -> None:
             network.disconnect()
 
 
-def test_nmt_states_govern_boot_up_heartbeat_sdo_and_pdo(config: Path) -> None:
-    session = load_session(config)
-    channel = session.bus.channel
-    with RawSocket(channel) as bus, robot_process(config):
+def test_nmt_states_govern_boot_up_heartbeat_sdo_and_pdo(slow_config: Path) -> None:
+    session = load_session(slow_config)
+    with open_bus(session.bus) as bus, robot_process(slow_config):
         boot = collect(bus, 0.3)
         assert {int(f["can_id"]) for f in boot if f["length"] == 1 and f["data"][0] == 0} >= set(range(0x701, 0x707))
         network = canopen.Network()
-        network.connect(interface="socketcan", channel=channel)
+        network.bus = open_python_can(session.bus)
+        network.connect()
         try:
             node = network.add_node(3, str(session.drives[0].eds))
             node.sdo.RESPONSE_TIMEOUT, node.sdo.MAX_RETRIES = 0.5, 1
@@ -223,6 +239,7 @@ def test_nmt_states_govern_boot_up_heartbeat_sdo_and_pdo(config: Path) -> None:
             network.disconnect()
 
 
+@pytest.mark.vcan
 def test_a_replayed_recording_arrives_unchanged(config: Path, tmp_path: Path) -> None:
     session = load_session(config)
     robot = load_robot(session.robot)
