@@ -48,7 +48,7 @@ event.register("numba:compile", Listener())
 BUS = """
 import numpy as np
 from armident.configs import load_robot, load_session
-from armident.daq.guard.limits import limits_of
+from armident.daq.guard.motion_limits import motion_limits_of
 from armident.daq.guard.monitor import MotionMonitor
 from armident.daq.matching.assembler import Assembler, TpdoStream
 from armident.drivers.can.frames import frames
@@ -67,7 +67,7 @@ sync_loop.Loop(one, 1_000_000, 240, state, late, other, third, times)
 session = load_session("tx40_cell.yaml")
 robot = load_robot(session.robot)
 for count in (0, 1, 2):
-    MotionMonitor(session, robot, limits_of(robot)).check(frames(count), 0)
+    MotionMonitor(session, robot, motion_limits_of(robot)).check(frames(count), 0)
 """
 
 
@@ -193,7 +193,7 @@ def test_nothing_compiles_at_run_time(tmp_path: Path) -> None:
         ("check", "tx40.mcap"),
         ("diagnose", "emps.mcap", "--out", "diagnosis"),
         ("trajectory", "--config", "emps.yaml", "--out", "trajectory.yaml", "--evaluations", "20"),
-        ("watch", "tx40.mcap", "--reference", "tx40/identification.json"),
+        ("watch", "emps.mcap", "--reference", "emps/identification.json"),
     ):
         done = run("main(sys.argv[1:])", *words, cwd=tmp_path)
         lines += [f"{words[0]}: {line}" for line in done.stderr.splitlines() if line.startswith("compiled: ")]
