@@ -72,7 +72,7 @@ def examine(path: Path, robot: RobotConfig, stated: Mapping[str, Any]) -> Record
             rate = usual_rate(times) / UNITS[options.get("time_unit") or rows.time_unit or "s"]
             options["resample_hz"] = float(f"{rate:.2g}")
             recording = import_recording(path, robot, **given(options))
-    return _facts(path, recording, robot, options)
+    return _facts(path, recording, robot, given(options))
 
 
 _OF_ROWS = ("effort", "names", "topic", "joints", "by_position")

@@ -461,7 +461,7 @@ def test_a_unit_that_is_none_is_one_line(tmp_path: Path, units: str) -> None:
     path = table(tmp_path / "d.csv")
     refused = run("import", str(path), "--config", "tx40", "--units", units, "--out", str(tmp_path / "d.mcap"))
     assert refused.exit_code == 2
-    assert "--units: " in refused.stderr
+    assert "--units" in refused.stderr.splitlines()[-1]
 
 
 def test_joints_that_were_not_recorded_are_left_out(tmp_path: Path, arm: Path) -> None:

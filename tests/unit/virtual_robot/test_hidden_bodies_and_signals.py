@@ -237,7 +237,10 @@ EXAMPLES: dict[str, float] = {
     "quadratic_coupling": 2.0, "base_vibration": 1.0, "friction_scale": 1.3,
 }  # fmt: skip
 """Clearly visible value of the required parameter of each effect."""
-ON_EMPS = EXAMPLES | {"presliding_friction": 1e-4, "backlash": 1e-4, "rotor_inertia": 10.0}
+ON_EMPS = EXAMPLES | {
+    "asymmetric_viscous_friction": 0.3 * 203.5, "asymmetric_coulomb_friction": 0.3 * 20.39,
+    "presliding_friction": 1e-4, "backlash": 1e-4, "rotor_inertia": 10.0,
+}  # fmt: skip
 CASES = [("tx40", effect) for effect in sorted(EXAMPLES)]
 CASES += [("emps", effect) for effect in sorted(EXAMPLES) if EFFECTS[effect].other != "required"]
 

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from armident.configs import load_robot
-from armident.identify.estimators.idim_piv import idim_piv
+from armident.identify.estimators import idim_piv as module
 from armident.identify.estimators.methods import Method
-from armident.identify.identification import solvers as methods
 from armident.identify.identification.from_recording import experiments_from_recording
 from armident.identify.identification.options import Options
 from armident.identify.identification.pipeline import identify_experiment
@@ -44,7 +43,7 @@ def test_idim_iv_replaces_a_prefilter_that_does_not_converge(
     at_500_hz: list[Experiment], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The same iterations, stopped after the first: the estimate is that of IDIM-IV, which converges."""
-    monkeypatch.setattr(methods, "idim_piv", partial(idim_piv, iterations=1))
+    monkeypatch.setattr(module, "idim_piv", partial(module.idim_piv, iterations=1))
     robot = load_robot("tx40.yaml")
     found = identify_experiment(at_500_hz, robot, Options())
     assert found.converged
