@@ -28,7 +28,7 @@ class Reader(Protocol):
     name: ClassVar[str]
     suffixes: ClassVar[tuple[str, ...]]
     reads: ClassVar[str]
-    """What is read of it, for help and docs."""
+    """Name of the quantities or files that are read, for help and docs."""
     reader: ClassVar[str] = ""
     writer: ClassVar[str] = ""
     extra: ClassVar[str] = ""

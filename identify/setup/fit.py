@@ -33,7 +33,7 @@ BLOCKS = 24
 class Hypothesis:
     """Corrections ``position``, ``torque`` (n, n) of the recorded signals, and of the configuration.
 
-    ``gravity`` (3,): base frame, m/s^2. ``shift`` (n,): lateness of torques, s. ``clock``: true over recorded duration.
+    ``gravity`` (3,): base frame, m/s^2. ``shift`` (n,): torque delay, s. ``clock``: true over recorded duration.
     """
 
     position: Array
