@@ -16,12 +16,15 @@ from armident.daq.matching.state import (
     INCOMPLETE,
     NEVER,
     ORIGIN,
+    PENDING,
     RECEIVED,
     SEND_TIMES,
+    SETTLED,
     SYNC,
     SYNC_MISALIGNED,
     TIME,
     TOP,
+    WRONG_LENGTHS,
     MatchedSamples,
     StreamShape,
     new_state,
@@ -164,18 +167,17 @@ class Assembler:
 
     def _outstanding(self) -> NDArray[np.int64]:
         """Return the number of outstanding answers, (streams, drives)."""
+        drives = self._state.drives
         outstanding: NDArray[np.int64] = (
-            self._state.head[self._state.bus_of].T - self._state.settled - self._state.pending
+            self._state.head[self._state.bus_of].T - drives[:, :, SETTLED] - drives[:, :, PENDING]
         )
         return outstanding
 
     @property
     def wrong_lengths(self) -> dict[tuple[str, str], int]:
         """Number of TPDOs whose length differs from the mapping, by stream and joint, where not zero."""
-        return {
-            (self._streams[s].name, self._joints[j]): int(self._state.wrong_length[s, j])
-            for s, j in np.argwhere(self._state.wrong_length > 0)
-        }
+        counts = self._state.drives[:, :, WRONG_LENGTHS]
+        return {(self._streams[s].name, self._joints[j]): int(counts[s, j]) for s, j in np.argwhere(counts > 0)}
 
     @property
     def counters(self) -> dict[str, int]:
@@ -202,7 +204,7 @@ class Assembler:
         self._load_send_times(self._lossy[bus])
         if dropped:
             self._state.bus_state[bus, INCOMPLETE] = 2
-        syncs = _count_sync(*arguments, longest, self._state)
+        syncs = _count_sync(*arguments, longest, self._state.bus_state.copy(), self._state)
         if dropped:
             self._state.gap_end[bus] = self._state.watermark[:, TOP] + syncs + 1
         out = output_buffers(self._state, syncs)
@@ -266,7 +268,7 @@ class Assembler:
             self._shapes, windows, windows, windows, self._state.bus_of.tolist(), no_channel, no_channel
         )
         arguments = (*_columns(frames), *self._timing, 0)
-        out = output_buffers(scratch, _count_sync(*arguments, self._longest_gap, scratch))
+        out = output_buffers(scratch, _count_sync(*arguments, self._longest_gap, scratch.bus_state.copy(), scratch))
         _match(*arguments, self._longest_gap, scratch, out)
         _finish(0, scratch, out)
 

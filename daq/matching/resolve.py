@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from armident.compiled import compiled
+from armident.compiled import UNCOUNTED, compiled
 from armident.daq.matching.state import (
     ALIGNED_SYNCS,
     ALL_BEHIND,
@@ -15,18 +15,25 @@ from armident.daq.matching.state import (
     BALANCE_LAST,
     BALANCE_RUN,
     BASE,
+    CLEAR_FROM,
     COUNTED_AT,
     EMITTED,
     HELD_AT,
     IN_STEP_RUN,
+    LAG,
+    LAG_AT,
     LENGTH,
     LONG_WINDOW,
     LONGEST_LOSS,
     NEVER,
     NO_SYNC,
+    OPEN,
     PACK,
+    PENDING,
     RECEIVED,
+    SETTLED,
     SHORT_WINDOW,
+    SINCE_SYNC,
     SIZE,
     STALE,
     TOP,
@@ -38,30 +45,30 @@ from armident.daq.matching.state import (
 )
 
 
-@compiled()
+@compiled(**UNCOUNTED)
 def slot_of(m: MatcherState, s: int, u: int) -> int:
     """Return the ring slot of a row. ``s``: number of the stream; ``u``: ordinal of the row."""
     return int((u - m.watermark[s, BASE]) % m.row_sync.shape[1])
 
 
-@compiled()
+@compiled(**UNCOUNTED)
 def _is_received(m: MatcherState, s: int, j: int, u: int) -> bool:
     """Return True if the SYNC of row ``u`` was received on the bus of a joint."""
     return bool(m.row_t[s, slot_of(m, s, u), m.config[s, PACK] - 1, m.bus_of[j]] != NEVER)
 
 
-@compiled()
+@compiled(**UNCOUNTED)
 def _assign(m: MatcherState, s: int, j: int, u: int, i: int) -> None:
     """Assign answer ``i`` of a drive to row ``u``."""
     slot = slot_of(m, s, u)
     for w in range(m.answer.shape[3]):
         m.row_data[s, slot, j, w] = m.answer[s, j, i, w]
-    m.row_code[s, slot, j] = m.answer_code[s, j, i] if u >= m.ambiguous_before[s, j] else AMBIGUOUS
+    m.row_code[s, slot, j] = m.answer_code[s, j, i] if u >= m.drives[s, j, CLEAR_FROM] else AMBIGUOUS
     if m.newest_row[s, j, i] > u and _is_received(m, s, j, u):
         m.counts[TPDO_LATE] += 1
 
 
-@compiled()
+@compiled(**UNCOUNTED)
 def _are_equal(m: MatcherState, s: int, j: int, i: int, k: int) -> bool:
     """Return True if two answers of a drive have the same bytes."""
     same = m.answer_code[s, j, i] == m.answer_code[s, j, k]
@@ -72,17 +79,17 @@ def _are_equal(m: MatcherState, s: int, j: int, i: int, k: int) -> bool:
     return bool(same)
 
 
-@compiled()
+@compiled(**UNCOUNTED)
 def _drop_repetitions(m: MatcherState, s: int, j: int, outstanding: int) -> None:
     """Drop repeated frames if there are more answers than SYNCs; mark all as ambiguous if they cannot be identified."""
-    count = m.pending[s, j]
+    count = m.drives[s, j, PENDING]
     m.counts[TPDO_DUPLICATE] += count - outstanding
     distinct = 0
     for i in range(count):
         if i == 0 or not _are_equal(m, s, j, i, i - 1):
             distinct += 1
     if distinct != outstanding and distinct > 1:
-        m.ambiguous_before[s, j] = max(m.ambiguous_before[s, j], m.settled[s, j] + outstanding)
+        m.drives[s, j, CLEAR_FROM] = max(m.drives[s, j, CLEAR_FROM], m.drives[s, j, SETTLED] + outstanding)
     elif distinct == outstanding:
         kept = 0
         for i in range(count):
@@ -92,87 +99,89 @@ def _drop_repetitions(m: MatcherState, s: int, j: int, outstanding: int) -> None
                 for w in range(m.answer.shape[3]):
                     m.answer[s, j, kept, w] = m.answer[s, j, i, w]
                 kept += 1
-    m.pending[s, j] = outstanding
+    m.drives[s, j, PENDING] = outstanding
 
 
-@compiled()
+@compiled(**UNCOUNTED)
 def _record_lag(m: MatcherState, s: int, j: int, rows: int) -> None:
     """Record that a drive had this number of outstanding answers."""
-    if rows >= m.lag[s, j] or m.head[m.bus_of[j], s] - m.lag_at[s, j] > 2 * m.config[s, WINDOW]:
-        m.lag[s, j] = rows
-        m.lag_at[s, j] = m.head[m.bus_of[j], s]
+    if rows >= m.drives[s, j, LAG] or m.head[m.bus_of[j], s] - m.drives[s, j, LAG_AT] > 2 * m.config[s, WINDOW]:
+        m.drives[s, j, LAG] = rows
+        m.drives[s, j, LAG_AT] = m.head[m.bus_of[j], s]
 
 
-@compiled()
+@compiled(**UNCOUNTED)
 def _update_progress(m: MatcherState, s: int, j: int) -> None:
     """Update the progress of a drive: its best balance of answers and rows, and for how many rows it has kept it."""
     head = m.head[m.bus_of[j], s]
-    balance = m.pending[s, j] - (head - m.settled[s, j])
-    best = m.progress[s, j, BALANCE]
-    if balance > best or (balance < best and head - m.progress[s, j, BALANCE_LAST] > m.config[s, SHORT_WINDOW]):
-        m.progress[s, j, BALANCE], m.progress[s, j, BALANCE_AT] = balance, head
-        m.progress[s, j, BALANCE_RUN], m.progress[s, j, BALANCE_COUNT] = 0, 0
-    if m.progress[s, j, COUNTED_AT] == head:
+    balance = m.drives[s, j, PENDING] - (head - m.drives[s, j, SETTLED])
+    best = m.drives[s, j, BALANCE]
+    if balance > best or (balance < best and head - m.drives[s, j, BALANCE_LAST] > m.config[s, SHORT_WINDOW]):
+        m.drives[s, j, BALANCE], m.drives[s, j, BALANCE_AT] = balance, head
+        m.drives[s, j, BALANCE_RUN], m.drives[s, j, BALANCE_COUNT] = 0, 0
+    if m.drives[s, j, COUNTED_AT] == head:
         return
-    m.progress[s, j, COUNTED_AT] = head
-    at_best = balance == m.progress[s, j, BALANCE]
+    m.drives[s, j, COUNTED_AT] = head
+    at_best = balance == m.drives[s, j, BALANCE]
     if at_best:
-        m.progress[s, j, BALANCE_LAST] = head
-    m.progress[s, j, BALANCE_RUN] = m.progress[s, j, BALANCE_RUN] + 1 if at_best else 0
-    m.progress[s, j, BALANCE_COUNT] += at_best
-    m.progress[s, j, IN_STEP_RUN] = (
-        m.progress[s, j, IN_STEP_RUN] + 1 if balance == 0 and not m.progress[s, j, STALE] else 0
-    )
+        m.drives[s, j, BALANCE_LAST] = head
+    m.drives[s, j, BALANCE_RUN] = m.drives[s, j, BALANCE_RUN] + 1 if at_best else 0
+    m.drives[s, j, BALANCE_COUNT] += at_best
+    m.drives[s, j, IN_STEP_RUN] = m.drives[s, j, IN_STEP_RUN] + 1 if balance == 0 and not m.drives[s, j, STALE] else 0
 
 
-@compiled()
+@compiled(**UNCOUNTED)
 def _is_aligned(m: MatcherState, s: int, j: int, head: int) -> bool:
     """Return True if the surplus is that of answers to discarded rows, the largest one: drives never answer early."""
-    if m.progress[s, j, BALANCE_RUN] >= ALIGNED_SYNCS:
+    if m.drives[s, j, BALANCE_RUN] >= ALIGNED_SYNCS:
         return True
-    lasting = head - m.progress[s, j, BALANCE_AT] >= m.config[s, SHORT_WINDOW] // 2
-    return bool(lasting and m.progress[s, j, BALANCE_RUN] > 0 and m.progress[s, j, BALANCE_COUNT] >= ALIGNED_SYNCS)
+    lasting = head - m.drives[s, j, BALANCE_AT] >= m.config[s, SHORT_WINDOW] // 2
+    return bool(lasting and m.drives[s, j, BALANCE_RUN] > 0 and m.drives[s, j, BALANCE_COUNT] >= ALIGNED_SYNCS)
 
 
-@compiled()
+@compiled(**UNCOUNTED)
 def _close_rows(m: MatcherState, s: int, j: int, until: int, stale: bool) -> None:
     """Settle the rows before ``until``; ``stale``: answers to discarded rows may still arrive."""
-    m.settled[s, j], m.pending[s, j] = until, 0
-    m.progress[s, j, BALANCE], m.progress[s, j, BALANCE_RUN], m.progress[s, j, STALE] = NEVER, 0, int(stale)
+    m.drives[s, j, SETTLED], m.drives[s, j, PENDING] = until, 0
+    m.drives[s, j, BALANCE], m.drives[s, j, BALANCE_RUN], m.drives[s, j, STALE] = NEVER, 0, int(stale)
 
 
-@compiled()
+@compiled(**UNCOUNTED)
 def _drop_stale(m: MatcherState, s: int, j: int, count: int) -> None:
     """Drop the first answers, which belong to discarded rows; with repeated frames, their number is ambiguous."""
-    for i in range(1, m.pending[s, j]):
+    for i in range(1, m.drives[s, j, PENDING]):
         if _are_equal(m, s, j, i, i - 1):
-            m.ambiguous_before[s, j] = max(m.ambiguous_before[s, j], m.settled[s, j] + m.pending[s, j] - count)
-    m.pending[s, j] -= count
+            m.drives[s, j, CLEAR_FROM] = max(
+                m.drives[s, j, CLEAR_FROM], m.drives[s, j, SETTLED] + m.drives[s, j, PENDING] - count
+            )
+    m.drives[s, j, PENDING] -= count
     m.counts[TPDO_LATE] += count
-    for i in range(m.pending[s, j]):
+    for i in range(m.drives[s, j, PENDING]):
         m.newest_row[s, j, i] = m.newest_row[s, j, i + count]
         m.answer_code[s, j, i] = m.answer_code[s, j, i + count]
         for w in range(m.answer.shape[3]):
             m.answer[s, j, i, w] = m.answer[s, j, i + count, w]
 
 
-@compiled()
+@compiled(**UNCOUNTED)
 def _may_hold_repetition(m: MatcherState, s: int, j: int) -> bool:
     """Return True if one of the late answers may be a repetition; the next SYNC then shows a surplus."""
     found = False
-    for i in range(1, m.pending[s, j]):
+    for i in range(1, m.drives[s, j, PENDING]):
         found = found or (m.newest_row[s, j, i] == m.newest_row[s, j, i - 1] and _are_equal(m, s, j, i, i - 1))
     return found
 
 
-@compiled()
+@compiled(**UNCOUNTED)
 def _count_prompt(m: MatcherState, s: int, j: int) -> int:
     """Return the number of answers certainly sent in time; all if no recent lag of the drive is known."""
-    count, prompt = m.pending[s, j], 0
-    while prompt < count and not m.progress[s, j, STALE] and m.newest_row[s, j, prompt] == m.settled[s, j] + prompt:
+    count, prompt = m.drives[s, j, PENDING], 0
+    while (
+        prompt < count and not m.drives[s, j, STALE] and m.newest_row[s, j, prompt] == m.drives[s, j, SETTLED] + prompt
+    ):
         prompt += 1
-    lags = m.lag[s, j] > 0 and m.head[m.bus_of[j], s] - m.lag_at[s, j] <= 2 * m.config[s, WINDOW]
-    previous = m.settled[s, j] + prompt - 1
+    lags = m.drives[s, j, LAG] > 0 and m.head[m.bus_of[j], s] - m.drives[s, j, LAG_AT] <= 2 * m.config[s, WINDOW]
+    previous = m.drives[s, j, SETTLED] + prompt - 1
     for i in range(prompt, count):
         # Two answers at once, or so many consecutive rows missing that the drive has paused.
         lags = lags or m.newest_row[s, j, i] == previous or m.newest_row[s, j, i] - previous > LONGEST_LOSS
@@ -180,40 +189,38 @@ def _count_prompt(m: MatcherState, s: int, j: int) -> int:
     return prompt if lags else count
 
 
-@compiled()
+@compiled(**UNCOUNTED)
 def _settle(m: MatcherState, s: int, j: int, final: bool, peer_in_step: bool) -> None:
     """Decide the open rows of one TPDO of one drive: match certain answers, discard rows no longer answered."""
     bus = m.bus_of[j]
-    head, stale = m.head[bus, s], m.progress[s, j, STALE] != 0
-    outstanding = head - m.settled[s, j]
-    if m.pending[s, j] > outstanding and not stale:
+    head, stale = m.head[bus, s], m.drives[s, j, STALE] != 0
+    outstanding = head - m.drives[s, j, SETTLED]
+    if m.drives[s, j, PENDING] > outstanding and not stale:
         _drop_repetitions(m, s, j, outstanding)
-    m.since_sync[s, j] = 0
-    balance, balance_run = m.pending[s, j] - outstanding, m.progress[s, j, BALANCE_RUN]
+    m.drives[s, j, SINCE_SYNC] = 0
+    balance, balance_run = m.drives[s, j, PENDING] - outstanding, m.drives[s, j, BALANCE_RUN]
     # If answers to discarded rows may arrive, equal numbers prove nothing until the drive is in step.
     if (balance == 0 and not stale) or (balance >= 0 and stale and _is_aligned(m, s, j, head)):
         if balance > 0:
             _drop_stale(m, s, j, balance)
-        elif not stale and not final and m.progress[s, j, HELD_AT] != head - 1 and _may_hold_repetition(m, s, j):
-            m.progress[s, j, HELD_AT] = head
+        elif not stale and not final and m.drives[s, j, HELD_AT] != head - 1 and _may_hold_repetition(m, s, j):
+            m.drives[s, j, HELD_AT] = head
             return
         for i in range(outstanding):
-            if m.newest_row[s, j, i] > m.settled[s, j] + i and _is_received(m, s, j, m.newest_row[s, j, i]):
+            if m.newest_row[s, j, i] > m.drives[s, j, SETTLED] + i and _is_received(m, s, j, m.newest_row[s, j, i]):
                 _record_lag(m, s, j, outstanding)
-            _assign(m, s, j, m.settled[s, j] + i, i)
-        if m.settled[s, j] < m.gap_end[bus, s]:
+            _assign(m, s, j, m.drives[s, j, SETTLED] + i, i)
+        if m.drives[s, j, SETTLED] < m.gap_end[bus, s]:
             _discard_near_gap(m, s, j, outstanding)
-        _close_rows(m, s, j, head, False)
+        _close_rows(m, s, j, head, OPEN)
         return
-    count = m.pending[s, j]
-    last = m.newest_row[s, j, count - 1] + 1 if count else m.settled[s, j]
+    count = m.drives[s, j, PENDING]
+    last = m.newest_row[s, j, count - 1] + 1 if count else m.drives[s, j, SETTLED]
     # The drive answers every SYNC but does not catch up, while others lack no answer: its missing answers are lost.
     in_step = (
-        balance < 0
-        and balance_run >= ALIGNED_SYNCS
-        and head - m.progress[s, j, BALANCE_AT] >= m.config[s, SHORT_WINDOW]
+        balance < 0 and balance_run >= ALIGNED_SYNCS and head - m.drives[s, j, BALANCE_AT] >= m.config[s, SHORT_WINDOW]
     )
-    in_step = in_step and (peer_in_step or m.settled[s, j] < m.gap_end[bus, s])
+    in_step = in_step and (peer_in_step or m.drives[s, j, SETTLED] < m.gap_end[bus, s])
     silent = peer_in_step and head - last > 2 * m.config[s, SHORT_WINDOW]
     late = outstanding > m.config[s, WINDOW] and head - m.watermark[s, ALL_BEHIND] > m.config[s, WINDOW]
     if not (late or outstanding > m.config[s, LONG_WINDOW] or final or in_step or silent):
@@ -224,8 +231,8 @@ def _settle(m: MatcherState, s: int, j: int, final: bool, peer_in_step: bool) ->
     keep = head if final else head - m.config[s, WINDOW]
     if silent:
         keep = max(keep, head - 2 * m.config[s, SHORT_WINDOW])
-    keep = max(keep, m.settled[s, j])
-    u, repeated, answered = head, False, m.settled[s, j]
+    keep = max(keep, m.drives[s, j, SETTLED])
+    u, repeated, answered = head, False, m.drives[s, j, SETTLED]
     ending = (final or silent) and not in_step
     first_late = _count_prompt(m, s, j)
     for i in range(count - 1, -1, -1):
@@ -248,7 +255,7 @@ def _settle(m: MatcherState, s: int, j: int, final: bool, peer_in_step: bool) ->
     _close_rows(m, s, j, max(keep, answered), keep > answered or (stale and not in_step))
 
 
-@compiled()
+@compiled(**UNCOUNTED)
 def _discard_near_gap(m: MatcherState, s: int, j: int, count: int) -> None:
     """Discard answers as ambiguous where frames were missing recently: one may be lost and a later one repeated."""
     repeated, differ = -1, False
@@ -258,14 +265,14 @@ def _discard_near_gap(m: MatcherState, s: int, j: int, count: int) -> None:
     for i in range(1, repeated + 1):
         differ = differ or not _are_equal(m, s, j, i, i - 1)
     for i in range(repeated + 1 if differ else 0):
-        m.row_code[s, slot_of(m, s, m.settled[s, j] + i), j] = AMBIGUOUS
+        m.row_code[s, slot_of(m, s, m.drives[s, j, SETTLED] + i), j] = AMBIGUOUS
 
 
-@compiled()
+@compiled(**UNCOUNTED)
 def _discard_ambiguous(m: MatcherState, s: int, j: int, count: int) -> None:
     """Discard answers that were taken as prompt but may be late, where one was lost."""
     # Answers in a burst after a pause: with one of them lost, their SYNCs are ambiguous.
-    previous = m.settled[s, j] - 1
+    previous = m.drives[s, j, SETTLED] - 1
     for i in range(count):
         newest = m.newest_row[s, j, i]
         if i + 1 < count and m.newest_row[s, j, i + 1] == newest:
@@ -276,23 +283,23 @@ def _discard_ambiguous(m: MatcherState, s: int, j: int, count: int) -> None:
         else:
             previous = newest
     # A drive that lagged recently may have lagged when an answer was lost: later answers are then late.
-    if m.head[m.bus_of[j], s] - m.lag_at[s, j] > 2 * m.config[s, WINDOW]:
-        m.lag[s, j] = 0
-    previous = m.settled[s, j] - 1
+    if m.head[m.bus_of[j], s] - m.drives[s, j, LAG_AT] > 2 * m.config[s, WINDOW]:
+        m.drives[s, j, LAG] = 0
+    previous = m.drives[s, j, SETTLED] - 1
     for i in range(count):
         newest = m.newest_row[s, j, i]
         if i + 1 < count and m.newest_row[s, j, i + 1] == newest:
             # After a burst the drive has caught up.
-            m.ambiguous_before[s, j] = min(m.ambiguous_before[s, j], newest + 1)
-        elif m.lag[s, j] > 1 and newest > previous + 1:
-            m.ambiguous_before[s, j] = max(m.ambiguous_before[s, j], newest + m.lag[s, j] - 1)
-        for v in range(max(previous + 1, m.settled[s, j]), min(newest + 1, m.ambiguous_before[s, j])):
+            m.drives[s, j, CLEAR_FROM] = min(m.drives[s, j, CLEAR_FROM], newest + 1)
+        elif m.drives[s, j, LAG] > 1 and newest > previous + 1:
+            m.drives[s, j, CLEAR_FROM] = max(m.drives[s, j, CLEAR_FROM], newest + m.drives[s, j, LAG] - 1)
+        for v in range(max(previous + 1, m.drives[s, j, SETTLED]), min(newest + 1, m.drives[s, j, CLEAR_FROM])):
             if m.row_code[s, slot_of(m, s, v), j] == RECEIVED:
                 m.row_code[s, slot_of(m, s, v), j] = AMBIGUOUS
         previous = newest
 
 
-@compiled()
+@compiled(**UNCOUNTED)
 def _sample(m: MatcherState, s: int, slot: int, j: int, i: int, word: int) -> Any:
     """Return eight bytes of sample ``i`` of a packed answer."""
     value = np.uint64(0)
@@ -303,7 +310,7 @@ def _sample(m: MatcherState, s: int, slot: int, j: int, i: int, word: int) -> An
     return value
 
 
-@compiled()
+@compiled(**UNCOUNTED)
 def _emit(m: MatcherState, s: int, end: int, out: MatchedSamples) -> None:
     """Output the rows before ``end``; a packed row is several samples."""
     pack, buses = m.config[s, PACK], m.bus_state.shape[0]
@@ -320,7 +327,7 @@ def _emit(m: MatcherState, s: int, end: int, out: MatchedSamples) -> None:
             for bus in range(buses - 1, -1, -1):
                 if m.row_t[s, slot, i, bus] != NEVER:
                     out.t_ns[s, o] = m.row_t[s, slot, i, bus]
-            for j in range(m.settled.shape[1]):
+            for j in range(m.drives.shape[1]):
                 seen = m.row_t[s, slot, i, m.bus_of[j]] != NEVER
                 out.code[s, o, j] = m.row_code[s, slot, j] if seen else NO_SYNC
                 for w in range(words):
@@ -331,10 +338,10 @@ def _emit(m: MatcherState, s: int, end: int, out: MatchedSamples) -> None:
         m.watermark[s, BASE] = m.watermark[s, TOP]
 
 
-@compiled()
+@compiled(**UNCOUNTED)
 def settle_all(m: MatcherState, bus: int, s: int, final: bool, out: MatchedSamples) -> None:
     """Decide the open rows of a bus's drives in stream ``s``, and output the settled; ``final``: no answers follow."""
-    n = m.settled.shape[1]
+    n = m.drives.shape[1]
     head = m.head[bus, s]
     slot = (head - 1 - m.watermark[s, BASE]) % m.row_sync.shape[1]
     all_behind, complete = n > 1, True
@@ -344,25 +351,25 @@ def settle_all(m: MatcherState, bus: int, s: int, final: bool, out: MatchedSampl
             here += 1
             # Common case, one answer to one SYNC, inline: passing the state to a function costs more than all of it.
             if (
-                m.pending[s, j] == 1
-                and m.settled[s, j] == head - 1
-                and not m.progress[s, j, STALE]
+                m.drives[s, j, PENDING] == 1
+                and m.drives[s, j, SETTLED] == head - 1
+                and not m.drives[s, j, STALE]
                 and head > m.gap_end[bus, s]
             ):
                 for w in range(m.answer.shape[3]):
                     m.row_data[s, slot, j, w] = m.answer[s, j, 0, w]
-                m.row_code[s, slot, j] = m.answer_code[s, j, 0] if head > m.ambiguous_before[s, j] else AMBIGUOUS
-                m.settled[s, j], m.pending[s, j], m.since_sync[s, j] = head, 0, 0
-                m.progress[s, j, BALANCE], m.progress[s, j, BALANCE_RUN] = NEVER, 0
-                if m.progress[s, j, COUNTED_AT] != head:
-                    m.progress[s, j, COUNTED_AT] = head
-                    m.progress[s, j, IN_STEP_RUN] += 1
+                m.row_code[s, slot, j] = m.answer_code[s, j, 0] if head > m.drives[s, j, CLEAR_FROM] else AMBIGUOUS
+                m.drives[s, j, SETTLED], m.drives[s, j, PENDING], m.drives[s, j, SINCE_SYNC] = head, 0, 0
+                m.drives[s, j, BALANCE], m.drives[s, j, BALANCE_RUN] = NEVER, 0
+                if m.drives[s, j, COUNTED_AT] != head:
+                    m.drives[s, j, COUNTED_AT] = head
+                    m.drives[s, j, IN_STEP_RUN] += 1
             else:
                 _update_progress(m, s, j)
-        all_behind = all_behind and m.settled[s, j] + m.pending[s, j] < m.head[m.bus_of[j], s]
-        complete = complete and m.settled[s, j] >= m.gap_end[m.bus_of[j], s]
+        all_behind = all_behind and m.drives[s, j, SETTLED] + m.drives[s, j, PENDING] < m.head[m.bus_of[j], s]
+        complete = complete and m.drives[s, j, SETTLED] >= m.gap_end[m.bus_of[j], s]
         # Buses are read one after the other: only the state of another bus at this row counts.
-        run_start, run_end = m.progress[s, j, COUNTED_AT] - m.progress[s, j, IN_STEP_RUN], m.progress[s, j, COUNTED_AT]
+        run_start, run_end = m.drives[s, j, COUNTED_AT] - m.drives[s, j, IN_STEP_RUN], m.drives[s, j, COUNTED_AT]
         if run_start <= head - ALIGNED_SYNCS and run_end >= head - 1:
             in_step += 1
             in_step_here += m.bus_of[j] == bus
@@ -370,9 +377,9 @@ def settle_all(m: MatcherState, bus: int, s: int, final: bool, out: MatchedSampl
         m.watermark[s, ALL_BEHIND] = head
     end = m.watermark[s, TOP]
     for j in range(n):
-        if m.bus_of[j] == bus and (m.settled[s, j] < head or m.pending[s, j]):
+        if m.bus_of[j] == bus and (m.drives[s, j, SETTLED] < head or m.drives[s, j, PENDING]):
             # A drive without outstanding answers shows that neither the host nor the bus is delayed.
             _settle(m, s, j, final, in_step_here > 0 if here > 1 else in_step > 0)
-        end = min(end, m.settled[s, j])
+        end = min(end, m.drives[s, j, SETTLED])
     if end > m.watermark[s, EMITTED]:
         _emit(m, s, end, out)

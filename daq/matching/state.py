@@ -1,7 +1,7 @@
 """State of the matcher: the SYNCs of every bus that drives must answer, and the answers received."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,12 +28,19 @@ EVERY, PACK, SIZE, LENGTH, WINDOW, LONG_WINDOW, SHORT_WINDOW = range(7)
 # ring, last row at which all joints lacked answers, rows emitted.
 TOP, BASE, ALL_BEHIND, EMITTED = range(4)
 
-# Columns of MatcherState.progress, per stream and joint: recent maximum of answers minus rows; row at which it was
-# reached; number of consecutive rows at this maximum; number of consecutive rows without outstanding answers; row at
-# which these were counted last; 1 if answers to discarded rows may still arrive; row at which late answers were held
-# back because one of them may be a repetition; number of rows at this maximum since it was
-# reached, and the last of them.
-BALANCE, BALANCE_AT, BALANCE_RUN, IN_STEP_RUN, COUNTED_AT, STALE, HELD_AT, BALANCE_COUNT, BALANCE_LAST = range(9)
+# Columns of MatcherState.drives, per stream and joint: rows settled, answers to later rows, and answers since SYNC;
+# largest recent number of outstanding answers, and its row; row before which a match is ambiguous; TPDOs of wrong
+# length.
+SETTLED, PENDING, SINCE_SYNC, LAG, LAG_AT, CLEAR_FROM, WRONG_LENGTHS = range(7)
+# Progress: recent maximum of answers minus rows; row at which it was reached; number of consecutive rows at this
+# maximum; number of consecutive rows without outstanding answers; row at which these were counted last; 1 if answers
+# to discarded rows may still arrive; row at which late answers were held back because one of them may be a repetition;
+# number of rows at this maximum since it was reached, and the last of them.
+BALANCE, BALANCE_AT, BALANCE_RUN, IN_STEP_RUN, COUNTED_AT, STALE, HELD_AT, BALANCE_COUNT, BALANCE_LAST = range(7, 16)
+
+OPEN: Any = np.bool_(False)
+FINAL: Any = np.bool_(True)
+"""Whether more answers follow. For each constant of Python's bool, numba would compile a function again."""
 
 ALIGNED_SYNCS = 8
 """Number of consecutive rows with unchanged balance after which a drive counts as answering every SYNC.
@@ -74,7 +81,7 @@ SEND_TIMES = 1 << 16
 
 @structure(
     "i8[:, ::1], i8[::1], i8[:, ::1], *[i8[::1]] * 3, *[i8[:, ::1]] * 2, i8[::1], *[i8[:, ::1]] * 4, "
-    "i8[:, :, ::1], *[i8[:, ::1]] * 8, i8[:, :, ::1], u8[:, :, :, ::1], u1[:, :, ::1], "
+    "i8[:, :, ::1], i8[:, ::1], i8[:, :, ::1], u8[:, :, :, ::1], u1[:, :, ::1], "
     "i8[:, ::1], i8[:, :, :, ::1], u1[:, :, ::1], u8[:, :, :, ::1]"
 )
 class MatcherState(NamedTuple):
@@ -84,14 +91,11 @@ class MatcherState(NamedTuple):
     row is open the ring restarts, so that memory is only touched if answers are late.
 
     ``bus_state`` (B, 7): `SYNC` and following; ``config`` (S, 7): `EVERY` ...; ``watermark`` (S, 4): `TOP` ...
-    ``progress`` (S, n, 9): `BALANCE` ... of each drive; ``counts``: `COUNT_NAMES`; ``bus_of`` (n,).
+    ``drives`` (S, n, 16): `SETTLED` ... of each drive; ``counts``: `COUNT_NAMES`; ``bus_of`` (n,).
     ``slack`` (B,): SYNCs behind another bus before a bus counts as silent; ``sync_times`` (B, R): ring, ns UTC.
     ``send_times`` (`SEND_TIMES`,): used where SYNCs are lost; valid before SYNC ``sends_known``, -1: none.
     ``channel_of`` (B, 2048): ``s n + j`` by COB-ID of a TPDO; ``writes_to``: joint by COB-ID of an SDO request; or -1.
     ``head``, ``gap_end`` (B, S): number of rows to be answered, and row before which a frame is known to be missing.
-    ``settled``, ``pending``, ``since_sync`` (S, n): rows settled, answers to later rows, and answers since SYNC.
-    ``lag``, ``lag_at`` (S, n): largest recent number of outstanding answers, and its row.
-    ``ambiguous_before``, ``wrong_length`` (S, n): row before which a match is ambiguous, and TPDOs of wrong length.
     ``unverified`` (n, 2): span of another mapping, ns UTC; ``newest_row`` (S, n, A): of the bus at each answer.
     ``answer`` (S, n, A, words), ``answer_code`` (S, n, A): 64-bit words, and states, of the pending answers.
     ``row_sync`` (S, C), ``row_t`` (S, C, pack, B) or `NEVER`, ``row_code`` (S, C, n), ``row_data`` (S, C, n, words).
@@ -110,14 +114,7 @@ class MatcherState(NamedTuple):
     writes_to: NDArray[np.int64]
     head: NDArray[np.int64]
     gap_end: NDArray[np.int64]
-    progress: NDArray[np.int64]
-    settled: NDArray[np.int64]
-    pending: NDArray[np.int64]
-    since_sync: NDArray[np.int64]
-    wrong_length: NDArray[np.int64]
-    lag: NDArray[np.int64]
-    lag_at: NDArray[np.int64]
-    ambiguous_before: NDArray[np.int64]
+    drives: NDArray[np.int64]
     unverified: NDArray[np.int64]
     newest_row: NDArray[np.int64]
     answer: NDArray[np.uint64]
@@ -173,6 +170,8 @@ def new_state(
     pack = max(shape.pack for shape in shapes)
     slack = max(w * s.every for w, s in zip(window, shapes, strict=True))
     sync_times = SYNC_TIMES if buses == 1 else SYNC_TIMES + 2 * slack
+    drives = np.zeros((streams, n, 16), np.int64)
+    drives[:, :, [BALANCE, HELD_AT]] = NEVER
     return MatcherState(
         bus_state=np.tile(np.array([-1, -1, NEVER, 1, 0, 0, 0]), (buses, 1)),
         slack=np.full(buses, slack, np.int64),
@@ -193,14 +192,7 @@ def new_state(
         writes_to=writes_to,
         head=np.zeros((buses, streams), np.int64),
         gap_end=np.zeros((buses, streams), np.int64),
-        progress=np.tile(np.array([NEVER, 0, 0, 0, 0, 0, NEVER, 0, 0]), (streams, n, 1)),
-        settled=np.zeros((streams, n), np.int64),
-        pending=np.zeros((streams, n), np.int64),
-        since_sync=np.zeros((streams, n), np.int64),
-        wrong_length=np.zeros((streams, n), np.int64),
-        lag=np.zeros((streams, n), np.int64),
-        lag_at=np.zeros((streams, n), np.int64),
-        ambiguous_before=np.zeros((streams, n), np.int64),
+        drives=drives,
         unverified=np.tile(np.array([0, NEVER]), (n, 1)),
         newest_row=np.zeros((streams, n, answers), np.int64),
         answer=np.zeros((streams, n, answers, words), np.uint64),

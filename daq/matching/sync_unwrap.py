@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from armident.compiled import compiled
+from armident.compiled import UNCOUNTED, compiled
 from armident.daq.matching.state import (
     COUNTER,
     INCOMPLETE,
@@ -31,13 +31,13 @@ _MISALIGNED = 2.0
 """Largest time between the same SYNC on two buses, periods."""
 
 
-@compiled()
+@compiled(**UNCOUNTED)
 def turns_in(periods: float, overflow: int) -> int:
     """Return the number of whole counter turns in SYNC periods; SYNCs may be late, but at most a quarter turn early."""
     return int(np.floor(periods / overflow + _EARLY))
 
 
-@compiled()
+@compiled(**UNCOUNTED)
 def _is_delayed(counter: int, previous: int, elapsed: float, irregular: bool, overflow: int) -> bool:
     """Return True if the time between counters is no multiple of turns; an ``irregular`` master's tells nothing."""
     step = (counter - previous) % overflow
@@ -45,7 +45,7 @@ def _is_delayed(counter: int, previous: int, elapsed: float, irregular: bool, ov
     return bool(step == 1 and (irregular or abs(deviation) > _ON_TIME + _DRIFT * elapsed))
 
 
-@compiled()
+@compiled(**UNCOUNTED)
 def sync_step(counter: int, previous: int, elapsed: float, overflow: int, longest: int) -> int:
     """Return the number of SYNCs by which the counter advanced; zero or less for a repeated SYNC.
 
@@ -60,7 +60,7 @@ def sync_step(counter: int, previous: int, elapsed: float, overflow: int, longes
     return int(step)
 
 
-@compiled()
+@compiled(**UNCOUNTED)
 def _first_step(buses: Any, sync_times: Any, bus: int, counter: int, t_ns: int, period_ns: int, overflow: int) -> int:
     """Number a bus's first SYNC, 0 or by another bus; return the step: 0 before SYNC 0, < 0 if counters disagree."""
     for other in range(buses.shape[0]):
@@ -86,7 +86,7 @@ def _first_step(buses: Any, sync_times: Any, bus: int, counter: int, t_ns: int, 
     return 1
 
 
-@compiled()
+@compiled(**UNCOUNTED)
 def _step_by_other_bus(
     buses: Any, sync_times: Any, bus: int, step: int, t_ns: int, period_ns: int, overflow: int
 ) -> int:
@@ -115,7 +115,7 @@ def _step_by_other_bus(
     return int(best)
 
 
-@compiled()
+@compiled(**UNCOUNTED)
 def _bus_ahead(buses: Any, bus: int, number: int, t_ns: int, period_ns: int, overflow: int) -> int:
     """Return a bus that is farther ahead of this SYNC's number than the time allows; -1 if there is none."""
     for other in range(buses.shape[0]):
@@ -127,7 +127,7 @@ def _bus_ahead(buses: Any, bus: int, number: int, t_ns: int, period_ns: int, ove
     return -1
 
 
-@compiled()
+@compiled(**UNCOUNTED)
 def _step_to_bus(buses: Any, bus: int, other: int, counter: int, t_ns: int, period_ns: int, overflow: int) -> int:
     """Return the advance of a bus to the SYNC that is nearest in time to the last one of another bus."""
     elapsed = (t_ns - buses[other, TIME]) / period_ns
@@ -135,7 +135,7 @@ def _step_to_bus(buses: Any, bus: int, other: int, counter: int, t_ns: int, peri
     return int(buses[other, SYNC] + step + overflow * np.rint((elapsed - step) / overflow) - buses[bus, SYNC])
 
 
-@compiled()
+@compiled(**UNCOUNTED)
 def _step_by_send_time(
     send_times: Any, sent: int, last: int, step: int, t_ns: int, half_turn_ns: int, overflow: int
 ) -> int:
@@ -153,21 +153,30 @@ def _step_by_send_time(
     return int(k - last)
 
 
-@compiled()
+@compiled(**UNCOUNTED)
 def _step_by_counter(
-    buses: Any, m: Any, bus: int, counter: int, t_ns: int, period_ns: int, overflow: int, longest: int
+    buses: Any,
+    sync_times: Any,
+    send_times: Any,
+    sends_known: Any,
+    bus: int,
+    counter: int,
+    t_ns: int,
+    period_ns: int,
+    overflow: int,
+    longest: int,
 ) -> int:
     """Return the advance of a bus whose last and present SYNC have a counter."""
     elapsed = (t_ns - buses[bus, TIME]) / period_ns if buses[bus, TIME] != NEVER else 0.0
     step = (counter - buses[bus, COUNTER]) % overflow
-    if m.sends_known[0] > buses[bus, SYNC]:
+    if sends_known[0] > buses[bus, SYNC]:
         half_turn_ns = period_ns * overflow // 2
-        sent = _step_by_send_time(m.send_times, m.sends_known[0], buses[bus, SYNC], step, t_ns, half_turn_ns, overflow)
+        sent = _step_by_send_time(send_times, sends_known[0], buses[bus, SYNC], step, t_ns, half_turn_ns, overflow)
         if sent != UNKNOWN_STEP:
             return sent
     if buses[bus, INFERRED]:
         # Delayed frames of this bus may be older than SYNCs that other buses have received since.
-        found = _step_by_other_bus(buses, m.sync_times, bus, step, t_ns, period_ns, overflow)
+        found = _step_by_other_bus(buses, sync_times, bus, step, t_ns, period_ns, overflow)
         return found if found != UNKNOWN_STEP else int(step + overflow * turns_in(elapsed - step, overflow))
     irregular = buses[bus, IRREGULAR] > _IRREGULAR_LIMIT
     if not buses[bus, INCOMPLETE] and _is_delayed(counter, buses[bus, COUNTER], elapsed, irregular, overflow):
@@ -175,7 +184,7 @@ def _step_by_counter(
     counted = sync_step(counter, buses[bus, COUNTER], elapsed, overflow, longest)
     found = 0
     if counted > overflow:
-        found = _step_by_other_bus(buses, m.sync_times, bus, step, t_ns, period_ns, overflow)
+        found = _step_by_other_bus(buses, sync_times, bus, step, t_ns, period_ns, overflow)
     else:
         # The time of one bus may be wrong; the bus that is behind can still skip numbers.
         other = _bus_ahead(buses, bus, buses[bus, SYNC] + counted, t_ns, period_ns, overflow)
@@ -184,19 +193,32 @@ def _step_by_counter(
     return int(found) if found > 0 else int(counted)
 
 
-@compiled()
-def advance(buses: Any, m: Any, bus: int, counter: int, t_ns: int, period_ns: int, overflow: int, longest: int) -> int:
+@compiled(**UNCOUNTED)
+def advance(
+    buses: Any,
+    sync_times: Any,
+    send_times: Any,
+    sends_known: Any,
+    bus: int,
+    counter: int,
+    t_ns: int,
+    period_ns: int,
+    overflow: int,
+    longest: int,
+) -> int:
     """Number a received SYNC, update ``buses``, and return the advance of its bus; nothing changes at zero or less.
 
     ``buses``: ``bus_state`` of ``m``, or a copy. ``counter``: -1 if it has none. ``t_ns``: receive time, ns UTC.
     ``longest``: largest advance with whole counter turns, SYNCs.
     """
     if buses[bus, SYNC] < 0 and buses[bus, COUNTER] < 0:
-        step = _first_step(buses, m.sync_times, bus, counter, t_ns, period_ns, overflow)
+        step = _first_step(buses, sync_times, bus, counter, t_ns, period_ns, overflow)
     elif counter >= 0 and buses[bus, COUNTER] >= 0:
-        step = _step_by_counter(buses, m, bus, counter, t_ns, period_ns, overflow, longest)
-    elif counter < 0 and m.sends_known[0] > buses[bus, SYNC]:
-        step = _step_by_send_time(m.send_times, m.sends_known[0], buses[bus, SYNC], 1, t_ns, period_ns // 2, 1)
+        step = _step_by_counter(
+            buses, sync_times, send_times, sends_known, bus, counter, t_ns, period_ns, overflow, longest
+        )
+    elif counter < 0 and sends_known[0] > buses[bus, SYNC]:
+        step = _step_by_send_time(send_times, sends_known[0], buses[bus, SYNC], 1, t_ns, period_ns // 2, 1)
         step = max(1, step)
     elif counter < 0 and (buses.shape[0] > 1 or buses[bus, INCOMPLETE]):
         # Without a counter, time alone keeps the buses together, and shows how many of the lost frames were SYNCs.

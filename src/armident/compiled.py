@@ -43,8 +43,11 @@ ARITHMETIC: dict[str, Any] = {"error_model": "numpy", "fastmath": {"contract", "
 """Options of the kernels of the model: a division by zero is no error, products and sums may be fused."""
 PLAIN: dict[str, Any] = {"error_model": "numpy", "nogil": False}
 """Options of the kernels of the virtual arm: a division by zero is no error, the interpreter waits."""
-# No reference counts: the caller keeps the arrays alive, and an atomic increment costs as much as the arithmetic.
-_UNCOUNTED: dict[str, Any] = {"_nrt": False, "forceinline": True}
+UNCOUNTED: dict[str, Any] = {"_nrt": False}
+"""Option of kernels that allocate nothing: no reference counts, for the caller keeps the arrays alive.
+
+An atomic increment costs as much as the arithmetic, and thirty arrays in a tuple take as long to count as to use.
+"""
 
 SHIPPED = Path(__file__).with_name("kernels")
 """Folder of the machine code in this installation; part of a wheel."""
@@ -60,7 +63,8 @@ def compiled(*signatures: str, kept: bool = False, nogil: bool = True, **options
     """
 
     def decorate(function: F) -> F:
-        chosen: dict[str, Any] = {"nogil": nogil, "no_cfunc_wrapper": True, **options}
+        called_by_kernels = not (signatures or kept)
+        chosen = {"nogil": nogil, "no_cfunc_wrapper": True, "no_cpython_wrapper": called_by_kernels, **options}
         kernel: Any = numba.njit(**chosen)(function)
         if signatures or kept:
             kernel._cache = _MachineCode(kernel)
@@ -73,7 +77,7 @@ def compiled(*signatures: str, kept: bool = False, nogil: bool = True, **options
 
 def inlined(function: F) -> F:
     """Compile a helper, no allocation, into its callers, where the compiler sees distinct arrays and short loops."""
-    return compiled(nogil=False, **ARITHMETIC, **_UNCOUNTED)(function)
+    return compiled(nogil=False, forceinline=True, **ARITHMETIC, **UNCOUNTED)(function)
 
 
 def structure(fields: str) -> Callable[[F], F]:
