@@ -33,7 +33,7 @@ $(PY):
 	fi
 	"$(PYTHON)" -m venv $(VENV)
 
-# Two processes of pip, each with every second package, and bytecode on all processors.
+# Two processes of pip, each with every second package. Bytecode is written at first use: half of it is never used.
 define INSTALL
 	mkdir -p .cache
 	awk -v part=.cache/install '/^[^ #]/ {k++} {print > (part (k % 2))}' $(1)
@@ -41,7 +41,6 @@ define INSTALL
 		$(PY) -m pip install -qq --disable-pip-version-check --no-compile --no-deps --require-hashes -r .cache/install$$k & pids[k]=$$!
 	done
 	wait $${pids[0]}; wait $${pids[1]}
-	$(PY) -m compileall -qq -j 0 $(VENV)/lib/python*/site-packages || true
 endef
 
 $(VENV)/.lock: requirements.lock | $(PY)

@@ -144,7 +144,8 @@ def advance(  # type: ignore[no-untyped-def]
     n, count, total = tau.size, bristles.shape[0], q.size
     full = rotor.copy()
     held = np.zeros(total)
-    held[:n] = tau
+    for i in range(n):
+        held[i] = tau[i]
     gravity = np.zeros(total)
     for i in range(link.size):
         a = link[i]
@@ -248,7 +249,8 @@ def advance(  # type: ignore[no-untyped-def]
                 for j in range(link.size):
                     a = link[j]
                     load[i] += mass[min(i, j), max(i, j)] * (qd[a] - last[a]) / h
-            last[:] = qd
+            for i in range(total):
+                last[i] = qd[i]
     for i in range(total):
         half = 0.5 * (qd[i] - before[i])
         speed[i] = qd[i] + half

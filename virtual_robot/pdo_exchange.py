@@ -95,7 +95,9 @@ def _exchange(  # type: ignore[no-untyped-def]
         values[ERROR, j] = np.int64(demand[j]) - position[j]
         before[j] = position[j]
     result[2] += 1
-    history[result[2] % HISTORY] = values[:CONSTANT]
+    for row in range(CONSTANT):
+        for j in range(position.size):
+            history[result[2] % HISTORY, row, j] = values[row, j]
     count = 0
     for p in range(tx_kinds.size):
         if counter % tx_kinds[p]:

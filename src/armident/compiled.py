@@ -66,13 +66,23 @@ def compiled(*signatures: str, kept: bool = False, nogil: bool = True, **options
         called_by_kernels = not (signatures or kept)
         chosen = {"nogil": nogil, "no_cfunc_wrapper": True, "no_cpython_wrapper": called_by_kernels, **options}
         kernel: Any = numba.njit(**chosen)(function)
-        if signatures or kept:
+        if called_by_kernels:
+            kernel._insert, kernel._compile_for_args = _ignore, _refuse  # a call without wrapper ends the process
+        else:
             kernel._cache = _MachineCode(kernel)
             _KERNELS.append((kernel, signatures))
         found: F = kernel
         return found
 
     return decorate
+
+
+def _ignore(*_: Any, **__: Any) -> None:
+    pass
+
+
+def _refuse(*_: Any, **__: Any) -> None:
+    raise TypeError("only kernels call this function; call its py_func")
 
 
 def inlined(function: F) -> F:

@@ -150,6 +150,12 @@ def test_without_a_folder_that_can_be_written_a_kernel_runs(package: Package) ->
     assert package.run() == (7.0, False)
 
 
+def test_a_function_that_only_kernels_call_is_refused_from_python(package: Package) -> None:
+    package.run()
+    with pytest.raises(TypeError, match="only kernels call this function"):
+        importlib.import_module("callee").twice(3.0)
+
+
 def test_every_process_gives_machine_code_the_same_name() -> None:
     program = (
         "import armident.compiled as c\n"

@@ -136,7 +136,8 @@ def _reported(signal, past, newest, delay, leak, ripples, t):  # type: ignore[no
     """
     n, length = signal.size, past.shape[0]
     late, out = np.empty(n), np.zeros(n)
-    past[newest] = signal
+    for j in range(n):
+        past[newest, j] = signal[j]  # as a loop; the message for an assignment of unequal shapes takes 3 s to compile
     for j in range(n):
         whole = int(delay[j])
         part = delay[j] - whole

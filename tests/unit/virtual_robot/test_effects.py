@@ -6,8 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import typer
+from numpy.typing import NDArray
 from typer.testing import CliRunner
 
+from armident.compiled import PLAIN, compiled
 from armident.configs import ConfigError, RobotConfig, load_robot
 from armident.configs.loading import HERE, load_scenario
 from armident.configs.schema.scenario import HiddenEffect, Scenario
@@ -144,6 +146,13 @@ def test_a_hidden_torque_acts_on_its_joint_alone(tx40: RobotConfig, effect: str,
     assert np.delete(largest, int(joint[-1]) - 1).max() < 1e-12
 
 
+@compiled(kept=True, **PLAIN)
+def torque_and_slope(code: int, row: NDArray[np.float64], qd: float) -> tuple[float, float]:
+    """A kernel around the function of kernels."""
+    found: tuple[float, float] = effect_torque(code, row, 0.4, qd, 0.3, 0.7, 3.0, 1.13, 150.0)
+    return found
+
+
 @pytest.mark.parametrize("effect", CODES)
 def test_the_slope_of_a_hidden_torque_is_its_derivative(tx40: RobotConfig, effect: str) -> None:
     other = "joint_2" if effect == "quadratic_coupling" else None
@@ -152,8 +161,7 @@ def test_the_slope_of_a_hidden_torque_is_its_derivative(tx40: RobotConfig, effec
     step = 1e-6
 
     def torque(qd: float) -> tuple[float, float]:
-        out: tuple[float, float] = effect_torque(int(row[0]), row[3:], 0.4, qd, 0.3, 0.7, 3.0, 1.13, 150.0)
-        return out
+        return torque_and_slope(int(row[0]), row[3:], qd)
 
     # None of them exactly at standstill, where asymmetric friction has a kink.
     for qd in (-1.3, -0.05, -0.004, 0.003, 0.08, 1.1):

@@ -98,6 +98,18 @@ def test_closed_loop_through_a_reversal_agrees_with_fine_integration(tx40: ArmMo
         q, qd = finely(tx40, theta, r.T @ nu, q, qd, DT)
 
 
+def test_the_loop_for_any_number_of_joints_agrees_with_the_unrolled(
+    tx40: ArmModel, theta: Floats, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    reference = load_trajectory("trajectories/tx40_excitation.yaml").sample(DT)[:2000]
+    unrolled = simulate(tx40, theta, position_controller(tx40), reference, DT)
+    monkeypatch.setattr("armident.identify.robot.simulation.UNROLLED", ())
+    rolled = simulate(tx40, theta, position_controller(tx40), reference, DT)
+    assert unrolled.diverged_at is None
+    assert np.abs(rolled.q - unrolled.q).max() < 1e-10
+    assert np.abs(rolled.tau - unrolled.tau).max() < 1e-6
+
+
 def test_integration_is_of_second_order(tx40: ArmModel, theta: Floats) -> None:
     duration, q0 = 0.1, np.array([0.1, 0.3, 1.2, -0.4, 0.8, 0.2])
     qd0 = np.array([1.0, -0.8, 1.2, 2.0, -1.5, 3.0])
