@@ -68,7 +68,7 @@ UDP_GROUP = "239.74.163.2"
 UDP_PERIOD_US = 2000
 """SYNC period on UDP multicast, us."""
 SLOW_PERIOD_US = 1000
-"""SYNC period on a machine that cannot run arm, bus, capture and worker at 5 kHz, us."""
+"""SYNC period of the second part, and on a machine that cannot run arm, bus, capture and worker at 5 kHz, us."""
 MAX_LOST_SHARE = 0.02
 """Largest fraction of lost samples before the recording is repeated at the lower rate."""
 READY_S = 120.0
@@ -267,8 +267,9 @@ def _identify_part(subject: Subject, out: Path) -> tuple[Identified, Subject]:
 
 def _diagnose_part(subject: Subject, out: Path) -> Diagnosed:
     """Record the arm with a hidden effect and diagnose it."""
-    session = subject.session
-    log.info("part 2: record the same arm with a hidden effect, and let the diagnosis find the effect")
+    # The diagnosis needs a long motion, not a high rate.
+    session = _slower(subject.session) or subject.session
+    log.info(f"part 2: record the same arm at {_rate(session)} with a hidden effect, which the diagnosis has to find")
     if session.setpoints is not None:
         session = session.model_copy(
             update={"setpoints": session.setpoints.model_copy(update={"repeat": subject.repeats})}
