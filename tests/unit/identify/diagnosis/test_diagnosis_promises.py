@@ -84,6 +84,7 @@ def test_the_gain_of_one_drive_is_named() -> None:
     assert [f.joint for f in findings] == ["joint_2"]
 
 
+@pytest.mark.nightly
 @MISSED
 def test_a_drive_that_gives_twice_its_torque_is_sized_by_what_the_model_with_it_predicts() -> None:
     """Of the torque that the model without it predicts, which reports half of it, it would be another share."""
