@@ -34,8 +34,8 @@ LONGEST_S = 240.0
 
 
 def in_its_file(robot: str, folder: Path) -> Recording:
-    """A recording of a virtual arm as capture would have left it, in its file."""
-    recording = arms.recording(robot, f"{robot}_excitation", 1)
+    """A recording of a virtual arm at 1 kHz as capture would have left it, in its file."""
+    recording = arms.recording(robot, f"{robot}_excitation", 1, period=arms.FAST if robot == "tx40" else None)
     rows = {f"{name}.rows": int(s.sync.size) for name, s in recording.streams.items()}
     path = folder / f"{robot}-test.mcap"
     write_recording(replace(recording, session=load_session(f"{robot}_cell.yaml"), counters=rows), path)

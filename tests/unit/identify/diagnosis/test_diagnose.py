@@ -37,8 +37,7 @@ def test_a_plant_without_hidden_effects_has_no_gap(period: float | None, repeats
 
 
 def worn(period: float | None = FAST, repeats: int = 1) -> DiagnosisResult:
-    """Diagnosis of the worn joint; at 1 kHz the one that `test_diagnosis_promises.py` compares with a baseline."""
-    return diagnosis("tx40", MOTION, 4, WORN, period=period, repeats=repeats, against_baseline=period == FAST)
+    return diagnosis("tx40", MOTION, 4, WORN, period=period, repeats=repeats)
 
 
 @pytest.mark.slow
@@ -118,8 +117,8 @@ def test_an_entry_with_a_parameter_of_another_effect_is_refused(robot: RobotConf
 def test_identifying_with_the_effect_inside_brings_the_torque_error_down(robot: RobotConfig) -> None:
     data = recording("tx40", MOTION, 4, WORN, repeats=1, period=FAST)
     model = worn().robot
-    plain = identify_recording(data, robot, Options(method="idim-ls")).document
-    better = identify_recording(data, model, Options(method="idim-ls")).document
+    plain = identify_recording(data, robot, Options(method="idim-ls"), check=None).document
+    better = identify_recording(data, model, Options(method="idim-ls"), check=None).document
     assert better.relative_error_pct_by_joint["joint_2"] < plain.relative_error_pct_by_joint["joint_2"]
     (added,) = [p for p in better.parameters if p.name == "fva2"]
     # 0.2 of the 5.53 N m s/rad of table B.4.

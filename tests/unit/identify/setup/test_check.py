@@ -134,6 +134,8 @@ def test_a_mistake_is_named_alone_and_corrected(name: str, healthy: list[Experim
     assert [(f.kind, f.joints) for f in found.findings] == [(kind, joints)]
     assert found.findings[0].probability > 0.9
     assert found.findings[0].decisive
+    if name == "torques of the motors":
+        assert "--motor-side" in found.findings[0].remedy
     assert max(found.corrected_error_pct) < 8.0
     assert found.joints_not_understood == ()
     if name == "time in ms":
@@ -206,6 +208,7 @@ def test_the_healthy_virtual_tx40_has_no_finding(virtual: list[Experiment], tx40
 
 
 @pytest.mark.slow
+@pytest.mark.nightly
 def test_a_coupled_wrist_with_motor_side_torques_is_corrected_by_the_configuration(
     virtual: list[Experiment], tx40: RobotConfig
 ) -> None:
@@ -218,6 +221,7 @@ def test_a_coupled_wrist_with_motor_side_torques_is_corrected_by_the_configurati
 
 
 @pytest.mark.slow
+@pytest.mark.nightly
 def test_an_order_of_six_joints_is_found_as_a_whole(virtual: list[Experiment], tx40: RobotConfig) -> None:
     order = setups.in_order(5, 0, 1, 2, 3, 4)
     found = check_setup(setups.with_torques(setups.with_positions(virtual, order), order), tx40)
