@@ -112,7 +112,8 @@ def test_stream_and_file_give_the_same_numbers_to_the_last_bit(tmp_path: Path) -
         assert worker.result(LONGEST_S) == 0
         replies = answers(session, Keys(session.cell, "tx40").identification)
     streamed = load_document(tmp_path / "tx40-test.identification" / "identification.json", IdentificationDocument)
-    outcome = identify_recording(captured)
+    # The check of the set-up, which is half of the time, changes no number of a healthy arm.
+    outcome = identify_recording(captured, check=None)
     assert streamed.recording.sha256 == outcome.document.recording.sha256
     assert streamed.parameters == outcome.document.parameters
     assert streamed.covariance == outcome.document.covariance

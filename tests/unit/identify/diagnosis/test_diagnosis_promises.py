@@ -7,8 +7,10 @@ import sys
 from pathlib import Path
 
 import pytest
+from typer.testing import CliRunner
 
 from armident.configs.schema.scenario import HiddenEffect
+from armident.daq.cli import application
 from armident.daq.recording import write_recording
 from armident.identify.diagnosis.diagnose import run_diagnosis
 from armident.identify.documents.diagnosis import Finding
@@ -140,8 +142,8 @@ def test_an_effect_of_somebody_else_is_listed(elsewhere: dict[str, str]) -> None
         [*ARMIDENT, "effects", "tight_spot"], env=elsewhere, capture_output=True, text=True, check=True
     )
     assert "something pushes back near one position" in listed.stdout
-    without = subprocess.run([*ARMIDENT, "effects", "tight_spot"], capture_output=True, text=True, check=False)
-    assert without.returncode == 2
+    words = ["effects", "tight_spot"]
+    assert CliRunner().invoke(application(words), words).exit_code == 2
 
 
 def test_an_effect_of_somebody_else_is_found_by_name(elsewhere: dict[str, str], tmp_path: Path) -> None:
