@@ -15,6 +15,10 @@ from tests.fixtures.arms import recording
 pytestmark = pytest.mark.slow
 
 
+USUAL: tuple[Method, ...] = ("idim-piv", "idim-ls", "cloe")
+"""Methods of `make test`: with instruments, without, and one that needs a simulated loop."""
+
+
 def turned(healthy: Recording) -> Recording:
     """The recording with the sign of every voltage changed in its scale."""
     samples = healthy.samples
@@ -36,7 +40,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     return good, bad
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", [pytest.param(m, marks=[pytest.mark.nightly] * (m not in USUAL)) for m in METHODS])
 def test_an_impossible_result_exits_with_3(files: tuple[Path, Path], tmp_path: Path, method: Method) -> None:
     words = ["identify", str(files[1]), "--method", method, "--out", str(tmp_path)]
     result = CliRunner().invoke(application(words), words)

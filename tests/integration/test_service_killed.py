@@ -12,7 +12,7 @@ from tests.faults.service import run_rounds
 @pytest.mark.parametrize(
     "rounds",
     [
-        pytest.param(4, marks=pytest.mark.timeout(300)),
+        pytest.param(2, marks=pytest.mark.timeout(300)),
         pytest.param(200, marks=[pytest.mark.nightly, pytest.mark.timeout(3600)]),
     ],
 )

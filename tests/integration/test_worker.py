@@ -34,8 +34,8 @@ LONGEST_S = 240.0
 
 
 def in_its_file(robot: str, folder: Path) -> Recording:
-    """A recording of a virtual arm as capture would have left it, in its file."""
-    recording = arms.recording(robot, f"{robot}_excitation", 1)
+    """A recording of a virtual arm at 1 kHz as capture would have left it, in its file."""
+    recording = arms.recording(robot, f"{robot}_excitation", 1, period=arms.FAST if robot == "tx40" else None)
     rows = {f"{name}.rows": int(s.sync.size) for name, s in recording.streams.items()}
     path = folder / f"{robot}-test.mcap"
     write_recording(replace(recording, session=load_session(f"{robot}_cell.yaml"), counters=rows), path)
@@ -112,7 +112,8 @@ def test_stream_and_file_give_the_same_numbers_to_the_last_bit(tmp_path: Path) -
         assert worker.result(LONGEST_S) == 0
         replies = answers(session, Keys(session.cell, "tx40").identification)
     streamed = load_document(tmp_path / "tx40-test.identification" / "identification.json", IdentificationDocument)
-    outcome = identify_recording(captured)
+    # The check of the set-up, which is half of the time, changes no number of a healthy arm.
+    outcome = identify_recording(captured, check=None)
     assert streamed.recording.sha256 == outcome.document.recording.sha256
     assert streamed.parameters == outcome.document.parameters
     assert streamed.covariance == outcome.document.covariance

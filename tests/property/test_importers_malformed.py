@@ -22,6 +22,9 @@ from tests.unit.daq.test_importing import TX40
 FORMATS = {suffix: reader for reader, suffix in EXAMPLES} | {".db3": RosBag()}
 INSERTED = (b"", b"\n", b",", b";", b"nan", b"1e999", b"-", b"\0", b"\xff\xfe", b"9" * 400, b"#", b"(", b'"', b"0,5")
 
+FEWER = settings().max_examples // 3
+"""Examples of a format: there are many formats, and `make nightly` has thousands of each."""
+
 
 @cache
 def valid(suffix: str) -> bytes:
@@ -82,7 +85,7 @@ def check(suffix: str, data: bytes) -> None:
 
 
 @pytest.mark.parametrize("suffix", list(FORMATS))
-@settings(suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large], deadline=None)
+@settings(max_examples=FEWER, suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large], deadline=None)
 @given(changes=edits, cut=st.sampled_from([1.0, 1.0, 0.97, 0.6, 0.1]))
 def test_a_damaged_file_is_read_or_refused_in_one_line(
     suffix: str, changes: list[tuple[float, int, bytes]], cut: float

@@ -50,6 +50,15 @@ def test_other_arguments_are_another_result() -> None:
     assert len(calls) == 8
 
 
+def test_a_default_and_the_same_value_given_are_one_result() -> None:
+    def power(x: float, exponent: float = 2.0) -> float:
+        return slow_square(x, exponent)
+
+    share = store.shared(power)
+    assert share(3.0) == share(3.0, 2.0) == share(x=3.0, exponent=2.0) == 9.0
+    assert calls == [(3.0, 2.0)]
+
+
 def test_an_argument_without_a_text_of_its_own_is_refused() -> None:
     with pytest.raises(TypeError, match="list is no key"):
         store.shared(slow_square)(1.0, [1])

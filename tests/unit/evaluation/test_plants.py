@@ -7,7 +7,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
+from armident.compiled import PLAIN, compiled
 from armident.configs import load_robot
 from armident.daq.recording import read_recording
 from tests.evaluation.plants.arm import Arm, random_arm
@@ -23,6 +25,8 @@ from tests.evaluation.plants.slots import COULOMB, SMOOTHING, VISCOUS
 from tests.evaluation.plants.truth import ACCEPTED, SHARES, block
 from tests.evaluation.plants.visibility import pin, rigid_residual
 
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
 SEEDS = range(12)
 BLOCK = len(block())
 
@@ -159,12 +163,25 @@ def test_without_noise_pinocchio_explains_the_torques_of_the_simulation() -> Non
     assert (residual / run.torque.std(axis=0)).max() < 0.005
 
 
+@compiled(kept=True, **PLAIN)
+def with_friction(v: Floats, step: Floats, rows: Integers, bounds: Floats, smoothing: Floats, impulses: Floats) -> None:
+    """A kernel around the function of kernels."""
+    friction_impulses(v, step, rows, bounds, smoothing, impulses)
+
+
+@compiled(kept=True, **PLAIN)
+def impulse_of(speed: float, weight: float, level: float, smoothing: float) -> float:
+    """A kernel around the function of kernels."""
+    found: float = one_impulse(speed, weight, level, level, smoothing)
+    return found
+
+
 @pytest.mark.parametrize(("drive", "moves"), [(0.9, False), (1.1, True), (-1.1, True)])
 def test_dry_friction_holds_a_joint_up_to_its_bound(drive: float, moves: bool) -> None:
     mass, step, level = 2.0, 1e-3, 3.0
     v = np.array([step * drive * level / mass])
     rows, bounds = np.array([[0, -1]]), np.full((1, 2), step * level)
-    friction_impulses(v, np.array([[1.0 / mass]]), rows, bounds, np.zeros(1), np.zeros(1))
+    with_friction(v, np.array([[1.0 / mass]]), rows, bounds, np.zeros(1), np.zeros(1))
     expected = step * level * (abs(drive) - 1.0) / mass * np.sign(drive) if moves else 0.0
     assert v[0] == pytest.approx(expected, abs=1e-15)
 
@@ -172,7 +189,7 @@ def test_dry_friction_holds_a_joint_up_to_its_bound(drive: float, moves: bool) -
 @pytest.mark.parametrize("speed", [1e-4, 1e-2, 0.3, -0.3])
 def test_friction_with_a_smooth_sign_is_that_of_the_velocity_after_the_step(speed: float) -> None:
     weight, level, smoothing = 0.5, 3e-3, 0.01
-    impulse = one_impulse(speed, weight, level, level, smoothing)
+    impulse = impulse_of(speed, weight, level, smoothing)
     assert impulse == pytest.approx(level * np.tanh((speed - weight * impulse) / smoothing), rel=1e-6)
 
 

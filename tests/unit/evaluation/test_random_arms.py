@@ -136,6 +136,7 @@ def test_the_reserve_names_no_case(
 
 
 @pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.timeout(600)
 def test_a_sample_of_the_development_half_is_diagnosed(tmp_path: Path) -> None:
     """Bounds of the first measurement; the aims of the suite stand on docs/diagnosis.md."""

@@ -13,11 +13,9 @@ from tests.evaluation.plants.two_robots import simulate
 from tests.evaluation.schema import load_suite
 from tests.evaluation.tasks import DiagnosisTask, diagnose_file
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
+pytestmark = [pytest.mark.slow, pytest.mark.nightly, pytest.mark.timeout(600)]
 MISSED = pytest.mark.xfail(strict=True, reason="the stepwise selection misses it: docs/diagnosis.md, What is missed")
 """Promises of the former search that the selection does not keep yet."""
-nightly = pytest.mark.nightly
-"""`make test` runs cases of the EMPS and one of the TX40; the suite runs all of them."""
 
 
 def diagnosed(name: str, folder: Path) -> tuple[dict[str, Any], dict[str, float]]:
@@ -39,7 +37,6 @@ def diagnosed(name: str, folder: Path) -> tuple[dict[str, Any], dict[str, float]
     return json.loads(to_json(document)), hidden
 
 
-@nightly
 def test_a_late_torque_of_joint_2_is_found_in_the_loop_that_it_makes(tmp_path: Path) -> None:
     """The simulated loop without the delay speaks against the delay."""
     told, hidden = diagnosed("effect time_delay joint_2 obvious tx40 run 1", tmp_path)
@@ -51,7 +48,6 @@ def test_a_late_torque_of_joint_2_is_found_in_the_loop_that_it_makes(tmp_path: P
     assert told["verdict"] == "explained"
 
 
-@nightly
 @pytest.mark.parametrize("run", [3, 5])
 def test_a_late_torque_is_no_friction_that_yields_where_noise_hides_what_the_loop_gains(
     run: int, tmp_path: Path
@@ -63,7 +59,7 @@ def test_a_late_torque_is_no_friction_that_yields_where_noise_hides_what_the_loo
     assert abs(found["parameters"]["delay"] - hidden["delay"]) < 3.0 * found["evidence"]["std"]["delay"]
 
 
-@pytest.mark.parametrize("run", [pytest.param(1, marks=MISSED), pytest.param(4, marks=nightly)])
+@pytest.mark.parametrize("run", [pytest.param(1, marks=MISSED), 4])
 def test_a_link_that_swings_beyond_the_bandwidth_is_found_where_measured_positions_bring_more_noise(
     run: int, tmp_path: Path
 ) -> None:
@@ -79,7 +75,6 @@ def test_a_link_that_swings_beyond_the_bandwidth_is_found_where_measured_positio
     assert found["evidence"]["gap_at_measured_motion"] > found["gap_after"]
 
 
-@nightly
 @pytest.mark.parametrize("run", [2, 5])
 def test_a_link_on_a_spring_is_found_at_its_own_joint_although_the_one_before_shows_more_of_it(
     run: int, tmp_path: Path
@@ -100,7 +95,6 @@ def test_a_link_on_a_spring_is_found_at_its_own_joint_although_the_one_before_sh
         assert errors["after"]["by_joint"][joint] < 0.93 * errors["before"]["by_joint"][joint]
 
 
-@nightly
 @pytest.mark.parametrize("strength", ["obvious tx40 run 2", "typical tx40 run 2"])
 def test_a_coupling_has_to_account_for_both_of_its_joints(strength: str, tmp_path: Path) -> None:
     """Crosstalk of currents, which the catalogue does not have, is no coupling of friction.
@@ -116,7 +110,7 @@ def test_a_coupling_has_to_account_for_both_of_its_joints(strength: str, tmp_pat
 @pytest.mark.parametrize(
     "case",
     [
-        pytest.param("outside stick_events joint_2 obvious tx40 run 4", marks=nightly),
+        "outside stick_events joint_2 obvious tx40 run 4",
         "outside stick_events joint_1 typical emps run 1",
     ],
 )
@@ -139,9 +133,7 @@ def test_ripple_among_the_frequencies_of_the_motion_is_a_line(tmp_path: Path) ->
     assert "16.7 Hz" in rest["hint"]
 
 
-@pytest.mark.parametrize(
-    "strength", [pytest.param("obvious emps run 3", marks=nightly), pytest.param("typical emps run 4", marks=MISSED)]
-)
+@pytest.mark.parametrize("strength", ["obvious emps run 3", pytest.param("typical emps run 4", marks=MISSED)])
 def test_a_spring_is_found_beside_friction_that_is_far_stronger(strength: str, tmp_path: Path) -> None:
     """A bristle carries the Coulomb friction of a joint with Stribeck friction, too, or reversals hide the spring."""
     told, _ = diagnosed(f"pair joint_spring joint_1 and stribeck_friction joint_1 {strength}", tmp_path)
@@ -151,7 +143,6 @@ def test_a_spring_is_found_beside_friction_that_is_far_stronger(strength: str, t
     assert told["gap"]["validation"]["after"]["all"] < 0.5
 
 
-@nightly
 def test_friction_far_from_where_it_seems_is_found_where_the_arm_sticks_and_its_model_does_not(tmp_path: Path) -> None:
     """Four fifths of the torque are error before; steps downhill from the first look end in a hollow beside it.
 
@@ -168,7 +159,6 @@ def test_friction_far_from_where_it_seems_is_found_where_the_arm_sticks_and_its_
     assert errors["after"]["all"] < 1.0
 
 
-@nightly
 def test_friction_of_a_joint_that_moves_the_same_without_it_is_looked_for_in_its_own_loop(tmp_path: Path) -> None:
     """With it the simulated wrist follows the arm neither better nor worse; the torque of its reversals differs."""
     case = "pair asymmetric_viscous_friction joint_2 and stribeck_friction joint_5 typical tx40 run 5"
@@ -180,7 +170,6 @@ def test_friction_of_a_joint_that_moves_the_same_without_it_is_looked_for_in_its
     assert told["verdict"] == "explained"
 
 
-@nightly
 def test_what_shows_at_no_joint_alone_shows_at_all_of_them_together(tmp_path: Path) -> None:
     """A base that shakes: a thousandth by chance is no alarm at the worst of six joints, but is one over all."""
     told, _ = diagnosed("outside base_vibration joint_1 typical tx40 run 5", tmp_path)
@@ -188,7 +177,7 @@ def test_what_shows_at_no_joint_alone_shows_at_all_of_them_together(tmp_path: Pa
     assert [rest["varies_with"] for rest in told["unexplained"]] == ["motion"]
 
 
-@pytest.mark.parametrize("run", [pytest.param(3, marks=MISSED), pytest.param(4, marks=nightly)])
+@pytest.mark.parametrize("run", [pytest.param(3, marks=MISSED), 4])
 def test_a_saturated_drive_is_found_where_a_stiff_loop_moves_the_same_without_it(run: int, tmp_path: Path) -> None:
     """Simulated and measured velocity differ by a ten-thousandth either way; the torques by five times."""
     told, hidden = diagnosed(f"effect drive_gain_saturation joint_1 obvious emps run {run}", tmp_path)
@@ -197,7 +186,6 @@ def test_a_saturated_drive_is_found_where_a_stiff_loop_moves_the_same_without_it
     assert abs(found["parameters"]["gain_loss"] - hidden["gain_loss"]) < 3.0 * found["evidence"]["std"]["gain_loss"]
 
 
-@nightly
 @pytest.mark.parametrize("joint", ["joint_3", "joint_5"])
 def test_a_joint_that_yields_before_it_slides_is_found_where_the_rigid_loop_reverses_at_other_instants(
     joint: str, tmp_path: Path
@@ -208,7 +196,6 @@ def test_a_joint_that_yields_before_it_slides_is_found_where_the_rigid_loop_reve
     assert (found["effect"], found["joint"], told["verdict"]) == ("presliding_friction", joint, "explained")
 
 
-@nightly
 @pytest.mark.parametrize(
     "case", ["friction_drift joint_5 typical tx40 run 4", "joint_spring joint_4 typical tx40 run 1"]
 )
@@ -219,7 +206,6 @@ def test_noise_of_the_measured_positions_does_not_speak_against_a_finding(case: 
     assert [found["effect"], found["joint"]] == case.split()[:2]
 
 
-@nightly
 @MISSED
 def test_a_rotor_that_is_missing_is_no_wrong_sign(tmp_path: Path) -> None:
     """Both signs of the wrist's roll exchanged leave a little less than the model with the rotor."""

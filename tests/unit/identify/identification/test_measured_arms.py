@@ -99,6 +99,11 @@ def least_squares(experiments: Sequence[Experiment], robot: RobotConfig) -> Iden
     return identify_experiment(experiments, robot, Options(method="idim-ls"))
 
 
+@pytest.fixture(scope="module")
+def panda_fit(panda: Experiment) -> IdentificationResult:
+    return least_squares([panda], PANDA)
+
+
 def prepared(
     robot: RobotConfig, experiments: Sequence[Experiment], theta: np.ndarray | None = None
 ) -> tuple[list[ExperimentEquations], list[Derivatives], Decimation]:
@@ -130,10 +135,11 @@ def test_each_recording_of_the_kuka_is_explained_up_to_1_7_percent(kuka: list[Ex
         assert found.relative_error_pct < 1.7
 
 
-def test_both_arms_are_usable_although_some_values_are_impossible(kuka: list[Experiment], panda: Experiment) -> None:
+def test_both_arms_are_usable_although_some_values_are_impossible(
+    kuka: list[Experiment], panda_fit: IdentificationResult
+) -> None:
     """Behind the gears, wrist inertias and friction are so small that model errors make them negative."""
-    for experiments, robot in ((kuka, KUKA), ([panda], PANDA)):
-        verdict = least_squares(experiments, robot).verdict
+    for verdict in (least_squares(kuka, KUKA).verdict, panda_fit.verdict):
         assert verdict.level == "doubtful"
         (reason,) = verdict.of_kind("physics")
         assert "mass matrix is not positive definite" in reason.message
@@ -211,7 +217,7 @@ def test_the_first_recording_of_the_kuka_is_predicted_from_the_others_up_to_1_7_
     assert held_out_error(KUKA, [settled[1], settled[2]], [settled[0]]) < 1.7
 
 
-@pytest.mark.parametrize("number", [0, 1, 2])
+@pytest.mark.parametrize("number", [0, *(pytest.param(k, marks=pytest.mark.nightly) for k in (1, 2))])
 def test_every_training_part_by_itself_shows_four_ripples_per_turn_of_joint_6(
     settled: list[Experiment], number: int
 ) -> None:
@@ -254,7 +260,7 @@ def test_the_kuka_repeats_its_own_torques_to_1_6_percent_only(kuka: list[Experim
 
 
 def test_samples_read_without_waiting_explain_the_panda_three_times_better_on_its_clock(
-    panda_files: tuple[Path, Path], panda: Experiment
+    panda_files: tuple[Path, Path], panda: Experiment, panda_fit: IdentificationResult
 ) -> None:
     position, torque = panda_files
     as_read = import_recording(position, PANDA, effort=torque, rate_hz=1000.0)
@@ -262,23 +268,23 @@ def test_samples_read_without_waiting_explain_the_panda_three_times_better_on_it
     # The stamps of the reading program span 20.9991 s.
     assert len(panda.q) == 20_999
     assert len(rows.q) == 20_544
-    assert 3 * least_squares([panda], PANDA).relative_error_pct < least_squares([rows], PANDA).relative_error_pct
+    assert 3 * panda_fit.relative_error_pct < least_squares([rows], PANDA).relative_error_pct
 
 
-def test_the_panda_is_explained_and_its_last_third_predicted_up_to_1_8_percent(panda: Experiment) -> None:
-    whole = least_squares([panda], PANDA)
-    assert len(whole.names) == 64
-    assert whole.relative_error_pct < 1.8
+def test_the_panda_is_explained_and_its_last_third_predicted_up_to_1_8_percent(
+    panda: Experiment, panda_fit: IdentificationResult
+) -> None:
+    assert len(panda_fit.names) == 64
+    assert panda_fit.relative_error_pct < 1.8
     first, last = parts(panda)
     assert held_out_error(PANDA, [first], [last]) < 1.8
 
 
 def test_half_a_sample_between_position_and_sensor_torque_makes_no_difference(
-    panda: Experiment, monkeypatch: pytest.MonkeyPatch
+    panda: Experiment, panda_fit: IdentificationResult, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    held = least_squares([panda], PANDA).relative_error_pct
     monkeypatch.setattr("armident.identify.identification.equations.aligned_torque", lambda tau, late=0.0: tau)
-    assert least_squares([panda], PANDA).relative_error_pct == pytest.approx(held, abs=0.02)
+    assert least_squares([panda], PANDA).relative_error_pct == pytest.approx(panda_fit.relative_error_pct, abs=0.02)
 
 
 def followed(robot: RobotConfig, experiments: Sequence[Experiment]) -> tuple[np.ndarray, np.ndarray, bool]:

@@ -15,6 +15,7 @@ from armident.identify.identification.identify_recording import IdentificationOu
 from armident.identify.identification.options import Options, parse_decimation, parse_nvr
 from armident.identify.report.identification_report import identification_report
 from armident.virtual_robot.inertias import plant_parameters
+from tests.fixtures import arms
 from tests.fixtures.arms import recording
 
 pytestmark = pytest.mark.slow
@@ -22,7 +23,9 @@ pytestmark = pytest.mark.slow
 
 @cache
 def identified(options: Options, robot: str = "tx40") -> IdentificationOutcome:
-    return identify_recording(recording(robot, f"{robot}_excitation", 1), options=options)
+    if options == Options(options.method):
+        return arms.identified(robot, f"{robot}_excitation", 1, options.method, checked=False)
+    return identify_recording(recording(robot, f"{robot}_excitation", 1), options=options, check=None)
 
 
 def options(method: Method) -> Options:

@@ -9,7 +9,6 @@ import pytest
 
 from armident.configs import ArmidentError, DataError, config_path, load_session
 from armident.daq.recording import Recording, read_recording, write_recording
-from armident.identify.identification.identify_recording import identify_recording
 from armident.identify.monitoring.change import history_schema
 from armident.identify.monitoring.change.history import History
 from armident.identify.monitoring.reidentify import identify_once, keep, run
@@ -55,11 +54,13 @@ def recorded(tmp_path: Path) -> Recording:
     return read_recording(path)
 
 
-def job(folder: Path, baseline: Recording) -> Job:
+def job(folder: Path) -> Job:
     session = load_session("emps_cell.yaml")
-    document = identify_recording(baseline).document
+    baseline = arms.identified("emps", "emps_excitation", 1)
     store = f"sqlite:///{folder}/h.sqlite"
-    return Job(config_path("emps_cell.yaml"), session, baseline.robot, Baseline(document, "b"), store, folder, 1e-4)
+    return Job(
+        config_path("emps_cell.yaml"), session, baseline.robot, Baseline(baseline.document, "b"), store, folder, 1e-4
+    )
 
 
 @pytest.fixture
@@ -72,7 +73,7 @@ def quickly(monkeypatch: pytest.MonkeyPatch, recorded: Recording) -> None:
 
 @pytest.mark.usefixtures("quickly")
 def test_a_locked_history_is_reported_and_the_verdict_is_published(tmp_path: Path, recorded: Recording) -> None:
-    work = job(tmp_path, arms.recording("emps", "emps_excitation", 1))
+    work = job(tmp_path)
     History(work.store)
     heard, said = Published(), list[str]()
     db = sqlite3.connect(tmp_path / "h.sqlite")
@@ -98,7 +99,7 @@ def test_a_locked_history_is_reported_and_the_verdict_is_published(tmp_path: Pat
 
 @pytest.mark.usefixtures("quickly")
 def test_a_result_that_zenoh_has_not_taken_is_left_to_a_worker(tmp_path: Path, recorded: Recording) -> None:
-    work = job(tmp_path, arms.recording("emps", "emps_excitation", 1))
+    work = job(tmp_path)
     carry_out(work, cast(StatusPublisher, Published(reachable=False)), lambda _: None)
     ledger = Ledger(tmp_path / FILE, "worker")
     entry = ledger.claim(recorded.sha256)
@@ -112,7 +113,7 @@ def test_a_ledger_that_locks_or_is_damaged_stops_neither_verdict_nor_announcemen
 ) -> None:
     monkeypatch.setattr(ledger_module, "BUSY_S", 0.1)
     monkeypatch.setattr(identify_once, "RETRY_S", 0.5)
-    work = job(tmp_path, arms.recording("emps", "emps_excitation", 1))
+    work = job(tmp_path)
     Ledger(tmp_path / FILE, "worker")
     db = sqlite3.connect(tmp_path / FILE)
     db.execute("BEGIN EXCLUSIVE")
@@ -135,7 +136,7 @@ def test_a_failure_is_published_once_with_its_reason(
     def fails(*_: object) -> None:
         raise DataError("too short")
 
-    work = job(tmp_path, arms.recording("emps", "emps_excitation", 1))
+    work = job(tmp_path)
     monkeypatch.setattr(identify_once, "identify_recording", fails)
     heard = Published()
     for _ in range(2):
@@ -151,7 +152,7 @@ def test_a_failure_is_published_once_with_its_reason(
 
 @pytest.mark.usefixtures("quickly")
 def test_a_result_that_cannot_be_written_is_one_line_and_left_to_a_worker(tmp_path: Path, recorded: Recording) -> None:
-    work = job(tmp_path, arms.recording("emps", "emps_excitation", 1))
+    work = job(tmp_path)
     (tmp_path / "emps-20260105T060000-000Z.identification").write_text("a file is where the folder belongs")
     with pytest.raises(ArmidentError, match=r"the result cannot be written: .*; fix this; a worker"):
         carry_out(work, cast(StatusPublisher, Published()), lambda _: None)
