@@ -32,6 +32,7 @@ from armident.virtual_robot.inertias import plant_parameters
 from armident.virtual_robot.offline import simulate_recording
 from armident.virtual_robot.plant import Plant
 from tests.fixtures.arms import recording, trajectory
+from tests.reproduction.gear_ratios import with_gear_ratios
 
 pytestmark = pytest.mark.slow
 
@@ -143,7 +144,7 @@ def test_idim_iv_and_didim_agree_within_three_standard_deviations() -> None:
 
 def test_gear_ratios_at_80_percent_in_the_simulator_move_didim_by_20_percent_and_idim_iv_not_at_all() -> None:
     data = recorded(1.0)
-    wrong = data.loop.with_gear_ratios(0.8)
+    wrong = with_gear_ratios(data.loop, 0.8)
     iv, moved = idim_iv(data.blocks, wrong, cad()), didim(data.blocks, wrong, cad())
     assert iv.converged
     assert moved.converged
