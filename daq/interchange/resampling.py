@@ -11,6 +11,7 @@ from armident.daq.interchange.clocks import (
     EQUAL,
     MOST_NUMBERS,
     POLLED_SHARE,
+    check_resolution,
     clock_of,
     in_seconds,
     repeated_share,
@@ -122,6 +123,7 @@ def _times(source: Source, rows: TableRows, robot: RobotConfig, unit: str | None
         where = source.place(int(rows.row[backward[0] + 1]), rows.time_name)
         raise DataError(f"{where}: time does not increase")
     times, notes = in_seconds(rows.times, rows.values["position"], robot, named=rows.time_unit, stated=unit)
+    check_resolution(times)
     return times, list(notes)
 
 
@@ -220,6 +222,11 @@ def _from_jitter(rows: TableRows, times: Floats, rate_hz: float, notes: list[str
     if holes.size > _MOST_UNEVEN * steps.size:
         raise DataError(f"{holes.size} of {steps.size} steps are holes: the rows have no common clock")
     relative = times - times[0]
+    if relative[-1] * rate_hz < 1.0:
+        raise DataError(
+            f"the times span {relative[-1]:.3g} s, less than a period of --resample {rate_hz:g}; "
+            "state the unit of the times with --time-unit"
+        )
     if (_HOLE + jitter) * median * grid > _MOST_BETWEEN or not relative[-1] * grid < MOST_NUMBERS:
         raise DataError(
             f"time column inconsistent: steps of {steps.min():.4g} to {steps.max():.4g} s on a clock of {grid:g} Hz"
