@@ -15,6 +15,7 @@ from rich.console import Console
 from rich.live import Live
 
 from armident.configs import ConfigError, DataError, RobotConfig, load_robot, load_session
+from armident.configs.errors import FOUND
 from armident.daq.recording import read_recording
 from armident.identify.documents.files import load_document
 from armident.identify.documents.identification import IdentificationDocument
@@ -25,8 +26,6 @@ from armident.identify.monitoring.recursive.report import document, friction_tab
 
 log = logging.getLogger(__name__)
 
-FOUND = 4
-"""Exit code after an alarm."""
 REPLAY_SYNCS = 1000
 """SYNCs per block of a replay."""
 

@@ -19,6 +19,7 @@ from armident.configs import (
     load_session,
     load_trajectory,
 )
+from armident.configs.errors import FOUND
 from armident.daq.recording import Recording
 from armident.identify.documents.diagnosis import DiagnosisDocument
 from armident.identify.documents.files import from_json, to_json
@@ -37,8 +38,6 @@ from armident.identify.monitoring.reidentify.summary import change_lines, findin
 from armident.identify.monitoring.worker.worker import options_of
 from armident.processes import Start
 
-DRIFTED = 4
-"""Exit code: done, and the arm has changed."""
 CHECK_PERIOD = 1e-3
 """Sampling period of predicted torques, s."""
 DIAGNOSIS_S = 3600.0
@@ -80,7 +79,7 @@ class Outcome:
 
 
 def reidentify_command(asked: ReidentifyOptions, *, as_json: bool) -> int:
-    """Carry out ``armident reidentify`` without ``--recordings``; returns 0 or `DRIFTED`.
+    """Carry out ``armident reidentify`` without ``--recordings``; returns 0 or `FOUND`.
 
     Raises ConfigError, DataError or ArmidentError if an input is wrong, or motion or identification fail.
     """
@@ -101,7 +100,7 @@ def reidentify_command(asked: ReidentifyOptions, *, as_json: bool) -> int:
         print(json.dumps(entry(job, outcome), indent=1))
     else:
         show(job, outcome)
-    return DRIFTED if outcome.changed else 0
+    return FOUND if outcome.changed else 0
 
 
 def prepare(config: Path, baseline: Path | None, store: str, out: Path | None, false_alarms: float) -> Job:
@@ -253,7 +252,7 @@ def _diagnosed(job: Job, recording: Recording, outcome: Outcome, say: Say) -> Ou
             timeout=DIAGNOSIS_S,
             check=False,
         )
-        if done.returncode not in (0, DRIFTED):
+        if done.returncode not in (0, FOUND):
             raise DataError((done.stderr.strip().splitlines() or [f"exit code {done.returncode}"])[-1])
         document = from_json(done.stdout, DiagnosisDocument, "diagnosis")
     except (subprocess.TimeoutExpired, ArmidentError) as error:
