@@ -17,12 +17,11 @@ from armident.extras import install_line
 from armident.identify.documents.files import from_json, load_document, to_json
 from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.identification.identify_recording import identify_recording
-from armident.identify.identification.options import Options
+from armident.identify.identification.options import Options, options_of
 from armident.identify.monitoring.change.change_test import ParameterChangeTest, compare
 from armident.identify.monitoring.change.history import History
 from armident.identify.monitoring.reidentify.reidentify_options import ReidentifyOptions
 from armident.identify.monitoring.reidentify.summary import change_lines
-from armident.identify.monitoring.worker.worker import options_of
 from armident.identify.report.robot_file import write_identification
 
 if TYPE_CHECKING:

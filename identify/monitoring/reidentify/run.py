@@ -27,6 +27,7 @@ from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.effects.terms import arm_model
 from armident.identify.excitation.point_to_point import sample_trajectory
 from armident.identify.excitation.previous_estimate import previous_estimate
+from armident.identify.identification.options import options_of
 from armident.identify.monitoring.change.change_test import Inconclusive, ParameterChangeTest, compare
 from armident.identify.monitoring.reidentify.baseline import Baseline, baseline_of
 from armident.identify.monitoring.reidentify.identify_once import identify_once
@@ -35,7 +36,6 @@ from armident.identify.monitoring.reidentify.publish import StatusPublisher
 from armident.identify.monitoring.reidentify.record_run import Say, record_run, start_process
 from armident.identify.monitoring.reidentify.reidentify_options import ReidentifyOptions
 from armident.identify.monitoring.reidentify.summary import change_lines, finding_lines
-from armident.identify.monitoring.worker.worker import options_of
 from armident.processes import Start
 
 CHECK_PERIOD = 1e-3
