@@ -11,7 +11,15 @@ import numpy as np
 from scipy import signal
 
 from armident.configs import DataError
-from armident.identify.controller.law import Array, Stretch, Structure, columns, integral_slopes, low_pass, simulate_law
+from armident.identify.controller.law import (
+    Array,
+    Stretch,
+    Structure,
+    columns,
+    integral_slopes,
+    pole_filter,
+    simulate_law,
+)
 from armident.identify.regression.ar_noise import WHITE, ArModel, fit_ar
 
 ITERATIONS = 40
@@ -134,12 +142,12 @@ def _rows(
 ) -> _Rows:
     m, split, pole = len(structure.names), structure.unfiltered, structure.pole(theta)
     u, y = columns(stretch, structure, theta, dt), stretch.nu[structure.lead :]
-    x = np.concatenate([u[:, :split], low_pass(u[:, split:], pole)], axis=1)
+    x = np.concatenate([u[:, :split], pole_filter(u[:, split:], pole)], axis=1)
     z = x.copy()
     error = y - x @ theta[:m]
     if structure.filtered:
-        measured = _past(low_pass(y - u[:, :split] @ theta[:split], pole))
-        simulated = measured if first else _past(low_pass(low_pass(u[:, split:] @ theta[split:m], pole), pole))
+        measured = _past(pole_filter(y - u[:, :split] @ theta[:split], pole))
+        simulated = measured if first else _past(pole_filter(pole_filter(u[:, split:] @ theta[split:m], pole), pole))
         x, z = np.column_stack([x, measured]), np.column_stack([z, simulated])
         y = y + pole * measured
     if structure.integral:

@@ -21,7 +21,7 @@ from armident.identify.documents.files import load_document
 from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.monitoring.recursive.estimator import RecursiveEstimator, RecursiveResult
 from armident.identify.monitoring.recursive.live_watch import SAVED_S, LiveWatch, Watch, live_estimator
-from armident.identify.monitoring.recursive.replay import blocks_of, has_reference
+from armident.identify.monitoring.recursive.recorded_blocks import blocks_of, has_reference
 from armident.identify.monitoring.recursive.report import document, friction_table, joint_states
 
 log = logging.getLogger(__name__)

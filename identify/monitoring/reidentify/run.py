@@ -31,7 +31,7 @@ from armident.identify.identification.options import options_of
 from armident.identify.monitoring.change.change_test import Inconclusive, ParameterChangeTest, compare
 from armident.identify.monitoring.reidentify.baseline import Baseline, baseline_of
 from armident.identify.monitoring.reidentify.identify_once import identify_once
-from armident.identify.monitoring.reidentify.keep import HistoryEntry, history_or_reason, kept
+from armident.identify.monitoring.reidentify.keep import HistoryEntry, history_or_reason, recorded_in_history
 from armident.identify.monitoring.reidentify.publish import StatusPublisher
 from armident.identify.monitoring.reidentify.record_run import Say, record_run, start_process
 from armident.identify.monitoring.reidentify.reidentify_options import ReidentifyOptions
@@ -175,7 +175,7 @@ def carry_out(job: Job, announcer: StatusPublisher, say: Say, start: Start = sta
         drift = None if job.baseline.document is None else compare(job.baseline.document, document, job.false_alarms)
     except Inconclusive as error:
         return _unexpected(job, recording, document, path, str(error), announcer, say)
-    with kept(HistoryEntry(job.store, recording, document, path, job.baseline.document, drift), say):
+    with recorded_in_history(HistoryEntry(job.store, recording, document, path, job.baseline.document, drift), say):
         return _concluded(job, recording, document, path, drift, announcer, say)
 
 
@@ -221,7 +221,7 @@ def _unexpected(
     # The diagnosis decides what the comparison left open.
     defect = defect.removesuffix(": whether the arm has changed is unknown")
     unknown = DataError(f"{recording.path}: {defect}: whether the arm has changed is unknown (result: {path})")
-    with kept(HistoryEntry(job.store, recording, document, path), say):
+    with recorded_in_history(HistoryEntry(job.store, recording, document, path), say):
         if job.baseline.document is None:
             raise unknown
         say(f"{defect}; diagnosing")

@@ -105,7 +105,7 @@ def recorded(noise: float, steps: int = 1) -> Recorded:
 def drives() -> DiscreteController:
     """The law of the virtual drives: ``kv (kp e + de/dt)``, the derivative through a first-order filter."""
     robot, period = load_robot("tx40"), servo.CONTROL_PERIOD
-    kp, kv = servo.gains(robot, Plant(robot, np.zeros(robot.n)).mass_matrix())
+    kp, kv = servo.cascade_gains(robot, Plant(robot, np.zeros(robot.n)).mass_matrix())
     share = 1 - math.exp(-2 * math.pi * servo.VELOCITY_FILTER_HZ * period)
     gain = kv * np.array([joint.drive.gain for joint in robot.joints])
     error = np.stack([gain * (kp + share / period), -gain * (kp * (1 - share) + share / period)], axis=1)
