@@ -119,9 +119,11 @@ def _velocity_share(times: Floats, q: Floats, robot: RobotConfig) -> float:
 
 
 def check_resolution(times: Floats) -> None:
-    """Refuse times (N,), s, whose usual step is shorter than a recording can hold."""
+    """Refuse times (N,), s, of a single row, and those whose usual step is shorter than a recording can hold."""
     steps = np.diff(times)
-    usual = (float(np.median(steps)) or float(steps.max())) if steps.size else 0.0
+    if steps.size == 0:
+        raise DataError("a single row is not a recording")
+    usual = float(np.median(steps)) or float(steps.max())
     if 0.0 < usual < SHORTEST_STEP_S:
         raise DataError(
             f"steps of {usual:.3g} s are shorter than 1 ns, the resolution of a recording; state the unit of the times "
@@ -143,8 +145,6 @@ def clock_of(times: Floats, rate_hz: float | None, repeated: float = 0.0) -> Clo
     Raises `JitterError` if steps are too uneven for that, and DataError if the times contradict ``rate_hz``.
     """
     steps = np.diff(times)
-    if steps.size == 0:
-        raise DataError("a single row is not a recording")
     median = float(np.median(steps))
     if times[-1] <= times[0]:
         raise DataError("all times are equal; give the sampling rate with --rate, and omit the times: --map time=-")

@@ -13,6 +13,7 @@ from armident.daq.interchange.clocks import (
     POLLED_SHARE,
     check_resolution,
     clock_of,
+    gaps_and_counters,
     in_seconds,
     repeated_share,
     stamped_clock,
@@ -209,8 +210,6 @@ def _from_jitter(rows: TableRows, times: Floats, rate_hz: float, notes: list[str
     if not first.all():
         notes.append(f"{int((~first).sum())} rows have the time of the row before: left out")
         rows, times = rows.taken(first), times[first]
-    if times.size < 2:
-        raise DataError("a single row is not a recording")
     if times.size < _FEWEST:
         raise DataError(f"only {times.size} rows: too few to resample")
     usual = usual_rate(times)
@@ -274,10 +273,7 @@ def at_rate(recording: Recording, rate_hz: float) -> Recording:
     if abs(ratio - 1.0) < SAME:
         return recording
     streams = {name: _stream(stream, ratio) for name, stream in recording.streams.items() if stream.sync.size}
-    counters: dict[str, int] = {}
-    for name, stream in streams.items():
-        expected, rows = int(stream.sync[-1] - stream.sync[0]) + 1, stream.sync.size
-        counters |= {f"{name}.expected": expected, f"{name}.rows": rows, f"{name}.in_gaps": expected - rows}
+    _, counters = gaps_and_counters(streams)
     counters["sync_skipped_periods"] = round(recording.counters.get("sync_skipped_periods", 0) * ratio)
     return Recording(
         None,
