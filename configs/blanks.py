@@ -142,7 +142,7 @@ def grouped(keys: Iterable[str]) -> dict[str, list[str]]:
     return entries
 
 
-def listed(keys: Iterable[str]) -> list[str]:
+def blank_lines(keys: Iterable[str]) -> list[str]:
     """Blanks as lines of text: key, the entries that lack it, and how to find its value."""
     lines = []
     for key, names in grouped(keys).items():
@@ -156,4 +156,4 @@ def check_filled(where: str, blanks: Sequence[str], command: str | None) -> None
     """Raise ConfigError, with the way to find each value, if a configuration has blanks that the command needs."""
     if blanks:
         who = f"armident {command} needs" if command is not None else "expected"
-        raise ConfigError(f"{where}: {who} values for keys marked {MARK}: {'; '.join(listed(blanks))}")
+        raise ConfigError(f"{where}: {who} values for keys marked {MARK}: {'; '.join(blank_lines(blanks))}")

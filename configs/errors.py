@@ -1,4 +1,7 @@
-"""Exceptions of all packages, with the exit code of each."""
+"""Exceptions of all packages, with the exit code of each, and of commands that find something."""
+
+FOUND = 4
+"""Exit code: done, and the answer is a finding, a change, or a missing part."""
 
 
 class ArmidentError(Exception):

@@ -1,6 +1,7 @@
 """Loading and checking of configuration files; an error is one line that names file, key and expected value."""
 
 import difflib
+from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -32,6 +33,8 @@ _LONGEST = 80
 """Maximum number of characters of a file that a message quotes."""
 _LISTED = 12
 """Maximum number of missing keys that a message lists."""
+CHECKS = "armident.session_checks"
+"""Entry-point group of functions that check a session's keys of other packages, which no configuration imports."""
 T = TypeVar("T", bound=BaseModel)
 
 
@@ -258,6 +261,11 @@ def load_session(name: str | Path, command: str | None = None) -> SessionConfig:
     """
     path = config_path(name, of_folder="session.yaml")
     session = _checked(_marked(path), SessionConfig, str(path))
+    for check in entry_points(group=CHECKS) if session.identification else ():
+        try:
+            check.load()(session)
+        except ConfigError as error:
+            raise ConfigError(f"{path}: {error}") from error
     base = path.resolve().parent
 
     def resolved(relative: Path, key: str) -> Path:

@@ -184,6 +184,7 @@ def service(
     Example: armident service install line3 --dry-run
     """
     from armident.configs import ConfigError
+    from armident.configs.errors import FOUND
     from armident.daq.service import install, status, uninstall
 
     if action == "status":
@@ -195,7 +196,7 @@ def service(
         raise ConfigError(f"no action {action!r}; expected: armident service install, status or uninstall CELL")
     print(*lines, sep="\n")
     if not complete:
-        raise typer.Exit(4)
+        raise typer.Exit(FOUND)
 
 
 def recover(

@@ -25,18 +25,19 @@ from armident.configs import (
     load_session,
     load_trajectory,
 )
-from armident.configs.blanks import listed, needed, pattern
+from armident.configs.blanks import blank_lines, needed, pattern
 from armident.configs.loading import is_session
 from armident.configs.schema.session import Bus
 from armident.daq.capture.clock import clock_state
 from armident.daq.capture.recording_files import chunk_duration_ns
 from armident.daq.matching.streams import captured_streams, unknown_phase
 from armident.daq.streaming.zenoh_session import configuration, endpoints, unreadable_files
+from armident.drivers.can.interface import SYSFS, is_can, is_up
 from armident.drivers.can.socketcan import RECEIVE_BUFFER, RawSocket
 from armident.drivers.can.timestamps import has_hardware_timestamps
 from armident.drivers.canopen.bus_load import check_fits
 from armident.drivers.canopen.eds import read_eds
-from armident.drivers.vcan.interfaces import NETWORK, have_socketcan, is_up
+from armident.drivers.vcan.interfaces import have_socketcan
 
 Verdict = Literal["ok", "warning", "failed"]
 Command = Literal["capture", "import", "identify", "trajectory", "robot"]
@@ -71,7 +72,7 @@ def checks_for(config: str | Path, command: Command) -> list[Check]:
     of_session = () if session is None else session.blanks
     missing = (*needed(of_session, command), *robot.blanks_for(command))
     checks = [Check("configuration", "ok", f"{config}: robot {robot.name}, {robot.n} joints")]
-    checks += [Check("blank", "failed", line) for line in listed(missing)]
+    checks += [Check("blank", "failed", line) for line in blank_lines(missing)]
     if command == "trajectory" and not missing:
         try:
             robot.check_movable(str(path))
@@ -92,7 +93,7 @@ def run_checks(config: str | Path) -> list[Check]:
     except ArmidentError as error:
         return [Check("configuration", "failed", str(error)), _installation(), _clock()]
     if blanks:
-        return [*(Check("blank", "failed", line) for line in listed(blanks)), _installation(), _clock()]
+        return [*(Check("blank", "failed", line) for line in blank_lines(blanks)), _installation(), _clock()]
     try:
         captured_streams(session, robot)
         if session.setpoints is not None:
@@ -158,8 +159,8 @@ def _interface(bus: Bus) -> Iterator[Check]:
     if not have_socketcan():
         yield Check("bus", "failed", "this kernel has no SocketCAN; try: sudo modprobe -a can_raw vcan")
         return
-    if not (NETWORK / name).exists():
-        have = ", ".join(sorted(path.name for path in NETWORK.iterdir() if _is_can(path))) or "none"
+    if not (SYSFS / name).exists():
+        have = ", ".join(sorted(path.name for path in SYSFS.iterdir() if is_can(path.name))) or "none"
         yield Check("bus", "failed", f"no interface {name}; CAN interfaces here: {have}")
         return
     if not is_up(name):
@@ -181,13 +182,6 @@ def _interface(bus: Bus) -> Iterator[Check]:
     clock = "hardware" if has_hardware_timestamps(name) else "software"
     yield Check("bus", "ok", f"{name} is up{rate}, {clock} time stamps")
     yield _receive_buffer(bus)
-
-
-def _is_can(path: Path) -> bool:
-    try:
-        return (path / "type").read_text().strip() == "280"
-    except OSError:
-        return False
 
 
 def _link(name: str) -> dict[str, object]:

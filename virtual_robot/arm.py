@@ -174,6 +174,6 @@ def design_drives(
     if given is not None and known is None:
         # A bandwidth is given: the known controller of the configuration does not count.
         robot = robot.model_copy(update={"controller": None})
-    return servo.design(
+    return servo.tuned_drives(
         robot, mass, velocity_feedback, period=period, bandwidth_hz=parameters.bandwidth_hz, known=known
     )

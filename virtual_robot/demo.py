@@ -34,7 +34,7 @@ from armident.virtual_robot.demo_report import (
     Diagnosed,
     Identified,
     print_next_steps,
-    print_table,
+    print_results,
     true_values,
     write_report,
 )
@@ -141,7 +141,7 @@ def demo(options: DemoOptions) -> None:
     first, subject = _identify_part(subject, out)
     second = None if options.quick else _diagnose_part(subject, out)
     report = write_report(out, subject.robot, first, second)
-    print_table(first, second)
+    print_results(first, second)
     if options.keep_going:
         with ExitStack() as stack:
             robot = _start_robot(_write_session(subject.session, out, "running"), out, stack, subject.robot_options)

@@ -132,7 +132,7 @@ def _against_truth(first: Identified) -> list[tuple[str, float, float, float, fl
     ]
 
 
-def print_table(first: Identified, second: Diagnosed | None) -> None:
+def print_results(first: Identified, second: Diagnosed | None) -> None:
     """Print the identified parameters beside the true ones, and the findings of the second part, if any."""
     print(f"\n{'parameter':>10} {'identified':>11} {'+- std':>9} {'true':>9} {'off by':>9}")
     for name, value, std, truth, distance in _against_truth(first):

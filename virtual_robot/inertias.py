@@ -107,7 +107,7 @@ def pseudo_inertia(standard: Mapping[str, float], link: int) -> NDArray[np.float
     return out
 
 
-def solve() -> dict[str, float]:
+def solve_inertias() -> dict[str, float]:
     """Standard parameters that meet table B.4 (kg, kg m, kg m^2); raises ArmidentError without a solution."""
     names = [f"{k}{j}" for j in range(1, JOINTS + 1) for k in INERTIAL] + [f"ia{j}" for j in range(1, JOINTS + 1)]
     at = {name: k for k, name in enumerate(names)}
@@ -206,7 +206,7 @@ def rest_posture(robot: RobotConfig) -> tuple[float, ...]:
 
 def main() -> None:
     """Solve and write the data file of the virtual TX40."""
-    parameters = solve() | {f"off{j}": 0.0 for j in range(1, JOINTS + 1)} | FRICTION | {"iam6": IAM6}
+    parameters = solve_inertias() | {f"off{j}": 0.0 for j in range(1, JOINTS + 1)} | FRICTION | {"iam6": IAM6}
     lines = [
         "# Standard parameters of the virtual TX40, joint side, SI. From python -m armident.virtual_robot.inertias",
         "# Inertias about the frame origins (MDH frames of table B.1); friction of table B.4.",

@@ -109,7 +109,7 @@ def control_period(robot: RobotConfig, sync_period: float | None = None) -> floa
     return sync_period / math.ceil(sync_period / CONTROL_PERIOD - 1e-6)
 
 
-def design(
+def tuned_drives(
     robot: RobotConfig,
     mass: NDArray[np.float64],
     velocity_feedback: bool | None = None,
@@ -126,13 +126,13 @@ def design(
     period = control_period(robot) if period is None else period
     known = robot.controller if known is None else known
     if known is None:
-        return Servo(period, *gains(robot, mass, bandwidth_hz), bool(velocity_feedback), 1, VELOCITY_FILTER_HZ)
+        return Servo(period, *cascade_gains(robot, mass, bandwidth_hz), bool(velocity_feedback), 1, VELOCITY_FILTER_HZ)
     if velocity_feedback is False:
         raise ConfigError(f"robot {robot.name!r}: its controller (kp, kv) feeds back the velocity, and cannot without")
     return Servo(period, np.array(known.kp), np.array(known.kv), True, known.velocity_samples, math.inf)
 
 
-def gains(
+def cascade_gains(
     robot: RobotConfig, mass: NDArray[np.float64], bandwidth_hz: Sequence[float] = BANDWIDTH_HZ
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Gains ``kp`` (1/s) and ``kv`` (A s/rad), (n,) each, motor side, for two equal poles at the given bandwidths.

@@ -290,7 +290,7 @@ class SessionConfig(WithBlanks):
     recording, zenoh, metrics
         Options of recordings, Zenoh and Prometheus.
     identification
-        Options of the worker by their names in ``armident.identify``, which the worker checks.
+        Options of the worker by their names in ``armident.identify``, which checks them.
     blanks
         Keys that the file marks as blank.
     """

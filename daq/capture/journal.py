@@ -37,7 +37,7 @@ class JournalHandler(StderrHandler):
         if self._socket is not None:
             try:
                 # Waiting for a journal whose buffer is full would delay the capture: stderr receives the line then.
-                datagram = entry(record, self.format(record), self.fields)
+                datagram = journal_entry(record, self.format(record), self.fields)
                 self._socket.sendto(datagram, socket.MSG_DONTWAIT, self._address)
                 return
             except OSError:
@@ -64,7 +64,7 @@ def in_journal() -> bool:
     return (found.st_dev, found.st_ino) == (int(device), int(inode))
 
 
-def entry(record: logging.LogRecord, message: str, fields: Mapping[str, object]) -> bytes:
+def journal_entry(record: logging.LogRecord, message: str, fields: Mapping[str, object]) -> bytes:
     """Return the datagram of one entry; ``extra`` attributes that are not ``None`` take precedence over ``fields``."""
     own = {key: value for key, value in vars(record).items() if key not in _STANDARD}
     entries: dict[str, object] = {

@@ -12,7 +12,7 @@ from armident.configs import RobotConfig, SessionConfig
 from armident.configs.schema.session import RecordingOptions, Trigger
 from armident.daq.matching.streams import CapturedStream
 from armident.daq.recording import QueuedSeries, RecordingSeries, RecordingWriter, TriggeredSeries
-from armident.daq.recording.retention import RetentionThread, prune, recordings_of
+from armident.daq.recording.retention import RetentionThread, prune, recordings_in
 
 log = logging.getLogger(__name__)
 
@@ -84,7 +84,7 @@ def capture_stamp(now: datetime.datetime) -> str:
 
 def next_time(directory: Path, robot: str, now: datetime.datetime) -> datetime.datetime:
     """Return a time (UTC) for a new recording's name, later than all of the robot: the clock may have stepped back."""
-    newest = max((made for _, made in recordings_of(directory, robot)), default=None)
+    newest = max((made for _, made in recordings_in(directory, robot)), default=None)
     if newest is None or now - newest >= _STAMP_STEP:
         return now
     if newest - now > _STAMP_STEP:

@@ -16,7 +16,7 @@ from armident.configs.expression import evaluate
 from armident.configs.mdh import modified_dh
 from armident.configs.suspected_units import FULL_TURN, LONGEST_LINK
 from armident.configs.yaml_loader import is_file
-from armident.daq.init.geometry import Geometry, identifier, of_rows
+from armident.daq.init.geometry import Geometry, name_from, of_rows
 from armident.daq.interchange.text_files import encoding_of
 
 Convention = Literal["classical", "modified"]
@@ -56,7 +56,7 @@ def from_dh_table(file: Path, convention: Convention | None) -> Geometry:
         raise ConfigError(f"{file}: column r belongs to modified parameters (alpha, d, theta, r)")
     chosen = convention or ("modified" if khalil else "classical")
     made = modified(rows) if chosen == "modified" else of_classical(rows)
-    geometry = of_rows(str(file), identifier(file.stem), [(r.name, r.type, m) for r, m in zip(rows, made, strict=True)])
+    geometry = of_rows(str(file), name_from(file.stem), [(r.name, r.type, m) for r, m in zip(rows, made, strict=True)])
     return Geometry(file.name, geometry.content, geometry.robot, (f"{chosen} parameters", *notes))
 
 

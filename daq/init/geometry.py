@@ -123,7 +123,7 @@ def _of_chain(file: Path, out: Path, base: str | None, tip: str | None) -> Geome
     part = UrdfSource(file=str(part_file), base=base, tip=tip)
     made = geometry_from_urdf(UrdfGeometry(urdf=part), out / "robot.yaml")
     urdf = {"file": os.path.relpath(part.file, out.resolve()), **part.model_dump(exclude={"file"}, exclude_none=True)}
-    name = identifier(robot_name(file) or file.stem)
+    name = name_from(robot_name(file) or file.stem)
     robot = checked_robot({"schema": "armident/robot/1", "name": name, **made}, str(file))
     content: dict[str, Any] = {
         "schema": "armident/robot/1",
@@ -168,7 +168,7 @@ def of_axes(count: int) -> Geometry:
     return Geometry("a number of joints", content, RobotConfig.model_validate({**robot, "blanks": blanks}))
 
 
-def identifier(text: str) -> str:
+def name_from(text: str) -> str:
     """Name of a robot or cell: lower-case letters, digits and underscores, beginning with a letter."""
     plain = re.sub(r"[^a-z0-9]+", "_", text.lower()).strip("_")[:60]
     return plain if plain and plain[0].isalpha() else f"arm_{plain}".rstrip("_")

@@ -5,7 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from armident.daq.init.geometry import URDF_SUFFIXES, identifier
+from armident.daq.init.geometry import URDF_SUFFIXES, name_from
 from armident.daq.init.initialize import InitOptions
 from armident.daq.interchange.readers import names_of_formats
 
@@ -38,7 +38,7 @@ def questionnaire(options: InitOptions, ask: Ask, tell: Callable[[str], None]) -
         gravity = _vector(ask, tell, "Gravity in the frame of the base, X,Y,Z in m/s^2", "0,-9.81,0")
     changes["gravity"] = gravity
     changes["cell"] = {**options.cell, **_cell(ask, tell)}
-    folder = ask("Folder of the files", identifier(Path(source).stem) if source else "arm")
+    folder = ask("Folder of the files", name_from(Path(source).stem) if source else "arm")
     return replace(options, out=Path(folder), **changes)
 
 

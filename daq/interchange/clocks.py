@@ -118,6 +118,19 @@ def _velocity_share(times: Floats, q: Floats, robot: RobotConfig) -> float:
     return float(np.quantile(speeds.max(axis=1), 0.99))
 
 
+def check_resolution(times: Floats) -> None:
+    """Refuse times (N,), s, of a single row, and those whose usual step is shorter than a recording can hold."""
+    steps = np.diff(times)
+    if steps.size == 0:
+        raise DataError("a single row is not a recording")
+    usual = float(np.median(steps)) or float(steps.max())
+    if 0.0 < usual < SHORTEST_STEP_S:
+        raise DataError(
+            f"steps of {usual:.3g} s are shorter than 1 ns, the resolution of a recording; state the unit of the times "
+            "with --time-unit, or another column with --map time=NAME"
+        )
+
+
 def repeated_share(values: Floats) -> float:
     """Return the share of rows (N, columns) that repeat the row before; longer runs are standstill."""
     same = np.all(values[1:] == values[:-1], axis=1)
@@ -132,15 +145,7 @@ def clock_of(times: Floats, rate_hz: float | None, repeated: float = 0.0) -> Clo
     Raises `JitterError` if steps are too uneven for that, and DataError if the times contradict ``rate_hz``.
     """
     steps = np.diff(times)
-    if steps.size == 0:
-        raise DataError("a single row is not a recording")
     median = float(np.median(steps))
-    usual = median if median > 0 else float(steps.max())
-    if 0.0 < usual < SHORTEST_STEP_S:
-        raise DataError(
-            f"steps of {usual:.3g} s are shorter than 1 ns, the resolution of a recording; state the unit of the times "
-            "with --time-unit, or another column with --map time=NAME"
-        )
     if times[-1] <= times[0]:
         raise DataError("all times are equal; give the sampling rate with --rate, and omit the times: --map time=-")
     if median <= 0 or np.any(steps <= 0):

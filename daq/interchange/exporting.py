@@ -12,7 +12,7 @@ from armident.daq.recording import Recording, Stream
 from armident.extras import install_line
 
 
-def columns(recording: Recording) -> dict[str, NDArray[np.float64]]:
+def exported_columns(recording: Recording) -> dict[str, NDArray[np.float64]]:
     """Return time ``t`` (s), joint positions ``q1..``, torques ``tau1..`` and references ``qr1..``, (N,) each.
 
     References are linear between recorded set points, as drives interpolate (CiA 402, 60C0h = 0), and NaN outside them.
@@ -71,40 +71,40 @@ def _numbered(base: str, values: NDArray[np.float64]) -> dict[str, NDArray[np.fl
 
 
 def export_csv(recording: Recording, path: Path) -> None:
-    """Write the `columns` of a recording as text."""
-    table = columns(recording)
+    """Write the `exported_columns` of a recording as text."""
+    table = exported_columns(recording)
     values = np.stack(list(table.values()), axis=1)
     np.savetxt(path, values, fmt="%.17g", delimiter=",", header=",".join(table), comments="")
 
 
 def export_npz(recording: Recording, path: Path) -> None:
-    """Write the `columns` of a recording as an archive of numpy."""
+    """Write the `exported_columns` of a recording as an archive of numpy."""
     with path.open("wb") as file:
-        np.savez_compressed(file, allow_pickle=False, **columns(recording))
+        np.savez_compressed(file, allow_pickle=False, **exported_columns(recording))
 
 
 def export_parquet(recording: Recording, path: Path) -> None:
-    """Write the `columns` of a recording as a table of Apache Parquet."""
+    """Write the `exported_columns` of a recording as a table of Apache Parquet."""
     try:
         import pyarrow
         import pyarrow.parquet
     except ImportError as error:
         raise ConfigError(install_line(f"{path}: Parquet", ["parquet"])) from error
-    pyarrow.parquet.write_table(pyarrow.table(columns(recording)), path)
+    pyarrow.parquet.write_table(pyarrow.table(exported_columns(recording)), path)
 
 
 def export_mat(recording: Recording, path: Path) -> None:
-    """Write the `columns` of a recording as a MAT file."""
+    """Write the `exported_columns` of a recording as a MAT file."""
     from scipy.io import savemat
 
-    savemat(path, columns(recording), do_compression=True, oned_as="column")
+    savemat(path, exported_columns(recording), do_compression=True, oned_as="column")
 
 
 def export_rosbag(recording: Recording, path: Path) -> None:
-    """Write the `columns` of a recording as joint states, stamped by the sampling clock: times of reception jitter."""
+    """Write the `exported_columns` as joint states, stamped by the sampling clock: times of reception jitter."""
     from armident.daq.interchange.rosbag import write_joint_states
 
-    table, samples = columns(recording), recording.samples
+    table, samples = exported_columns(recording), recording.samples
     t_ns = samples.t_ns[0] + np.round((samples.sync - samples.sync[0]) * (1e9 / recording.sample_rate_hz)).astype(
         np.int64
     )

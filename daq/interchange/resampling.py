@@ -11,7 +11,9 @@ from armident.daq.interchange.clocks import (
     EQUAL,
     MOST_NUMBERS,
     POLLED_SHARE,
+    check_resolution,
     clock_of,
+    gaps_and_counters,
     in_seconds,
     repeated_share,
     stamped_clock,
@@ -122,6 +124,7 @@ def _times(source: Source, rows: TableRows, robot: RobotConfig, unit: str | None
         where = source.place(int(rows.row[backward[0] + 1]), rows.time_name)
         raise DataError(f"{where}: time does not increase")
     times, notes = in_seconds(rows.times, rows.values["position"], robot, named=rows.time_unit, stated=unit)
+    check_resolution(times)
     return times, list(notes)
 
 
@@ -207,8 +210,6 @@ def _from_jitter(rows: TableRows, times: Floats, rate_hz: float, notes: list[str
     if not first.all():
         notes.append(f"{int((~first).sum())} rows have the time of the row before: left out")
         rows, times = rows.taken(first), times[first]
-    if times.size < 2:
-        raise DataError("a single row is not a recording")
     if times.size < _FEWEST:
         raise DataError(f"only {times.size} rows: too few to resample")
     usual = usual_rate(times)
@@ -220,6 +221,11 @@ def _from_jitter(rows: TableRows, times: Floats, rate_hz: float, notes: list[str
     if holes.size > _MOST_UNEVEN * steps.size:
         raise DataError(f"{holes.size} of {steps.size} steps are holes: the rows have no common clock")
     relative = times - times[0]
+    if relative[-1] * rate_hz < 1.0:
+        raise DataError(
+            f"the times span {relative[-1]:.3g} s, less than a period of --resample {rate_hz:g}; "
+            "state the unit of the times with --time-unit"
+        )
     if (_HOLE + jitter) * median * grid > _MOST_BETWEEN or not relative[-1] * grid < MOST_NUMBERS:
         raise DataError(
             f"time column inconsistent: steps of {steps.min():.4g} to {steps.max():.4g} s on a clock of {grid:g} Hz"
@@ -267,10 +273,7 @@ def at_rate(recording: Recording, rate_hz: float) -> Recording:
     if abs(ratio - 1.0) < SAME:
         return recording
     streams = {name: _stream(stream, ratio) for name, stream in recording.streams.items() if stream.sync.size}
-    counters: dict[str, int] = {}
-    for name, stream in streams.items():
-        expected, rows = int(stream.sync[-1] - stream.sync[0]) + 1, stream.sync.size
-        counters |= {f"{name}.expected": expected, f"{name}.rows": rows, f"{name}.in_gaps": expected - rows}
+    _, counters = gaps_and_counters(streams)
     counters["sync_skipped_periods"] = round(recording.counters.get("sync_skipped_periods", 0) * ratio)
     return Recording(
         None,

@@ -34,7 +34,7 @@ def prune(
     that is ahead deletes nothing younger. ``min_free_bytes``, ``free``: wanted and present space, bytes.
     """
     deleted = []
-    found = [(path, made, is_being_written(path)) for path, made in recordings_of(directory, robot)]
+    found = [(path, made, is_being_written(path)) for path, made in recordings_in(directory, robot)]
     keep = datetime.timedelta.max if keep_days is None else datetime.timedelta(days=keep_days)
     newest = max((made for _, made, written in found if not written and made <= now), default=now)
     ages = _ages([made for _, made, _ in found if made <= newest], keep)
@@ -64,7 +64,7 @@ def _ages(times: list[datetime.datetime], keep: datetime.timedelta) -> dict[date
     return ages
 
 
-def recordings_of(directory: Path, robot: str) -> Iterator[tuple[Path, datetime.datetime]]:
+def recordings_in(directory: Path, robot: str) -> Iterator[tuple[Path, datetime.datetime]]:
     """Yield the recordings of a robot in a directory with the times in their names, the oldest first."""
     found = []
     for path in directory.glob(f"{robot}-*.mcap*"):

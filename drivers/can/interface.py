@@ -12,7 +12,7 @@ _ARPHRD_CAN = 280
 
 
 def is_up(channel: str) -> bool:
-    """Return True if the interface is administratively up."""
+    """Return True if the interface exists and is administratively up."""
     try:
         return bool(int((SYSFS / channel / "flags").read_text(), 16) & _IFF_UP)
     except (OSError, ValueError):
@@ -43,7 +43,7 @@ def check_fd(channel: str) -> None:
     )
 
 
-def missing(channel: str, reason: str | None) -> ConfigError:
+def no_interface(channel: str, reason: str | None) -> ConfigError:
     """Error for an interface that does not exist or is not a CAN interface. ``reason``: text of the system's error."""
     hint = f"sudo ip link add dev {channel} type vcan && " if channel.startswith("vcan") else ""
     return ConfigError(

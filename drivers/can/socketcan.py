@@ -128,7 +128,7 @@ class RawSocket:
         try:
             self._socket.bind((self.channel,))
         except OSError as error:
-            raise interface.missing(self.channel, error.strerror) from error
+            raise interface.no_interface(self.channel, error.strerror) from error
         if not self.up:
             raise interface.down(self.channel, "is down")
         if self.fd:

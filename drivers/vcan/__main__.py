@@ -32,7 +32,7 @@ def main() -> int:
             return 0
         if native:
             os.execvp(command[0], command)
-        return guest.run(command, options.buses, options.memory)
+        return guest.run_in_guest(command, options.buses, options.memory)
     except (ArmidentError, OSError) as error:
         print(f"armident.drivers.vcan: {error}", file=sys.stderr)
         return CANNOT_RUN

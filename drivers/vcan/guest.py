@@ -56,7 +56,7 @@ def launcher_command(command: Sequence[str], buses: int = 1) -> list[str]:
     return [sys.executable, "-m", "armident.drivers.vcan", "-n", str(buses), "--", *command]
 
 
-def run(command: Sequence[str], buses: int = 1, memory: str = "4096M", writable: Sequence[Path] = ()) -> int:
+def run_in_guest(command: Sequence[str], buses: int = 1, memory: str = "4096M", writable: Sequence[Path] = ()) -> int:
     """Run ``command`` in a guest, in the current directory, and return its exit status.
 
     ``memory`` has the format of the kernel's ``mem=``; only used pages take memory of the host. ``writable``: more

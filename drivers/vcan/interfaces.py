@@ -2,12 +2,9 @@
 
 import socket
 import subprocess
-from pathlib import Path
 
 from armident.configs.errors import ConfigError
-
-NETWORK = Path("/sys/class/net")
-IFF_UP = 1
+from armident.drivers.can.interface import SYSFS, is_up
 
 
 def have_socketcan() -> bool:
@@ -19,15 +16,6 @@ def have_socketcan() -> bool:
     return True
 
 
-def is_up(name: str) -> bool:
-    """Return True if the network interface exists and is administratively up."""
-    try:
-        flags = int((NETWORK / name / "flags").read_text(), 16)
-    except (OSError, ValueError):
-        return False
-    return bool(flags & IFF_UP)
-
-
 def ensure_vcan(name: str = "vcan0") -> None:
     """Bring a vcan interface up, and create it if needed; a ConfigError has the command for an administrator."""
     if is_up(name):
@@ -35,7 +23,7 @@ def ensure_vcan(name: str = "vcan0") -> None:
     if not have_socketcan():
         raise ConfigError(f"{name}: this kernel has no SocketCAN (try: sudo modprobe -a can_raw vcan)")
     steps = [["ip", "link", "set", "dev", name, "up"]]
-    if not (NETWORK / name).exists():
+    if not (SYSFS / name).exists():
         steps.insert(0, ["ip", "link", "add", "dev", name, "type", "vcan"])
     for step in steps:
         problem = _run(step)
@@ -46,7 +34,7 @@ def ensure_vcan(name: str = "vcan0") -> None:
 
 def remove_vcan(name: str) -> None:
     """Delete a vcan interface if it exists. Raises ConfigError if it cannot be deleted."""
-    if not (NETWORK / name).exists():
+    if not (SYSFS / name).exists():
         return
     problem = _run(["ip", "link", "delete", "dev", name])
     if problem is not None:

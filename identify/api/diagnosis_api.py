@@ -4,7 +4,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Self
 
 from armident.configs import ConfigError, DataError, RobotConfig
 from armident.identify.api.arguments import Progress, Recorded, Robot, recordings_of, robot_of
@@ -13,7 +13,6 @@ from armident.identify.api.result_base import Result
 from armident.identify.api.result_tables import EffectTable, Table
 from armident.identify.documents.base import reference
 from armident.identify.documents.diagnosis import DiagnosisDocument
-from armident.identify.documents.files import write_atomically
 from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.effects.registry import catalogue
 from armident.identify.identification.from_recording import rest_notes
@@ -75,25 +74,12 @@ class Diagnosis(Result):
         gap = self.document.gap.validation
         return gap.before.all, gap.after.all
 
-    def save(self, folder: str | Path) -> tuple[Path, ...]:
-        """Write ``diagnosis.json``, ``report.html`` and, where effects were found, the new model ``model.yaml``.
-
-        Parameters
-        ----------
-        folder
-            Folder of the files; made if it does not exist.
-
-        Returns
-        -------
-        tuple of Path
-            The two or three files.
-        """
+    def _for_folder(self, folder: Path) -> tuple[Self, dict[Path, str]]:
         if self.robot == self.configured or self.document.model is not None:
-            return super().save(folder)
-        model = Path(folder) / "model.yaml"
-        write_atomically(model, robot_yaml(self.robot))
+            return self, {}
+        model = folder / "model.yaml"
         document = self.document.model_copy(update={"model": str(model)})
-        return *replace(self, document=document).save(folder), model
+        return replace(self, document=document), {model: robot_yaml(self.robot)}
 
     def _html(self) -> str:
         from armident.identify.report.diagnosis_report import diagnosis_report

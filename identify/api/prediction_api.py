@@ -5,7 +5,7 @@ import io
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +18,6 @@ from armident.identify.api.identification_api import Identification
 from armident.identify.api.result_base import Result
 from armident.identify.api.result_tables import Table
 from armident.identify.documents.base import reference, versions
-from armident.identify.documents.files import write_atomically
 from armident.identify.documents.prediction import PredictionDocument
 from armident.identify.effects.recording_corrections import corrected_experiments
 from armident.identify.identification.equations import equations, least_rows, published_equations
@@ -108,22 +107,8 @@ class TorquePrediction(Result):
         writer.writerows([[f"{v:.9g}" for v in row] for row in np.column_stack([self.t, values])])
         return stream.getvalue()
 
-    def save(self, folder: str | Path) -> tuple[Path, ...]:
-        """Write ``prediction.json``, ``report.html`` and ``torques.csv``.
-
-        Parameters
-        ----------
-        folder
-            Folder of the files; made if it does not exist.
-
-        Returns
-        -------
-        tuple of Path
-            The three files.
-        """
-        torques = Path(folder) / "torques.csv"
-        write_atomically(torques, self.csv())
-        return *super().save(folder), torques
+    def _for_folder(self, folder: Path) -> tuple[Self, dict[Path, str]]:
+        return self, {folder / "torques.csv": self.csv()}
 
     def _html(self) -> str:
         from armident.identify.report.prediction_report import prediction_report

@@ -3,7 +3,7 @@
 from abc import ABC, abstractmethod
 from html import escape
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 from pydantic import BaseModel
 
@@ -50,7 +50,7 @@ class Result(ABC):
         return file
 
     def save(self, folder: str | Path) -> tuple[Path, ...]:
-        """Write the document and ``report.html``.
+        """Write the document, ``report.html``, and ``torques.csv`` of a prediction or ``model.yaml`` of a diagnosis.
 
         Parameters
         ----------
@@ -60,11 +60,14 @@ class Result(ABC):
         Returns
         -------
         tuple of Path
-            The document, the report, and further files if there are any.
+            The document, the report, and the third file if there is one: a model that has new effects, or torques.
         """
         document = Path(folder) / self.file
-        write_atomically(document, self.to_json())
-        return document, self.report(Path(folder) / "report.html")
+        result, further = self._for_folder(Path(folder))
+        for file, text in further.items():
+            write_atomically(file, text)
+        write_atomically(document, result.to_json())
+        return document, result.report(Path(folder) / "report.html"), *further
 
     def __repr__(self) -> str:
         table = self._table()
@@ -73,6 +76,10 @@ class Result(ABC):
     def _repr_html_(self) -> str:
         table = self._table()
         return f"<p>{escape(self._summary())}</p>{'' if table is None else table._repr_html_()}"
+
+    def _for_folder(self, folder: Path) -> tuple[Self, dict[Path, str]]:
+        """Return the result as a folder shall hold it, and its further files with their text."""
+        return self, {}
 
     @abstractmethod
     def _html(self) -> str:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from armident.configs import ConfigError, DataError
+from armident.configs.errors import FOUND
 from armident.identify.diagnosis.diagnosis_options import DiagnosisOptions
 from armident.identify.documents.files import to_json, write_atomically
 from armident.identify.identification.options import Options
@@ -19,9 +20,6 @@ if TYPE_CHECKING:
 
 UNUSABLE = DataError.exit_code
 """Exit code: the data cannot support the request as they are configured, and the result says why."""
-
-FOUND = 4
-"""Exit code: done, with findings, a change, or an unexplained residual."""
 
 
 def identify_command(path: Path, config: Path | None, options: Options, out: Path | None, *, as_json: bool) -> int:

@@ -150,20 +150,20 @@ def integral_slopes(stretch: Stretch, structure: Structure, theta: Array, dt: fl
     for i, name in enumerate(names):
         if name[0] in inside:
             slopes[:, i] = share * level[name] * _late(inside[name[0]], structure.delay)[structure.lead :]
-    return low_pass(slopes, structure.pole(theta)) if structure.filtered == "command" else slopes
+    return pole_filter(slopes, structure.pole(theta)) if structure.filtered == "command" else slopes
 
 
 def simulate_law(stretch: Stretch, structure: Structure, theta: Array, dt: float) -> Array:
     """Torque of the law (N - lead,), N m or N, along measured motion; the initial integral is that of the best fit."""
     m, split = len(structure.names), structure.unfiltered
     u = columns(stretch, structure, theta, dt)
-    simulated: Array = u[:, :split] @ theta[:split] + low_pass(u[:, split:] @ theta[split:m], structure.pole(theta))
+    simulated: Array = u[:, :split] @ theta[:split] + pole_filter(u[:, split:] @ theta[split:m], structure.pole(theta))
     if structure.integral:
         simulated = simulated + np.mean(stretch.nu[structure.lead :] - simulated)
     return simulated
 
 
-def low_pass(x: Array, pole: float) -> Array:
+def pole_filter(x: Array, pole: float) -> Array:
     """``x / (1 - pole z^-1)`` along the first axis, from the steady state of its first sample."""
     if pole == 0.0 or x.size == 0:
         return x

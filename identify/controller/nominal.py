@@ -8,7 +8,8 @@ from armident.identify.robot.arm import ArmModel
 from armident.identify.robot.controller import DiscreteController
 
 STIFFNESS = 8.0
-"""Natural frequency of the nominal controller, over the closed-loop bandwidth of the robot."""
+"""Natural frequency of the nominal controller, over the closed-loop bandwidth of the robot: at that bandwidth the
+continuous loop leaves an error of ``1 / (1 + 8^2)``, 1.5 %."""
 
 HIGHEST = 0.3
 """Largest natural frequency times sampling period (rad); above it the sampled loop is poorly damped."""

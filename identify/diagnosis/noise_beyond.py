@@ -115,7 +115,4 @@ def _smooth_functions(column_cache: ColumnCache, motion: Motion, rows: int) -> l
 
 def _quantile_hats(values: Array, knots: int) -> Array:
     """Piecewise linear functions, one at their own knot and zero at the others; knots at quantiles of the values."""
-    places = np.unique(np.quantile(values, np.linspace(0, 1, knots)))
-    if places.size < 2:
-        return np.ones((values.size, 1))
-    return hats(values, places)
+    return hats(values, np.unique(np.quantile(values, np.linspace(0, 1, knots))))

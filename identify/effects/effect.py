@@ -155,6 +155,8 @@ class Effect(ABC):
         Signals at which the columns of the regressor and its instruments are computed.
     change_title
         Words for a change against a baseline, if base parameters absorb a part of the effect.
+    rigid_part
+        Part of an exported arm that holds the effect, by its first law: ``springs``, ``gravity``, ...; empty: none.
     """
 
     name: str
@@ -173,6 +175,7 @@ class Effect(ABC):
     regressor_signals: Signals = "measured"
     instrument_signals: Signals = "simulated"
     change_title: str = ""
+    rigid_part: str = ""
 
     @abstractmethod
     def columns(self, motion: Motion, place: Place, shapes: Mapping[str, float]) -> Array:

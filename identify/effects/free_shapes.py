@@ -15,11 +15,16 @@ KNOTS = 9
 
 
 def hats(x: Array, knots: Sequence[float] | Array) -> Array:
-    """Return piecewise linear functions (N, k), one at each of the increasing knots, constant beyond them."""
+    """Return piecewise linear functions (N, k), one at each of the increasing knots, constant beyond them.
+
+    They are all one where the knots coincide: those of a signal that never changes.
+    """
     at = np.asarray(knots, dtype=np.float64)
     if x.dtype == object:
         # Symbols in place of numbers: a formula is derived, see `armident.identify.model_export.formulas`.
         return np.array([symbol.hats(at) for symbol in x])
+    if not at[-1] > at[0]:
+        return np.ones((x.size, at.size))
     left = np.clip(np.searchsorted(at, x, side="right") - 1, 0, at.size - 2)
     share = np.clip((x - at[left]) / (at[left + 1] - at[left]), 0.0, 1.0)
     out, rows = np.zeros((x.size, at.size)), np.arange(x.size)

@@ -423,6 +423,7 @@ class CouplingFriction(Effect):
         Linear("fvc", VISCOUS, "Viscous friction shared by the two joints.", sign=1),
         Linear("fcc", TORQUE, "Coulomb friction of the sum of the two velocities.", sign=1),
     )
+    rigid_part = "couplings"
 
     def columns(self, motion: Motion, place: Place, shapes: Mapping[str, float]) -> Array:
         """Return acceleration and velocity of the other joint, and the sign of the common velocity."""

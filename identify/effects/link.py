@@ -26,6 +26,7 @@ class JointSpring(Effect):
     required_motion = "a wide range of joint positions"
     excitation = ("range",)
     linear: tuple[Linear, ...] = (Linear("ks", ("N m/rad", "N/m"), "Stiffness: torque per joint position."),)
+    rigid_part = "springs"
 
     def columns(self, motion: Motion, place: Place, shapes: Mapping[str, float]) -> Array:
         """Return the position."""
@@ -113,6 +114,7 @@ class RotorInertia(Effect):
     scope = "motor"
     linear = (Linear("iax", ("kg m^2", "kg"), "Motor inertia on the joint side beyond that of the model.", sign=1),)
     change_title = "motor inertia changed since the baseline"
+    rigid_part = "rotor inertia"
 
     def columns(self, motion: Motion, place: Place, shapes: Mapping[str, float]) -> Array:
         """Return the acceleration of the motor."""
@@ -141,6 +143,7 @@ class GravityDirection(TorqueDependent):
         Linear("tilt_y", ("rad", "rad"), "Tilt of gravity along the second axis across it (y axis of an upright arm)."),
     )
     change_title = "gravity direction changed since the baseline"
+    rigid_part = "gravity"
 
     def columns(self, motion: Motion, place: Place, shapes: Mapping[str, float]) -> Array:
         """Return those of gravity along `across`, in which the torque is linear; zeros without gravity."""

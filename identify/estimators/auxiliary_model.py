@@ -141,27 +141,6 @@ class AuxiliaryModel:
         """
         self._warnings.append(text)
 
-    def with_gear_ratios(self, share: float) -> Self:
-        """The loop simulated with gear ratios wrong by the factor ``share`` (thesis section 4.2.3).
-
-        Controller, reference and encoders are on the motor side. The simulated joints therefore move ``1 / share`` as
-        far as the real ones and receive ``share`` of the torques of the drives.
-
-        Parameters
-        ----------
-        share
-            Assumed over true gear ratio.
-        """
-        robot = self.model.robot
-        ratios = tuple(tuple(share * ratio for ratio in row) for row in robot.transmission_matrix.tolist())
-        return replace(
-            self.fresh(),
-            model=replace(self.model, robot=robot.model_copy(update={"transmission": ratios})),
-            references=[q_ref / share for q_ref in self.references],
-            initial=[(q / share, qd / share) for q, qd in self.initial],
-            max_velocity=self.max_velocity / share,
-        )
-
     def of_experiments(self, numbers: Sequence[int]) -> Self:
         """The loop of some of the experiments.
 

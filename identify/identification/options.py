@@ -1,12 +1,17 @@
 """Options of an identification."""
 
 from dataclasses import dataclass
-from typing import Literal, cast, get_args
+from typing import TYPE_CHECKING, Literal, cast, get_args
+
+from pydantic import TypeAdapter, ValidationError
 
 from armident.identify.command_options import documented, option
 from armident.identify.estimators.methods import METHODS, Method
 from armident.identify.regression.orders import MAX_AR_ORDER
 from armident.identify.signals.choices import NVR_RULES, DerivativesName, NvrRule
+
+if TYPE_CHECKING:
+    from armident.configs import SessionConfig
 
 ControllerName = Literal["crc", "parametric", "known"]
 CONTROLLERS: tuple[ControllerName, ...] = get_args(ControllerName)
@@ -91,3 +96,19 @@ class Options:
                 raise ConfigError(f"nvr: {self.nvr!r} is neither a number nor one of {', '.join(NVR_RULES)}")
         elif self.nvr is not None and not self.nvr > 0:
             raise ConfigError(f"nvr: expected a ratio above 0, got {self.nvr}")
+
+
+def options_of(session: "SessionConfig") -> Options:
+    """Return the options of the worker of a cell; a ConfigError names the key that is wrong."""
+    from armident.configs.errors import ConfigError
+
+    # The filters of a published fit are for a comparison with it, not for a cell.
+    given = {"derivatives": "irwsm"} | session.identification
+    try:
+        return TypeAdapter(Options).validate_python(given)
+    except ValidationError as error:
+        problem = error.errors()[0]
+        keys = ".".join(str(key) for key in ("identification", *problem["loc"]))
+        raise ConfigError(f"{keys}: {problem['msg']}") from error
+    except ConfigError as error:
+        raise ConfigError(f"identification.{error}") from error

@@ -103,14 +103,9 @@ def residual_statistics(
 
 def motion_functions(q: Array, qd: Array, limits: tuple[float, float], fastest: float) -> Array:
     """Free functions (M, k) of the motion (M,) of a joint, SI, with knots in ``limits`` and up to ``fastest``."""
-    place = _hats(q, np.linspace(*limits, POSITION_KNOTS))
+    place = hats(q, np.linspace(*limits, POSITION_KNOTS))
     direction = qd / np.hypot(qd, max(DIRECTION * fastest, 1e-300))
-    return np.hstack([place, place * direction[:, None], _hats(qd, np.linspace(-fastest, fastest, VELOCITY_KNOTS))])
-
-
-def _hats(x: Array, knots: Array) -> Array:
-    """Piecewise linear functions (M, k), each one at its knot; all one for a signal that never changes."""
-    return hats(x, knots) if knots[-1] > knots[0] else np.ones((x.size, knots.size))
+    return np.hstack([place, place * direction[:, None], hats(qd, np.linspace(-fastest, fastest, VELOCITY_KNOTS))])
 
 
 def band_powers(series: Sequence[Array], noise: ArModel) -> tuple[Array, Array]:

@@ -10,7 +10,7 @@ from scipy import linalg
 from armident.identify.identification.equations import Prepared
 from armident.identify.identification.identification_criteria import IdentificationCriteria
 from armident.identify.identification.identification_result import units
-from armident.identify.identification.verdict import listed
+from armident.identify.identification.verdict import enumerated
 from armident.identify.regression.ar_noise import ArModel
 from armident.identify.regression.equations import ExperimentEquations, filtered_regressor
 from armident.identify.regression.least_squares import RANK_TOLERANCE, Triangle
@@ -63,7 +63,7 @@ class Support:
             return count
         unit = units(model)
         values = [f"{model.base.names[k]} = {self.theta[k]:.3g} +- {self.std[k]:.1g} {unit[k]}" for k in found]
-        return f"{count}, each with what cannot be separated from it: {listed(values, criteria.max_listed)}"
+        return f"{count}, each with what cannot be separated from it: {enumerated(values, criteria.max_listed)}"
 
 
 def examine_support(

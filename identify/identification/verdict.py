@@ -79,7 +79,7 @@ def _setup_reasons(findings: Sequence[SetupFinding]) -> list[Reason]:
 
 def _not_understood(setup: SetupCheck) -> Reason:
     """Reason for joints that the rigid model does not explain with any hypothesis."""
-    joints, tried = listed(setup.joints_not_understood), _tried(setup)
+    joints, tried = enumerated(setup.joints_not_understood), _tried(setup)
     message = f"The rigid model leaves more than a third of the torque of {joints}{tried}"
     step = "check signs, order, units and gear ratios of the recording: armident check RECORDING"
     return Reason("unusable", message, step, kind="setup")
@@ -89,7 +89,7 @@ def _tried(setup: SetupCheck) -> str:
     return f" (tried: {', '.join(setup.tried)})" if setup.tried else ""
 
 
-def listed(names: Sequence[str], most: int = 12) -> str:
+def enumerated(names: Sequence[str], most: int = 12) -> str:
     """Return at least one name as a list in words, cut after ``most``."""
     shown = list(names[:most])
     if len(names) > most:

@@ -57,7 +57,7 @@ def write_fmu(model: ExportedModel, path: Path) -> tuple[list[Path], LimitationS
         f"{code.name}.h": code.render("model.h.jinja"),
         "fmu.c": code.render("fmu.c.jinja", **interface),
     }
-    library = compiled(sources, code.name)
+    library = shared_library(sources, code.name)
     contents: dict[str, str | bytes] = {
         "modelDescription.xml": code.render("modelDescription.xml.jinja", **interface),
         f"binaries/linux64/{code.name}.so": library,
@@ -96,7 +96,7 @@ def variables_of(model: ExportedModel) -> list[Variable]:
     return found
 
 
-def compiled(sources: dict[str, str], name: str) -> bytes:
+def shared_library(sources: dict[str, str], name: str) -> bytes:
     """Compile C sources by file name to a shared library; ConfigError without compiler or 64-bit Linux."""
     if (platform.system(), platform.machine()) != MACHINE:
         raise ConfigError(f"--format fmu: needs {' '.join(MACHINE)}; on other machines use --format c")

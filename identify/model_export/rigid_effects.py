@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from armident.identify.effects.link import across
+from armident.identify.effects.registry import known
 from armident.identify.model_export.exported_model import ExportedEffect, ExportedModel, JointCoupling
 
 SPRINGS = "springs"
@@ -46,12 +47,7 @@ def springs(model: ExportedModel) -> dict[int, float]:
 
 def _part(model: ExportedModel, effect: ExportedEffect) -> str | None:
     """Part of the model that holds an effect; ``None`` if none does."""
-    if effect.of_recording:
-        return None
-    if effect.effect == "rotor_inertia":
-        # A motor that turns with two joints couples them.
-        alone = np.count_nonzero(model.robot.transmission_matrix[effect.joint]) == 1
-        return "rotor inertia" if alone else None
-    if effect.effect == "joint_spring":
-        return SPRINGS if not effect.law and effect.parameters.get("ks", 0.0) > 0.0 else None
-    return {"coupling_friction": "couplings", "gravity_direction": "gravity"}.get(effect.effect)
+    part = "" if effect.of_recording or effect.law else known(effect.effect).rigid_part
+    # A motor that turns with two joints couples them; a spring that pushes away from its centre is none.
+    two = part == "rotor inertia" and np.count_nonzero(model.robot.transmission_matrix[effect.joint]) > 1
+    return None if not part or two or (part == SPRINGS and effect.parameters.get("ks", 0.0) <= 0.0) else part

@@ -20,7 +20,7 @@ from armident.identify.regression.equations import InstrumentedEquations
 from armident.identify.regression.fir import filter_columns
 from armident.identify.regression.least_squares import column_norms
 from armident.identify.regression.qr import triangularize, triangularize_parts
-from armident.identify.regression.whitening import columns_of, whitened
+from armident.identify.regression.whitening import nonzero_columns, whitened
 from armident.identify.signals.decimate import Decimation
 
 Array = NDArray[np.float64]
@@ -122,7 +122,7 @@ def serial_covariance(
         squares += np.einsum("ij,ij->j", rows, rows)
         cross += rows.T @ whitened([regressor], weights, [used])
         for j, (weight, ar) in enumerate(zip(weights, noise, strict=True)):
-            acting = columns_of(z[:, j])
+            acting = nonzero_columns(z[:, j])
             own = z[:, j, acting] * used[:, j, None] / weight.variance
             coloured = signal.lfilter([np.sqrt(ar.variance)], np.append(1.0, ar.coefficients), own[::-1], axis=0)
             meat[np.ix_(acting, acting)] += coloured.T @ coloured
@@ -161,8 +161,8 @@ class JointEquations:
     @classmethod
     def of(cls, blocks: Sequence[InstrumentedEquations], joint: int, *, copied: bool) -> "JointEquations":
         """Equations of a joint; ``copied``: columns side by side, faster to whiten many times."""
-        x = np.unique(np.concatenate([columns_of(b.x[:, joint]) for b in blocks]))
-        z = np.unique(np.concatenate([columns_of(b.z[:, joint]) for b in blocks]))
+        x = np.unique(np.concatenate([nonzero_columns(b.x[:, joint]) for b in blocks]))
+        z = np.unique(np.concatenate([nonzero_columns(b.z[:, joint]) for b in blocks]))
         parts = [Columns(b.x[:, joint], b.z[:, joint], b.y[:, joint], (x, z)) for b in blocks]
         keep = [None if b.keep[:, joint].all() else b.keep[:, joint] for b in blocks]
         return cls(x, z, tuple(part[:] if copied else part for part in parts), tuple(keep))

@@ -52,7 +52,7 @@ def joints_of(columns: Array) -> list[int]:
     return [int(j) for j in np.flatnonzero(_acting(columns))]
 
 
-def columns_of(values: Array) -> NDArray[np.int64]:
+def nonzero_columns(values: Array) -> NDArray[np.int64]:
     """Numbers of the columns of an array (M, k) that are not all zero."""
     return np.flatnonzero(_acting(values[:, :, None]))
 

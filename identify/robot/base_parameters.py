@@ -11,7 +11,7 @@ from scipy.linalg import solve_triangular
 from armident.configs import RobotConfig
 from armident.identify.robot.chain import Chain, Columns, Floats, Ints
 from armident.identify.robot.kernels import fill_regressor
-from armident.identify.robot.khalil import Form, evaluate, khalil_rules, lengths_of, text_of
+from armident.identify.robot.khalil import Form, coefficients_at, khalil_rules, lengths_of, text_of
 
 KEEP_FIRST = ("xx", "xy", "xz", "yz", "zz", "mx", "my", "m*", "fv", "fc", "off", "ia", "yy", "mz", "m")
 """Priority of columns within a link, first kept first (tables B.2 and B.3); ``m*`` is the mass at a prismatic joint."""
@@ -78,7 +78,7 @@ def base_parameters(robot: RobotConfig, chain: Chain, columns: Columns, names: t
     lengths = lengths_of(chain)
     where = {name: k for k, name in enumerate(names)}
     candidates = np.array([where[name] for name in forms], dtype=np.int64)
-    rules = np.array([evaluate(form, lengths, names) for form in forms.values()]).reshape(-1, len(names))
+    rules = np.array([coefficients_at(form, lengths, names) for form in forms.values()]).reshape(-1, len(names))
     kept, mixing = independent_columns(robot, chain, columns, names, candidates)
     formulas: dict[str, str] = {}
     final = []

@@ -66,7 +66,7 @@ def khalil_rules(robot: RobotConfig, chain: Chain, names: tuple[str, ...]) -> di
     return {name: forms[name] for name in sorted(forms, key=order.__getitem__)}
 
 
-def evaluate(form: Form, lengths: Mapping[str, float], names: tuple[str, ...]) -> Floats:
+def coefficients_at(form: Form, lengths: Mapping[str, float], names: tuple[str, ...]) -> Floats:
     """Coefficients (p,) of a linear form at given lengths, m, from `lengths_of`."""
     row = np.zeros(len(names))
     for k, name in enumerate(names):

@@ -12,7 +12,7 @@ SMALLEST_EIGENVALUE = 1e-6
 """Ratio of smallest to largest eigenvalue above which a mass matrix counts as positive definite."""
 
 MOST_HALVINGS = 30
-"""Maximum number of halvings of a step; after these the previous iterate is kept."""
+"""Maximum number of halvings of a step, which leave 1e-9 of it; after these the previous iterate is kept."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -28,7 +28,7 @@ RUNAWAY = 10.0
 
 
 NEAR_STANDSTILL = 4.0
-"""``g |qd|`` below which the slope of the smoothed sign changes noticeably within a sample."""
+"""``g |qd|`` up to which the slope of the smoothed sign counts: it is ``1 / 17`` of that at rest there."""
 
 STEPS_PER_UNIT = 4.0
 """Integration steps per unit change of ``g qd`` within one sample near standstill."""

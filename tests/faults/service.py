@@ -38,13 +38,14 @@ from armident.daq.streaming import Block, Keys, encode_event, open_session
 from armident.daq.streaming.codec import end_content, start_content
 from armident.identify.documents.files import load_document
 from armident.identify.documents.identification import IdentificationDocument
+from armident.identify.identification.options import options_of
 from armident.identify.monitoring.change.history import History, recorded_at
 from armident.identify.monitoring.reidentify.identify_once import identify_once
 from armident.identify.monitoring.reidentify.keep import HistoryEntry
 from armident.identify.monitoring.reidentify.publish import StatusPublisher
 from armident.identify.monitoring.worker.ledger import FILE, Ledger
 from armident.identify.monitoring.worker.recorded import Captured, captured_in
-from armident.identify.monitoring.worker.worker import Worker, options_of
+from armident.identify.monitoring.worker.worker import Worker
 from tests.fixtures import arms
 
 BLOCK_ROWS = 500

@@ -21,7 +21,7 @@ from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.monitoring.recursive.block_order import LONGEST_HOLD_S, BlockOrder
 from armident.identify.monitoring.recursive.estimator import RecursiveEstimator
 from armident.identify.monitoring.recursive.live_watch import LiveWatch, live_estimator
-from armident.identify.monitoring.recursive.replay import blocks_of
+from armident.identify.monitoring.recursive.recorded_blocks import blocks_of
 from armident.identify.monitoring.recursive.saved_state import state_of
 from armident.identify.monitoring.recursive.watch import WatchOptions, watch_cell, watch_recordings
 from armident.identify.monitoring.worker.stream_buffer import LARGEST_BLOCK

@@ -15,7 +15,7 @@ from armident.configs.urdf_tree import read_chain
 from armident.identify.effects.terms import arm_model
 from armident.identify.robot.base_parameters import independent_columns
 from armident.identify.robot.chain import chain_of, columns_of, standard_names
-from armident.identify.robot.khalil import evaluate, khalil_rules, lengths_of
+from armident.identify.robot.khalil import coefficients_at, khalil_rules, lengths_of
 from tests.pinocchio_oracle import TO_OURS, Floats, pinocchio_model, random_parameters, random_robot
 from tests.urdf_chains import configuration, link_frames, random_urdf
 
@@ -139,7 +139,7 @@ def assert_rules_and_qr_agree(robot: RobotConfig) -> None:
     kept, mixing = independent_columns(robot, chain, columns_of(robot, names), names)
     assert list(forms) == [names[k] for k in kept]
     lengths = lengths_of(chain)
-    rules = np.array([evaluate(form, lengths, names) for form in forms.values()])
+    rules = np.array([coefficients_at(form, lengths, names) for form in forms.values()])
     assert np.abs(rules - mixing).max() < 1e-7
 
 

@@ -32,6 +32,7 @@ from armident.identify.signals.bandpass import butterworth, central_difference
 from armident.identify.signals.choices import NvrRule
 from armident.identify.signals.decimate import Decimation, design
 from armident.identify.signals.differentiate import Derivatives, differentiate, encoder_resolution
+from tests.reproduction.gear_ratios import with_gear_ratios
 from tests.reproduction.recordings import Recorded
 from tests.reproduction.reference import essential_names
 from tests.reproduction.subset import restricted_to
@@ -234,7 +235,7 @@ class Laboratory:
             max_velocity=RUNAWAY * np.abs(motion.qd).max(axis=0) + SLOWEST,
             midway=case.midway,
         )
-        return loop if case.gear_ratio == 1.0 else loop.with_gear_ratios(case.gear_ratio)
+        return loop if case.gear_ratio == 1.0 else with_gear_ratios(loop, case.gear_ratio)
 
     def run(self, method: Method, case: Case) -> Run:
         """Return the estimate of a method in a case.

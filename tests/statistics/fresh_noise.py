@@ -16,7 +16,7 @@ from armident.configs import RobotConfig
 from armident.daq.recording import Recording
 from armident.identify.monitoring.recursive.equations import EARLIER, Instant, StreamEquations
 from armident.identify.monitoring.recursive.estimator import RecursiveEstimator
-from armident.identify.monitoring.recursive.replay import blocks_of
+from armident.identify.monitoring.recursive.recorded_blocks import blocks_of
 from armident.identify.monitoring.recursive.rows import RowMatcher
 from armident.virtual_robot.noise import DISTURBANCE_HZ, Noise, amplitudes
 from armident.virtual_robot.servo import control_period

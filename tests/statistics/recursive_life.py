@@ -23,7 +23,7 @@ from armident.daq.recording import Recording
 from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.identification.identify_recording import identify_recording
 from armident.identify.monitoring.recursive.estimator import RecursiveEstimator
-from armident.identify.monitoring.recursive.replay import blocks_of
+from armident.identify.monitoring.recursive.recorded_blocks import blocks_of
 from armident.virtual_robot.offline import simulate_recording
 from tests.fixtures import arms
 from tests.statistics.fresh_noise import FreshNoise, Motion, MotionRecorder, held, repeat

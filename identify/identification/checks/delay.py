@@ -6,7 +6,7 @@ from armident.identify.estimators.reason import Reason
 from armident.identify.identification.checks.judged import Judged
 from armident.identify.identification.identification_criteria import IdentificationCriteria
 from armident.identify.identification.torque_delay import HELD
-from armident.identify.identification.verdict import listed
+from armident.identify.identification.verdict import enumerated
 
 
 def delay(judged: Judged, criteria: IdentificationCriteria) -> list[Reason]:
@@ -23,6 +23,6 @@ def delay(judged: Judged, criteria: IdentificationCriteria) -> list[Reason]:
     if not late:
         return []
     names = [joint.name for joint, wrong in zip(robot.joints, off, strict=True) if wrong]
-    message = f"The torque belongs to the position some samples later ({listed(late)}; expected is {HELD})"
+    message = f"The torque belongs to the position some samples later ({enumerated(late)}; expected is {HELD})"
     step = "check the clocks of drives and capture; time_delay is an effect that the configuration can contain"
     return [Reason("doubtful", message, step, names[0] if len(names) == 1 else None, "delay")]

@@ -7,7 +7,7 @@ from armident.identify.identification.checks.judged import Judged
 from armident.identify.identification.identification_criteria import IdentificationCriteria
 from armident.identify.identification.identification_result import relative_torque_errors
 from armident.identify.identification.moving_joints import MOVE
-from armident.identify.identification.verdict import listed
+from armident.identify.identification.verdict import enumerated
 from armident.identify.regression.ar_noise import whiteness
 from armident.identify.regression.equations import residuals
 
@@ -32,7 +32,7 @@ def error(judged: Judged, criteria: IdentificationCriteria) -> list[Reason]:
         (noisy if white else wrong).append(j)
 
     def reason(level: Level, at: list[int], more: str, step: str = step) -> Reason:
-        shares = listed([f"{joints[j].name} ({errors[j]:.3g} %)" for j in at])
+        shares = enumerated([f"{joints[j].name} ({errors[j]:.3g} %)" for j in at])
         message = f"The model leaves more than {limits[at].min():.0f} % of the torque of {shares}{more}"
         return Reason(level, message, step, joints[at[0]].name if len(at) == 1 else None, "error")
 

@@ -10,7 +10,7 @@ from armident.identify.estimators.reason import Level, Reason
 from armident.identify.identification.checks.judged import Judged
 from armident.identify.identification.identification_criteria import IdentificationCriteria
 from armident.identify.identification.moving_joints import FARTHEST, MOVE
-from armident.identify.identification.verdict import listed
+from armident.identify.identification.verdict import enumerated
 from armident.identify.robot.arm import ArmModel
 from armident.identify.signals.experiments import Experiment
 
@@ -41,13 +41,13 @@ def excitation(judged: Judged, criteria: IdentificationCriteria) -> list[Reason]
     parts = []
     if not support.moving.all():
         resting = [name for name, moves in zip(names, support.moving, strict=True) if not moves]
-        parts.append(f"{listed(resting)} {'does' if len(resting) == 1 else 'do'} not move")
+        parts.append(f"{enumerated(resting)} {'does' if len(resting) == 1 else 'do'} not move")
     if weak.any():
         shares = [
             f"{names[j]} (inertia +- {_percent(max(inertia[j], anywhere[j]))}, gravity +- {_percent(gravity[j])})"
             for j in np.flatnonzero(weak)
         ]
-        parts.append(f"inertia or gravity torque is undetermined at {listed(shares)}")
+        parts.append(f"inertia or gravity torque is undetermined at {enumerated(shares)}")
     message = f"The motion does not determine the whole model: {'; '.join(parts)}; {support.sentence(model, criteria)}"
     level: Level = "unusable" if unknown.sum() > model.n / 2 else "doubtful"
     return [Reason(level, message, MOVE, kind="excitation")]

@@ -11,7 +11,7 @@ from armident.identify.identification.checks.judged import Judged
 from armident.identify.identification.identification_criteria import IdentificationCriteria
 from armident.identify.identification.identification_result import relative_torque_errors, units
 from armident.identify.identification.support import NON_NEGATIVE
-from armident.identify.identification.verdict import listed
+from armident.identify.identification.verdict import enumerated
 from armident.identify.robot.arm import ArmModel
 from armident.identify.robot.consistent import nearest_base
 
@@ -60,7 +60,7 @@ def physics(judged: Judged, criteria: IdentificationCriteria) -> list[Reason]:
     wrong = (errors[1] > criteria.max_joint_error_pct) & (own[1] <= criteria.max_joint_error_pct)
     if wrong.any():
         left = [f"{errors[1][j]:.0f} % at {names[j]}" for j in np.flatnonzero(wrong)]
-        message += f". No possible arm explains the torques: the nearest one leaves {listed(left)}"
+        message += f". No possible arm explains the torques: the nearest one leaves {enumerated(left)}"
         return [Reason("unusable", message, CHECK_SIGNALS, kind="physics")]
     message += f". The nearest possible arm leaves {errors[0]:.3g} % of the torques, the estimate {own[0]:.3g} %"
     return [Reason("doubtful", message, USE_NEAREST, kind="physics")]
@@ -89,7 +89,7 @@ def _negative(model: ArmModel, theta: Array, covariance: Array, criteria: Identi
     ]
     found.sort(key=lambda k: theta[k] / std[k])
     values = [f"{rigid[k]} = {theta[k]:.3g} +- {std[k]:.1g} {unit[k]}" for k in found]
-    return [f"negative {listed(values, 3)}"] if values else []
+    return [f"negative {enumerated(values, 3)}"] if values else []
 
 
 def _indefinite(

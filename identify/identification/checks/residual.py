@@ -5,7 +5,7 @@ from armident.identify.estimators.reason import Reason
 from armident.identify.identification.checks.judged import Judged
 from armident.identify.identification.identification_criteria import IdentificationCriteria
 from armident.identify.identification.motion_dependence import motion_dependence
-from armident.identify.identification.verdict import listed
+from armident.identify.identification.verdict import enumerated
 
 DIAGNOSE = "look for a missing effect: armident diagnose RECORDING"
 
@@ -27,7 +27,7 @@ def residual(judged: Judged, criteria: IdentificationCriteria) -> list[Reason]:
     coloured = [j for j in diagnostics.joints if j.joint in names and not j.white]
     parts, step = [], DIAGNOSE
     if coloured:
-        parts.append(f"serially correlated at {listed([j.joint for j in coloured])}")
+        parts.append(f"serially correlated at {enumerated([j.joint for j in coloured])}")
     dependent = [
         d
         for d in dependences
@@ -41,7 +41,7 @@ def residual(judged: Judged, criteria: IdentificationCriteria) -> list[Reason]:
         cause = (
             "friction, its smoothed sign or an effect is not as modelled" if friction else "the model misses an effect"
         )
-        parts.append(f"they depend on {listed(shares)}, so {cause} there")
+        parts.append(f"they depend on {enumerated(shares)}, so {cause} there")
         step = f"adjust friction.sign_smoothing, or {DIAGNOSE}" if friction else DIAGNOSE
     parts += [reason.message for reason in known if reason.kind == "residual"]
     reasons = []
@@ -66,6 +66,6 @@ def instruments(judged: Judged, criteria: IdentificationCriteria) -> list[Reason
     weak = diagnostics.weak_instruments
     if not weak:
         return []
-    of = f"all {parameters} parameters" if len(weak) == parameters else listed(weak, criteria.max_listed)
+    of = f"all {parameters} parameters" if len(weak) == parameters else enumerated(weak, criteria.max_listed)
     message = f"The instruments of {of} are weak: the estimate may be biased like least squares"
     return [Reason("doubtful", message, "record the reference if it is missing, or move faster", kind="instruments")]

@@ -7,13 +7,11 @@ from pathlib import Path
 import numpy as np
 
 from armident.configs import ConfigError
+from armident.configs.errors import FOUND
 from armident.identify.documents.files import load_document
 from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.monitoring.change.change_test import Inconclusive, ParameterChangeTest, compare
 from armident.identify.monitoring.change.history import History, HistoryRun, recorded_at
-
-DRIFTED = 4
-"""Exit code: done, and the last run differs significantly from the first."""
 
 
 def history_command(
@@ -29,7 +27,7 @@ def history_command(
 ) -> int:
     """Carry out ``armident history``: add documents, compare runs with the first one, plot parameters.
 
-    ``robot``: default that of the documents, or the only one. Returns 0 or `DRIFTED`. Raises ConfigError if an option
+    ``robot``: default that of the documents, or the only one. Returns 0 or `FOUND`. Raises ConfigError if an option
     or the database is wrong, DataError if a document is wrong or of another model.
     """
     loaded = [(load_document(path, IdentificationDocument), path) for path in documents]
@@ -50,7 +48,7 @@ def history_command(
     else:
         _table(title, runs, drifts, parameters)
     last = drifts[-1]
-    return DRIFTED if last is not None and last.drifted else 0
+    return FOUND if last is not None and last.drifted else 0
 
 
 def _compared(first: HistoryRun, run: HistoryRun, false_alarms: float) -> ParameterChangeTest | None:

@@ -23,7 +23,8 @@ A shift of an eighth of the range would be one knot of the functions of position
 
 RANK = 1e-3
 """Eigenvalue of the information of normalised functions, relative to the largest, below which a combination of
-functions is left out: base parameters explain it, or the motion does not show it."""
+functions is left out: base parameters explain it, or the motion does not show it. Its standard deviation is more than
+thirty times that of the best determined one."""
 
 NOT_COMPARED = (
     "structure is not compared: the baseline has no statistics of the residuals; "

@@ -8,13 +8,15 @@ from armident.identify.monitoring.recursive.settings import RecursiveSettings
 Array = NDArray[np.float64]
 
 SPREAD_WINDOWS = 50.0
-"""Memory of the spread of successive windows, in windows."""
+"""Memory of the spread of successive windows, in windows: of so many squares it is known to 20 %."""
 SPREAD_PRIOR = 10.0
-"""Weight of the expected spread at the start, in windows."""
+"""Weight of the expected spread at the start, in windows: the first one moves the spread by at most 0.74."""
 LARGEST_SQUARE = 9.0
-"""Largest squared difference of two windows, in variances: a step in friction is no spread."""
+"""Largest squared difference of two windows, in variances (three standard deviations): a step in friction is no
+spread."""
 LEVEL_STD = 0.01
-"""Standard deviation of a window from which on it moves the level with its full weight, 1."""
+"""Standard deviation of a window from which on it moves the level with its full weight, 1: half of
+`RecursiveSettings.excitation_std`."""
 
 
 class FrictionTest:

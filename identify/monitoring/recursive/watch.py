@@ -15,18 +15,17 @@ from rich.console import Console
 from rich.live import Live
 
 from armident.configs import ConfigError, DataError, RobotConfig, load_robot, load_session
+from armident.configs.errors import FOUND
 from armident.daq.recording import read_recording
 from armident.identify.documents.files import load_document
 from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.monitoring.recursive.estimator import RecursiveEstimator, RecursiveResult
 from armident.identify.monitoring.recursive.live_watch import SAVED_S, LiveWatch, Watch, live_estimator
-from armident.identify.monitoring.recursive.replay import blocks_of, has_reference
+from armident.identify.monitoring.recursive.recorded_blocks import blocks_of, has_reference
 from armident.identify.monitoring.recursive.report import document, friction_table, joint_states
 
 log = logging.getLogger(__name__)
 
-FOUND = 4
-"""Exit code after an alarm."""
 REPLAY_SYNCS = 1000
 """SYNCs per block of a replay."""
 

@@ -11,24 +11,22 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from armident.configs import ArmidentError, ConfigError, DataError, RobotConfig, load_robot
+from armident.configs.errors import FOUND
 from armident.daq.recording import Recording, read_recording
 from armident.extras import install_line
 from armident.identify.documents.files import from_json, load_document, to_json
 from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.identification.identify_recording import identify_recording
-from armident.identify.identification.options import Options
+from armident.identify.identification.options import Options, options_of
 from armident.identify.monitoring.change.change_test import ParameterChangeTest, compare
 from armident.identify.monitoring.change.history import History
 from armident.identify.monitoring.reidentify.reidentify_options import ReidentifyOptions
 from armident.identify.monitoring.reidentify.summary import change_lines
-from armident.identify.monitoring.worker.worker import options_of
 from armident.identify.report.robot_file import write_identification
 
 if TYPE_CHECKING:
     from distributed import Client
 
-DRIFTED, FAILED = 4, 1
-"""Exit codes: an arm has changed; no arm has changed, but a recording could not be identified."""
 CONNECT_S = 10.0
 """Longest wait for the scheduler, s."""
 
@@ -60,7 +58,7 @@ class Row:
 def fleet_command(pattern: str, asked: ReidentifyOptions, *, as_json: bool) -> int:
     """Carry out ``armident reidentify --recordings``; a failed recording does not stop the others.
 
-    Each is compared with the baseline, or the first run of the arm (robot and cell). Returns 0, `DRIFTED` or `FAILED`.
+    Each is compared with the baseline, or the first run of the arm (robot and cell). Returns 0, `FOUND` or 1.
     Raises ConfigError if nothing matches, or there are no workers.
     """
     paths = [Path(name).resolve() for name in sorted(glob.glob(pattern, recursive=True))]
@@ -85,8 +83,8 @@ def fleet_command(pattern: str, asked: ReidentifyOptions, *, as_json: bool) -> i
     if as_json:
         print(json.dumps({"runs": [_entry(row) for row in rows]}, indent=1))
     if any(row.drift is not None and row.drift.drifted for row in rows):
-        return DRIFTED
-    return FAILED if any(row.error for row in rows) else 0
+        return FOUND
+    return ArmidentError.exit_code if any(row.error for row in rows) else 0
 
 
 @contextmanager

@@ -53,7 +53,7 @@ class HistoryEntry:
 
 
 @contextmanager
-def kept(entry: HistoryEntry, say: Say) -> Iterator[None]:
+def recorded_in_history(entry: HistoryEntry, say: Say) -> Iterator[None]:
     """Write an entry before the block, and try a refused one again after it, also if it ends with an error."""
     written = entry.write_or_say(say)
     try:

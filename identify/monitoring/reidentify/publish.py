@@ -11,7 +11,7 @@ from armident.configs import ConfigError, RobotConfig, SessionConfig
 from armident.daq.streaming import Announcer, Keys, open_session
 from armident.daq.streaming.announcer import longest_retry_s
 from armident.daq.streaming.zenoh_session import configuration
-from armident.identify.monitoring.worker.status_messages import failure_status, status
+from armident.identify.monitoring.worker.status_messages import failure_status, status_message
 
 log = logging.getLogger(__name__)
 
@@ -45,7 +45,7 @@ class StatusPublisher:
 
     def status(self, state: str, **more: Any) -> None:
         """Publish the state of the job, with further keys."""
-        self._put(self._keys.status, status("reidentify", state, **more))
+        self._put(self._keys.status, status_message("reidentify", state, **more))
 
     def failure(self, message: str, name: str, sha256: str) -> None:
         """Publish why a recording cannot be identified. ``name``, ``sha256``: name of the recording and its hash."""

@@ -19,6 +19,7 @@ from armident.configs import (
     load_session,
     load_trajectory,
 )
+from armident.configs.errors import FOUND
 from armident.daq.recording import Recording
 from armident.identify.documents.diagnosis import DiagnosisDocument
 from armident.identify.documents.files import from_json, to_json
@@ -26,19 +27,17 @@ from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.effects.terms import arm_model
 from armident.identify.excitation.point_to_point import sample_trajectory
 from armident.identify.excitation.previous_estimate import previous_estimate
+from armident.identify.identification.options import options_of
 from armident.identify.monitoring.change.change_test import Inconclusive, ParameterChangeTest, compare
 from armident.identify.monitoring.reidentify.baseline import Baseline, baseline_of
 from armident.identify.monitoring.reidentify.identify_once import identify_once
-from armident.identify.monitoring.reidentify.keep import HistoryEntry, history_or_reason, kept
+from armident.identify.monitoring.reidentify.keep import HistoryEntry, history_or_reason, recorded_in_history
 from armident.identify.monitoring.reidentify.publish import StatusPublisher
 from armident.identify.monitoring.reidentify.record_run import Say, record_run, start_process
 from armident.identify.monitoring.reidentify.reidentify_options import ReidentifyOptions
 from armident.identify.monitoring.reidentify.summary import change_lines, finding_lines
-from armident.identify.monitoring.worker.worker import options_of
 from armident.processes import Start
 
-DRIFTED = 4
-"""Exit code: done, and the arm has changed."""
 CHECK_PERIOD = 1e-3
 """Sampling period of predicted torques, s."""
 DIAGNOSIS_S = 3600.0
@@ -80,7 +79,7 @@ class Outcome:
 
 
 def reidentify_command(asked: ReidentifyOptions, *, as_json: bool) -> int:
-    """Carry out ``armident reidentify`` without ``--recordings``; returns 0 or `DRIFTED`.
+    """Carry out ``armident reidentify`` without ``--recordings``; returns 0 or `FOUND`.
 
     Raises ConfigError, DataError or ArmidentError if an input is wrong, or motion or identification fail.
     """
@@ -101,7 +100,7 @@ def reidentify_command(asked: ReidentifyOptions, *, as_json: bool) -> int:
         print(json.dumps(entry(job, outcome), indent=1))
     else:
         show(job, outcome)
-    return DRIFTED if outcome.changed else 0
+    return FOUND if outcome.changed else 0
 
 
 def prepare(config: Path, baseline: Path | None, store: str, out: Path | None, false_alarms: float) -> Job:
@@ -176,7 +175,7 @@ def carry_out(job: Job, announcer: StatusPublisher, say: Say, start: Start = sta
         drift = None if job.baseline.document is None else compare(job.baseline.document, document, job.false_alarms)
     except Inconclusive as error:
         return _unexpected(job, recording, document, path, str(error), announcer, say)
-    with kept(HistoryEntry(job.store, recording, document, path, job.baseline.document, drift), say):
+    with recorded_in_history(HistoryEntry(job.store, recording, document, path, job.baseline.document, drift), say):
         return _concluded(job, recording, document, path, drift, announcer, say)
 
 
@@ -222,7 +221,7 @@ def _unexpected(
     # The diagnosis decides what the comparison left open.
     defect = defect.removesuffix(": whether the arm has changed is unknown")
     unknown = DataError(f"{recording.path}: {defect}: whether the arm has changed is unknown (result: {path})")
-    with kept(HistoryEntry(job.store, recording, document, path), say):
+    with recorded_in_history(HistoryEntry(job.store, recording, document, path), say):
         if job.baseline.document is None:
             raise unknown
         say(f"{defect}; diagnosing")
@@ -253,7 +252,7 @@ def _diagnosed(job: Job, recording: Recording, outcome: Outcome, say: Say) -> Ou
             timeout=DIAGNOSIS_S,
             check=False,
         )
-        if done.returncode not in (0, DRIFTED):
+        if done.returncode not in (0, FOUND):
             raise DataError((done.stderr.strip().splitlines() or [f"exit code {done.returncode}"])[-1])
         document = from_json(done.stdout, DiagnosisDocument, "diagnosis")
     except (subprocess.TimeoutExpired, ArmidentError) as error:

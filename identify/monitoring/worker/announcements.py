@@ -2,7 +2,7 @@
 
 from armident.daq.streaming import Keys
 from armident.identify.monitoring.worker.ledger import Ledger, LedgerEntry
-from armident.identify.monitoring.worker.status_messages import failure_status, status
+from armident.identify.monitoring.worker.status_messages import failure_status, status_message
 from armident.identify.monitoring.worker.worker_link import LinkDown, WorkerLink
 from armident.identify.monitoring.worker.worker_receiver import content_hash
 
@@ -37,7 +37,7 @@ class Announcements:
                 if document is None:
                     self._link.announce((self._keys.status, failure_status("worker", message, entry.name, sha256)))
                 else:
-                    done = status(
+                    done = status_message(
                         "worker", "done", result=str(entry.result), verdict=message, capture=entry.name, sha256=sha256
                     )
                     self._link.announce((self._keys.identification, document), (self._keys.status, done))

@@ -23,7 +23,7 @@ from armident.configs.reasons import reason_of
 FILE = "worker.sqlite"
 """Name of the ledger in the folder of the results."""
 LEASE_S = 6.0
-"""Time after which a claim ends that is not renewed, s."""
+"""Time after which a claim ends that is not renewed, s: six renewals of a worker."""
 BUSY_S = 10.0
 """Longest wait for another process that writes the ledger, s."""
 MOST_ATTEMPTS = 12

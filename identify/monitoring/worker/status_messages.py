@@ -3,11 +3,11 @@
 import json
 
 
-def status(component: str, state: str, **more: object) -> bytes:
+def status_message(component: str, state: str, **more: object) -> bytes:
     """Return a message for the key of the status."""
     return json.dumps({"component": component, "state": state, **more}).encode()
 
 
 def failure_status(component: str, message: str, name: str, sha256: str) -> bytes:
     """Return the announcement that a recording cannot be identified."""
-    return status(component, "failed", message=message, capture=name, sha256=sha256)
+    return status_message(component, "failed", message=message, capture=name, sha256=sha256)

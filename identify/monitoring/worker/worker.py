@@ -11,13 +11,11 @@ from pathlib import Path
 from types import FrameType
 from typing import TypeVar
 
-from pydantic import TypeAdapter, ValidationError
-
-from armident.configs import ArmidentError, ConfigError, DataError, RobotConfig, SessionConfig, load_robot, load_session
+from armident.configs import ArmidentError, DataError, RobotConfig, SessionConfig, load_robot, load_session
 from armident.configs.reasons import reason_of
 from armident.daq.streaming import Keys
 from armident.identify.identification.identify_recording import identify_recording
-from armident.identify.identification.options import Options
+from armident.identify.identification.options import options_of
 from armident.identify.monitoring.worker.announcements import Announcements
 from armident.identify.monitoring.worker.intake import Intake
 from armident.identify.monitoring.worker.ledger import (
@@ -55,18 +53,6 @@ T = TypeVar("T")
 
 class _Closing(Exception):
     """The worker is being closed while it waits."""
-
-
-def options_of(session: SessionConfig) -> Options:
-    """Options of the worker of a cell; a ConfigError names the key that is wrong."""
-    # The filters of a published fit are for a comparison with it, not for a cell.
-    given = {"derivatives": "irwsm"} | session.identification
-    try:
-        return TypeAdapter(Options).validate_python(given)
-    except ValidationError as error:
-        problem = error.errors()[0]
-        keys = ".".join(str(key) for key in ("identification", *problem["loc"]))
-        raise ConfigError(f"session of cell {session.cell}: {keys}: {problem['msg']}") from error
 
 
 class Worker:

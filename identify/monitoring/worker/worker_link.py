@@ -11,7 +11,7 @@ from armident.configs import ArmidentError, ConfigError, SessionConfig
 from armident.daq.streaming import Announcer, Keys, open_session
 from armident.daq.streaming.announcer import longest_retry_s
 from armident.daq.streaming.zenoh_session import configuration
-from armident.identify.monitoring.worker.status_messages import status
+from armident.identify.monitoring.worker.status_messages import status_message
 from armident.identify.monitoring.worker.worker_receiver import Take, WorkerReceiver
 
 log = logging.getLogger(__name__)
@@ -86,7 +86,7 @@ class WorkerLink:
 
     def status(self, state: str, **more: Any) -> None:
         """Publish the state of the worker if there is a session. ``more``: further entries."""
-        content = status("worker", state, **more)
+        content = status_message("worker", state, **more)
         with self._lock:
             if self._session is None:
                 return

@@ -6,19 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armident.virtual_robot.drawn_parameters import log_uniform
+from tests.evaluation.plants import slots
 from tests.evaluation.plants.arm import Arm, Generator
 from tests.evaluation.plants.halves import Ranges
-from tests.evaluation.plants.slots import (
-    CONTROLLERS,
-    FEEDFORWARD,
-    FILTER,
-    KI,
-    KP,
-    KV,
-    LIMIT,
-    ONE_LOOP,
-    WINDOW,
-)
 
 Floats = NDArray[np.float64]
 ControllerKind = Literal["cascade", "pid", "feed_forward", "filtered"]
@@ -41,25 +31,25 @@ def random_controller(rng: Generator, arm: Arm, kind: ControllerKind, ranges: Ra
     (n, .).
     """
     n = arm.n
-    table = np.zeros((n, len(CONTROLLERS)))
+    table = np.zeros((n, len(slots.CONTROLLERS)))
     natural = 2.0 * np.pi * log_uniform(rng, ranges.bandwidth, n)
     damping = rng.uniform(0.7, 1.1, n)
     proportional, rate = arm.diagonal * natural**2, 2.0 * damping * natural * arm.diagonal
-    table[:, WINDOW] = max(round(WINDOW_S / step), 1)
-    table[:, FILTER] = 1.0
-    table[:, LIMIT] = LIMIT_FACTOR * arm.scale
+    table[:, slots.WINDOW] = max(round(WINDOW_S / step), 1)
+    table[:, slots.FILTER] = 1.0
+    table[:, slots.LIMIT] = LIMIT_FACTOR * arm.scale
     if kind == "pid":
-        table[:, KP], table[:, KV], table[:, ONE_LOOP] = proportional, rate, 1.0
-        table[:, KI] = proportional * rng.uniform(0.3, 1.5)
+        table[:, slots.KP], table[:, slots.KV], table[:, slots.ONE_LOOP] = proportional, rate, 1.0
+        table[:, slots.KI] = proportional * rng.uniform(0.3, 1.5)
         return table
-    table[:, KV] = rate
-    table[:, KP] = proportional / rate
+    table[:, slots.KV] = rate
+    table[:, slots.KP] = proportional / rate
     if rng.random() < 0.5:
-        table[:, KI] = rate * rng.uniform(0.5, 3.0)
+        table[:, slots.KI] = rate * rng.uniform(0.5, 3.0)
     if kind == "feed_forward":
-        table[:, FEEDFORWARD] = rng.uniform(0.7, 1.0)
+        table[:, slots.FEEDFORWARD] = rng.uniform(0.7, 1.0)
     if kind == "filtered":
-        table[:, FILTER] = 1.0 - np.exp(-2.0 * np.pi * FILTER_HZ * rng.uniform(0.7, 1.5) * step)
+        table[:, slots.FILTER] = 1.0 - np.exp(-2.0 * np.pi * FILTER_HZ * rng.uniform(0.7, 1.5) * step)
     return table
 
 
@@ -68,4 +58,4 @@ def finest_needed(arm: Arm, control: Floats) -> Floats:
 
     ``control``: table of the controller.
     """
-    return np.asarray(CHATTER * arm.scale * WINDOW_S / (control[:, KV] * control[:, FILTER]))
+    return np.asarray(CHATTER * arm.scale * WINDOW_S / (control[:, slots.KV] * control[:, slots.FILTER]))

@@ -245,6 +245,9 @@ def session_with(tmp_path: Path, **changes: object) -> Path:
         ("drives", lambda d: [*d[:-1], d[-1] | {"joint": "wrist"}], "'wrist' is not a joint of tx40.yaml"),
         ("drives", lambda d: [*d[:-1], d[-1] | {"eds": "no.eds"}], "drives[5].eds: no such file no.eds"),
         ("sync", {"period_us": 20}, "sync.period_us: input should be greater than or equal to 100, found 20"),
+        ("identification", {"method": "best"}, "cell.yaml: identification.method: Input should be"),
+        ("identification", {"methods": "idim-ls"}, "identification.methods: Unexpected keyword argument"),
+        ("identification", {"max_ar_order": -1}, "cell.yaml: identification.max_ar_order: expected 0 or more, got -1"),
     ],
 )
 def test_a_session_that_cannot_work_is_refused_with_its_key(

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from armident.configs import ConfigError, DataError, load_robot
-from armident.daq.interchange.exporting import columns, export_recording
+from armident.daq.interchange.exporting import export_recording, exported_columns
 from armident.daq.interchange.importing import import_recording
 from armident.daq.recording import Recording, read_recording, write_recording
 
@@ -50,7 +50,7 @@ def test_export_converts_the_coupled_wrist_to_the_joints(tmp_path: Path) -> None
     motors[:, 1:7] = q @ TX40.transmission_matrix.T
     motors[:, 7:] = tau @ np.linalg.inv(TX40.transmission_matrix)
     recording = import_recording(write_csv(tmp_path / "m.csv", motors), TX40, motor_side=True)
-    out = columns(recording)
+    out = exported_columns(recording)
     assert np.allclose(np.column_stack([out[f"q{j}"] for j in range(1, 7)]), q, rtol=0, atol=1e-12)
     assert np.allclose(np.column_stack([out[f"tau{j}"] for j in range(1, 7)]), tau, rtol=0, atol=1e-12)
 
@@ -233,7 +233,7 @@ def test_a_recording_without_samples_is_not_exported(tmp_path: Path) -> None:
         "samples", 1, samples.sync[:0], samples.t_ns[:0], samples.fields, {k: v[:0] for k, v in samples.raw.items()}
     )
     with pytest.raises(DataError, match="no samples"):
-        columns(Recording(None, TX40, None, 1000.0, {"samples": empty}))
+        exported_columns(Recording(None, TX40, None, 1000.0, {"samples": empty}))
 
 
 def test_columns_of_different_lengths_are_refused_by_name(tmp_path: Path) -> None:

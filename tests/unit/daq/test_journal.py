@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from armident.daq.capture.clock import clock_state
-from armident.daq.capture.journal import entry
+from armident.daq.capture.journal import journal_entry
 
 LOG = """
 import logging
@@ -98,7 +98,7 @@ def test_records_are_plain_lines_if_the_journal_does_not_answer(tmp_path: Path) 
 
 def test_a_long_message_is_cut_to_fit_into_a_datagram() -> None:
     record = logging.makeLogRecord({"levelno": logging.INFO})
-    assert len(entry(record, "x" * 1_000_000, {})) < 10_000
+    assert len(journal_entry(record, "x" * 1_000_000, {})) < 10_000
 
 
 @pytest.mark.parametrize(
@@ -106,12 +106,12 @@ def test_a_long_message_is_cut_to_fit_into_a_datagram() -> None:
     [(logging.DEBUG, "7"), (logging.INFO, "6"), (logging.WARNING, "4"), (logging.ERROR, "3"), (logging.CRITICAL, "2")],
 )
 def test_levels_become_priorities_of_syslog(level: int, priority: str) -> None:
-    assert parsed(entry(logging.makeLogRecord({"levelno": level}), "text", {}))["PRIORITY"] == priority
+    assert parsed(journal_entry(logging.makeLogRecord({"levelno": level}), "text", {}))["PRIORITY"] == priority
 
 
 def test_fields_of_a_record_precede_those_of_the_handler() -> None:
     record = logging.makeLogRecord({"levelno": logging.INFO, "cell": "own"})
-    assert parsed(entry(record, "text", {"cell": "press_7"}))["ARMIDENT_CELL"] == "own"
+    assert parsed(journal_entry(record, "text", {"cell": "press_7"}))["ARMIDENT_CELL"] == "own"
 
 
 def test_the_kernel_gives_the_state_of_its_clock() -> None:

@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from armident.configs import ConfigError, DataError
 from armident.daq.cli import application
-from armident.daq.interchange.exporting import columns, export_recording
+from armident.daq.interchange.exporting import export_recording, exported_columns
 from armident.daq.interchange.importing import import_recording
 from armident.daq.interchange.rosbag import TOPIC, JointStates, read_joint_states, write_joint_states
 from armident.daq.recording import Recording, read_recording, write_recording
@@ -268,7 +268,7 @@ def test_an_exported_capture_comes_back_with_the_same_numbers(tmp_path: Path) ->
     np.testing.assert_array_equal(back.samples.sync, made.samples.sync)
     assert [(gap.first, gap.last) for gap in back.gaps] == [(50, 52)]
     assert "source_remarks" not in back.metadata
-    before, after = columns(capture), columns(back)
+    before, after = exported_columns(capture), exported_columns(back)
     for name in before:
         np.testing.assert_allclose(after[name], before[name], rtol=1e-12)
 

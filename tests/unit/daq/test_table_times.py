@@ -76,8 +76,15 @@ def test_steps_below_a_nanosecond_are_no_clock(tmp_path: Path, step: float, repe
     values = motion(500, 1000.0)
     values[:, 0] = np.arange(500) // repeats * step
     path = written(tmp_path / "a.csv", values, cell="{:.17g}")
-    with pytest.raises(DataError, match=r"shorter than 1 ns.*--time-unit"):
-        import_recording(path, TX40)
+    for rate in (None, 1000.0):
+        with pytest.raises(DataError, match=r"shorter than 1 ns.*--time-unit"):
+            import_recording(path, TX40, resample_hz=rate)
+
+
+def test_times_of_less_than_a_period_are_not_resampled(tmp_path: Path) -> None:
+    values = motion(500, 1e6)
+    with pytest.raises(DataError, match=r"span 0.000499 s, less than a period of --resample 1000; .*--time-unit"):
+        import_recording(written(tmp_path / "a.csv", values, cell="{:.17g}"), TX40, resample_hz=1000.0)
 
 
 def test_slow_motion_and_low_rates_are_seconds(tmp_path: Path) -> None:

@@ -9,9 +9,9 @@ from typer.testing import CliRunner, Result
 
 import armident
 from armident.configs import DataError
+from armident.configs.errors import FOUND
 from armident.daq.cli import application
 from armident.daq.recording import write_recording
-from armident.identify.cli.result_commands import FOUND
 from armident.identify.documents.diagnosis import DiagnosisDocument
 from armident.identify.documents.files import load_document
 from armident.identify.signals.experiments import Experiment, check_one_rate

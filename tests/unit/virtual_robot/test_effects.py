@@ -19,6 +19,7 @@ from armident.virtual_robot.effects import CATALOGUE, EFFECTS, OUTSIDE, describe
 from armident.virtual_robot.effects.forces import CODES, effect_torque, force_table
 from armident.virtual_robot.inertias import rest_posture
 from armident.virtual_robot.plant import Plant
+from tests.statistics.twin_effects import SIZES
 
 cli = typer.Typer()
 cli.command()(robot_command)
@@ -34,41 +35,7 @@ def emps() -> RobotConfig:
     return load_robot("emps.yaml")
 
 
-EXAMPLES: dict[str, dict[str, float]] = {
-    "asymmetric_viscous_friction": {"fva": 0.2},
-    "asymmetric_coulomb_friction": {"fca": 0.2},
-    "stribeck_friction": {"extra": 2.0},
-    "nonlinear_viscous_friction": {"thinning": 0.3},
-    "load_dependent_friction": {"fcl": 0.1},
-    "presliding_friction": {"deflection": 1e-3},
-    "position_dependent_friction": {"ratio": 0.3},
-    "friction_drift": {"change": 0.3},
-    "coupling_friction": {"coulomb": 1.0},
-    "cogging_torque": {"amplitude": 0.5, "harmonic": 2.0},
-    "joint_spring": {"stiffness": 5.0},
-    "joint_elasticity": {"stiffness": 5e3},
-    "backlash": {"gap": 1e-3},
-    "payload": {"mass": 1.0},
-    "rotor_inertia": {"inertia": 0.1},
-    "gravity_direction": {"tilt": 0.1},
-    "drive_gain_error": {"error": 0.1},
-    "drive_gain_saturation": {"drop": 0.1},
-    "sign_error": {},
-    "joint_order": {},
-    "time_delay": {"delay": 3e-3},
-    "encoder_eccentricity": {"amplitude": 1e-3},
-    "actuator_bandwidth": {"time_constant": 5e-3},
-    "torque_offset": {"torque": 1.0},
-    "torque_bump": {"torque": 2.0},
-    "mains_ripple": {"amplitude": 1.0},
-    "slosh_payload": {"mass": 0.5},
-    "current_crosstalk": {"share": 0.1},
-    "stick_events": {"torque": 2.0},
-    "quadratic_coupling": {"coefficient": 0.5},
-    "base_vibration": {"amplitude": 0.5},
-    "friction_scale": {"factor": 1.3},
-}
-"""A value of the required parameter of each effect."""
+LIMITS = {joint.name: joint.limits for joint in load_robot("tx40.yaml").joints}
 
 HEALTHY = (
     0.04804163140280711, 0.14355670318505015, 1.8563242080086155,
@@ -114,7 +81,7 @@ def test_without_hidden_effects_the_arm_moves_as_it_always_did(tx40: RobotConfig
 
 
 def test_every_effect_of_the_catalogue_can_be_hidden_and_at_least_five_outside_it() -> None:
-    assert set(EXAMPLES) == set(EFFECTS)
+    assert set(SIZES) == set(EFFECTS)
     assert not set(CATALOGUE) & set(OUTSIDE)
     assert len(OUTSIDE) >= 5
     assert {e for e in EFFECTS if EFFECTS[e].target == "force"} == {*CODES, "coupling_friction"}
@@ -123,7 +90,7 @@ def test_every_effect_of_the_catalogue_can_be_hidden_and_at_least_five_outside_i
 def test_a_scenario_needs_one_number_per_effect_at_most() -> None:
     for name, effect in EFFECTS.items():
         required = {key for key, parameter in effect.parameters.items() if parameter.default is None}
-        assert required == set(EXAMPLES[name]) - {"harmonic"}
+        assert required <= set(SIZES[name](LIMITS["joint_1"]))
         assert len(required) <= 1
 
 
@@ -138,7 +105,7 @@ def test_the_list_of_effects_names_every_parameter_with_its_unit() -> None:
 @pytest.mark.parametrize("effect", sorted(set(CODES) - {"quadratic_coupling", "load_dependent_friction"}))
 @pytest.mark.parametrize("joint", ["joint_1", "joint_6"])
 def test_a_hidden_torque_acts_on_its_joint_alone(tx40: RobotConfig, effect: str, joint: str) -> None:
-    plant, healthy = with_effect(tx40, effect, joint, EXAMPLES[effect]), Plant(tx40, np.zeros(6))
+    plant, healthy = with_effect(tx40, effect, joint, SIZES[effect](LIMITS[joint])), Plant(tx40, np.zeros(6))
     q, qd = np.full(6, 0.05), np.full(6, 0.1)
     extra = [plant.resistance(q, qd, t) - healthy.resistance(q, qd, t) for t in np.arange(0.5, 2.0, 0.01)]
     largest = np.abs(extra).max(axis=0)
@@ -156,7 +123,7 @@ def torque_and_slope(code: int, row: NDArray[np.float64], qd: float) -> tuple[fl
 @pytest.mark.parametrize("effect", CODES)
 def test_the_slope_of_a_hidden_torque_is_its_derivative(tx40: RobotConfig, effect: str) -> None:
     other = "joint_2" if effect == "quadratic_coupling" else None
-    hidden = hidden_effects(scenario((effect, "joint_1", other, EXAMPLES[effect])), tx40)
+    hidden = hidden_effects(scenario((effect, "joint_1", other, SIZES[effect](LIMITS["joint_1"]))), tx40)
     row = force_table(hidden, tx40, np.array([[5.0, 8.0, 0.0]] * 6))[0]
     step = 1e-6
 

@@ -6,7 +6,7 @@ import pytest
 
 from armident.virtual_robot.effects import EFFECTS
 from tests.fixtures.other_arms import write_scara
-from tests.statistics.twin_effects import ROBOTS, RUN_AWAY, SIZES, VISIBLE, change, needs_two_joints, twin
+from tests.statistics.twin_effects import ROBOTS, RUN_AWAY, VISIBLE, change, needs_two_joints, twin
 
 PLACES = {"panda": (3, 1), "kuka_lwr4": (1, 3), "scara": (2, 1)}
 """Joint of the effect, from 0, and the other joint of an effect between two; the lift of the SCARA is prismatic."""
@@ -37,8 +37,3 @@ def test_an_effect_changes_the_signals_of_every_shipped_robot(effect: str, robot
     size, peak = change(Path(robot), effect, min(1, n - 1), min(2, n - 1))
     assert peak < RUN_AWAY
     assert size > VISIBLE
-
-
-@pytest.mark.slow
-def test_every_effect_has_a_size() -> None:
-    assert set(SIZES) == set(EFFECTS)

@@ -14,6 +14,7 @@ from armident.virtual_robot.effects import EFFECTS, hidden_effects
 from armident.virtual_robot.effects.signals import Signals
 from armident.virtual_robot.offline import simulate_recording
 from armident.virtual_robot.plant import Plant, pin
+from tests.statistics.twin_effects import SIZES
 from tests.unit.hidden import hide
 
 PERIOD = 200e-6
@@ -226,23 +227,13 @@ def test_wrong_signs_and_names_change_the_recording_and_nothing_else(tx40: Robot
         np.testing.assert_array_equal(wires[key], healthy[key][:, order] if key == "effort" else healthy[key])
 
 
-EXAMPLES: dict[str, float] = {
-    "asymmetric_viscous_friction": 0.3, "asymmetric_coulomb_friction": 0.3, "stribeck_friction": 2.0,
-    "nonlinear_viscous_friction": 0.3, "load_dependent_friction": 0.2, "presliding_friction": 1e-3,
-    "position_dependent_friction": 0.5, "friction_drift": 2.0, "coupling_friction": 2.0, "cogging_torque": 2.0,
-    "joint_spring": 50.0, "joint_elasticity": 1e4, "backlash": 1e-3, "payload": 2.0, "rotor_inertia": 0.2,
-    "gravity_direction": 0.1, "drive_gain_error": 0.1, "drive_gain_saturation": 0.2, "time_delay": 3e-3,
-    "encoder_eccentricity": 1e-3, "actuator_bandwidth": 5e-3, "torque_offset": 2.0, "torque_bump": 5.0,
-    "mains_ripple": 2.0, "slosh_payload": 1.0, "current_crosstalk": 0.2, "stick_events": 5.0,
-    "quadratic_coupling": 2.0, "base_vibration": 1.0, "friction_scale": 1.3,
+ON_EMPS = {
+    "asymmetric_viscous_friction": {"fva": 0.3 * 203.5}, "payload": {"mass": 2.0}, "slosh_payload": {"mass": 1.0},
 }  # fmt: skip
-"""Clearly visible value of the required parameter of each effect."""
-ON_EMPS = EXAMPLES | {
-    "asymmetric_viscous_friction": 0.3 * 203.5, "asymmetric_coulomb_friction": 0.3 * 20.39,
-    "presliding_friction": 1e-4, "backlash": 1e-4, "rotor_inertia": 10.0,
-}  # fmt: skip
-CASES = [("tx40", effect) for effect in sorted(EXAMPLES)]
-CASES += [("emps", effect) for effect in sorted(EXAMPLES) if EFFECTS[effect].other != "required"]
+"""Sizes that show on an axis of 95 kg with much friction."""
+NEED_SIZE = [name for name in sorted(SIZES) if None in (p.default for p in EFFECTS[name].parameters.values())]
+CASES = [("tx40", effect) for effect in NEED_SIZE]
+CASES += [("emps", effect) for effect in NEED_SIZE if EFFECTS[effect].other != "required"]
 
 
 @pytest.fixture(scope="module")
@@ -261,13 +252,10 @@ def test_every_effect_shows_in_a_recording_and_leaves_the_arm_under_control(
 ) -> None:
     robot, healthy = {"tx40": tx40, "emps": emps}[name], quiet[name]
     pair = EFFECTS[effect].other == "required"
-    needed = next(key for key, parameter in EFFECTS[effect].parameters.items() if parameter.default is None)
-    options = {needed: (EXAMPLES if name == "tx40" else ON_EMPS)[effect]}
-    if effect == "torque_bump":
-        options["position"] = 0.02 if robot.n == 1 else 0.1
-    if effect == "stick_events":
-        options["every"] = 0.3
     joint = "joint_1" if EFFECTS[effect].first_joint or robot.n == 1 else "joint_2"
+    options = SIZES[effect](next(each.limits for each in robot.joints if each.name == joint))
+    if name == "emps":
+        options = ON_EMPS.get(effect, options)
     hidden = record(robot, hide(effect, joint, "joint_3" if pair else None, **options), noise=0.0)
     inside = slice(len(healthy["effort"]) // 5, None)
     shown = np.abs(hidden["effort"] - healthy["effort"])[inside].max(axis=0)

@@ -21,7 +21,7 @@ def tx40() -> RobotConfig:
 
 def test_solving_again_gives_the_stored_link_parameters(tx40: RobotConfig) -> None:
     stored = inertias.plant_parameters(tx40)
-    for name, value in inertias.solve().items():
+    for name, value in inertias.solve_inertias().items():
         # The solver stops at a relative gap of 1e-8; only values that are fixed by table B.4 are that sharp.
         assert stored[name] == pytest.approx(value, abs=1e-4), name
 

@@ -207,7 +207,7 @@ def test_current_of_the_tx40s_drives_is_the_law_of_figure_b_1(feedback: bool) ->
     robot = load_robot("tx40")
     recording = simulate_recording(robot, short(), seed=0, noise=0.0, settle=0.1, velocity_feedback=feedback)
     q, wanted, current = motor_side(recording)
-    kp, kv = servo.gains(robot, Plant(robot, short().start).mass_matrix())
+    kp, kv = servo.cascade_gains(robot, Plant(robot, short().start).mass_matrix())
     error = wanted - q
     keep = np.exp(-2 * np.pi * servo.VELOCITY_FILTER_HZ * servo.CONTROL_PERIOD)
     change = np.diff(-q if feedback else error, axis=0, prepend=(-q if feedback else error)[:1])
@@ -229,7 +229,7 @@ def test_velocity_feedback_lags_behind_by_the_velocity_over_kp() -> None:
         recording = simulate_recording(robot, short(), seed=0, noise=0.0, settle=0.1, velocity_feedback=feedback)
         q, wanted, _ = motor_side(recording)
         errors.append((wanted - q)[middle].mean(axis=0))
-    kp, _ = servo.gains(robot, Plant(robot, short().start).mass_matrix())
+    kp, _ = servo.cascade_gains(robot, Plant(robot, short().start).mass_matrix())
     qd = (wanted[middle.stop] - wanted[middle.start]) / (250 * servo.CONTROL_PERIOD)
     np.testing.assert_allclose(errors[0] - errors[1], qd / kp, rtol=0.1, atol=0.05)
 

@@ -21,7 +21,7 @@ from armident.identify.signals.differentiate import Derivatives, differentiate
 from armident.identify.signals.experiments import Experiment
 from armident.virtual_robot.inertias import plant_parameters
 from armident.virtual_robot.plant import Plant
-from armident.virtual_robot.servo import CONTROL_PERIOD, VELOCITY_FILTER_HZ, gains
+from armident.virtual_robot.servo import CONTROL_PERIOD, VELOCITY_FILTER_HZ, cascade_gains
 from tests.fixtures.arms import recording
 
 pytestmark = pytest.mark.slow
@@ -64,7 +64,7 @@ def identified_tx40(noise: float) -> IdentifiedController:
 @pytest.mark.parametrize(("noise", "tolerance"), [(0.0, 1e-3), (1.0, 0.01)])
 def test_gains_of_the_virtual_drives_come_out(noise: float, tolerance: float) -> None:
     experiment = recorded(noise)
-    kp, kv = gains(robot(), Plant(robot(), experiment.q[0]).mass_matrix())
+    kp, kv = cascade_gains(robot(), Plant(robot(), experiment.q[0]).mass_matrix())
     laws = [law for law in identified_tx40(noise).responses if isinstance(law, ControlLaw)]
     np.testing.assert_allclose([value(law, "kp") for law in laws], kp, rtol=tolerance)
     np.testing.assert_allclose([value(law, "kv") for law in laws], kv, rtol=tolerance)

@@ -18,6 +18,7 @@ from armident.identify.estimators.sensitivity import sensitivity
 from armident.identify.estimators.sep_pem import sep_pem
 from armident.identify.regression.ar_noise import whiteness
 from armident.identify.regression.equations import Estimate
+from tests.reproduction.gear_ratios import with_gear_ratios
 from tests.unit.two_joint_arm import Recorded, masked, model, recorded, start
 
 Start = NDArray[np.float64]
@@ -175,7 +176,7 @@ def smoothed_positions(estimate: Estimate) -> list[float]:
 
 def test_wrong_gear_ratios_in_the_simulator_move_didim_and_not_idim_iv() -> None:
     data = recorded(torque_noise=1.0)
-    wrong = data.loop.with_gear_ratios(0.8)
+    wrong = with_gear_ratios(data.loop, 0.8)
     viscous = [model().base.names.index(name) for name in ("fv1", "fv2")]
     iv, moved = idim_iv(data.blocks, wrong, start()), didim(data.blocks, wrong, start())
     assert (np.abs(iv.theta - data.truth) < 4 * iv.std).all()

@@ -32,6 +32,7 @@ from armident.virtual_robot.inertias import plant_parameters
 from armident.virtual_robot.offline import simulate_recording
 from armident.virtual_robot.plant import Plant
 from tests.fixtures.arms import recording, trajectory
+from tests.reproduction.gear_ratios import with_gear_ratios
 
 pytestmark = pytest.mark.slow
 
@@ -104,7 +105,7 @@ def recorded(noise: float, steps: int = 1) -> Recorded:
 def drives() -> DiscreteController:
     """The law of the virtual drives: ``kv (kp e + de/dt)``, the derivative through a first-order filter."""
     robot, period = load_robot("tx40"), servo.CONTROL_PERIOD
-    kp, kv = servo.gains(robot, Plant(robot, np.zeros(robot.n)).mass_matrix())
+    kp, kv = servo.cascade_gains(robot, Plant(robot, np.zeros(robot.n)).mass_matrix())
     share = 1 - math.exp(-2 * math.pi * servo.VELOCITY_FILTER_HZ * period)
     gain = kv * np.array([joint.drive.gain for joint in robot.joints])
     error = np.stack([gain * (kp + share / period), -gain * (kp * (1 - share) + share / period)], axis=1)
@@ -143,7 +144,7 @@ def test_idim_iv_and_didim_agree_within_three_standard_deviations() -> None:
 
 def test_gear_ratios_at_80_percent_in_the_simulator_move_didim_by_20_percent_and_idim_iv_not_at_all() -> None:
     data = recorded(1.0)
-    wrong = data.loop.with_gear_ratios(0.8)
+    wrong = with_gear_ratios(data.loop, 0.8)
     iv, moved = idim_iv(data.blocks, wrong, cad()), didim(data.blocks, wrong, cad())
     assert iv.converged
     assert moved.converged

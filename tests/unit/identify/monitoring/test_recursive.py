@@ -21,8 +21,8 @@ from armident.identify.monitoring.recursive.equations import EARLIER, Instant, S
 from armident.identify.monitoring.recursive.estimator import RecursiveEstimator
 from armident.identify.monitoring.recursive.kernels import solve, update
 from armident.identify.monitoring.recursive.noise import RunningNoise
+from armident.identify.monitoring.recursive.recorded_blocks import RecordedBlock, blocks_of
 from armident.identify.monitoring.recursive.reference import torque_lead
-from armident.identify.monitoring.recursive.replay import RecordedBlock, blocks_of
 from armident.identify.monitoring.recursive.saved_state import state_of
 from armident.identify.monitoring.recursive.settings import RecursiveSettings
 from armident.virtual_robot.noise import amplitudes

@@ -5,7 +5,7 @@ import pytest
 from numpy.typing import NDArray
 
 from armident.identify.regression.ar_noise import LEAST_VARIANCE, ArModel, ar_models, fit_ar
-from armident.identify.regression.whitening import columns_of, joints_of, rows_of_joints, whitened, whitened_series
+from armident.identify.regression.whitening import joints_of, nonzero_columns, rows_of_joints, whitened, whitened_series
 
 Array = NDArray[np.float64]
 
@@ -93,7 +93,7 @@ def test_series_no_longer_than_the_filter_have_no_rows() -> None:
 def test_columns_are_those_with_a_number_that_is_not_zero() -> None:
     values = np.zeros((50, 4))
     values[49, 1], values[0, 3] = 1e-300, np.nan
-    np.testing.assert_array_equal(columns_of(values), [1, 3])
+    np.testing.assert_array_equal(nonzero_columns(values), [1, 3])
 
 
 def test_joints_are_those_with_a_number_that_is_not_zero() -> None:
