@@ -4,7 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg, optimize
+from scipy import optimize
+from scipy.linalg import lapack
 
 from armident.identify.setup.bench import Bench
 
@@ -177,11 +178,14 @@ def physical_least_squares(gram: Array, right: Array, physical: Array) -> Array:
     """
     scale = np.sqrt(np.diag(gram))
     scale[scale <= 1e-12 * scale.max(initial=0.0)] = np.inf
-    lower = linalg.cholesky(gram / np.outer(scale, scale) + RIDGE * np.eye(scale.size), lower=True)
-    free = linalg.solve_triangular(lower, right / scale, lower=True)
-    limits = linalg.solve_triangular(lower, (physical / scale).T, lower=True)
+    # LAPACK itself: scipy's checks of the arguments take as long, thousands of times in a search.
+    lower, failed = lapack.dpotrf(gram / np.outer(scale, scale) + RIDGE * np.eye(scale.size), lower=1)
+    if failed:
+        raise np.linalg.LinAlgError("the normal equations are not positive definite")
+    free = lapack.dtrtrs(lower, right / scale, lower=1)[0]
+    limits = lapack.dtrtrs(lower, (physical / scale).T, lower=1)[0]
     limits /= np.maximum(np.linalg.norm(limits, axis=0), 1e-300)
     if np.any(limits.T @ free < 0):
         free = free + limits @ optimize.nnls(limits, -free)[0]
-    theta: Array = linalg.solve_triangular(lower.T, free, lower=False) / scale
+    theta: Array = lapack.dtrtrs(lower, free, lower=1, trans=1)[0] / scale
     return theta
