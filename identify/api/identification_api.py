@@ -194,8 +194,7 @@ def identify(
     robot
         Configuration to use, or the path or shipped name of one; by default the one inside the first recording.
     method
-        ``idim-piv`` (thesis section 6.2, the default), ``idim-iv`` (2.3.3), ``idim-ls`` (2.3.1), ``didim``, ``clie``,
-        ``cloe`` or ``sep-pem``.
+        Estimator, by default ``idim-piv`` (thesis section 6.2); ``armident identify --help`` lists all.
     derivatives
         ``irwsm``, ``irwsm2`` or ``bandpass``; by default IRWSM of order 1 (thesis chapter 5).
     controller

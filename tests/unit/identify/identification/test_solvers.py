@@ -129,7 +129,7 @@ def test_unweighted_least_squares_is_another_estimate_of_the_same() -> None:
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        ({"method": "idim"}, "method: 'idim' is not one of idim-piv, idim-iv, idim-ls, didim, clie, cloe, sep-pem"),
+        ({"method": "idim"}, f"method: 'idim' is not one of {', '.join(METHODS)}"),
         ({"controller": "pid"}, "controller: 'pid' is not one of crc, parametric, known"),
         ({"noise_model": "white"}, "noise_model: 'white' is not one of black-box, grey-box"),
         ({"nvr": parse_nvr("likelyhood")}, "nvr: 'likelyhood' is neither a number nor one of automatic"),
