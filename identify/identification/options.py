@@ -3,8 +3,6 @@
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal, cast, get_args
 
-from pydantic import TypeAdapter, ValidationError
-
 from armident.identify.command_options import documented, option
 from armident.identify.estimators.methods import METHODS, Method
 from armident.identify.regression.orders import MAX_AR_ORDER
@@ -100,6 +98,8 @@ class Options:
 
 def options_of(session: "SessionConfig") -> Options:
     """Return the options of the worker of a cell; a ConfigError names the key that is wrong."""
+    from pydantic import TypeAdapter, ValidationError
+
     from armident.configs.errors import ConfigError
 
     # The filters of a published fit are for a comparison with it, not for a cell.
