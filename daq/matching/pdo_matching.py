@@ -162,21 +162,19 @@ def count_sync(
     for i in range(count):
         if can_id[i] == sync_id:
             counter = int(np.int64(data[i, 0] & np.uint64(0xFF))) if length[i] > 0 and overflow > 0 else -1
-            total += max(
-                0,
-                advance(
-                    bus_state,
-                    m.sync_times,
-                    m.send_times,
-                    m.sends_known,
-                    bus,
-                    counter,
-                    t_ns[i],
-                    period_ns,
-                    overflow,
-                    longest,
-                ),
+            step = advance(
+                bus_state,
+                m.sync_times,
+                m.send_times,
+                m.sends_known,
+                bus,
+                counter,
+                t_ns[i],
+                period_ns,
+                overflow,
+                longest,
             )
+            total += max(0, step)
     return int(total)
 
 
@@ -199,17 +197,9 @@ def match(
             counter = int(np.int64(data[i, 0] & np.uint64(0xFF))) if length[i] > 0 and overflow > 0 else -1
             last = m.bus_state[bus, SYNC]
             step = advance(
-                m.bus_state,
-                m.sync_times,
-                m.send_times,
-                m.sends_known,
-                bus,
-                counter,
-                t_ns[i],
-                period_ns,
-                overflow,
-                longest,
-            )
+                m.bus_state, m.sync_times, m.send_times, m.sends_known,
+                bus, counter, t_ns[i], period_ns, overflow, longest,
+            )  # fmt: skip
             if step <= 0:
                 misaligned = last < 0 and step < 0
                 m.counts[SYNC_MISALIGNED if misaligned else SYNC_REPEATED] += 1

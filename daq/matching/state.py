@@ -40,7 +40,7 @@ BALANCE, BALANCE_AT, BALANCE_RUN, IN_STEP_RUN, COUNTED_AT, STALE, HELD_AT, BALAN
 
 OPEN: Any = np.bool_(False)
 FINAL: Any = np.bool_(True)
-"""Whether more answers follow. For each constant of Python's bool, numba would compile a function again."""
+"""State of a drive's rows: answers may follow, or not. As Python's bool, each would compile its own functions."""
 
 ALIGNED_SYNCS = 8
 """Number of consecutive rows with unchanged balance after which a drive counts as answering every SYNC.

@@ -155,17 +155,9 @@ def _step_by_send_time(
 
 @compiled(**UNCOUNTED)
 def _step_by_counter(
-    buses: Any,
-    sync_times: Any,
-    send_times: Any,
-    sends_known: Any,
-    bus: int,
-    counter: int,
-    t_ns: int,
-    period_ns: int,
-    overflow: int,
-    longest: int,
-) -> int:
+    buses: Any, sync_times: Any, send_times: Any, sends_known: Any,
+    bus: int, counter: int, t_ns: int, period_ns: int, overflow: int, longest: int,
+) -> int:  # fmt: skip
     """Return the advance of a bus whose last and present SYNC have a counter."""
     elapsed = (t_ns - buses[bus, TIME]) / period_ns if buses[bus, TIME] != NEVER else 0.0
     step = (counter - buses[bus, COUNTER]) % overflow
@@ -195,20 +187,13 @@ def _step_by_counter(
 
 @compiled(**UNCOUNTED)
 def advance(
-    buses: Any,
-    sync_times: Any,
-    send_times: Any,
-    sends_known: Any,
-    bus: int,
-    counter: int,
-    t_ns: int,
-    period_ns: int,
-    overflow: int,
-    longest: int,
-) -> int:
+    buses: Any, sync_times: Any, send_times: Any, sends_known: Any,
+    bus: int, counter: int, t_ns: int, period_ns: int, overflow: int, longest: int,
+) -> int:  # fmt: skip
     """Number a received SYNC, update ``buses``, and return the advance of its bus; nothing changes at zero or less.
 
-    ``buses``: ``bus_state`` of ``m``, or a copy. ``counter``: -1 if it has none. ``t_ns``: receive time, ns UTC.
+    ``buses``: ``bus_state``, or a copy; with three arrays of the state, which as a whole takes longer to pass.
+    ``counter``: -1 if it has none. ``t_ns``: receive time, ns UTC.
     ``longest``: largest advance with whole counter turns, SYNCs.
     """
     if buses[bus, SYNC] < 0 and buses[bus, COUNTER] < 0:
