@@ -156,11 +156,9 @@ def identification_table(document: IdentificationDocument) -> None:
         highlight=False,
         soft_wrap=True,
     )
-    console.print(
-        f"{document.iterations} iterations{residuals}",
-        highlight=False,
-        soft_wrap=True,
-    )
+    for line in (document.transition_sentence, f"{document.iterations} iterations{residuals}"):
+        if line:
+            console.print(line, highlight=False, soft_wrap=True)
 
 
 def diagnosis_table(document: DiagnosisDocument) -> None:
@@ -188,6 +186,11 @@ def diagnosis_table(document: DiagnosisDocument) -> None:
         console.print(
             f"unexplained: {u.joint}, {100 * u.share_of_residual:.0f} % of its residual varies with {u.varies_with}",
             highlight=False,
+        )
+    if document.transitions:
+        found = ", ".join(f"{joint} {1e3 * velocity:.3g}" for joint, velocity in document.transitions.items())
+        console.print(
+            f"dry friction reverses over a velocity of (mrad/s, mm/s): {found}", highlight=False, soft_wrap=True
         )
     if document.recommended_experiment is not None:
         console.print(f"next experiment: {document.recommended_experiment}", highlight=False)

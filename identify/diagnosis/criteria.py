@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from armident.identify.identification.identification_criteria import IdentificationCriteria
 from armident.identify.setup.search import NOT_UNDERSTOOD
 
 
@@ -98,7 +99,7 @@ class Criteria:
     """
 
     false_alarm_rate: float = 0.01
-    material_pct: float = 0.2
+    material_pct: float = IdentificationCriteria.material_pct
     least_share: float = 0.04
     confirmation_level: float = 0.01
     named_share: float = 0.5

@@ -22,7 +22,7 @@ from armident.identify.estimators.idim_ls import idim_ls
 from armident.identify.identification.auxiliary_loop import closed_loop
 from armident.identify.identification.equations import Prepared, equations, least_rows
 from armident.identify.identification.options import CONTROLLERS, Options
-from armident.identify.identification.sign_smoothing import unsaturated_joints, with_sign_smoothing
+from armident.identify.identification.sign_smoothing import recorded_speeds, unsaturated_joints, with_sign_smoothing
 from armident.identify.identification.solvers import decimation_of
 from armident.identify.regression.ar_noise import ar_models
 from armident.identify.robot.arm import ArmModel
@@ -235,7 +235,8 @@ def build_study(
     dt = experiments[0].dt
     experiments = _continued(experiments)
     bandwidth = robot.bandwidth_hz or motion_bandwidth([e.q for e in experiments], dt)
-    given, robot = robot, with_sign_smoothing(robot, experiments, bandwidth)
+    speeds = recorded_speeds(experiments, bandwidth)
+    given, robot = robot, with_sign_smoothing(robot, speeds)
     model = arm_model(robot)
     cutoff = min(criteria.band * bandwidth, 0.25 / dt)
     factor = max(1, int(1.0 / (dt * WORKING_RATE * cutoff)))
@@ -245,7 +246,7 @@ def build_study(
         replace(differentiate(e.q, dt, bandwidth_hz=bandwidth), start=e.start) for e in experiments
     ]
     simulated, loop, auxiliary, warnings = _simulated(model, experiments, signals, bandwidth)
-    warnings += unsaturated_joints(given, robot, experiments, bandwidth)
+    warnings += unsaturated_joints(given, robot, speeds)
     slowest = 1.0 / np.asarray(robot.sign_smoothing)
     train: list[MotionStretch] = []
     held: list[MotionStretch] = []

@@ -223,6 +223,9 @@ class IdentificationDocument(Document):
         irrelevant.
     sign_smoothing
         ``g`` of each joint's ``sign(qd) -> (2/pi) atan(g qd)``, s/rad or s/m.
+    transitions
+        Velocity ``1/g`` over which dry friction of a joint reverses, and the limits of its 95 % interval, rad/s or m/s,
+        where the torques determine it.
     criteria
         Limits of the verdict.
     residual_statistics
@@ -263,11 +266,22 @@ class IdentificationDocument(Document):
     further_recordings: list[RecordingReference] | None = None
     bias: dict[str, float] | None = None
     sign_smoothing: dict[str, float] | None = None
+    transitions: dict[str, tuple[float, float, float]] | None = None
     criteria: dict[str, float] | None = None
     residual_statistics: list[ResidualStatistics] | None = None
     configuration: dict[str, Any] | None = None
     held_out_error_pct: float | None = None
     held_out_error_pct_by_joint: dict[str, float] | None = None
+
+    @property
+    def transition_sentence(self) -> str:
+        """Velocities over which dry friction reverses, with their intervals; empty if the torques determine none."""
+        joints = {} if self.configuration is None else {joint["name"]: joint for joint in self.configuration["joints"]}
+        found = []
+        for joint, (velocity, low, high) in (self.transitions or {}).items():
+            unit = "mm/s" if joints.get(joint, {}).get("type") == "prismatic" else "mrad/s"
+            found.append(f"{joint} {1e3 * velocity:.3g} ({1e3 * low:.3g} to {1e3 * high:.3g}) {unit}")
+        return f"Dry friction reverses over a velocity of: {', '.join(found)} (95 % intervals)." if found else ""
 
     @property
     def sentence(self) -> str:

@@ -80,6 +80,7 @@ def identification_document(
         further_recordings=[reference(recording) for recording in recordings[1:]] or None,
         bias=None if result.bias is None else dict(zip(result.names, map(float, result.bias), strict=True)),
         sign_smoothing=dict(zip(joints, (float(g) for g in result.sign_smoothing), strict=True)),
+        transitions={name: (one.velocity, one.low, one.high) for name, one in result.transitions.items()} or None,
         criteria=plain(result.criteria),
         residual_statistics=[ResidualStatistics(**plain(each)) for each in result.residual_statistics] or None,
         configuration=robot.model_dump(mode="json", by_alias=True),

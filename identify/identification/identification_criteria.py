@@ -39,6 +39,8 @@ class IdentificationCriteria:
         explain beyond chance. 0.2: without it the residual is a tenth smaller. Healthy virtual arms have 0.13 at most.
     ``min_motion_deviation``: deviation of that share from its mean under circular shifts, standard deviations of the
         shifts, from which on a dependence counts. 4: noise with a pole up to 0.9 per row reaches 3.7 in 540 tests.
+    ``material_pct``: torque that such a dependence moves, percent of the joint's torque, from which on it counts: the
+        default of ``diagnose --material``.
     ``max_bias_std``: bias by derivatives, encoder noise and sampling, standard deviations, above which an estimate is
         corrected. 0.5: an interval of two standard deviations with this bias covers 92.7 % instead of 95.4 %.
     ``max_serial_std_ratio``: ratio of standard deviations with and without serial correlation above which intervals are
@@ -71,6 +73,7 @@ class IdentificationCriteria:
     white_fraction: float = 0.15
     max_motion_share: float = 0.2
     min_motion_deviation: float = 4.0
+    material_pct: float = 0.2
     max_bias_std: float = 0.5
     max_serial_std_ratio: float = 1.25
     serial_level: float = 1e-3

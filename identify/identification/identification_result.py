@@ -1,7 +1,7 @@
 """The result of an identification, and its assembly."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -13,6 +13,7 @@ from armident.identify.identification.held_out import held_out_errors
 from armident.identify.identification.identification_criteria import IdentificationCriteria
 from armident.identify.identification.options import Options
 from armident.identify.identification.residual_statistics import JointResidualStatistics
+from armident.identify.identification.sign_smoothing import Transition
 from armident.identify.identification.torque_delay import TorqueDelay
 from armident.identify.identification.verdict import Verdict
 from armident.identify.regression.ar_noise import whiteness
@@ -83,6 +84,7 @@ class IdentificationResult:
     residual_autocorrelation: Array
     autocorrelation_bound: Array
     residual_statistics: tuple[JointResidualStatistics, ...] = ()
+    transitions: Mapping[str, Transition] = field(default_factory=dict)
     held_out: tuple[float, Array] | None = None
 
 
@@ -118,6 +120,7 @@ class Statistics:
     interval_warnings: tuple[str, ...] = ()
     bias: Array | None = None
     residuals: tuple[JointResidualStatistics, ...] = ()
+    transitions: Mapping[str, Transition] = field(default_factory=dict)
 
 
 def make_result(
@@ -183,6 +186,7 @@ def make_result(
         residual_autocorrelation=np.stack([test.autocorrelation for test in tests]),
         autocorrelation_bound=np.array([test.bound for test in tests]),
         residual_statistics=statistics.residuals,
+        transitions=statistics.transitions,
         held_out=held_out_errors(ls_blocks, estimate.theta),
     )
 

@@ -41,7 +41,14 @@ from armident.identify.identification.moving_joints import MOVE, moving_joints, 
 from armident.identify.identification.noise_decimation import decimation_from_noise
 from armident.identify.identification.options import CONTROLLERS, Options
 from armident.identify.identification.residual_statistics import residual_statistics
-from armident.identify.identification.sign_smoothing import unsaturated_joints, with_sign_smoothing
+from armident.identify.identification.sign_smoothing import (
+    Transition,
+    law_error,
+    recorded_speeds,
+    unsaturated_joints,
+    with_sign_smoothing,
+    with_transitions,
+)
 from armident.identify.identification.solvers import IdentificationProblem, Solution, decimation_of, solve
 from armident.identify.identification.support import examine_support
 from armident.identify.identification.verdict import judge
@@ -115,17 +122,21 @@ def _identify(
         or robot.bandwidth_hz
         or motion_bandwidth(mapped(lambda e: e.q, experiments), experiments[0].dt)
     )
-    given, robot = robot, with_sign_smoothing(robot, experiments, bandwidth)
-    notes.reasons += [interval_reason(line) for line in unsaturated_joints(given, robot, experiments, bandwidth)]
-    model = arm_model(robot)
+    speeds = recorded_speeds(experiments, bandwidth)
+    given, robot = robot, with_sign_smoothing(robot, speeds)
 
     clock.enter("derivatives", 0.05)
     signals = smoothed_derivatives(experiments, robot, options, bandwidth)
 
     clock.enter("idim-ls", 0.2)
-    if any(term.depends_on_torque for term in model.terms):
-        model = _with_predicted_torques(model, experiments, signals, bandwidth)
-    prepared = Prepared(model, experiments, signals)
+    prepared, transitions = _prepared(robot, experiments, signals, bandwidth), dict[str, Transition]()
+    if given.friction.sign_smoothing is None and not has_published_filters(robot, options):
+        first = _least_squares(prepared, options, bandwidth, moving, criteria, Notes())
+        robot, transitions = with_transitions(given, prepared, first.decimation, speeds, criteria)
+        if transitions:
+            prepared = _prepared(robot, experiments, signals, bandwidth)
+    model = prepared.model
+    notes.reasons += [interval_reason(line) for line in unsaturated_joints(given, robot, speeds)]
     ls = _least_squares(prepared, options, bandwidth, moving, criteria, notes)
     support = examine_support(prepared, ls.blocks, ls.decimation, moving, criteria, ls.estimate.noise)
 
@@ -139,6 +150,15 @@ def _identify(
             solution, found = _solve_in_closed_loop(prepared, options, ls, bandwidth, clock, notes)
         require_finite(found.estimate)
         clock.enter("statistics", 0.85)
+        shift = law_error(prepared, ls.decimation, transitions)
+        if shift is not None:
+            covariance = found.estimate.covariance + np.outer(shift, shift)
+            found = replace(found, estimate=replace(found.estimate, covariance=covariance))
+            joints = ", ".join(name for name, one in transitions.items() if one.saturating is not None)
+            notes.warnings.append(
+                f"The law by which dry friction of {joints} reverses is not known: standard deviations contain the "
+                "difference between two laws (atan and tanh)."
+            )
         statistics = _statistics(prepared, found, solution)
         statistics = replace(statistics, interval_warnings=(*statistics.interval_warnings, *doubts))
         numbers = tested(found.blocks)
@@ -153,12 +173,24 @@ def _identify(
             statistics = replace(statistics, physical=physical)
 
     clock.enter("verdict", 0.97)
-    reasons = judgement(Judged(prepared, options, ls, found, solution, statistics, support), criteria)
+    sign_given = given.friction.sign_smoothing is not None
+    reasons = judgement(Judged(prepared, options, ls, found, solution, statistics, support, sign_given), criteria)
     verdict = judge([*notes.reasons, *reasons], setup)
     if verdict.of_kind("excitation"):
         statistics = replace(statistics, essential=statistics.essential & support.supported)
     clock.done()
+    statistics = replace(statistics, transitions=transitions)
     return make_result(options, model, found, ls, statistics, (verdict, criteria), notes.warnings, clock.spent)
+
+
+def _prepared(
+    robot: RobotConfig, experiments: Sequence[Experiment], signals: Sequence[Derivatives], bandwidth: float
+) -> Prepared:
+    """Recordings with the model of a configuration; terms that depend on torques get predicted ones."""
+    model = arm_model(robot)
+    if any(term.depends_on_torque for term in model.terms):
+        model = _with_predicted_torques(model, experiments, signals, bandwidth)
+    return Prepared(model, experiments, signals)
 
 
 def _least_squares(

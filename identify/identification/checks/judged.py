@@ -14,7 +14,8 @@ from armident.identify.identification.support import Support
 class Judged:
     """Parts of an identification that its verdict depends on; errors are measured in the equations of ``ls``.
 
-    ``solution`` is ``None`` for IDIM-LS; ``reasons`` are of the checks before.
+    ``solution`` is ``None`` for IDIM-LS; ``sign_given``: the configuration has the smoothing of the sign; ``reasons``
+    are of the checks before.
     """
 
     prepared: Prepared
@@ -24,6 +25,7 @@ class Judged:
     solution: Solution | None
     statistics: Statistics
     support: Support
+    sign_given: bool = False
     reasons: list[Reason] = field(default_factory=list)
 
     @property

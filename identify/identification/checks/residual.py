@@ -1,9 +1,12 @@
 """Checks of the residuals, which must be noise, and of the instruments."""
 
+import numpy as np
+
 from armident.identify.estimators.methods import estimator
 from armident.identify.estimators.reason import Reason
 from armident.identify.identification.checks.judged import Judged
 from armident.identify.identification.identification_criteria import IdentificationCriteria
+from armident.identify.identification.identification_result import relative_torque_errors
 from armident.identify.identification.motion_dependence import motion_dependence
 from armident.identify.identification.verdict import enumerated
 
@@ -24,6 +27,7 @@ def residual(judged: Judged, criteria: IdentificationCriteria) -> list[Reason]:
     used = estimator(method)
     finest = judged.found.blocks if used.measured and used.prefiltered else judged.ls.blocks
     dependences = motion_dependence(judged.prepared, finest, judged.found.estimate.theta)
+    errors = relative_torque_errors(judged.ls.blocks, judged.found.estimate.theta)[1]
     coloured = [j for j in diagnostics.joints if j.joint in names and not j.white]
     parts, step = [], DIAGNOSE
     if coloured:
@@ -34,15 +38,14 @@ def residual(judged: Judged, criteria: IdentificationCriteria) -> list[Reason]:
         if diagnostics.joints[d.joint].joint in names
         and d.share > criteria.max_motion_share
         and d.deviation >= criteria.min_motion_deviation
+        and errors[d.joint] * np.sqrt(d.share) >= criteria.material_pct
     ]
     if dependent:
         shares = [f"{d.variable} of {diagnostics.joints[d.joint].joint} ({100 * d.share:.0f} %)" for d in dependent]
         friction = any(d.variable == "velocity" for d in dependent)
-        cause = (
-            "friction, its smoothed sign or an effect is not as modelled" if friction else "the model misses an effect"
-        )
+        cause = "friction or an effect is not as modelled" if friction else "the model misses an effect"
         parts.append(f"they depend on {enumerated(shares)}, so {cause} there")
-        step = f"adjust friction.sign_smoothing, or {DIAGNOSE}" if friction else DIAGNOSE
+        step = f"leave friction.sign_smoothing out, or {DIAGNOSE}" if friction and judged.sign_given else DIAGNOSE
     parts += [reason.message for reason in known if reason.kind == "residual"]
     reasons = []
     if parts:

@@ -1,9 +1,11 @@
 """Smoothing of the sign by the speeds of each joint."""
 
+from collections.abc import Callable
 from functools import cache
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from armident.configs import RobotConfig, load_robot
@@ -11,7 +13,7 @@ from armident.identify.effects.terms import arm_model
 from armident.identify.estimators.methods import Method
 from armident.identify.identification.options import Options
 from armident.identify.identification.pipeline import identify_experiment
-from armident.identify.identification.sign_smoothing import SATURATION, with_sign_smoothing
+from armident.identify.identification.sign_smoothing import Speeds, recorded_speeds, with_sign_smoothing
 from armident.identify.robot.controller import DiscreteController
 from armident.identify.robot.simulation import simulate
 from armident.identify.signals.experiments import Experiment
@@ -60,14 +62,57 @@ def recorded() -> Experiment:
     return Experiment(run.q, run.tau + 0.2 * rng.normal(size=run.tau.shape), q_ref, DT)
 
 
+def speeds(experiment: Experiment) -> Speeds:
+    return recorded_speeds([experiment], BANDWIDTH)
+
+
 @pytest.mark.parametrize("method", ["idim-ls", "idim-iv"])
 def test_friction_of_a_slow_prismatic_joint_is_not_biased_by_the_smoothing(method: Method) -> None:
     found = identify_experiment(recorded(), lift(), Options(method=method))
     friction = dict(zip(found.names, found.theta, strict=True))
     assert friction["fv1"] == pytest.approx(VISCOUS, rel=0.02)
     assert friction["fc1"] == pytest.approx(COULOMB, rel=0.01)
-    assert found.sign_smoothing[0] == pytest.approx(SATURATION / 0.15, rel=0.2)
+    # Friction switches within 10 um/s; the search ends at a ten-thousandth of the top speed.
+    assert found.transitions["lift"].velocity < 2e-5
     assert not any("smoothed sign" in reason.message for reason in found.verdict.reasons)
+
+
+def with_friction(law: Callable[[NDArray[np.float64]], NDArray[np.float64]], seed: int) -> Experiment:
+    """A smooth motion of up to 0.15 m/s under the force of a friction law, with 0.2 N of noise; held for a sample."""
+    t, seconds = np.arange(0, 16, DT)[:, None], np.array([5.0, 3.1, 1.7])
+
+    def derivative(order: int) -> NDArray[np.float64]:
+        rate = 2 * np.pi / seconds
+        return np.asarray(
+            np.sum(0.06 * rate ** (order - 1) * np.cos(rate * (t + DT / 2 * (order > 0)) + 0.5 * np.pi * order), axis=1)
+        )[:, None]
+
+    speed = derivative(1)
+    force = MASS * (derivative(2) + 9.81) + VISCOUS * speed + COULOMB * law(speed)
+    return Experiment(derivative(0), force + 0.2 * np.random.default_rng(seed).normal(size=force.shape), None, DT)
+
+
+def test_intervals_hold_the_width_of_the_transition() -> None:
+    inside = []
+    for seed in range(12):
+        width = 4e-4 * 1.15**seed
+        simulated = with_friction(lambda speed, w=width: 2 / np.pi * np.arctan(speed / w), seed)  # type: ignore[misc]
+        found = identify_experiment(simulated, lift(), Options(method="idim-ls")).transitions["lift"]
+        assert found.velocity == pytest.approx(width, rel=0.3)
+        inside.append(found.low <= width <= found.high)
+    # Two misses of twelve at 95 % have a probability of 10 %, four of 0.2 %.
+    assert sum(inside) >= 9
+
+
+def test_standard_deviations_contain_the_unknown_law_of_the_transition() -> None:
+    found = identify_experiment(with_friction(lambda v: np.tanh(v / 2e-3), 0), lift(), Options(method="idim-ls"))
+    known = identify_experiment(with_friction(lambda v: np.tanh(v / 2e-3), 0), lift(700.0), Options(method="idim-ls"))
+    assert found.transitions["lift"].saturating == pytest.approx(2e-3, rel=0.3)
+    assert any(line.startswith("The law by which dry friction of lift reverses") for line in found.warnings)
+    for name, true in (("fv1", VISCOUS), ("fc1", COULOMB)):
+        k = found.names.index(name)
+        assert abs(found.theta[k] - true) < 3 * found.std[k]
+        assert found.std[k] > known.std[k]
 
 
 def test_a_smoothing_wider_than_the_motion_is_reported_with_the_joint() -> None:
@@ -81,27 +126,27 @@ def test_a_smoothing_wider_than_the_motion_is_reported_with_the_joint() -> None:
 def test_configured_smoothing_is_kept() -> None:
     for given in (150.0, [150.0]):
         robot = lift(given)
-        assert with_sign_smoothing(robot, [recorded()], BANDWIDTH) is robot
+        assert with_sign_smoothing(robot, speeds(recorded())) is robot
 
 
 def test_width_does_not_depend_on_the_unit_of_length() -> None:
-    metres = with_sign_smoothing(lift(), [recorded()], BANDWIDTH).sign_smoothing
+    metres = with_sign_smoothing(lift(), speeds(recorded())).sign_smoothing
     e = recorded()
-    millimetres = with_sign_smoothing(lift(), [Experiment(1e3 * e.q, e.tau, None, DT)], BANDWIDTH).sign_smoothing
+    millimetres = with_sign_smoothing(lift(), speeds(Experiment(1e3 * e.q, e.tau, None, DT))).sign_smoothing
     assert millimetres == pytest.approx(metres / 1e3, rel=1e-3)
 
 
 def test_width_is_not_below_the_noise_of_the_velocity() -> None:
     e = recorded()
     noisy = Experiment(e.q + 1e-3 * np.random.default_rng(0).normal(size=e.q.shape), e.tau, None, DT)
-    width = 1 / with_sign_smoothing(lift(), [noisy], BANDWIDTH).sign_smoothing[0]
+    width = 1 / with_sign_smoothing(lift(), speeds(noisy)).sign_smoothing[0]
     # White noise through a low-pass: std = sigma pi f sqrt(8 f dt / 3).
     assert width == pytest.approx(1e-3 * np.pi * BANDWIDTH * np.sqrt(8 / 3 * BANDWIDTH * DT), rel=0.05)
 
 
 def test_a_joint_at_rest_has_the_nominal_smoothing() -> None:
     still = Experiment(np.zeros((2000, 1)), np.zeros((2000, 1)), None, DT)
-    assert with_sign_smoothing(lift(), [still], BANDWIDTH).sign_smoothing.tolist() == [5000.0]
+    assert with_sign_smoothing(lift(), speeds(still)).sign_smoothing.tolist() == [5000.0]
 
 
 def test_number_of_values_must_be_that_of_the_joints() -> None:
