@@ -168,7 +168,7 @@ class Friction(FrozenModel):
     ----------
     sign_smoothing
         ``g`` (s/rad or s/m) in ``sign(qd) -> (2/pi) atan(g qd)`` (thesis appendix B.2): one value for all joints, or
-        one per joint. ``None``: each joint has its own, chosen from its recorded velocities
+        one per joint. ``None``: each joint has its own, from its torques and velocities
         (`armident.identify.identification.sign_smoothing`).
     velocity_threshold
         Per joint (rad/s or m/s): samples of a joint slower than this are left out of that joint's equations, because

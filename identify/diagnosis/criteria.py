@@ -85,6 +85,9 @@ class Criteria:
     motion_share
         Share of the dependence on the motion altogether that single variables have to explain, so that it is not
         listed beside them: the greater part.
+    burst_share
+        Least share of the residual's power in bursts that are reported: they are most of the error. Stick-slip of
+        healthy arms, which the smoother of the velocity does not follow, has less.
     line_level
         Significance level from which a spectral line is searched in the references: as the usual false-alarm rate.
     reference_line
@@ -127,6 +130,7 @@ class Criteria:
     functions_in_noise: int = 3
     most_unexplained: int = 2
     motion_share: float = 0.5
+    burst_share: float = 0.5
     line_level: float = 0.01
     reference_line: float = 100.0
     modulated_line: float = 0.1

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armident.identify.diagnosis.criteria import Criteria
+from armident.identify.diagnosis.excess import Excess, bursts, spectral_excess
 from armident.identify.diagnosis.free_functions import FINE, FreeFunction, free_functions, in_band
 from armident.identify.diagnosis.noise_beyond import noise_beyond
 from armident.identify.diagnosis.projection import JointResidual, Projection
@@ -58,7 +59,8 @@ class ResidualDependence:
 
     ``share``: share of the power of the held-out residual that the training shape predicts; for a frequency, of that at
     the working rate. ``p_value``: of this one test. ``curve``: for a frequency the spectrum around it. For the motion
-    the root of the residual's spectral density, with that without the dependence as band.
+    the root of the residual's spectral density, with that without the dependence as band. ``where``: moments, s, or
+    frequency, Hz, that the hint names; else that of the largest value.
     """
 
     joint: str
@@ -68,6 +70,7 @@ class ResidualDependence:
     share: float
     p_value: float
     curve: Curve
+    where: tuple[float, ...] = ()
 
     @property
     def varies_with(self) -> str:
@@ -81,7 +84,7 @@ class ResidualDependence:
     @property
     def of_noise(self) -> bool:
         """True if the band of the curve is the level of noise instead of the uncertainty of the curve."""
-        return self.kind in ("frequency", "motion")
+        return self.kind in ("frequency", "motion", "unrecorded signal", "bursts")
 
     @property
     def hint(self) -> str:
@@ -89,8 +92,8 @@ class ResidualDependence:
         height = np.abs(self.curve.value)
         if self.kind == "motion":
             height = height / np.maximum(self.curve.band, 1e-300)
-        at = self.curve.x[int(np.argmax(height))]
-        return hint_of(self.kind, self.joint, self.other, f"{at:.3g} {self.unit}")
+        at = self.where or (float(self.curve.x[int(np.argmax(height))]),)
+        return hint_of(self.kind, self.joint, self.other, f"{', '.join(f'{x:.3g}' for x in at)} {self.unit}")
 
 
 def dependences(state: Fitted) -> tuple[ResidualDependence, ...]:
@@ -151,13 +154,16 @@ class LackOfFit:
             # The motion altogether, where no variable explains the greater part of what it does.
             least = named / self.criteria.motion_share
             found += [self._dependence(p, own) for p in mine if p.function is None and least < p.share]
-            found += [self._of_line(k, line) for k, line in self.lines if k == j and self._reported(line, j)]
+            lines = [self._of_line(k, line) for k, line in self.lines if k == j and self._reported(line, j)]
+            found += lines
+            if not here and not lines:
+                found += [self._of_excess(j, excess) for excess in self._excesses(j) if self._reported(excess, j)]
         return _by_share(found)
 
-    def _significant(self, test: Projection | SpectralLine) -> bool:
+    def _significant(self, test: Projection | SpectralLine | Excess) -> bool:
         return test.p_value < self.level and test.p_held < self.criteria.held_out_level and test.share > 0
 
-    def _reported(self, test: Projection | SpectralLine, joint: int | None = None) -> bool:
+    def _reported(self, test: Projection | SpectralLine | Excess, joint: int | None = None) -> bool:
         """True if a dependence is significant and material."""
         j = test.joint if isinstance(test, Projection) else joint
         torque = np.concatenate([s.y[:, j] for s in self.fit.study.train])
@@ -191,6 +197,24 @@ class LackOfFit:
         return ResidualDependence(
             name, "frequency", None, unit_of_variable("frequency", ""), line.share, line.p_value, curve
         )
+
+    def _excesses(self, joint: int) -> list[Excess]:
+        """Parts of a joint's residual that are no broadband noise, the largest one first."""
+        study = self.fit.study
+        train, held = ([e[:, joint] for e in self.fit.errors(self.fit.theta, held=part)] for part in (False, True))
+        found = [spectral_excess(train, held, study.dt * study.decimation.factor)]
+        for errors, stretches in ((train, study.train), (held, study.held)):
+            at = [study.decimation.instants(s.measured.qd.shape[0]) for s in stretches]
+            velocities = [s.measured.qd[rows, joint] for s, rows in zip(stretches, at, strict=True)]
+            moments = bursts(errors, [s.t for s in stretches], velocities)
+            if moments is not None and moments.share >= self.criteria.burst_share:
+                found.append(moments)
+        return sorted((one for one in found if one is not None), key=lambda one: -one.share)[:1]
+
+    def _of_excess(self, joint: int, excess: Excess) -> ResidualDependence:
+        curve = Curve(excess.x, excess.value, excess.noise)
+        name, unit = self.fit.study.joints[joint], unit_of_variable(excess.kind, "")
+        return ResidualDependence(name, excess.kind, None, unit, excess.share, excess.p_value, curve, excess.where)
 
     def _spectrum(self, p: Projection, own: JointResidual) -> Curve:
         """Root of the spectral density of the held-out residual, with that of the rest as band."""
@@ -267,8 +291,8 @@ class LackOfFit:
 
     @cached_property
     def tests(self) -> int:
-        """Number of all tests: every set of functions, and of each joint all functions together and its spectrum."""
-        return sum(len(own) + 2 for own in self.functions)
+        """Number of all tests: every set of functions; of each joint all together, two of spectra, two of bursts."""
+        return sum(len(own) + 4 for own in self.functions)
 
     def _whitened(self, fit: IvFit) -> tuple[JointResidual, ...]:
         blocks, rows = fit.equations.held, fit.regression.rows_of

@@ -8,10 +8,10 @@ from armident.identify.effects.effect import POSITION, TORQUE, VELOCITY
 Kind = Literal[
     "velocity", "position", "position and direction", "motor angle", "load", "load and direction", "torque",
     "acceleration", "time", "time and direction", "position of another joint", "velocity of another joint",
-    "torque of another joint", "frequency", "motion",
+    "torque of another joint", "frequency", "motion", "unrecorded signal", "bursts",
 ]  # fmt: skip
-"""Variables; those with a direction have the opposite sign in the negative direction. The last two have no free
-functions of their own: a frequency independent of the motion, and all functions of the motion together."""
+"""Variables; those with a direction have the opposite sign in the negative direction. The last four have no free
+functions of their own: all functions of the motion together, and what no recorded motion explains."""
 
 
 @dataclass(frozen=True)
@@ -131,6 +131,18 @@ VARIABLES: dict[Kind, ResidualVariable] = {
         "the torque error of {joint} at the frequencies of the motion exceeds the noise, most at {at}, and no "
         "candidate explains it: record the same motion twice to see how much of it is repeatable, and look for "
         "effects that are not in the model",
+    ),
+    "unrecorded signal": ResidualVariable(
+        "Frequencies at which the torque has more power than noise, and which no recorded motion explains.",
+        HERTZ,
+        "the torque of {joint} contains a signal, strongest at {at}, that no recorded motion explains: look for a "
+        "process force, a load or an axis that is not recorded, and record it with the arm",
+    ),
+    "bursts": ResidualVariable(
+        "Moments with far more torque error than the others.",
+        SECONDS,
+        "the torque of {joint} has bursts, the strongest at {at}, that the motion does not explain: look for contact "
+        "with the surroundings, a collision, a slipping brake or a loose part",
     ),
 }
 """All variables by their names in ``varies_with``."""
