@@ -10,6 +10,10 @@ from numpy.typing import NDArray
 WRITTEN_DECIMALS = 4
 """Minimum number of decimals of an angle that is rounded to the multiple of 15 degrees with the same decimals."""
 
+RIGHT_ANGLE = 1e-3
+"""Largest distance (rad) of an angle with two or three decimals from the right angle that is meant: 1.57, 1.571. Such a
+tilt is below the tolerance of joints, and makes nearly dependent parameters of dependent ones."""
+
 LENGTH_TOLERANCE = 0.01
 """Largest deviation of the length of a quaternion from 1; two written decimals make 0.01."""
 
@@ -43,13 +47,17 @@ def _cos_sin(angle: float) -> tuple[float, float]:
 
 
 def rounded_angle(word: str) -> float:
-    """Angle (rad) as written, or the multiple of 15 degrees of which it is a rounded or truncated value."""
-    value = float(word)
-    multiple = round(value / (math.pi / 12)) * (math.pi / 12)
-    exponent = Decimal(word).as_tuple().exponent
-    if isinstance(exponent, int) and exponent <= -WRITTEN_DECIMALS and abs(value - multiple) < 10.0**exponent:
-        return multiple
-    return value
+    """Angle (rad) as written, or the multiple of 15 degrees of which it is a rounded or truncated value.
+
+    With two or three decimals: the right angle that it is close to.
+    """
+    value, exponent = float(word), Decimal(word).as_tuple().exponent
+    if not isinstance(exponent, int) or exponent > -2:
+        return value
+    coarse = exponent > -WRITTEN_DECIMALS
+    step, tolerance = (math.pi / 2, RIGHT_ANGLE) if coarse else (math.pi / 12, 10.0**exponent)
+    multiple = round(value / step) * step
+    return multiple if abs(value - multiple) < tolerance else value
 
 
 def rotation_of_quaternion(quaternion: Sequence[float]) -> Floats:

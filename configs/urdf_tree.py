@@ -25,6 +25,9 @@ MOVING = {"revolute": "revolute", "continuous": "revolute", "prismatic": "prisma
 ENDLESS = (-math.inf, math.inf)
 """Position limits of a joint that has none."""
 
+COARSE = 1e-4
+"""Rounding of an angle, rad, from which on it is named: four decimals or more are what files usually have."""
+
 Floats = NDArray[np.float64]
 
 
@@ -97,6 +100,17 @@ def orientation(file: Path, link: str) -> Floats:
         turned = tree.origin(element, only(file, element, "origin"))[:3, :3] @ turned
         element = tree.above.get(end_link(element, "parent"))
     return turned
+
+
+def coarse_right_angles(file: Path) -> set[str]:
+    """Angles of the joints of a URDF, as written, that are right angles with two or three decimals."""
+    found = set()
+    for element in read_tree(file).above.values():
+        origin = only(file, element, "origin")
+        if origin is not None and origin.get("rpy") is not None:
+            written = words(file, element, origin, "rpy")
+            found |= {word for word in written if abs(rounded_angle(word) - float(word)) > COARSE}
+    return found
 
 
 def robot_name(file: Path) -> str:

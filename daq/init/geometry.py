@@ -14,7 +14,7 @@ from armident.configs.blanks import MARK, without_marks
 from armident.configs.loading import checked_robot
 from armident.configs.schema.robot import Mdh
 from armident.configs.urdf import UrdfGeometry, UrdfSource, geometry_from_urdf, joint_names
-from armident.configs.urdf_tree import moving_links, orientation, robot_name, serial_tips
+from armident.configs.urdf_tree import coarse_right_angles, moving_links, orientation, robot_name, serial_tips
 from armident.configs.yaml_loader import is_file, read_yaml
 
 UPRIGHT = (0.0, 0.0, -9.81)
@@ -138,6 +138,9 @@ def _of_chain(file: Path, out: Path, base: str | None, tip: str | None) -> Geome
     notes = [f"chain {ends}; what moves beyond it counts as its load"] if ends else []
     if base is not None:
         notes.append(f"gravity is that of an upright root of the URDF with the joints before link {base} at zero")
+    coarse = sorted(coarse_right_angles(part_file))
+    if coarse:
+        notes.append(f"angles {', '.join(coarse)} of the URDF are rounded right angles and taken as such")
     return Geometry(file.name, content, robot, tuple(notes))
 
 

@@ -179,7 +179,10 @@ def test_a_recording_needs_no_urdf(tmp_path: Path) -> None:
     assert read_recording(tmp_path / "r.mcap").robot == robot
 
 
-@pytest.mark.parametrize(("written", "exact"), [("1.5708", np.pi / 2), ("-3.14159", -np.pi), ("0.5235", np.pi / 6)])
+@pytest.mark.parametrize(
+    ("written", "exact"),
+    [("1.5708", np.pi / 2), ("-3.14159", -np.pi), ("0.5235", np.pi / 6), ("1.57", np.pi / 2), ("-1.571", -np.pi / 2)],
+)
 def test_an_angle_written_with_few_digits_is_the_multiple_of_15_degrees_that_is_meant(
     tmp_path: Path, written: str, exact: float
 ) -> None:
@@ -187,7 +190,7 @@ def test_an_angle_written_with_few_digits_is_the_multiple_of_15_degrees_that_is_
     assert abs(load_robot(configuration(tmp_path, 2)).joints[1].mdh.alpha) == pytest.approx(abs(exact), abs=1e-15)
 
 
-@pytest.mark.parametrize("angle", ["0.5236500", "1.5709"])
+@pytest.mark.parametrize("angle", ["0.5236500", "1.5709", "1.573", "0.524", "1.6"])
 def test_any_other_angle_stays_as_it_is(tmp_path: Path, angle: str) -> None:
     two_joints(tmp_path, rpy=f"{angle} 0 0")
     assert abs(load_robot(configuration(tmp_path, 2)).joints[1].mdh.alpha) == pytest.approx(float(angle), abs=1e-14)
