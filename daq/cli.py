@@ -80,6 +80,11 @@ def _add(app: typer.Typer, entry: importlib.metadata.EntryPoint) -> None:
         app.command(entry.name)(_reported(function, entry.name))
 
 
+def _interrupted() -> typer.Exit:
+    print("armident: interrupted", file=sys.stderr)
+    return typer.Exit(INTERRUPTED)
+
+
 def _reported(function: Callable[..., Any], name: str) -> Callable[..., Any]:
     """Return a command whose log goes to stderr, and whose exceptions become one line on stderr and an exit code."""
 
@@ -93,7 +98,7 @@ def _reported(function: Callable[..., Any], name: str) -> Callable[..., Any]:
         except (typer.Exit, typer.Abort, typer.BadParameter, BrokenPipeError):
             raise
         except KeyboardInterrupt:
-            raise typer.Exit(INTERRUPTED) from None
+            raise _interrupted() from None
         except Exception as error:
             from armident.configs.errors import ArmidentError, ConfigError
             from armident.configs.reasons import reason_of
@@ -101,7 +106,7 @@ def _reported(function: Callable[..., Any], name: str) -> Callable[..., Any]:
 
             if interrupts:
                 # A compiler or a callback in C can turn the interrupt into another error.
-                raise typer.Exit(INTERRUPTED) from None
+                raise _interrupted() from None
             if os.environ.get(DEBUG_VARIABLE):
                 traceback.print_exc()
             if isinstance(error, ImportError) and (extra := needed_extra(error, function.__module__)) is not None:

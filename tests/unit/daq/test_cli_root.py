@@ -87,7 +87,7 @@ def test_an_error_because_of_an_interrupt_is_an_interrupt() -> None:
     # A shell starts its background jobs with SIGINT ignored.
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
-        assert call("compile") == (130, "", "")
+        assert call("compile") == (130, "", "armident: interrupted\n")
         assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
     finally:
         signal.signal(signal.SIGINT, before)
@@ -106,8 +106,8 @@ def test_debug_prints_the_traceback_of_an_error() -> None:
     assert "in refuse" in err
 
 
-def test_an_interrupt_exits_with_130_without_output() -> None:
-    assert call("refuse", "interrupt") == (130, "", "")
+def test_an_interrupt_exits_with_130_and_says_so() -> None:
+    assert call("refuse", "interrupt") == (130, "", "armident: interrupted\n")
 
 
 def test_a_command_chooses_its_own_exit_code() -> None:
