@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from armident.configs import ConfigError, DataError, RobotConfig, SessionConfig
 from armident.daq.interchange.bag_files import bag_files
-from armident.daq.interchange.clocks import gaps_and_counters
+from armident.daq.interchange.clocks import UNITS, gaps_and_counters
 from armident.daq.interchange.import_options import ImportOptions
 from armident.daq.interchange.lerobot import data_files
 from armident.daq.interchange.readers import check_options, reader_of
@@ -22,8 +22,9 @@ from armident.daq.interchange.si_checks import OMITTED, check_units, fast_note, 
 from armident.daq.interchange.stated_units import in_si
 from armident.daq.interchange.table_columns import NAMES
 from armident.daq.interchange.table_files import Source
-from armident.daq.interchange.table_rows import TableRows, complete_rows
+from armident.daq.interchange.table_rows import EFFORTS, TableRows, complete_rows
 from armident.daq.recording import Field, Recording, Stream, read_recording
+from armident.daq.recording.faults.repair import repair
 from armident.daq.recording.model import Side
 
 __all__ = ["NAMES", "OMITTED", "import_recording"]
@@ -109,6 +110,7 @@ def _from_table(robot: RobotConfig, source: Source, options: ImportOptions, fact
     rows = in_si(table_rows(source, robot, options), robot, options.get("units") or {})
     _refuse_immense(source, rows)
     side: Side = "motor" if motor_side else "joint"
+    rows = _repaired(rows, robot, side, options)
     fields: dict[str, Field] = {
         name: Field(
             name, name, si_unit_of(name, robot), "motor" if name in ("current", "voltage") else side, (1.0,) * robot.n
@@ -146,6 +148,25 @@ def _from_table(robot: RobotConfig, source: Source, options: ImportOptions, fact
     if resample_hz is None or abs(made.rate_hz / resample_hz - 1.0) < 1e-9:
         return recording
     return at_rate(recording, resample_hz)
+
+
+def _repaired(rows: TableRows, robot: RobotConfig, side: Side, options: ImportOptions) -> TableRows:
+    """Return the rows without wraps of their positions and without impossible rows, with a note on each kind."""
+    rate_hz = options.get("rate_hz")
+    if rows.times is None or rate_hz is not None:
+        times = rows.row / (rate_hz or 1.0)
+    else:
+        unit = options.get("time_unit") or rows.time_unit
+        times = rows.times * UNITS.get(unit, 1.0)
+    effort = next(rows.values[name] for name in EFFORTS if name in rows.values)
+    found = repair(rows.values["position"], effort, rows.values.get("demand"), times, robot, side)
+    if not found.notes:
+        return rows
+    values = {**rows.values, "position": found.position}
+    if found.demand is not None:
+        values["demand"] = found.demand
+    made = replace(rows, values=values, notes=(*rows.notes, *found.notes))
+    return made.taken(~found.wrong)
 
 
 def read_rows(path: Path, robot: RobotConfig, **options: Unpack[ImportOptions]) -> tuple[Source, TableRows]:
