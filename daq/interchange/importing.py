@@ -159,7 +159,8 @@ def _repaired(rows: TableRows, robot: RobotConfig, side: Side, options: ImportOp
         unit = options.get("time_unit") or rows.time_unit
         times = rows.times * UNITS.get(unit, 1.0)
     effort = next(rows.values[name] for name in EFFORTS if name in rows.values)
-    found = repair(rows.values["position"], effort, rows.values.get("demand"), times, robot, side)
+    q, demand, polled = rows.values["position"], rows.values.get("demand"), options.get("polled", False)
+    found = repair(q, effort, demand, times, robot, side, polled=polled)
     if not found.notes:
         return rows
     values = {**rows.values, "position": found.position}

@@ -12,6 +12,7 @@ from armident.configs import DataError, Joint, RobotConfig
 from armident.configs.schema.limits import ENDLESS
 from armident.daq.recording import Recording, Stream
 from armident.daq.recording.faults.repair import repaired
+from armident.daq.recording.faults.zeros import NOTHING
 from armident.identify.identification.identification_criteria import IdentificationCriteria
 from armident.identify.identification.set_points import between_set_points
 from armident.identify.signals.experiments import Experiment
@@ -288,7 +289,8 @@ def _has_reference(stream: Stream, sync: NDArray[np.int64]) -> NDArray[np.bool_]
 
 
 def _signal_notes(experiments: Sequence[Experiment], robot: RobotConfig) -> list[str]:
-    notes = []
+    notes: list[str] = []
+    unmeasured: list[str] = []
     ranges, torques, count = [], [], 0
     saturation = [joint.drive.saturation for joint in robot.joints]
     gain = np.array([joint.drive.gain for joint in robot.joints])
@@ -309,8 +311,16 @@ def _signal_notes(experiments: Sequence[Experiment], robot: RobotConfig) -> list
                 f"{joint.name} was recorded over [{seen[0]:.3g}, {seen[1]:.3g}] {unit}, outside its limits "
                 f"[{low:.3g}, {high:.3g}]: wrong unit, or wrong limits?"
             )
+        largest = max(max(abs(float(low[j])), abs(float(high[j]))) for low, high in torques)
+        if largest < NOTHING and seen[1] - seen[0] >= IdentificationCriteria.rest_limit_share * _usual_range(joint):
+            unmeasured.append(joint.name)
         if max(float(tau[j]) for _, tau in torques) == min(float(tau[j]) for tau, _ in torques):
             notes.append(f"{joint.name}: the torque never changes; is its drive reporting?")
+    if unmeasured:
+        raise DataError(
+            f"the torque of {', '.join(unmeasured)} is 0 in every row although the joint moves: probably not measured; "
+            "check the mapping of the torque where it was recorded"
+        )
     for joint, share in zip(robot.joints, saturated / count, strict=True):
         if share > 0.01:
             notes.append(f"{joint.name}: its drive is saturated in {100 * share:.0f} % of the samples")

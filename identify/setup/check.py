@@ -68,6 +68,13 @@ def _check(experiments: Sequence[Experiment], robot: RobotConfig) -> SetupCheck:
         nothing = (100.0,) * robot.n
         return SetupCheck(tuple(findings), nothing, nothing, (), ("standstill",), None)
     findings += signals.clipped_findings(experiments, robot, moving)
+    findings += signals.held_findings(experiments, robot)
+    damaged = signals.step_findings(experiments, robot)
+    if damaged:
+        # No correction is right beside signals that are wrong for a part of the time.
+        bench = make_bench(experiments, robot, moving)
+        errors = _errors(bench, _as_configured(robot))
+        return SetupCheck((*damaged, *findings), errors, errors, (), (), None)
     bench, search, best = _searched(experiments, robot, moving)
     found = described(best, robot, bench)
     tried, before = search.tried, _errors(bench, _as_configured(robot))

@@ -7,6 +7,8 @@ from numpy.typing import NDArray
 from scipy import signal
 
 from armident.configs import RobotConfig
+from armident.daq.recording.faults.jumps import JumpCriteria, jumps
+from armident.daq.recording.faults.updates import held
 from armident.identify.setup.plausible import NO_LIMIT
 from armident.identify.setup.result import SetupFinding
 from armident.identify.signals.experiments import Experiment
@@ -40,6 +42,9 @@ CLIPPED_SHARE = 2e-3
 CLIPPED_UNUSABLE = 0.05
 """Share of clipped samples from which on results are unusable."""
 
+SHOWN = 4
+"""Events that a message lists."""
+
 REST_REMEDY = "record a motion of all joints: armident trajectory designs one"
 
 CLIPPED_REMEDY = "record a gentler motion, or with a wider range of the torque signal"
@@ -55,6 +60,52 @@ LEAST_SAMPLES = 10.0
 
 SAMPLES_UNUSABLE = 5.0
 """Samples per period below which central differences lose a fifth of the acceleration."""
+
+
+SLIP_REMEDY = "find out why the encoder lost counts (coupling, index, power), home the joint and record again"
+
+HELD_REMEDY = "record the torque at the rate at which the drive measures it"
+
+
+def step_findings(experiments: Sequence[Experiment], robot: RobotConfig) -> list[SetupFinding]:
+    """Return the steps of a position that last: no motion makes them, and nothing tells the right position."""
+    findings = []
+    criteria = JumpCriteria()
+    for j, joint in enumerate(robot.joints):
+        unit, limits = "rad" if joint.type == "revolute" else "m", joint.limits
+        found = [
+            (e.start + row * e.dt, size)
+            for e in experiments
+            for row, size in jumps(
+                e.q[:, j], e.dt, np.zeros(len(e.q) - 1, np.bool_), limits.velocity, limits.acceleration, criteria
+            ).steps
+        ]
+        if found:
+            each = ", ".join(f"{size:+.4g} {unit} at {t:.3f} s" for t, size in found[:SHOWN])
+            more = f", and {len(found) - SHOWN} more" if len(found) > SHOWN else ""
+            message = f"the position of {joint.name} steps for good, faster than any motion: {each}{more}"
+            findings.append(SetupFinding("position_step", (joint.name,), 1.0, message, SLIP_REMEDY, True))
+    return findings
+
+
+def held_findings(experiments: Sequence[Experiment], robot: RobotConfig) -> list[SetupFinding]:
+    """Return the signals that change every k-th sample only, with their true rate and mean delay."""
+    longest = max(experiments, key=lambda e: e.q.shape[0])
+    findings = []
+    for signal, values in (("torque", longest.tau), ("position", longest.q)):
+        periods: dict[int, list[str]] = {}
+        for j, joint in enumerate(robot.joints):
+            if found := held(values[:, j]):
+                periods.setdefault(found.rows, []).append(joint.name)
+        for rows, names in periods.items():
+            rate = 1.0 / longest.dt
+            message = (
+                f"the {signal} of {', '.join(names)} changes every {rows} samples only ({rate / rows:.4g} Hz, recorded "
+                f"at {rate:.4g} Hz): it is {500 * (rows - 1) * longest.dt:.3g} ms old on average"
+            )
+            remedy = HELD_REMEDY if signal == "torque" else "record at the rate at which the position is measured"
+            findings.append(SetupFinding(f"{signal}_held", tuple(names), 1.0, message, remedy, False))
+    return findings
 
 
 def moving_joints(experiments: Sequence[Experiment], robot: RobotConfig) -> NDArray[np.bool_]:

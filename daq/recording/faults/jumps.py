@@ -16,7 +16,8 @@ class JumpCriteria:
 
     ``ratio``: step over the usual steps near it. Of Gaussian noise the usual step (80 % quantile) is 1.8 standard
     deviations, so that noise exceeds 5 of them once in 1e9 rows. ``near``: changes of value on either side that tell
-    the usual step, without ``aside`` at the step itself. ``accelerations``: acceleration that the jump needs over the
+    the usual step, without ``aside`` at the step itself; ``most``: quantile of all steps that a usual one does not
+    exceed where a jump comes back. ``accelerations``: acceleration that the jump needs over the
     usual ones (95 % quantile of the joint), and over its limit. ``start_s``: a joint without a limit of acceleration
     takes at least this time to its velocity limit. ``counts``: least jump in steps of the encoder. ``longest``: rows
     that a value may be wrong before it counts as a lasting step. ``smallest``: least jump over the range of the motion;
@@ -28,6 +29,7 @@ class JumpCriteria:
     near: int = 20
     aside: int = 3
     quantile: float = 0.8
+    most: float = 0.95
     accelerations: float = 10.0
     start_s: float = 0.05
     counts: float = 8.0
@@ -93,15 +95,18 @@ def jumps(x: Array, dt: float, holes: Mask, fastest: float, hardest: float, crit
     )
     # Single jumps raise the mean of their neighbourhood by little: a quick choice of steps to look at.
     mean = uniform_filter1d(size, 2 * (criteria.near + criteria.aside) + 1)
-    candidates = np.flatnonzero((size > least) & (size > 0.5 * criteria.ratio * mean))
+    most = float(np.quantile(changes, criteria.most))
+    candidates = np.flatnonzero((size > least) & (size > criteria.ratio * np.minimum(mean / 2.0, most)))
     if not candidates.size:
         return Jumps(wrong, ())
     usual = _usual(size, candidates, criteria)
+    lasts = size[candidates] > criteria.ratio * usual
+    # Several wrong rows during a rest are each other's neighbours; rows that come back need no quiet neighbours.
+    usual = np.minimum(usual, most)
     chosen = size[candidates] > criteria.ratio * usual
-    candidates, allowed = candidates[chosen], criteria.ratio * usual[chosen]
     steps: list[tuple[int, float]] = []
     done = -1
-    for k, allow in zip(candidates, allowed, strict=True):
+    for k, allow, last in zip(candidates[chosen], criteria.ratio * usual[chosen], lasts[chosen], strict=True):
         if k < done:
             continue
         # y[k] -> y[k + 1] is a jump: it returns at a later row, or the rows before it are wrong, or it lasts.
@@ -109,6 +114,8 @@ def jumps(x: Array, dt: float, holes: Mask, fastest: float, hardest: float, crit
         if back:
             wrong[rows[k + 1] : rows[k + 1 + back]] = True
             done = k + 1 + back
+        elif not last:
+            continue
         elif rows[k + 1] <= criteria.longest:
             wrong[: rows[k + 1]] = True
         elif x.size - rows[k + 1] <= criteria.longest:
@@ -125,7 +132,8 @@ def _return(y: Array, k: int, allow: float, longest: int) -> int:
     jump = y[k + 1] - y[k]
     for m in range(1, min(longest, y.size - k - 2) + 1):
         returned = (y[k + 1] - y[k + 1 + m]) / jump
-        if returned > 0.5 and abs(y[k + 1 + m] - y[k] - (m + 1) * slope) <= allow * (1.0 + m / 4.0):
+        apart = y[k + 1 + m] - y[k]
+        if returned > 0.5 and min(abs(apart), abs(apart - (m + 1) * slope)) <= allow * (1.0 + m / 4.0):
             return m
     return 0
 

@@ -17,6 +17,14 @@ Mask = NDArray[np.bool_]
 REASON = "impossible values"
 """Reason of the gaps that a repair leaves."""
 EFFORTS = ("torque", "current", "voltage")
+CUT = 4
+"""Rows that are left out at a step of all joints: longer than the gaps that are interpolated."""
+NEAR = 8
+"""Rows on either side of a step that tell the velocities there: shorter than a change of a motion at usual rates."""
+SLOW = 0.2
+"""Velocity over the usual one near a step below which a joint tells nothing of missing rows."""
+SAME = 0.1
+"""Share of the power of the steps, in usual steps of each joint, that missing rows may leave unexplained."""
 _HOLE = 1.5
 """Step of the times over the usual one above which rows are missing between them."""
 _SHOWN = 4
@@ -40,10 +48,14 @@ def repair(
     times: Array,
     robot: RobotConfig,
     side: Side,
-    criteria: JumpCriteria | None = None,
+    *,
+    polled: bool = False,
 ) -> Repair:
-    """Return what of signals (N, n), SI, on one ``side`` of the gears, at times (N,), s, can be used, and why."""
-    criteria = criteria or JumpCriteria()
+    """Return what of signals (N, n), SI, on one ``side`` of the gears, at times (N,), s, can be used, and why.
+
+    Rows that are missing stay for an import of ``polled`` samples, which counts them by the motion.
+    """
+    criteria = JumpCriteria()
     steps = np.diff(times)
     if steps.size < 2 * criteria.near:
         return Repair(position, demand, np.zeros(times.size, dtype=np.bool_), ())
@@ -54,6 +66,7 @@ def repair(
     position = position.copy()
     demand = None if demand is None else demand.copy()
     notes: list[str] = []
+    lasting: list[tuple[int, int, float]] = []
     wrong = np.zeros((times.size, robot.n), dtype=np.bool_)
     for j, joint in enumerate(robot.joints):
         if joint.type == "revolute":
@@ -67,7 +80,15 @@ def repair(
                     if demand is not None:
                         demand[:, j] = _beside(demand[:, j], position[:, j], holes, turn, criteria)
         limits = (joint.limits.velocity, joint.limits.acceleration) if side == "joint" else (np.inf, np.inf)
-        wrong[:, j] = jumps(position[:, j], dt, holes, *limits, criteria).wrong
+        found = jumps(position[:, j], dt, holes, *limits, criteria)
+        wrong[:, j] = found.wrong
+        lasting += [(j, row, size) for row, size in found.steps]
+    cuts = set() if polled else shared_steps(position, lasting)
+    for row in sorted(cuts):
+        notes.append(
+            f"the positions of all joints step at {at[row]:.3f} s: rows are missing there, or two recordings are in one: "
+            "cut there"
+        )
     for chosen, rows in _alike(wrong, names):
         values = position[rows]
         what = "all 0" if not values.any() else "single rows"
@@ -80,7 +101,32 @@ def repair(
         notes.append(
             f"the torque of {chosen} is 0 {_times(rows, at)}, between rows where it is not: left out as gaps"
         )
-    return Repair(position, demand, np.asarray((wrong | zeros).any(axis=1), dtype=np.bool_), tuple(notes))
+    out = np.asarray((wrong | zeros).any(axis=1), dtype=np.bool_)
+    for row in cuts:
+        out[max(row - CUT // 2, 0) : row + CUT - CUT // 2] = True
+    return Repair(position, demand, out, tuple(notes))
+
+
+def shared_steps(position: Array, steps: Sequence[tuple[int, int, float]]) -> set[int]:
+    """Rows of lasting steps (joint, row, size) at which not one encoder but all joints (N, n) step.
+
+    Two joints step at once, or all joints by the same number of their own steps: rows are missing there.
+    """
+    found = set()
+    for row in {row for _, row, _ in steps}:
+        joints = {j for j, other, _ in steps if abs(other - row) <= 1}
+        near = position[max(row - NEAR, 0) : row + NEAR]
+        each = np.abs(np.diff(near, axis=0))
+        usual = np.quantile(each, JumpCriteria().quantile, axis=0)
+        moved = usual > 0
+        slope = np.median(np.diff(near, axis=0), axis=0)[moved] / usual[moved]
+        size = (position[row] - position[row - 1])[moved] / usual[moved]
+        several = int((np.abs(slope) > SLOW).sum()) > 1
+        missing = float(size @ slope) / max(float(slope @ slope), 1e-300)
+        left = float(np.sum((size - missing * slope) ** 2)) / max(float(size @ size), 1e-300)
+        if len(joints) > 1 or (several and missing > 1.0 and left < SAME):
+            found.add(row)
+    return found
 
 
 def repaired(recording: Recording) -> tuple[Recording, tuple[str, ...]]:
