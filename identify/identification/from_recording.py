@@ -71,6 +71,7 @@ def _converted(
 ) -> tuple[Sequence[Experiment], list[str]]:
     _check_same_robot(recording.robot, robot)
     _check_counters(recording)
+    recorded = recording.samples.sync
     recording, remarks = repaired(recording)
     notes = list(remarks)
     if recording.missing:
@@ -85,7 +86,7 @@ def _converted(
     used: list[NDArray[np.int64]] = []
     for first, last in recording.experiments():
         inside = (samples.sync >= first) & (samples.sync <= last)
-        _check_missing(int(inside.sum()), first, last, dt)
+        _check_missing(int(((recorded >= first) & (recorded <= last)).sum()), first, last, dt)
         rows = np.flatnonzero(inside & has_ref)
         lost_reference = int(inside.sum()) - rows.size
         if lost_reference > MAX_MISSING_SHARE * max(int(inside.sum()), 1):

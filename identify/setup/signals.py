@@ -61,10 +61,7 @@ LEAST_SAMPLES = 10.0
 SAMPLES_UNUSABLE = 5.0
 """Samples per period below which central differences lose a fifth of the acceleration."""
 
-
 SLIP_REMEDY = "find out why the encoder lost counts (coupling, index, power), home the joint and record again"
-
-HELD_REMEDY = "record the torque at the rate at which the drive measures it"
 
 
 def step_findings(experiments: Sequence[Experiment], robot: RobotConfig) -> list[SetupFinding]:
@@ -92,7 +89,7 @@ def held_findings(experiments: Sequence[Experiment], robot: RobotConfig) -> list
     """Return the signals that change every k-th sample only, with their true rate and mean delay."""
     longest = max(experiments, key=lambda e: e.q.shape[0])
     findings = []
-    for signal, values in (("torque", longest.tau), ("position", longest.q)):
+    for quantity, values in (("torque", longest.tau), ("position", longest.q)):
         periods: dict[int, list[str]] = {}
         for j, joint in enumerate(robot.joints):
             if found := held(values[:, j]):
@@ -100,11 +97,11 @@ def held_findings(experiments: Sequence[Experiment], robot: RobotConfig) -> list
         for rows, names in periods.items():
             rate = 1.0 / longest.dt
             message = (
-                f"the {signal} of {', '.join(names)} changes every {rows} samples only ({rate / rows:.4g} Hz, recorded "
-                f"at {rate:.4g} Hz): it is {500 * (rows - 1) * longest.dt:.3g} ms old on average"
+                f"the {quantity} of {', '.join(names)} changes every {rows} samples only ({rate / rows:.4g} Hz, "
+                f"recorded at {rate:.4g} Hz): it is {500 * (rows - 1) * longest.dt:.3g} ms old on average"
             )
-            remedy = HELD_REMEDY if signal == "torque" else "record at the rate at which the position is measured"
-            findings.append(SetupFinding(f"{signal}_held", tuple(names), 1.0, message, remedy, False))
+            remedy = f"record the {quantity} at the rate at which the drive measures it"
+            findings.append(SetupFinding(f"{quantity}_held", tuple(names), 1.0, message, remedy, False))
     return findings
 
 

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from armident.configs import RobotConfig
 from armident.daq.recording.faults.jumps import JumpCriteria, jumps, unwrapped
-from armident.daq.recording.faults.zeros import zero_rows
+from armident.daq.recording.faults.zeros import switched_off, zero_rows
 from armident.daq.recording.model import Gap, Recording, Side
 
 Array = NDArray[np.float64]
@@ -33,11 +33,15 @@ _SHOWN = 4
 
 @dataclass(frozen=True)
 class Repair:
-    """Positions and demand (N, n) without wraps, rows to leave out (N,), and a sentence for each kind of fault."""
+    """Positions and demand (N, n) without wraps, and a sentence for each kind of fault.
+
+    ``wrong`` (N,): rows to leave out. ``off`` (N,): rows with drives off, which a recording keeps and nobody uses.
+    """
 
     position: Array
     demand: Array | None
     wrong: Mask
+    off: Mask
     notes: tuple[str, ...]
 
 
@@ -58,7 +62,8 @@ def repair(
     criteria = JumpCriteria()
     steps = np.diff(times)
     if steps.size < 2 * criteria.near:
-        return Repair(position, demand, np.zeros(times.size, dtype=np.bool_), ())
+        none = np.zeros(times.size, dtype=np.bool_)
+        return Repair(position, demand, none, none, ())
     dt = float(np.median(steps))
     holes = np.asarray(steps > _HOLE * dt, dtype=np.bool_)
     names = [joint.name for joint in robot.joints]
@@ -86,8 +91,8 @@ def repair(
     cuts = set() if polled else shared_steps(position, lasting)
     for row in sorted(cuts):
         notes.append(
-            f"the positions of all joints step at {at[row]:.3f} s: rows are missing there, or two recordings are in one: "
-            "cut there"
+            f"the positions of all joints step at {at[row]:.3f} s: rows are missing there, or two recordings are in "
+            "one: cut there"
         )
     for chosen, rows in _alike(wrong, names):
         values = position[rows]
@@ -96,15 +101,22 @@ def repair(
             f"the position of {chosen} is impossible {_times(rows, at)} ({what}; no motion leads there and back): "
             "left out as gaps"
         )
-    zeros = zero_rows(effort, holes, criteria)
-    for chosen, rows in _alike(zeros & ~wrong.any(axis=1)[:, None], names):
-        notes.append(
-            f"the torque of {chosen} is 0 {_times(rows, at)}, between rows where it is not: left out as gaps"
-        )
+    zeros: Mask = zero_rows(effort, holes, criteria)
+    known = np.asarray(wrong.any(axis=1), dtype=np.bool_)
+    elsewhere = np.asarray(zeros & ~known[:, None], dtype=np.bool_)
+    for chosen, rows in _alike(elsewhere, names):
+        notes.append(f"the torque of {chosen} is 0 {_times(rows, at)}, between rows where it is not: left out as gaps")
     out = np.asarray((wrong | zeros).any(axis=1), dtype=np.bool_)
+    off = np.zeros(times.size, dtype=np.bool_)
+    for begin, end in switched_off(effort, dt, criteria):
+        off[begin:end] = True
+        notes.append(
+            f"all torques are 0 from {at[begin]:.3f} to {at[end - 1]:.3f} s: drives off or brakes on; that time is not "
+            "used"
+        )
     for row in cuts:
         out[max(row - CUT // 2, 0) : row + CUT - CUT // 2] = True
-    return Repair(position, demand, out, tuple(notes))
+    return Repair(position, demand, out, off, tuple(notes))
 
 
 def shared_steps(position: Array, steps: Sequence[tuple[int, int, float]]) -> set[int]:
@@ -152,8 +164,8 @@ def repaired(recording: Recording) -> tuple[Recording, tuple[str, ...]]:
         raw[position] = found.position / np.asarray(samples.fields[position].scale)
         if demand is not None and found.demand is not None:
             raw[demand] = found.demand / np.asarray(samples.fields[demand].scale)
-    kept = ~found.wrong
-    lost = samples.sync[found.wrong]
+    kept: Mask = np.asarray(~(found.wrong | found.off), dtype=np.bool_)
+    lost = samples.sync[~kept]
     made = replace(
         samples,
         sync=samples.sync[kept],

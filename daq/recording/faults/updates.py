@@ -57,4 +57,6 @@ def resolution(x: Array) -> float:
         return 0.0
     least = float(np.quantile(sizes, 0.02))
     counts = sizes / least
-    return least if np.median(counts) < LEAST_COUNTS and np.mean(np.abs(counts - np.rint(counts)) < ON_GRID) > 0.9 else 0.0
+    return (
+        least if np.median(counts) < LEAST_COUNTS and np.mean(np.abs(counts - np.rint(counts)) < ON_GRID) > 0.9 else 0.0
+    )

@@ -12,6 +12,10 @@ NOTHING = 1e-300
 """Magnitude below which an effort is 0 in every unit: memory that was never written holds such numbers."""
 
 
+LEAST_OFF_S = 0.1
+"""Shortest time, s, for which drives are off."""
+
+
 def never_measured(effort: Array) -> Mask:
     """Mask (n,) of the efforts (N, n) that are 0 in every row."""
     return np.asarray((np.abs(effort) < NOTHING).all(axis=0), dtype=np.bool_)
@@ -38,6 +42,29 @@ def zero_rows(effort: Array, holes: Mask, criteria: JumpCriteria) -> Mask:
         for begin, end in _runs(together):
             found[begin:end, used] |= end - begin <= criteria.longest
     return found | far
+
+
+def switched_off(effort: Array, dt: float, criteria: JumpCriteria) -> list[tuple[int, int]]:
+    """First row, and the one after the last, of stretches of time in which all efforts (N, n) are 0, unlike elsewhere.
+
+    At both ends an effort is far from 0: an arm at rest without load has small efforts before and after, too.
+    """
+    used = ~never_measured(effort)
+    if not used.any():
+        return []
+    x = effort[:, used]
+    zero: Mask = np.asarray((np.abs(x) < NOTHING).all(axis=1), dtype=np.bool_)
+    usual = np.array([float(np.quantile(np.abs(np.diff(v[~zero])), criteria.quantile)) for v in x.T])
+    far: Mask = np.asarray((np.abs(x) > criteria.ratio * usual).any(axis=1), dtype=np.bool_)
+    return [
+        (begin, end)
+        for begin, end in _runs(zero)
+        if (end - begin) * dt >= LEAST_OFF_S
+        and end - begin > criteria.longest
+        and (begin > 0 or end < len(x))
+        and (begin == 0 or far[begin - 1])
+        and (end == len(x) or far[end])
+    ]
 
 
 def _far(x: Array, zero: Mask, holes: Mask, criteria: JumpCriteria) -> Mask:
