@@ -96,7 +96,9 @@ def _check(experiments: Sequence[Experiment], robot: RobotConfig) -> SetupCheck:
     findings += signals.rate_findings(experiments, robot)
     findings += _clipped(bench, best, robot, {name for finding in findings for name in finding.joints})
     lost = _not_explained(bench, best)
+    after = _errors(bench, best.h)
     if changed is not None:
+        after = tuple(min(error, 100.0 * float(left)) for error, left in zip(after, changed.left, strict=True))
         lost = tuple(
             name
             for j, name in enumerate(joint.name for joint in robot.joints)
@@ -105,7 +107,7 @@ def _check(experiments: Sequence[Experiment], robot: RobotConfig) -> SetupCheck:
     return SetupCheck(
         findings=(*setup_findings, *findings),
         relative_error_pct=before,
-        corrected_error_pct=_errors(bench, best.h),
+        corrected_error_pct=after,
         joints_not_understood=lost,
         tried=tuple(words for family, words in TRIED.items() if family in tried),
         corrected_robot=corrected,

@@ -161,10 +161,14 @@ def _stretch(bench: Bench, h: Hypothesis, rows: Mask | None) -> tuple[Stretch, M
     solved = _solved(np.tensordot(weights, grams, 1)[np.ix_(used, used)], (weights @ products)[used], ridge)
     own = solved[c:] / scale[chosen[best + 1] - c]
     without = y - (x @ solved[:c]).T
-    better = (without**2 - (without - (each_change[:, :, chosen[best + 1] - c] @ own).T) ** 2) @ weights
+    made = (each_change[:, :, chosen[best + 1] - c] @ own).T
+    better = (without**2 - (without - made) ** 2) @ weights
     shares = np.ones((3, bench.n))
     shares[:, moving] = np.sqrt(errors[[0, best + 1, -1]] / power)
     kind, joint, _ = changes[best]
+    if kind == GAIN:
+        outside = (y - without)[:, moving == joint]
+        own = np.array([float((outside * made[:, moving == joint]).sum() / (outside**2).sum())])
     return Stretch(rows, kind, joint, shares[0], shares[1], shares[2], own), _ends(rows, better)
 
 
@@ -241,12 +245,15 @@ def _best(x: Array, residual: Array, weights: Array) -> Mask:
 
 
 def spans(found: Stretch, bench: Bench) -> tuple[Span, ...]:
-    """Parts of the experiments that a stretch covers."""
-    number, time = bench.times()
-    number, time = number[found.rows], time[found.rows]
-    return tuple(
-        Span(int(k), float(time[number == k].min()), float(time[number == k].max())) for k in np.unique(number)
-    )
+    """Parts of the experiments that a stretch covers; from the instant before to that after it; infinite at an end."""
+    of, time = bench.times()
+    parts = []
+    for number in np.unique(of[found.rows]):
+        rows, own = found.rows[of == number], time[of == number]
+        first, last = np.flatnonzero(rows)[[0, -1]]
+        begin = -np.inf if first == 0 else float(own[first - 1])
+        parts.append(Span(int(number), begin, np.inf if last == rows.size - 1 else float(own[last + 1])))
+    return tuple(parts)
 
 
 def change_finding(found: Stretch, bench: Bench, h: Hypothesis) -> SetupFinding:
