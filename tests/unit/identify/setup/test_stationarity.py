@@ -53,7 +53,7 @@ def test_an_arm_that_stays_the_same_gives_none(seed: int) -> None:
 @pytest.mark.parametrize("seed", SEEDS)
 def test_a_base_that_moves_is_gravity_of_another_direction(seed: int) -> None:
     robot = setups.random_arm(seed, 3)
-    g, angle = np.array(robot.gravity), np.radians(20.0)
+    g, angle = np.array(robot.gravity), np.radians(30.0)
     aside = np.cross(g, [0.3, 0.5, 0.8])
     moved = np.cos(angle) * g + np.sin(angle) * np.linalg.norm(g) * aside / np.linalg.norm(aside)
     e, at = recorded(robot, seed), 8.0 + seed
