@@ -23,8 +23,10 @@ from armident.daq.interchange.stated_units import in_si
 from armident.daq.interchange.table_columns import NAMES
 from armident.daq.interchange.table_files import Source
 from armident.daq.interchange.table_rows import EFFORTS, TableRows, complete_rows
+from armident.daq.interchange.text_files import listed
 from armident.daq.recording import Field, Recording, Stream, read_recording
 from armident.daq.recording.faults.repair import repair
+from armident.daq.recording.faults.sign_bit import sign_bit
 from armident.daq.recording.model import Side
 
 __all__ = ["NAMES", "OMITTED", "import_recording"]
@@ -107,7 +109,9 @@ def _from_table(robot: RobotConfig, source: Source, options: ImportOptions, fact
     path = source.path
     rate_hz, resample_hz = options.get("rate_hz"), options.get("resample_hz")
     polled, motor_side = options.get("polled", False), options.get("motor_side", False)
-    rows = in_si(table_rows(source, robot, options), robot, options.get("units") or {})
+    rows = table_rows(source, robot, options)
+    _refuse_sign_bits(source, rows)
+    rows = in_si(rows, robot, options.get("units") or {})
     _refuse_immense(source, rows)
     side: Side = "motor" if motor_side else "joint"
     rows = _repaired(rows, robot, side, options)
@@ -256,6 +260,21 @@ def _refuse_immense(source: Source, rows: TableRows) -> None:
             row, column = bad[0]
             where = source.place(int(rows.row[row]), rows.labels[name][column])
             raise DataError(f"{where}: {values[row, column]:.3g} is too large for a measurement")
+
+
+def _refuse_sign_bits(source: Source, rows: TableRows) -> None:
+    """Refuse efforts that have their sign in a bit: as numbers they are wrong wherever they are negative."""
+    for name in EFFORTS:
+        values = rows.values.get(name, np.zeros((0, 0)))
+        bit = next((bit for column in values.T if (bit := sign_bit(column)) is not None), None)
+        if bit is not None:
+            labels = zip(rows.labels[name], values.T, strict=True)
+            named = [label for label, column in labels if column.max() >= 1 << bit]
+            raise DataError(
+                f"{source.path}: {listed(named)}: whole numbers that are never negative, and jump by {1 << bit} "
+                f"where the motion turns: bit {bit} is the sign; decode it where they are recorded: "
+                f"x if x < {1 << bit} else {1 << bit} - x"
+            )
 
 
 def _rows_with_demand(source: Source, rows: TableRows) -> slice:

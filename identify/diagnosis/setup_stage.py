@@ -15,7 +15,7 @@ from armident.identify.signals.experiments import Experiment
 
 SIGNALS = {"position_sign": "position", "torque_sign": "torque"}
 
-REMARKS = ("rate_too_slow", "joint_at_rest", "torque_held", "position_held")
+REMARKS = ("rate_too_slow", "joint_at_rest", "torque_held", "position_held", "position_resolution")
 """Kinds of finding that become warnings: they limit the recordings and are no mistake of the model."""
 
 
@@ -76,7 +76,7 @@ def set_up(
         for experiments, first in ((training, 0), (validation, len(training)))
     )
     for finding in check.findings:
-        if finding.kind in ("standstill", "position_step"):
+        if finding.kind in ("standstill", "position_step", "torque_too_small"):
             raise DataError(f"{finding.message}; {finding.remedy}")
     corrected = robot if check.corrected_robot is None else check.corrected_robot
     tried = "; ".join(check.tried)

@@ -94,6 +94,8 @@ def _check(experiments: Sequence[Experiment], robot: RobotConfig) -> SetupCheck:
         setup_findings, corrected = (*of_clock, *found.findings), found.robot
         tried = tried | again.tried
     findings += signals.rate_findings(experiments, robot)
+    if not any(finding.kind in ("torque_unit", "side") for finding in setup_findings):
+        findings += signals.small_torque_findings(experiments, robot)
     findings += _clipped(bench, best, robot, {name for finding in findings for name in finding.joints})
     lost = _not_explained(bench, best)
     after = _errors(bench, best.h)

@@ -5,9 +5,10 @@ import pytest
 from numpy.random import Generator
 from numpy.typing import NDArray
 
-from armident.configs import RobotConfig, load_robot
+from armident.configs import DataError, RobotConfig, load_robot
 from armident.daq.interchange.importing import recording_of_arrays
 from armident.daq.recording.faults.repair import REASON, Repair, repair
+from armident.daq.recording.faults.sign_bit import sign_bit
 
 Array = NDArray[np.float64]
 SEEDS = range(30)
@@ -129,3 +130,28 @@ def test_impossible_rows_are_gaps_of_the_recording_and_are_interpolated(tx40: Ro
     again, notes = repaired(Recording(None, tx40, None, 500.0, {"samples": samples}))
     assert len(notes) == 1
     assert [(gap.first, gap.reason) for gap in again.gaps] == [(1000, REASON), (1001, REASON), (2500, REASON)]
+
+
+@pytest.mark.parametrize("bit", [7, 10, 15])
+def test_a_sign_in_a_bit_is_refused_with_the_way_to_decode_it(tx40: RobotConfig, bit: int) -> None:
+    t, q, tau = motion(np.random.default_rng(bit), 500.0)
+    size = np.rint(0.8 * (1 << bit) * (tau - tau.mean(axis=0)) / np.abs(tau - tau.mean(axis=0)).max(axis=0))
+    with pytest.raises(DataError, match=f"bit {bit} is the sign"):
+        recording_of_arrays(t, q, np.where(size < 0, (1 << bit) - size, size), tx40)
+    assert sign_bit(size[:, 0]) is None
+    assert sign_bit(np.abs(size[:, 0])) is None
+
+
+def test_drives_that_were_off_are_not_used(tx40: RobotConfig) -> None:
+    t, q, tau = motion(np.random.default_rng(5), 500.0)
+    tau[1000:2000] = 0.0
+    result = found(t, q, tau, tx40)
+    assert np.flatnonzero(result.off).tolist() == list(range(1000, 2000))
+    assert not result.wrong.any()
+
+
+def test_all_joints_that_step_at_once_are_cut_there(tx40: RobotConfig) -> None:
+    t, q, tau = motion(np.random.default_rng(6), 1000.0)
+    q[4000:] += [0.1, -0.2, 0.15, 0.3, -0.4, 0.2]
+    result = found(t, q, tau, tx40)
+    assert np.flatnonzero(result.wrong).tolist() == [3998, 3999, 4000, 4001]

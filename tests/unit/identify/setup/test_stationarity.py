@@ -13,7 +13,7 @@ from armident.identify.robot.arm import ArmModel
 from armident.identify.setup.bench import Bench, make_bench
 from armident.identify.setup.fit import Hypothesis
 from armident.identify.setup.result import SetupFinding
-from armident.identify.setup.signals import held_findings, step_findings
+from armident.identify.setup.signals import held_findings, rate_findings, small_torque_findings, step_findings
 from armident.identify.setup.stationarity import change_finding, spans, stretch
 from armident.identify.signals.experiments import Experiment
 from tests.fixtures import setups
@@ -95,7 +95,8 @@ def test_a_gain_that_changes_for_a_while_is_named_with_its_factor_and_left_out()
     assert finding is not None
     assert re.search(r"torques of axis_2 1\.[45]\d? times", finding.message)
     assert not finding.decisive
-    assert (begin, end) == (pytest.approx(6.0, abs=0.3), pytest.approx(13.0, abs=0.3))
+    assert begin == pytest.approx(6.0, abs=0.3)
+    assert end == pytest.approx(13.0, abs=0.3)
     h = Hypothesis(np.eye(3), np.eye(3), np.array(robot.gravity), np.zeros(3))
     change = stretch(bench, h)
     assert change is not None
@@ -129,3 +130,23 @@ def test_held_torques_are_said_with_their_rate_and_age(rows: int) -> None:
     assert f"({500 / rows:.4g} Hz" in finding.message
     assert f"{1000 * (rows - 1) / 2 * e.dt:.3g} ms old" in finding.message
     assert held_findings([replace(e, tau=np.round(e.tau, 1), q=np.round(e.q, 3))], robot) == []
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_torques_far_below_their_limits_do_not_carry_an_arm(seed: int) -> None:
+    robot = setups.random_arm(seed, 3)
+    e = recorded(robot, seed)
+    assert small_torque_findings([e], robot) == []
+    noise = np.random.default_rng(seed).normal(size=e.tau.shape)
+    external = 0.001 * np.array([joint.limits.torque for joint in robot.joints]) * noise
+    (finding,) = small_torque_findings([replace(e, tau=external)], robot)
+    assert finding.decisive
+
+
+def test_positions_with_two_decimals_are_named_for_their_steps_and_not_for_their_rate() -> None:
+    robot = setups.random_arm(1, 3)
+    e = recorded(robot, 1)
+    assert rate_findings([e], robot) == []
+    coarse = rate_findings([replace(e, q=np.round(e.q, 2))], robot)
+    assert {finding.kind for finding in coarse} <= {"position_resolution"}
+    assert any("steps of 0.01 rad" in finding.message for finding in coarse)
