@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from armident.configs import ConfigError, DataError, RobotConfig, SessionConfig
 from armident.daq.interchange.bag_files import bag_files
-from armident.daq.interchange.clocks import gaps_and_counters
+from armident.daq.interchange.clocks import UNITS, gaps_and_counters
 from armident.daq.interchange.import_options import ImportOptions
 from armident.daq.interchange.lerobot import data_files
 from armident.daq.interchange.readers import check_options, reader_of
@@ -22,8 +22,11 @@ from armident.daq.interchange.si_checks import OMITTED, check_units, fast_note, 
 from armident.daq.interchange.stated_units import in_si
 from armident.daq.interchange.table_columns import NAMES
 from armident.daq.interchange.table_files import Source
-from armident.daq.interchange.table_rows import TableRows, complete_rows
+from armident.daq.interchange.table_rows import EFFORTS, TableRows, complete_rows
+from armident.daq.interchange.text_files import listed
 from armident.daq.recording import Field, Recording, Stream, read_recording
+from armident.daq.recording.faults.repair import repair
+from armident.daq.recording.faults.sign_bit import sign_bit
 from armident.daq.recording.model import Side
 
 __all__ = ["NAMES", "OMITTED", "import_recording"]
@@ -106,9 +109,12 @@ def _from_table(robot: RobotConfig, source: Source, options: ImportOptions, fact
     path = source.path
     rate_hz, resample_hz = options.get("rate_hz"), options.get("resample_hz")
     polled, motor_side = options.get("polled", False), options.get("motor_side", False)
-    rows = in_si(table_rows(source, robot, options), robot, options.get("units") or {})
+    rows = table_rows(source, robot, options)
+    _refuse_sign_bits(source, rows)
+    rows = in_si(rows, robot, options.get("units") or {})
     _refuse_immense(source, rows)
     side: Side = "motor" if motor_side else "joint"
+    rows = _repaired(rows, robot, side, options)
     fields: dict[str, Field] = {
         name: Field(
             name, name, si_unit_of(name, robot), "motor" if name in ("current", "voltage") else side, (1.0,) * robot.n
@@ -146,6 +152,26 @@ def _from_table(robot: RobotConfig, source: Source, options: ImportOptions, fact
     if resample_hz is None or abs(made.rate_hz / resample_hz - 1.0) < 1e-9:
         return recording
     return at_rate(recording, resample_hz)
+
+
+def _repaired(rows: TableRows, robot: RobotConfig, side: Side, options: ImportOptions) -> TableRows:
+    """Return the rows without wraps of their positions and without impossible rows, with a note on each kind."""
+    rate_hz = options.get("rate_hz")
+    if rows.times is None or rate_hz is not None:
+        times = rows.row / (rate_hz or 1.0)
+    else:
+        unit = options.get("time_unit") or rows.time_unit
+        times = rows.times * UNITS.get(unit, 1.0)
+    effort = next(rows.values[name] for name in EFFORTS if name in rows.values)
+    q, demand, polled = rows.values["position"], rows.values.get("demand"), options.get("polled", False)
+    found = repair(q, effort, demand, times, robot, side, polled=polled)
+    if not found.notes:
+        return rows
+    values = {**rows.values, "position": found.position}
+    if found.demand is not None:
+        values["demand"] = found.demand
+    made = replace(rows, values=values, notes=(*rows.notes, *found.notes))
+    return made.taken(~found.wrong)
 
 
 def read_rows(path: Path, robot: RobotConfig, **options: Unpack[ImportOptions]) -> tuple[Source, TableRows]:
@@ -234,6 +260,21 @@ def _refuse_immense(source: Source, rows: TableRows) -> None:
             row, column = bad[0]
             where = source.place(int(rows.row[row]), rows.labels[name][column])
             raise DataError(f"{where}: {values[row, column]:.3g} is too large for a measurement")
+
+
+def _refuse_sign_bits(source: Source, rows: TableRows) -> None:
+    """Refuse efforts that have their sign in a bit: as numbers they are wrong wherever they are negative."""
+    for name in EFFORTS:
+        values = rows.values.get(name, np.zeros((0, 0)))
+        bit = next((bit for column in values.T if (bit := sign_bit(column)) is not None), None)
+        if bit is not None:
+            labels = zip(rows.labels[name], values.T, strict=True)
+            named = [label for label, column in labels if column.max() >= 1 << bit]
+            raise DataError(
+                f"{source.path}: {listed(named)}: whole numbers that are never negative, and jump by {1 << bit} "
+                f"where the motion turns: bit {bit} is the sign; decode it where they are recorded: "
+                f"x if x < {1 << bit} else {1 << bit} - x"
+            )
 
 
 def _rows_with_demand(source: Source, rows: TableRows) -> slice:

@@ -12,6 +12,7 @@ from armident.daq.interchange.si_checks import OMITTED
 from armident.daq.interchange.table_columns import TableColumns, find_columns, find_time, unused_demand
 from armident.daq.interchange.table_files import Source
 from armident.daq.interchange.text_files import listed
+from armident.daq.recording.faults.zeros import never_measured
 from armident.daq.recording.model import Quantity
 
 EFFORTS: tuple[Quantity, ...] = ("torque", "current", "voltage")
@@ -222,8 +223,8 @@ def _incomplete(source: Source, rows: TableRows, partial: NDArray[np.bool_], who
 
 def _zero(rows: TableRows, name: Quantity, whole: NDArray[np.bool_]) -> list[str]:
     """Return the labels of the columns of a quantity that are 0 in all complete rows."""
-    zero = rows.values[name][whole].T == 0
-    return [label for label, is_zero in zip(rows.labels[name], zero, strict=True) if is_zero.all()]
+    zero = never_measured(rows.values[name][whole])
+    return [label for label, is_zero in zip(rows.labels[name], zero, strict=True) if is_zero]
 
 
 def _empty(rows: TableRows) -> list[str]:

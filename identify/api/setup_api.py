@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from armident.configs import RobotConfig
+from armident.daq.recording.faults.repair import repaired
 from armident.identify.api.arguments import Recorded, Robot, recordings_of, robot_of
 from armident.identify.api.result_base import Result
 from armident.identify.api.result_tables import Table
@@ -55,6 +56,7 @@ class CheckedSetup(Result):
         for finding in self.findings:
             lines.append(f"{finding.kind}: {finding.message} (probability {finding.probability:.2f})")
             lines.append(f"  correct it by: {finding.remedy}")
+        lines += [f"remark: {note}" for note in document.repairs]
         if shift is not None and shift.applied:
             lines.append(f"remark: {shift.remark}")
         before, after = (
@@ -115,7 +117,8 @@ def check(recordings: Recorded | Sequence[Recorded], robot: Robot | None = None)
     """
     read = recordings_of(recordings)
     config = robot_of(robot, read)
-    experiments, _ = experiments_of(read, config, name_files=True)
+    usable = [repaired(recording) for recording in read]
+    experiments, _ = experiments_of([recording for recording, _ in usable], config, name_files=True)
     found = check_setup(experiments, config)
     joints = [joint.name for joint in config.joints]
     corrected = found.corrected_robot
@@ -131,6 +134,7 @@ def check(recordings: Recorded | Sequence[Recorded], robot: Robot | None = None)
         corrected_configuration=None if corrected is None else corrected.model_dump(mode="json", by_alias=True),
         clock=float(found.clock),
         torque_shift=None if found.torque_shift is None else plain(found.torque_shift),
+        repairs=[note for _, notes in usable for note in notes],
         versions=versions(),
     )
     return CheckedSetup(document, corrected, found)

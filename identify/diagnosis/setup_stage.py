@@ -8,13 +8,14 @@ import numpy as np
 from armident.configs import DataError, RobotConfig
 from armident.identify.diagnosis.criteria import Criteria
 from armident.identify.documents.diagnosis import Finding, Gap, Unexplained
+from armident.identify.identification.from_recording import MIN_PIECE_S
 from armident.identify.setup.check import check_setup
-from armident.identify.setup.result import CONVENTIONS, SetupCheck, SetupFinding, with_torque_shift
+from armident.identify.setup.result import CONVENTIONS, SetupCheck, SetupFinding, Span, with_torque_shift
 from armident.identify.signals.experiments import Experiment
 
 SIGNALS = {"position_sign": "position", "torque_sign": "torque"}
 
-REMARKS = ("rate_too_slow", "joint_at_rest")
+REMARKS = ("rate_too_slow", "joint_at_rest", "torque_held", "position_held", "position_resolution")
 """Kinds of finding that become warnings: they limit the recordings and are no mistake of the model."""
 
 
@@ -70,8 +71,12 @@ def set_up(
     """Check the set-up and correct its mistakes; DataError if nothing moves or recordings do not fit together."""
     check = check_setup([*training, *validation], robot)
     shift = check.torque_shift
+    training, validation = (
+        outside(experiments, check.stretch, first)
+        for experiments, first in ((training, 0), (validation, len(training)))
+    )
     for finding in check.findings:
-        if finding.kind == "standstill":
+        if finding.kind in ("standstill", "position_step", "torque_too_small"):
             raise DataError(f"{finding.message}; {finding.remedy}")
     corrected = robot if check.corrected_robot is None else check.corrected_robot
     tried = "; ".join(check.tried)
@@ -94,6 +99,26 @@ def set_up(
         shift is not None and shift.known,
         criteria,
     )
+
+
+def outside(experiments: Sequence[Experiment], stretch: Sequence[Span], first: int) -> list[Experiment]:
+    """Return the experiments, numbered from ``first``, without a stretch of time in which the arm is another one."""
+    kept = []
+    for number, e in enumerate(experiments, start=first):
+        time = e.start + e.dt * np.arange(e.q.shape[0])
+        inside = np.zeros(time.size, dtype=np.bool_)
+        for span in stretch:
+            inside |= (number == span.experiment) & (time >= span.begin) & (time <= span.end)
+        edges = np.flatnonzero(np.diff(np.concatenate([[True], inside, [True]])))
+        if not inside.any():
+            edges = np.array([0, time.size])
+        for begin, end in zip(edges[::2], edges[1::2], strict=True):
+            part = slice(int(begin), int(end))
+            if (end - begin) * e.dt >= MIN_PIECE_S:
+                q_ref = None if e.q_ref is None else e.q_ref[part]
+                start = float(time[begin])
+                kept.append(replace(e, q=e.q[part], tau=e.tau[part], q_ref=q_ref, start=start))
+    return kept
 
 
 def _findings(finding: SetupFinding, check: SetupCheck, robot: RobotConfig) -> Iterator[Finding]:
@@ -127,6 +152,9 @@ def _findings(finding: SetupFinding, check: SetupCheck, robot: RobotConfig) -> I
     if finding.kind in SIGNALS:
         for joint in finding.joints:
             yield made("sign_error", joint, dict(of_joint["sign_error", joint]))
+    elif finding.kind == "change_in_time":
+        for joint in finding.joints:
+            yield made(finding.kind, joint, {})
     elif finding.kind == "time_shift":
         for joint in finding.joints:
             yield made("time_delay", joint, dict(of_joint["time_delay", joint]))

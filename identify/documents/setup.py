@@ -64,6 +64,8 @@ class SetupDocument(Document):
     torque_shift
         Estimated common shift of the torques, samples, with its standard deviation and those of the joints; null if it
         was not estimated.
+    repairs
+        Faults of the signals that were repaired: wraps, impossible rows, drives that were off; empty if there are none.
     versions
         Versions of Python and of the libraries.
     """
@@ -80,4 +82,5 @@ class SetupDocument(Document):
     corrected_configuration: dict[str, Any] | None
     clock: float
     torque_shift: dict[str, Any] | None
+    repairs: list[str] = Field(default_factory=list)
     versions: dict[str, str]

@@ -1,15 +1,18 @@
 """Experiments from a recording, read from a file or assembled from the stream."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
 
 from armident.configs import DataError, Joint, RobotConfig
 from armident.configs.schema.limits import ENDLESS
 from armident.daq.recording import Recording, Stream
+from armident.daq.recording.faults.repair import repaired
+from armident.daq.recording.faults.zeros import NOTHING
 from armident.identify.identification.identification_criteria import IdentificationCriteria
 from armident.identify.identification.set_points import between_set_points
 from armident.identify.signals.experiments import Experiment
@@ -23,6 +26,9 @@ RATE_TOLERANCE = 0.01
 """Relative difference between the nominal rate and the receive times above which a note is added."""
 NO_REFERENCE = "no reference trajectory was recorded: identified without one"
 """Note on a recording without demands."""
+BRIDGED = 2
+"""Missing samples that are interpolated: a cubic through their neighbours errs by less than the noise where the rate
+gives ten samples per period of the motion. Longer gaps separate pieces."""
 PIECE = 1_000_000
 """Number of samples whose references are looked up at a time."""
 EFFORTS: tuple[Literal["torque", "current", "voltage"], ...] = ("torque", "current", "voltage")
@@ -65,7 +71,9 @@ def _converted(
 ) -> tuple[Sequence[Experiment], list[str]]:
     _check_same_robot(recording.robot, robot)
     _check_counters(recording)
-    notes: list[str] = []
+    recorded = recording.samples.sync
+    recording, remarks = repaired(recording)
+    notes = list(remarks)
     if recording.missing:
         notes.append(f"the recording is torn: {recording.missing}")
     samples = recording.samples
@@ -78,12 +86,12 @@ def _converted(
     used: list[NDArray[np.int64]] = []
     for first, last in recording.experiments():
         inside = (samples.sync >= first) & (samples.sync <= last)
-        _check_missing(int(inside.sum()), first, last, dt)
+        _check_missing(int(((recorded >= first) & (recorded <= last)).sum()), first, last, dt)
         rows = np.flatnonzero(inside & has_ref)
         lost_reference = int(inside.sum()) - rows.size
         if lost_reference > MAX_MISSING_SHARE * max(int(inside.sum()), 1):
             raise DataError(f"the reference is missing for {lost_reference} of {int(inside.sum())} samples")
-        cuts = np.flatnonzero(np.diff(samples.sync[rows]) != 1) + 1
+        cuts = np.flatnonzero(np.diff(samples.sync[rows]) > BRIDGED + 1) + 1
         pieces = [piece for piece in np.split(rows, cuts) if piece.size]
         long_enough = [piece for piece in pieces if piece.size * dt >= MIN_PIECE_S]
         if len(pieces) > 1:
@@ -126,15 +134,32 @@ def _experiments(
     q_ref = None if demand is None else _reference(demand, samples, robot)
     return [
         Experiment(
-            q=q[rows],
-            tau=tau[rows],
-            q_ref=None if q_ref is None else q_ref[rows],
+            q=_bridged(q[rows], samples.sync[rows], CubicSpline),
+            tau=_bridged(tau[rows], samples.sync[rows], _linear),
+            q_ref=None if q_ref is None else _bridged(q_ref[rows], samples.sync[rows], _linear),
             dt=dt,
             start=float(samples.sync[rows[0]] - begin) * dt,
             source="" if recording.path is None else str(recording.path),
         )
         for rows in pieces
     ]
+
+
+def _linear(at: Array, x: Array) -> Callable[[Array], Array]:
+    """Piecewise linear function through values (N, n) at increasing places (N,)."""
+    return lambda t: np.stack([np.interp(t, at, column) for column in x.T], axis=1)
+
+
+def _bridged(x: Array, sync: NDArray[np.int64], through: Callable[[Array, Array], Callable[[Array], Array]]) -> Array:
+    """Signals (N, n) at SYNC numbers (N,) with the missing samples between them, which ``through`` interpolates."""
+    every = np.arange(sync[0], sync[-1] + 1)
+    if every.size == sync.size:
+        return x
+    known = np.isin(every, sync)
+    whole = np.empty((every.size, x.shape[1]))
+    whole[known] = x
+    whole[~known] = through(sync.astype(np.float64), x)(every[~known].astype(np.float64))
+    return whole
 
 
 def _part(recording: Recording, rows: NDArray[np.int64]) -> Recording:
@@ -265,7 +290,8 @@ def _has_reference(stream: Stream, sync: NDArray[np.int64]) -> NDArray[np.bool_]
 
 
 def _signal_notes(experiments: Sequence[Experiment], robot: RobotConfig) -> list[str]:
-    notes = []
+    notes: list[str] = []
+    unmeasured: list[str] = []
     ranges, torques, count = [], [], 0
     saturation = [joint.drive.saturation for joint in robot.joints]
     gain = np.array([joint.drive.gain for joint in robot.joints])
@@ -286,8 +312,16 @@ def _signal_notes(experiments: Sequence[Experiment], robot: RobotConfig) -> list
                 f"{joint.name} was recorded over [{seen[0]:.3g}, {seen[1]:.3g}] {unit}, outside its limits "
                 f"[{low:.3g}, {high:.3g}]: wrong unit, or wrong limits?"
             )
+        largest = max(max(abs(float(low[j])), abs(float(high[j]))) for low, high in torques)
+        if largest < NOTHING and seen[1] - seen[0] >= IdentificationCriteria.rest_limit_share * _usual_range(joint):
+            unmeasured.append(joint.name)
         if max(float(tau[j]) for _, tau in torques) == min(float(tau[j]) for tau, _ in torques):
             notes.append(f"{joint.name}: the torque never changes; is its drive reporting?")
+    if unmeasured:
+        raise DataError(
+            f"the torque of {', '.join(unmeasured)} is 0 in every row although the joint moves: probably not measured; "
+            "check the mapping of the torque where it was recorded"
+        )
     for joint, share in zip(robot.joints, saturated / count, strict=True):
         if share > 0.01:
             notes.append(f"{joint.name}: its drive is saturated in {100 * share:.0f} % of the samples")

@@ -69,7 +69,7 @@ GENERIC = np.array([3.1, -5.3, -7.6])
 
 @dataclass(frozen=True)
 class Segment:
-    """Signals (W, n) of one experiment at the working rate: rad or m, s, N m or N."""
+    """Signals (W, n) of one experiment at the working rate: rad or m, s, N m or N; ``begin``: time of the first, s."""
 
     q: Array
     qd: Array
@@ -77,6 +77,8 @@ class Segment:
     tau: Array
     dt: float
     q_ref: Array | None = None
+    begin: float = 0.0
+    experiment: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,6 +135,14 @@ class Bench:
             moves = [np.ones_like(m) for m in moves]
         stride = max(1, -(-sum(int(m.sum()) for m in moves) // self.rows_kept))
         return tuple(np.flatnonzero(m)[::stride] for m in moves)
+
+    def times(self) -> tuple[NDArray[np.int64], Array]:
+        """Number of the experiment, and time since its recording began, s, of every instant of the rows, (M,) each."""
+        parts = [
+            (np.full(kept.size, s.experiment), s.begin + self.decimation.instants(s.q.shape[0])[kept] * s.dt)
+            for s, kept in zip(self.segments, self.instants_used, strict=True)
+        ]
+        return np.concatenate([number for number, _ in parts]), np.concatenate([time for _, time in parts])
 
     @property
     def _fastest(self) -> Array:
@@ -246,7 +256,7 @@ def make_bench(
     first = design(dt, 0.4 / working, first_factor) if first_factor > 1 else design(dt, 0.5 / dt, 1)
     second = design(working, cutoff, max(1, int(0.5 / (working * cutoff) + 1e-9)))
     segments = []
-    for e in experiments:
+    for number, e in enumerate(experiments):
         if second.count(first.count(e.q.shape[0])) < 4:
             continue
         q = first(e.q)
@@ -254,7 +264,16 @@ def make_bench(
         qdd = np.gradient(qd, working, axis=0)
         q_ref = None if e.q_ref is None else first(e.q_ref)
         segments.append(
-            Segment(q, qd, qdd, first(_shifted(e.tau, np.full(robot.n, e.torque_shift - 0.5))), working, q_ref)
+            Segment(
+                q,
+                qd,
+                qdd,
+                first(_shifted(e.tau, np.full(robot.n, e.torque_shift - 0.5))),
+                working,
+                q_ref,
+                e.start + first.margin * dt,
+                number,
+            )
         )
     count = sum(second.count(s.q.shape[0]) for s in segments)
     samples = sum(e.q.shape[0] for e in experiments)

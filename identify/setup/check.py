@@ -17,6 +17,7 @@ from armident.identify.setup.describe import described
 from armident.identify.setup.fit import Hypothesis, joint_errors
 from armident.identify.setup.result import SetupCheck, SetupFinding, TorqueShift
 from armident.identify.setup.search import NOT_UNDERSTOOD, STRUCTURED, Search, Step
+from armident.identify.setup.stationarity import Stretch, change_finding, spans, stretch
 from armident.identify.setup.torque_shift import SHIFT_RATE, long_torque_shift, torque_shift
 from armident.identify.signals.experiments import Experiment, check_one_rate
 
@@ -68,8 +69,19 @@ def _check(experiments: Sequence[Experiment], robot: RobotConfig) -> SetupCheck:
         nothing = (100.0,) * robot.n
         return SetupCheck(tuple(findings), nothing, nothing, (), ("standstill",), None)
     findings += signals.clipped_findings(experiments, robot, moving)
+    findings += signals.held_findings(experiments, robot)
+    damaged = signals.step_findings(experiments, robot)
+    if damaged:
+        # No correction is right beside signals that are wrong for a part of the time.
+        bench = make_bench(experiments, robot, moving)
+        errors = _errors(bench, _as_configured(robot))
+        return SetupCheck((*damaged, *findings), errors, errors, (), (), None)
     bench, search, best = _searched(experiments, robot, moving)
     found = described(best, robot, bench)
+    best, changed = _stretch(bench, best)
+    if changed is not None:
+        found = described(best, robot, bench)
+        findings.append(change_finding(changed, bench, best.h))
     tried, before = search.tried, _errors(bench, _as_configured(robot))
     setup_findings, corrected = found.findings, found.robot
     clock = best.h.clock
@@ -82,17 +94,28 @@ def _check(experiments: Sequence[Experiment], robot: RobotConfig) -> SetupCheck:
         setup_findings, corrected = (*of_clock, *found.findings), found.robot
         tried = tried | again.tried
     findings += signals.rate_findings(experiments, robot)
+    if not any(finding.kind in ("torque_unit", "side") for finding in setup_findings):
+        findings += signals.small_torque_findings(experiments, robot)
     findings += _clipped(bench, best, robot, {name for finding in findings for name in finding.joints})
     lost = _not_explained(bench, best)
+    after = _errors(bench, best.h)
+    if changed is not None:
+        after = tuple(min(error, 100.0 * float(left)) for error, left in zip(after, changed.left, strict=True))
+        lost = tuple(
+            name
+            for j, name in enumerate(joint.name for joint in robot.joints)
+            if name in lost and changed.left[j] > NOT_UNDERSTOOD
+        )
     return SetupCheck(
         findings=(*setup_findings, *findings),
         relative_error_pct=before,
-        corrected_error_pct=_errors(bench, best.h),
+        corrected_error_pct=after,
         joints_not_understood=lost,
         tried=tuple(words for family, words in TRIED.items() if family in tried),
         corrected_robot=corrected,
         clock=clock,
         torque_shift=None if lost else _torque_shift(experiments, bench, best),
+        stretch=() if changed is None else spans(changed, bench),
     )
 
 
@@ -105,6 +128,22 @@ def _torque_shift(experiments: Sequence[Experiment], bench: Bench, best: Step) -
         return torque_shift(finer, best.h)
     except (DataError, np.linalg.LinAlgError):
         return None
+
+
+def _stretch(bench: Bench, best: Step) -> tuple[Step, Stretch | None]:
+    """Return the set-up, and the stretch of time in which the arm is another one.
+
+    A change in time competes with the corrections: they go where it explains the torques as well without them.
+    """
+    found = stretch(bench, best.h)
+    if best.families and best.h.clock == 1.0:
+        configured = Step(_as_configured(bench.robot))
+        alone = stretch(bench, configured.h)
+        if found is not None and alone is not None and alone.certain:
+            left = found.left if found.certain else found.error
+            if np.log(alone.left / left).sum() <= 0.0:
+                return configured, alone
+    return best, found if found is not None and found.certain else None
 
 
 def _searched(

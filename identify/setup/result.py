@@ -35,8 +35,9 @@ class SetupFinding:
 
     ``kind``: ``position_sign``, ``torque_sign``, ``joint_order``, ``position_unit``, ``torque_unit``, ``time_unit``,
     ``gear_ratio``, ``side``, ``gravity_direction``, ``gravity_missing``, ``time_shift``, ``torque_clipped``,
-    ``rate_too_slow``, ``standstill`` or ``joint_at_rest``. ``probability``: share among the hypotheses tried.
-    ``remedy``: correcting configuration line or option. ``decisive``: results are unusable without it.
+    ``rate_too_slow``, ``standstill``, ``joint_at_rest``, ``position_step``, ``position_resolution``,
+    ``torque_held``, ``position_held``, ``torque_too_small`` or ``change_in_time``. ``probability``: share among
+    those tried. ``remedy``: correcting configuration line or option. ``decisive``: results are unusable without it.
     """
 
     kind: str
@@ -127,12 +128,22 @@ class TorqueShift:
 
 
 @dataclass(frozen=True)
+class Span:
+    """Part of an experiment (its number) from ``begin`` to ``end``, s since the recording began."""
+
+    experiment: int
+    begin: float
+    end: float
+
+
+@dataclass(frozen=True)
 class SetupCheck:
     """Result of `armident.identify.setup.check.check_setup`.
 
     ``relative_error_pct``, ``corrected_error_pct`` (n,): norm of the rigid model's torque residual over the torque,
     before and after correction. ``joints_not_understood``: over a third of the torque left, with no explanation.
-    ``clock``: true over recorded duration. ``torque_shift``: common shift by less than a sample or two.
+    ``clock``: true over recorded duration. ``torque_shift``: common shift by less than a sample or two. ``stretch``:
+    the part of the time in which the arm is another one.
     """
 
     findings: tuple[SetupFinding, ...]
@@ -143,6 +154,7 @@ class SetupCheck:
     corrected_robot: RobotConfig | None
     clock: float = 1.0
     torque_shift: TorqueShift | None = None
+    stretch: tuple[Span, ...] = ()
 
 
 def with_torque_shift(experiments: Sequence[Experiment], shift: TorqueShift | None) -> Sequence[Experiment]:

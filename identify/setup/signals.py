@@ -6,7 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import signal
 
-from armident.configs import RobotConfig
+from armident.configs import Joint, RobotConfig
+from armident.daq.recording.faults.jumps import JumpCriteria, jumps
+from armident.daq.recording.faults.updates import held, resolution
 from armident.identify.setup.plausible import NO_LIMIT
 from armident.identify.setup.result import SetupFinding
 from armident.identify.signals.experiments import Experiment
@@ -40,6 +42,9 @@ CLIPPED_SHARE = 2e-3
 CLIPPED_UNUSABLE = 0.05
 """Share of clipped samples from which on results are unusable."""
 
+SHOWN = 4
+"""Events that a message lists."""
+
 REST_REMEDY = "record a motion of all joints: armident trajectory designs one"
 
 CLIPPED_REMEDY = "record a gentler motion, or with a wider range of the torque signal"
@@ -55,6 +60,71 @@ LEAST_SAMPLES = 10.0
 
 SAMPLES_UNUSABLE = 5.0
 """Samples per period below which central differences lose a fifth of the acceleration."""
+
+SLIP_REMEDY = "find out why the encoder lost counts (coupling, index, power), home the joint and record again"
+
+
+SMALLEST_TORQUE = 0.005
+"""Torque (rms) over its limit that every joint of a moving arm exceeds: a quarter of the least peak of `plausible`."""
+
+
+def small_torque_findings(experiments: Sequence[Experiment], robot: RobotConfig) -> list[SetupFinding]:
+    """Return a finding if the torques of all joints are far too small to move and hold an arm with these limits."""
+    limits = np.array([joint.limits.torque for joint in robot.joints])
+    if not (limits < NO_LIMIT).all() or not any(robot.gravity):
+        return []
+    rms = np.sqrt(np.mean(np.concatenate([e.tau for e in experiments]) ** 2, axis=0))
+    if np.any(rms >= SMALLEST_TORQUE * limits):
+        return []
+    shares = ", ".join(f"{100 * share:.2g}" for share in rms / limits)
+    message = (
+        f"the torques are {shares} % of their limits (rms by joint), too little to carry this arm against gravity: "
+        "external torques, currents, or a residual of the controller?"
+    )
+    names = tuple(joint.name for joint in robot.joints)
+    remedy = "record the torques of the motors, or give drive.gain for currents"
+    return [SetupFinding("torque_too_small", names, 1.0, message, remedy, True)]
+
+
+def step_findings(experiments: Sequence[Experiment], robot: RobotConfig) -> list[SetupFinding]:
+    """Return the steps of a position that last: no motion makes them, and nothing tells the right position."""
+    findings = []
+    criteria = JumpCriteria()
+    for j, joint in enumerate(robot.joints):
+        unit, limits = "rad" if joint.type == "revolute" else "m", joint.limits
+        found = [
+            (e.start + row * e.dt, size)
+            for e in experiments
+            for row, size in jumps(
+                e.q[:, j], e.dt, np.zeros(len(e.q) - 1, np.bool_), limits.velocity, limits.acceleration, criteria
+            ).steps
+        ]
+        if found:
+            each = ", ".join(f"{size:+.4g} {unit} at {t:.3f} s" for t, size in found[:SHOWN])
+            more = f", and {len(found) - SHOWN} more" if len(found) > SHOWN else ""
+            message = f"the position of {joint.name} steps for good, faster than any motion: {each}{more}"
+            findings.append(SetupFinding("position_step", (joint.name,), 1.0, message, SLIP_REMEDY, True))
+    return findings
+
+
+def held_findings(experiments: Sequence[Experiment], robot: RobotConfig) -> list[SetupFinding]:
+    """Return the signals that change every k-th sample only, with their true rate and mean delay."""
+    longest = max(experiments, key=lambda e: e.q.shape[0])
+    findings = []
+    for quantity, values in (("torque", longest.tau), ("position", longest.q)):
+        periods: dict[int, list[str]] = {}
+        for j, joint in enumerate(robot.joints):
+            if found := held(values[:, j]):
+                periods.setdefault(found.rows, []).append(joint.name)
+        for rows, names in periods.items():
+            rate = 1.0 / longest.dt
+            message = (
+                f"the {quantity} of {', '.join(names)} changes every {rows} samples only ({rate / rows:.4g} Hz, "
+                f"recorded at {rate:.4g} Hz): it is {500 * (rows - 1) * longest.dt:.3g} ms old on average"
+            )
+            remedy = f"record the {quantity} at the rate at which the drive measures it"
+            findings.append(SetupFinding(f"{quantity}_held", tuple(names), 1.0, message, remedy, False))
+    return findings
 
 
 def moving_joints(experiments: Sequence[Experiment], robot: RobotConfig) -> NDArray[np.bool_]:
@@ -147,8 +217,12 @@ def rate_findings(experiments: Sequence[Experiment], robot: RobotConfig) -> list
     dt = experiments[0].dt
     highest = np.max([velocity_frequency(e.q, dt) for e in experiments], axis=0)
     slow = np.flatnonzero(highest * dt * LEAST_SAMPLES > 1.0)
+    longest = max(experiments, key=lambda e: e.q.shape[0])
+    coarse = {int(j): step for j in slow if (step := resolution(longest.q[:, j]))}
+    findings = [_coarse(robot.joints[j], step, longest.q[:, j]) for j, step in coarse.items()]
+    slow = np.array([j for j in slow if int(j) not in coarse], dtype=np.int64)
     if not slow.size:
-        return []
+        return findings
     names = tuple(robot.joints[j].name for j in slow)
     most = float(highest[slow].max())
     message = (
@@ -156,7 +230,21 @@ def rate_findings(experiments: Sequence[Experiment], robot: RobotConfig) -> list
         f"the velocity's power lies below {most:.3g} Hz, which needs {LEAST_SAMPLES * most:.3g} Hz"
     )
     unusable = most * dt * SAMPLES_UNUSABLE > 1.0
-    return [SetupFinding("rate_too_slow", names, 1.0, message, "record faster, or a slower motion", unusable)]
+    return [
+        *findings,
+        SetupFinding("rate_too_slow", names, 1.0, message, "record faster, or a slower motion", unusable),
+    ]
+
+
+def _coarse(joint: Joint, step: float, q: Array) -> SetupFinding:
+    """Position in steps so coarse that their noise looks like a fast motion."""
+    unit = "rad" if joint.type == "revolute" else "m"
+    message = (
+        f"the position of {joint.name} is recorded in steps of {step:.3g} {unit}, {np.ptp(q) / step:.0f} over its "
+        "motion: their noise is larger than the motion from one sample to the next"
+    )
+    remedy = "write positions with more decimals, or in the counts of the encoder"
+    return SetupFinding("position_resolution", (joint.name,), 1.0, message, remedy, False)
 
 
 def velocity_frequency(q: Array, dt: float) -> Array:
