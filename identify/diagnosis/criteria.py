@@ -15,6 +15,9 @@ class Criteria:
     ----------
     false_alarm_rate
         Probability of any finding for a plant that has the structure of the model. `alpha` divides it among the tests.
+    change_rate
+        Probability of a change against a baseline of the same plant, as of `armident compare`, so that both agree: one
+        in 200 years of weekly runs.
     material_pct
         Least change of a joint's torque by a finding, percent of the root mean square of its torque. Smaller effects
         are listed as negligible. Chosen by the user (``--material``).
@@ -92,12 +95,16 @@ class Criteria:
     modulated_line
         Width to either side of a line that the motion modulates, in bandwidths of the motion: sidebands of slow motion
         lie within a tenth.
+    larger_error
+        Relative error of a joint over that in the baseline, with another motion, above which an effect is looked for.
+        The torque that it relates to differs, and the errors of one model by less.
     estimable
         Share of a parameter in the observed directions above which its change is reported by itself: the other
         directions hold 3 % of it at most.
     """
 
     false_alarm_rate: float = 0.01
+    change_rate: float = 1e-4
     material_pct: float = 0.2
     least_share: float = 0.04
     confirmation_level: float = 0.01
@@ -129,13 +136,15 @@ class Criteria:
     line_level: float = 0.01
     reference_line: float = 100.0
     modulated_line: float = 0.1
+    larger_error: float = 1.5
     estimable: float = 0.999
 
     @property
     def alpha(self) -> dict[str, float]:
         """Division of the false-alarm rate: selection of effects, lack of fit, and changed parameters."""
         rate = self.false_alarm_rate
-        return {"selection": 0.5 * rate, "lack_of_fit": 0.25 * rate, "changed_parameters": 0.25 * rate}
+        changed = min(0.25 * rate, self.change_rate)
+        return {"selection": 0.5 * rate, "lack_of_fit": 0.25 * rate, "changed_parameters": changed}
 
     @property
     def ambiguous_odds(self) -> float:

@@ -12,7 +12,7 @@ from armident.identify.documents.comparison import LEVEL_95, ComparedModel, Comp
 from armident.identify.documents.identification import IdentificationDocument, Parameter
 from armident.identify.effects.terms import terms_of
 from armident.identify.identification.saved_model import configuration_of
-from armident.identify.monitoring.change.change_test import FALSE_ALARMS, ParameterChangeTest, compare
+from armident.identify.diagnosis.change_test import FALSE_ALARMS, ParameterChangeTest, compare
 from armident.identify.monitoring.change.model_differences import model_differences
 
 

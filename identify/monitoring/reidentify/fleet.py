@@ -18,7 +18,7 @@ from armident.identify.documents.files import from_json, load_document, to_json
 from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.identification.identify_recording import identify_recording
 from armident.identify.identification.options import Options, options_of
-from armident.identify.monitoring.change.change_test import ParameterChangeTest, compare
+from armident.identify.diagnosis.change_test import ParameterChangeTest, compare
 from armident.identify.monitoring.change.history import History
 from armident.identify.monitoring.reidentify.reidentify_options import ReidentifyOptions
 from armident.identify.monitoring.reidentify.summary import change_lines
@@ -153,7 +153,7 @@ def _judged(
         if document.verdict == "unusable":
             raise DataError(f"the identification is unusable ({document.reasons[0].message})")
         baselines.setdefault(arm, first or document)
-        drift = None if first is None else compare(first, document, false_alarms)
+        drift = None if first is None else compare(first, document, false_alarms, found.robot)
         if drift is None or first is None:
             words = (f"first run of {_name(*arm)}: the baseline", *refused)
             return Row(str(path), words=words, identification=found.path)

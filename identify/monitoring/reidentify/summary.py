@@ -6,7 +6,7 @@ import numpy as np
 
 from armident.configs import RobotConfig
 from armident.identify.documents.diagnosis import DiagnosisDocument
-from armident.identify.monitoring.change.change_test import ParameterChangeTest
+from armident.identify.diagnosis.change_test import ParameterChangeTest
 
 _NAME = re.compile(r"([a-z]+)(\d+)r?(?:_\d+)?$")
 CLEAR = 2.0
