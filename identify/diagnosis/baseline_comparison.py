@@ -3,7 +3,7 @@
 Runs are independent, so that covariances add. Errors that both models have, on the same motion, cancel.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -40,6 +40,10 @@ class Difference:
     def values(self) -> Array:
         """Later less earlier parameters, (k,)."""
         return np.asarray(self.now - self.before)
+
+    def widened(self, factor: float) -> "Difference":
+        """The difference with larger standard deviations."""
+        return replace(self, covariance=factor**2 * self.covariance)
 
     @property
     def std(self) -> Array:

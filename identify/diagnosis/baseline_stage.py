@@ -131,6 +131,11 @@ class _Described:
     def _joints(self) -> list[str]:
         return [joint.name for joint in self.robot.joints]
 
+    @property
+    def _share(self) -> float:
+        """Share of the difference that the explanation explains."""
+        return 1.0 if self.test.explanation is None else self.test.explanation.share
+
     def _errors(self, found: Sequence[ExplainedChange]) -> list[Array]:
         """Torque errors (M, n) of every experiment with the baseline's parameters after some changes."""
         blocks, prepared = self.result.equations, self.result.prepared
@@ -178,7 +183,7 @@ class _Described:
             other=found.change.joints[1] if len(found.change.joints) > 1 else None,
             kind="structure" if found.change.structure else "numbers",
             parameters=found.parameters,
-            confidence=found.probability(),
+            confidence=found.probability() * self._share,
             alternatives=[
                 Alternative(effect=change.effect.name, joint=change.joints[0], score=odds)
                 for change, odds in found.odds[: self.criteria.alternatives]

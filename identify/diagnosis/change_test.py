@@ -19,6 +19,7 @@ from armident.identify.diagnosis.residual_test import (
     ResidualTest,
     compare_residuals,
     residual_difference,
+    same_motion,
 )
 from armident.identify.documents.identification import IdentificationDocument, Parameter
 from armident.identify.regression.multiple_testing import holm
@@ -172,13 +173,16 @@ def compare(
 
     Changed parameters of a ``robot`` are explained. Raises DataError and Inconclusive as `difference_of`.
     """
+    criteria = criteria or Criteria()
     difference = difference_of(baseline, now)
+    if "doubtful" in (baseline.verdict, now.verdict) and not same_motion(baseline, now):
+        difference = difference.widened(criteria.other_motion)
     residuals = compare_residuals(baseline, now)
     pool = [] if robot is None else list(changes(robot, now))
     found = _tested(difference, tuple(now.parameters), false_alarms, residuals)
     if not pool:
         return replace(found, left=residuals)
-    competition = Competition.of(difference, residual_difference(baseline, now), pool, criteria or Criteria())
+    competition = Competition.of(difference, residual_difference(baseline, now), pool, criteria)
     found = replace(found, p_changes=competition.p_value())
     if not found.drifted:
         return replace(found, left=residuals)

@@ -76,22 +76,18 @@ class ExplainedChange:
 class Explanation:
     """Changes that explain a difference; without any, ``rest`` is the whole difference.
 
-    ``rest`` (k,): difference that is left. ``dispersion``: variance of its whitened values, at least 1. ``unexplained``:
-    numbers of the parameters of which a significant part is left.
+    ``rest`` (k,): difference of parameters that is left, with the probability ``p_rest`` without a further change, and
+    ``unexplained``: numbers of those of which a significant part is left. ``share``: of the chi-square of parameters
+    and residuals beyond its expectation, that the changes explain; 1 if what is left is not significant.
     """
 
     difference: Difference
     changes: tuple[ExplainedChange, ...]
     rest: Array
-    dispersion: float
     p_rest: float
     unexplained: tuple[int, ...]
+    share: float
 
-    @property
-    def share(self) -> float:
-        """Share of the chi-square of the difference that the changes explain."""
-        left = self.difference.whitening @ self.rest
-        return 1.0 - float(left @ left) / max(self.difference.chi_square()[0], 1e-300)
 
     def residual_scores(self, joint: int) -> Array | float:
         """Change of the residual statistics of a joint, (s,), that the changes predict."""
@@ -158,12 +154,16 @@ class Competition:
         moved = sum((one.change.directions @ v for one, v in zip(found, self._values(found), strict=True)), np.zeros(1))
         rest = self.difference.values - moved
         count = self.difference.whitening.shape[0]
-        own, degrees = _rest_of(self.target[:count], [w.of_parameters(count) for w in found])
-        p_rest = float(stats.chi2.sf(own @ own, degrees)) if degrees else 1.0
+        own, free = _rest_of(self.target[:count], [w.of_parameters(count) for w in found])
+        p_rest = float(stats.chi2.sf(own @ own, free)) if free else 1.0
         single = holm(2 * stats.norm.sf(np.abs(rest) / self.difference.std))
         unexplained = tuple(int(k) for k in np.argsort(single) if single[k] < alpha)
         changes = tuple(self._described(found, one, dispersion) for one in found)
-        return Explanation(self.difference, changes, rest, dispersion, p_rest, unexplained)
+        excess = float(self.target @ self.target) - self.target.size
+        share = 1.0
+        if stats.chi2.sf(left @ left, degrees) < alpha:
+            share = float(np.clip(1.0 - (left @ left - degrees) / max(excess, 1e-300), 0.0, 1.0))
+        return Explanation(self.difference, changes, rest, p_rest, unexplained, share)
 
     def _best(self, found: Sequence["Whitened"]) -> "Whitened | None":
         """Best physically possible candidate beside others."""

@@ -95,6 +95,9 @@ class Criteria:
     modulated_line
         Width to either side of a line that the motion modulates, in bandwidths of the motion: sidebands of slow motion
         lie within a tenth.
+    other_motion
+        Factor of the standard deviations of a difference between two motions, where the residuals of one run are not
+        noise: errors of the model do not cancel then. See docs/diagnosis.md, Baseline, for the healthy pairs.
     larger_error
         Relative error of a joint over that in the baseline, with another motion, above which an effect is looked for.
         The torque that it relates to differs, and the errors of one model by less.
@@ -136,6 +139,7 @@ class Criteria:
     line_level: float = 0.01
     reference_line: float = 100.0
     modulated_line: float = 0.1
+    other_motion: float = 2.0
     larger_error: float = 1.5
     estimable: float = 0.999
 

@@ -170,7 +170,7 @@ def _diagnose(
     if baseline is not None:
         steps("changed parameters")
         change = against_baseline(stage, baseline, criteria)
-        study = replace(study, sought=change.sought)
+        study = replace(study, sought=change.sought, sign_given=study.sign_given or change.complete)
     steps("base fit")
     selection = StepwiseSelection(study, steps, deadline, steps.tested, shifts=stage.shifts)
     first = selection.start()
@@ -182,7 +182,7 @@ def _diagnose(
     selected = [one for one in every if one not in conventional]
     after = gap_of(final, held=True)
     steps("unexplained dependences")
-    dependences = unexplained(final)
+    dependences = () if change.complete else unexplained(final)
     rest = [
         Unexplained(joint=d.joint, share_of_residual=d.share, varies_with=d.varies_with, hint=d.hint)
         for d in dependences
@@ -237,7 +237,7 @@ def _diagnose(
         own=_of_findings(_own, final, chosen_for),
         q=_sampled(final, "q"),
         qd=_sampled(final, "qd"),
-        where=dependences_of(first),
+        where=() if change.complete else dependences_of(first),
         left=dependences,
         simulated=simulated,
     )

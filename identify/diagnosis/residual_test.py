@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 
 SAME_MOTION = 0.1
 """Largest difference of range and speed of a joint between both runs, as share of them. The model errors of a healthy
-arm cancel in the difference only if the motion is the same.
+arm cancel in the difference only if the motion of all joints is the same.
 A shift of an eighth of the range would be one knot of the functions of position."""
 
 RANK = 1e-3
@@ -64,7 +64,7 @@ class ResidualChange:
 
 @dataclass(frozen=True)
 class ResidualTest:
-    """Test of all joints and kinds; ``reason``: why structure is not compared, for all joints or some."""
+    """Test of all joints and kinds; ``reason``: why structure is not compared."""
 
     tests: tuple[ResidualChange, ...] = ()
     reason: str = ""
@@ -95,17 +95,18 @@ def compare_residuals(
         return ResidualTest(reason="structure is not compared: this run has no statistics of the residuals")
     before = {each.joint: each for each in baseline.residual_statistics}
     pairs = [(before[e.joint], _less(e, predicted(j))) for j, e in enumerate(now.residual_statistics) if e.joint in before]
-    same = [(old, new) for old, new in pairs if _same_motion(old, new)]
     other = [new.joint for old, new in pairs if not _same_motion(old, new)]
-    reason = f"structure of {', '.join(other)} is not compared: the motion is not that of the baseline" if other else ""
-    tests = [test for old, new in same for test in _tests(old, new)]
+    if other:
+        return ResidualTest(
+            reason=f"structure is not compared: the motion of {', '.join(other)} is not that of the baseline"
+        )
+    tests = [test for old, new in pairs for test in _tests(old, new)]
     corrected = holm(np.array([test.p_value for test in tests])) if tests else np.empty(0)
     return ResidualTest(
         tuple(
             ResidualChange(t.joint, t.kind, t.statistic, t.degrees, float(p), t.band_hz)
             for t, p in zip(tests, corrected, strict=True)
-        ),
-        reason,
+        )
     )
 
 
@@ -187,9 +188,16 @@ def _whitened_functions(old: ResidualStatistics, new: ResidualStatistics, part: 
 def residual_difference(baseline: IdentificationDocument, now: IdentificationDocument) -> list[tuple[Array, Array]]:
     """Whitened difference of the functions of every joint, and its change per score; empty for another motion."""
     before = {each.joint: each for each in baseline.residual_statistics or ()}
+    same = same_motion(baseline, now)
     return [
         _whitened_functions(before[each.joint], each, slice(None))
-        if each.joint in before and _same_motion(before[each.joint], each)
+        if same
         else (np.zeros(0), np.zeros((0, len(each.score))))
         for each in now.residual_statistics or ()
     ]
+
+
+def same_motion(baseline: IdentificationDocument, now: IdentificationDocument) -> bool:
+    """True if all joints moved alike in both runs, as far as the documents tell."""
+    before = {each.joint: each for each in baseline.residual_statistics or ()}
+    return all(e.joint in before and _same_motion(before[e.joint], e) for e in now.residual_statistics or ())

@@ -20,6 +20,7 @@ from armident.identify.identification.identify_recording import identify_recordi
 from armident.identify.identification.options import Options, options_of
 from armident.identify.diagnosis.change_test import ParameterChangeTest, compare
 from armident.identify.monitoring.change.history import History
+from armident.identify.monitoring.reidentify.baseline import doubt_of
 from armident.identify.monitoring.reidentify.reidentify_options import ReidentifyOptions
 from armident.identify.monitoring.reidentify.summary import change_lines
 from armident.identify.report.robot_file import write_identification
@@ -155,7 +156,7 @@ def _judged(
         baselines.setdefault(arm, first or document)
         drift = None if first is None else compare(first, document, false_alarms, found.robot)
         if drift is None or first is None:
-            words = (f"first run of {_name(*arm)}: the baseline", *refused)
+            words = (f"first run of {_name(*arm)}: the baseline{doubt_of(document)}", *refused)
             return Row(str(path), words=words, identification=found.path)
         refused = refused or _entered(history, found, document, (first, drift))
     except (ArmidentError, OSError, RuntimeError) as error:
