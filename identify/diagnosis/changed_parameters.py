@@ -27,6 +27,8 @@ RANK_TOLERANCE = 1e-7
 """Relative singular value below which a direction of normalised changes is dropped: rounding of the covariances."""
 SIZES = np.geomspace(1e-2, 1e8, 41)
 """Sizes of a change to try, standard deviations of its best determined combination of parameters."""
+SWEEPS = 5
+"""Most passes over the sizes of several changes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -273,12 +275,26 @@ def _log_likelihood(square: float, count: int) -> float:
 
 
 def _whitened_by(target: Array, found: Sequence[Whitened]) -> tuple[Array, float]:
-    """Matrix (r, r) that whitens the difference with some changes of their best sizes, and half its log determinant."""
-    root, half = np.eye(target.size), 0.0
-    for one in found:
-        columns = root @ one.columns
-        _, size = _evidence(root @ target, columns)
-        u, s, _ = np.linalg.svd(columns, full_matrices=False)
+    """Matrix (r, r) that whitens the difference with some changes of their best sizes, and half its log determinant.
+
+    The sizes are those of all changes together: alone, one would take the size of another, too.
+    """
+    sizes = [0.0] * len(found)
+    for _ in range(SWEEPS if len(found) > 1 else 1):
+        before = list(sizes)
+        for k, one in enumerate(found):
+            root, _ = _whitening_of([o for o in found if o is not one], [*sizes[:k], *sizes[k + 1 :]], target.size)
+            sizes[k] = _evidence(root @ target, root @ one.columns)[1]
+        if sizes == before:
+            break
+    return _whitening_of(found, sizes, target.size)
+
+
+def _whitening_of(found: Sequence[Whitened], sizes: Sequence[float], rows: int) -> tuple[Array, float]:
+    """Matrix (rows, rows) that whitens the difference with changes of given sizes, and half its log determinant."""
+    root, half = np.eye(rows), 0.0
+    for one, size in zip(found, sizes, strict=True):
+        u, s, _ = np.linalg.svd(root @ one.columns, full_matrices=False)
         ratios = (size * s) ** 2
         root = root - (u * (1.0 - 1.0 / np.sqrt(1.0 + ratios))) @ (u.T @ root)
         half += 0.5 * float(np.log1p(ratios).sum())
