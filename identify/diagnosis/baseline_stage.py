@@ -4,23 +4,24 @@ The recordings are identified as the baseline was: errors that both models have 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
 
-from armident.configs import DataError, RobotConfig
+from armident.configs import RobotConfig
 from armident.configs.schema.robot import Effect as Entry
 from armident.identify.diagnosis.baseline_comparison import Inconclusive
 from armident.identify.diagnosis.change_test import ParameterChangeTest, compare
 from armident.identify.diagnosis.changed_parameters import ExplainedChange
-from armident.identify.diagnosis.changes import Change, place_of
+from armident.identify.diagnosis.changes import place_of
 from armident.identify.diagnosis.criteria import Criteria
 from armident.identify.diagnosis.setup_stage import SetupStage
 from armident.identify.documents.base import RecordingReference
 from armident.identify.documents.diagnosis import Alternative, Finding, Gap, Unexplained
 from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.effects.terms import entry_of
+from armident.identify.effects.unnamed import NAME as UNNAMED
 from armident.identify.identification.document import identification_document
 from armident.identify.identification.identification_result import IdentificationResult
 from armident.identify.identification.options import Options
@@ -56,7 +57,18 @@ class BaselineStage:
         """True if nothing is left to look for."""
         return self.sought == ()
 
-    def left(self, findings: Sequence[Finding], rest: Sequence[Unexplained], joints: Sequence[str]) -> list[Unexplained]:
+    def beside(self, structural: Sequence[Finding], joints: Sequence[str]) -> list[Finding]:
+        """Findings of changes, without those of joints at which something was left and has a structural name now.
+
+        The parameters there follow the effect that the model lacks.
+        """
+        sought = {joints[j] for j in self.sought or ()}
+        superseded = sought & {f.joint for f in structural if f.effect != UNNAMED}
+        return [f for f in self.findings if f.joint not in superseded]
+
+    def left(
+        self, findings: Sequence[Finding], rest: Sequence[Unexplained], joints: Sequence[str]
+    ) -> list[Unexplained]:
         """Dependences that are left beside structural ``findings``; ``rest``: those of the final model."""
         if self.sought is None:
             return list(rest)
@@ -232,7 +244,8 @@ class _Described:
             gap_after=float(self.result.relative_error_pct_by_joint[j]),
             evidence={
                 "title": "parameters that have changed",
-                "description": "parameters differ from the baseline, and no effect of the catalogue explains it: " + each,
+                "description": "parameters differ from the baseline, and no effect of the catalogue explains it: "
+                + each,
                 "p_value": explanation.p_rest,
                 "std": {name: float(std[k]) for name, k in zip(names, numbers, strict=True)},
                 "gap_joint": self._joints[j],
@@ -253,12 +266,13 @@ class _Described:
         return list(found.values())
 
     def _worse(self) -> set[int]:
-        """Joints of another motion than the baseline's with a much larger error: their residuals are not compared."""
+        """Joints of another motion than the baseline's with much larger residuals: their functions are not compared."""
         if not self.test.residuals.reason:
             return set()
-        before = [self.baseline.relative_error_pct_by_joint.get(name, 0.0) for name in self._joints]
-        errors = self.result.relative_error_pct_by_joint
-        return {j for j, b in enumerate(before) if errors[j] > self.criteria.larger_error * b}
+        before = {each.joint: each for each in self.baseline.residual_statistics or ()}
+        now = self.result.residual_statistics
+        ratios = [sum(e.band_power) / max(sum(before[e.joint].band_power), 1e-300) for e in now if e.joint in before]
+        return {j for j, ratio in enumerate(ratios) if ratio > self.criteria.larger_error**2}
 
     def _warnings(self) -> list[str]:
         lines = [self.test.residuals.reason] if self.test.residuals.reason else []

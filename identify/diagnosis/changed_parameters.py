@@ -90,7 +90,6 @@ class Explanation:
     unexplained: tuple[int, ...]
     share: float
 
-
     def residual_scores(self, joint: int) -> Array | float:
         """Change of the residual statistics of a joint, (s,), that the changes predict."""
         return sum(

@@ -30,7 +30,15 @@ from armident.identify.diagnosis.setup_stage import set_up
 from armident.identify.diagnosis.simulated import SimulatedErrors, simulated_errors
 from armident.identify.diagnosis.study import build_study
 from armident.identify.documents.base import RecordingReference, versions
-from armident.identify.documents.diagnosis import BeforeAfter, DiagnosisDocument, Finding, Gap, Gaps, Unexplained, Verdict
+from armident.identify.documents.diagnosis import (
+    BeforeAfter,
+    DiagnosisDocument,
+    Finding,
+    Gap,
+    Gaps,
+    Unexplained,
+    Verdict,
+)
 from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.effects.friction import TRANSITION
 from armident.identify.effects.recording_corrections import of_recording
@@ -191,7 +199,7 @@ def _diagnose(
     stopped = _stopped(selection, len(named))
     doubtful = {entry.joint for entry in stage.doubtful(after)}
     explained = [(f, one) for f, one in zip(named, selected, strict=True) if f.joint not in doubtful]
-    first_findings = [*stage.findings, *change.findings]
+    first_findings = [*stage.findings, *change.beside([f for f, _ in explained], study.joints)]
     findings = [*first_findings, *(f for f, _ in explained)]
     chosen_for = [*(None for _ in first_findings), *(one for _, one in explained)]
     left = stage.left(change.left(named, rest, study.joints), after)

@@ -94,7 +94,9 @@ def compare_residuals(
     if now.residual_statistics is None:
         return ResidualTest(reason="structure is not compared: this run has no statistics of the residuals")
     before = {each.joint: each for each in baseline.residual_statistics}
-    pairs = [(before[e.joint], _less(e, predicted(j))) for j, e in enumerate(now.residual_statistics) if e.joint in before]
+    pairs = [
+        (before[e.joint], _less(e, predicted(j))) for j, e in enumerate(now.residual_statistics) if e.joint in before
+    ]
     other = [new.joint for old, new in pairs if not _same_motion(old, new)]
     if other:
         return ResidualTest(

@@ -8,6 +8,9 @@ from typing import Any
 import numpy as np
 
 from armident.configs import DataError
+from armident.identify.diagnosis.change_test import FALSE_ALARMS, ParameterChangeTest, compare
+from armident.identify.diagnosis.changed_parameters import ExplainedChange
+from armident.identify.diagnosis.criteria import Criteria
 from armident.identify.documents.comparison import (
     LEVEL_95,
     ComparedModel,
@@ -16,9 +19,6 @@ from armident.identify.documents.comparison import (
     NamedChange,
 )
 from armident.identify.documents.identification import IdentificationDocument, Parameter
-from armident.identify.diagnosis.change_test import FALSE_ALARMS, ParameterChangeTest, compare
-from armident.identify.diagnosis.changed_parameters import ExplainedChange
-from armident.identify.diagnosis.criteria import Criteria
 from armident.identify.effects.terms import terms_of
 from armident.identify.identification.saved_model import configuration_of
 from armident.identify.monitoring.change.model_differences import model_differences

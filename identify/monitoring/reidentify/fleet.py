@@ -14,11 +14,11 @@ from armident.configs import ArmidentError, ConfigError, DataError, RobotConfig,
 from armident.configs.errors import FOUND
 from armident.daq.recording import Recording, read_recording
 from armident.extras import install_line
+from armident.identify.diagnosis.change_test import ParameterChangeTest, compare
 from armident.identify.documents.files import from_json, load_document, to_json
 from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.identification.identify_recording import identify_recording
 from armident.identify.identification.options import Options, options_of
-from armident.identify.diagnosis.change_test import ParameterChangeTest, compare
 from armident.identify.monitoring.change.history import History
 from armident.identify.monitoring.reidentify.baseline import doubt_of
 from armident.identify.monitoring.reidentify.reidentify_options import ReidentifyOptions

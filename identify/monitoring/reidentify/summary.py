@@ -5,8 +5,8 @@ import re
 import numpy as np
 
 from armident.configs import RobotConfig
-from armident.identify.documents.diagnosis import DiagnosisDocument
 from armident.identify.diagnosis.change_test import ParameterChangeTest
+from armident.identify.documents.diagnosis import DiagnosisDocument
 
 _NAME = re.compile(r"([a-z]+)(\d+)r?(?:_\d+)?$")
 CLEAR = 2.0

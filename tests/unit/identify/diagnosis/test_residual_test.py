@@ -6,11 +6,11 @@ import yaml
 
 from armident.configs import config_path
 from armident.configs.schema.scenario import Scenario
+from armident.identify.diagnosis.change_test import compare
+from armident.identify.diagnosis.residual_test import compare_residuals
 from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.identification.identify_recording import identify_recording
 from armident.identify.identification.residual_statistics import band_powers, motion_functions
-from armident.identify.diagnosis.change_test import compare
-from armident.identify.diagnosis.residual_test import compare_residuals
 from armident.identify.regression.ar_noise import ArModel
 from tests.fixtures.arms import FAST, recording
 from tests.fixtures.store import shared
