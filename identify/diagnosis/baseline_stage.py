@@ -32,9 +32,6 @@ from armident.identify.regression.equations import applied, instants
 
 Array = NDArray[np.float64]
 
-UNKNOWN = RecordingReference(path=None, sha256="", sample_rate_hz=0.0, samples=0)
-"""Reference of the identification within a diagnosis, which is not stored."""
-
 
 @dataclass(frozen=True)
 class BaselineStage:
@@ -83,10 +80,13 @@ def against_baseline(stage: SetupStage, baseline: IdentificationDocument, criter
 
     Raises DataError if the baseline is of another robot or model.
     """
-    robot = _as_identified(stage.robot, baseline)
+    robot, experiments = _as_identified(stage.robot, baseline), [*stage.training, *stage.validation]
+    # Of a document that is not stored; the test needs the length.
+    samples = sum(e.q.shape[0] for e in experiments)
+    recorded = RecordingReference(path=None, sha256="", sample_rate_hz=1.0 / experiments[0].dt, samples=samples)
     try:
-        result = identify_experiment([*stage.training, *stage.validation], robot, _options(baseline))
-        now = identification_document(result, [UNKNOWN], with_numbers(robot, result.sign_smoothing))
+        result = identify_experiment(experiments, robot, _options(baseline))
+        now = identification_document(result, [recorded], with_numbers(robot, result.sign_smoothing))
         test = compare(baseline, now, criteria.alpha["changed_parameters"], robot, criteria)
     except Inconclusive as error:
         return BaselineStage(warnings=(f"not compared with the baseline: {error}",))
@@ -230,7 +230,8 @@ class _Described:
         numbers = explanation.unexplained or tuple(np.argsort(-np.abs(explanation.rest) / std)[:3].tolist())
         names = [explanation.difference.names[k] for k in numbers]
         each = "; ".join(
-            f"{name} was {self.test.before[k]:.4g}, differs by {explanation.rest[k]:+.3g} (standard deviation {std[k]:.2g})"
+            f"{name} was {self.test.before[k]:.4g}, differs by {explanation.rest[k]:+.3g} "
+            f"(standard deviation {std[k]:.2g})"
             for name, k in zip(names, numbers, strict=True)
         )
         return Finding(

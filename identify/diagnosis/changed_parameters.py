@@ -3,8 +3,8 @@
 A change moves the difference d, of covariance C, along few directions: ``d = B p``. With ``p`` normal of typical ratios
 and free size, ``d`` is normal, too: its likelihood is the criterion. The data choose the size, so that an explanation
 with many parameters pays for those that it needs only. What no explanation takes enlarges C: the best one is judged by
-the difference that it leaves, not by a covariance that the recordings contradict. Residuals of the same motion are a part
-of the difference: changes that the parameters absorb alike differ in what they leave.
+the difference that it leaves, not by a covariance that the recordings contradict. Residuals of the same motion are a
+part of the difference: changes that the parameters absorb alike differ in what they leave.
 """
 
 from collections.abc import Sequence
@@ -147,7 +147,7 @@ class Competition:
                 break
             gain = _evidence_of(self.target, [*found, best]) - _evidence_of(self.target, found)
             # The tests of the difference admit the first change; among more, each must be significant by itself.
-            if found and gain < np.log(len(self.candidates) / alpha):
+            if found and (gain < np.log(len(self.candidates) / alpha) or self._within_first_order(found, best)):
                 break
             found = self._exchanged([*found, best])
         left, degrees = _rest_of(self.target, found)
@@ -165,6 +165,17 @@ class Competition:
         if stats.chi2.sf(left @ left, degrees) < alpha:
             share = float(np.clip(1.0 - (left @ left - degrees) / max(excess, 1e-300), 0.0, 1.0))
         return Explanation(self.difference, changes, rest, p_rest, unexplained, share)
+
+    def _within_first_order(self, found: Sequence["Whitened"], best: "Whitened") -> bool:
+        """True if a further change takes no more than what the directions of the others leave of large changes.
+
+        Those of parameters are exact. The others hold for small changes, and for noise models without them.
+        """
+        if all(one.change.scores is None for one in found):
+            return False
+        whole = float(self.target @ self.target)
+        before, after = (float(left @ left) for left, _ in (_rest_of(self.target, w) for w in (found, [*found, best])))
+        return before - after < self.criteria.least_share * (whole - before)
 
     def _best(self, found: Sequence["Whitened"]) -> "Whitened | None":
         """Best physically possible candidate beside others."""

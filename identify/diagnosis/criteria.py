@@ -100,7 +100,8 @@ class Criteria:
         noise: errors of the model do not cancel then. See docs/diagnosis.md, Baseline, for the healthy pairs.
     larger_error
         Root mean square of the residuals of a joint over that in the baseline, with another motion, above which an
-        effect is looked for. Errors of one model differ with the motion; of 152 joints of healthy random arms, 5 differ by more.
+        effect is looked for. Errors of one model differ with the motion; of 152 joints of healthy random arms, 5 differ
+        by more.
     estimable
         Share of a parameter in the observed directions above which its change is reported by itself: the other
         directions hold 3 % of it at most.

@@ -178,6 +178,7 @@ def _diagnose(
     if baseline is not None:
         steps("changed parameters")
         change = against_baseline(stage, baseline, criteria)
+        study = study.of_robot(with_entries(study.robot, change.entries))
         study = replace(study, sought=change.sought, sign_given=study.sign_given or change.complete)
     steps("base fit")
     selection = StepwiseSelection(study, steps, deadline, steps.tested, shifts=stage.shifts)
@@ -236,7 +237,7 @@ def _diagnose(
     held = final.study.held
     return DiagnosisResult(
         document=document,
-        robot=with_entries(final.with_values(), change.entries),
+        robot=final.with_values(),
         t=_continued([s.t for s in held]),
         measured=np.concatenate([s.y for s in held]),
         before=_predicted_for_final(final, first),

@@ -102,7 +102,8 @@ def compare_residuals(
         return ResidualTest(
             reason=f"structure is not compared: the motion of {', '.join(other)} is not that of the baseline"
         )
-    tests = [test for old, new in pairs for test in _tests(old, new)]
+    variance = _variance(baseline, now)
+    tests = [test for old, new in pairs for test in _tests(old, new, variance)]
     corrected = holm(np.array([test.p_value for test in tests])) if tests else np.empty(0)
     return ResidualTest(
         tuple(
@@ -129,7 +130,16 @@ def _same_motion(old: ResidualStatistics, new: ResidualStatistics) -> bool:
     )
 
 
-def _tests(old: ResidualStatistics, new: ResidualStatistics) -> list[ResidualChange]:
+def _variance(baseline: IdentificationDocument, now: IdentificationDocument) -> float:
+    """Variance of a difference over that of the baseline's coefficient: a shorter run determines them less well."""
+    before, after = (
+        sum(each.samples for each in (document.recording, *(document.further_recordings or ())))
+        for document in (baseline, now)
+    )
+    return 1.0 + before / after if before and after else 2.0
+
+
+def _tests(old: ResidualStatistics, new: ResidualStatistics, variance: float) -> list[ResidualChange]:
     """Tests of one joint; their p-values are not corrected. Bands are left out if their limits differ."""
     k = len(new.score)
     split = 2 * k // 3
@@ -139,7 +149,7 @@ def _tests(old: ResidualStatistics, new: ResidualStatistics) -> list[ResidualCha
         ("velocity", slice(split, k)),
     )
     for kind, part in kinds:
-        value, degrees = _functions(old, new, part)
+        value, degrees = _functions(old, new, part, variance)
         chance = float(stats.chi2.sf(value, degrees)) if degrees else 1.0
         found.append(ResidualChange(new.joint, kind, value, degrees, chance))
     if not np.allclose(old.band_edges_hz, new.band_edges_hz, rtol=1e-3):
@@ -162,13 +172,15 @@ def _tests(old: ResidualStatistics, new: ResidualStatistics) -> list[ResidualCha
     return found
 
 
-def _functions(old: ResidualStatistics, new: ResidualStatistics, part: slice) -> tuple[float, int]:
+def _functions(old: ResidualStatistics, new: ResidualStatistics, part: slice, variance: float) -> tuple[float, int]:
     """Chi-square of the difference of the coefficients of some functions, and its degrees of freedom."""
-    target, _ = _whitened_functions(old, new, part)
+    target, _ = _whitened_functions(old, new, part, variance)
     return float(target @ target), target.size
 
 
-def _whitened_functions(old: ResidualStatistics, new: ResidualStatistics, part: slice) -> tuple[Array, Array]:
+def _whitened_functions(
+    old: ResidualStatistics, new: ResidualStatistics, part: slice, variance: float
+) -> tuple[Array, Array]:
     """Whitened difference (r,) of the coefficients of some functions, and its change (r, k) per score of ``new``.
 
     The noise of the baseline counts for both: a noise model of a changed arm would absorb a part of the change.
@@ -181,8 +193,7 @@ def _whitened_functions(old: ResidualStatistics, new: ResidualStatistics, part: 
         return np.zeros(0), np.zeros((0, scale.size))
     kept = vectors[:, values > RANK * values[-1]] / scale[:, None]
     before, now = (kept.T @ each @ kept for each in information)
-    # Twice the inverse of the information is the covariance of the difference.
-    root = np.linalg.cholesky(before).T / np.sqrt(2.0)
+    root = np.linalg.cholesky(before).T / np.sqrt(variance)
     change = root @ np.linalg.pinv(now, hermitian=True) @ kept.T
     return change @ score[1] - root @ np.linalg.solve(before, kept.T @ score[0]), change
 
@@ -192,7 +203,7 @@ def residual_difference(baseline: IdentificationDocument, now: IdentificationDoc
     before = {each.joint: each for each in baseline.residual_statistics or ()}
     same = same_motion(baseline, now)
     return [
-        _whitened_functions(before[each.joint], each, slice(None))
+        _whitened_functions(before[each.joint], each, slice(None), _variance(baseline, now))
         if same
         else (np.zeros(0), np.zeros((0, len(each.score))))
         for each in now.residual_statistics or ()

@@ -10,7 +10,7 @@ Verdict = Literal["no_gap", "explained", "partly_explained", "unexplained"]
 
 VERDICTS: dict[Verdict, str] = {
     "no_gap": "The model explains the data; these recordings show no missing effect.",
-    "explained": "The findings explain the gap; the residual left is compatible with noise, or is that of the baseline.",
+    "explained": "The findings explain the gap; the residual left is compatible with noise or with the baseline.",
     "partly_explained": "The findings explain a part of the gap.",
     "unexplained": "The model lacks something that no effect of the catalogue explains.",
 }

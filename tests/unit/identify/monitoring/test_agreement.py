@@ -1,4 +1,4 @@
-"""One answer of compare, reidentify and diagnose --baseline about the same two recordings; watch does not contradict."""
+"""One answer of compare, reidentify and diagnose --baseline about the same two recordings, and watch's limits."""
 
 from itertools import chain
 
