@@ -125,7 +125,7 @@ class _Described:
         findings = [self._finding(c, gaps[k][1], gaps[k + 1][1]) for k, c in enumerate(found)]
         rest = self._rest(gaps[-1][1])
         unexplained = self._unexplained()
-        sought = sorted({self._joints.index(u.joint) for u in unexplained} | self._worse())
+        sought = sorted({self._joints.index(u.joint) for u in unexplained} | self._worse(gaps[-1][1]))
         if rest is not None:
             findings.append(rest)
             sought = sorted({*sought, self._joints.index(rest.joint)})
@@ -266,14 +266,24 @@ class _Described:
             found.setdefault(each.joint, entry)
         return list(found.values())
 
-    def _worse(self) -> set[int]:
-        """Joints of another motion than the baseline's with much larger residuals: their functions are not compared."""
+    def _worse(self, after: Gap) -> set[int]:
+        """Joints of another motion than the baseline's with much larger residuals or errors after the changes.
+
+        Their functions of the motion are not compared.
+        """
         if not self.test.residuals.reason:
             return set()
         before = {each.joint: each for each in self.baseline.residual_statistics or ()}
         now = self.result.residual_statistics
         ratios = [sum(e.band_power) / max(sum(before[e.joint].band_power), 1e-300) for e in now if e.joint in before]
-        return {j for j, ratio in enumerate(ratios) if ratio > self.criteria.larger_error**2}
+        errors = [
+            after.by_joint[name] / max(self.baseline.relative_error_pct_by_joint.get(name, 0.0), 1e-300)
+            for name in self._joints
+        ]
+        limits = self.criteria.larger_residuals, self.criteria.larger_error
+        return {j for j, r in enumerate(ratios) if r > limits[0] ** 2} | {
+            j for j, e in enumerate(errors) if e > limits[1]
+        }
 
     def _warnings(self) -> list[str]:
         lines = [self.test.residuals.reason] if self.test.residuals.reason else []

@@ -99,6 +99,9 @@ class Criteria:
         Factor of the standard deviations of a difference between two motions, where the residuals of one run are not
         noise: errors of the model do not cancel then. See docs/diagnosis.md, Baseline, for the healthy pairs.
     larger_error
+        Relative error of a joint by the baseline and its changes, over that of the baseline in its own motion, above
+        which an effect is looked for: half of the larger error is no error of the baseline then.
+    larger_residuals
         Root mean square of the residuals of a joint over that in the baseline, with another motion, above which an
         effect is looked for. Errors of one model differ with the motion; of 152 joints of healthy random arms, 5 differ
         by more.
@@ -141,7 +144,8 @@ class Criteria:
     reference_line: float = 100.0
     modulated_line: float = 0.1
     other_motion: float = 2.0
-    larger_error: float = 2.0
+    larger_error: float = 1.5
+    larger_residuals: float = 2.0
     estimable: float = 0.999
 
     @property
