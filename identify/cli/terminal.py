@@ -176,7 +176,7 @@ def diagnosis_table(document: DiagnosisDocument) -> None:
             )
             where = f.joint if f.other is None else f"{f.joint}, {f.other}"
             closed = f"{f.gap_before:.2f} % → {f.gap_after:.2f} %"
-            table.add_row(where, f.effect, values, f"{100 * f.confidence:.0f} %", closed)
+            table.add_row(where, f.effect, values, f.probability, closed)
         print_table(table, console)
         for f in document.findings:
             rivals = f.evidence.get("ambiguous_with", [])

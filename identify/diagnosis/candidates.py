@@ -167,6 +167,9 @@ def candidates(column_cache: ColumnCache) -> Iterator[Candidate]:
             continue
         right = {names.index(entry.joint) for entry in study.recorded if entry.effect == effect.name}
         for place in effect.places(study.robot.n):
+            acting = {place.joint, place.other}
+            if study.sought is not None and effect.scope != "arm" and acting.isdisjoint(study.sought):
+                continue
             there = present.get((effect.name, place.joint, place.other), [])
             if place.joint not in right and effect.may_be_added(motion, place, there):
                 yield Candidate(effect.minimal, place, tuple(s for s in effect.grid(motion, place) if s not in there))

@@ -1,11 +1,12 @@
-"""Test of the parameters of a baseline, and the changes of the plant that explain a difference.
+"""Changes of a plant that explain a difference from a baseline: competing explanations, one criterion.
 
-Of the same plant, ``d = theta - theta_0`` has the covariance ``S = C + C_0``. A change of the plant (payload, friction,
-drive gain) moves d along few directions, ``d = B p``. It must also predict held-out torques better than the baseline.
+A change moves the difference d, of covariance C, along few directions: ``d = B p``. With ``p`` normal of typical ratios
+and free size, ``d`` is normal, too: its likelihood is the criterion. The data choose the size, so that an explanation
+with many parameters pays for those that it needs only. What no explanation takes enlarges C: the best one is judged by
+the difference that it leaves, not by a covariance that the recordings contradict. Residuals of the same motion are a
+part of the difference: changes that the parameters absorb alike differ in what they leave.
 """
 
-import re
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -13,202 +14,339 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special, stats
 
-from armident.identify.diagnosis.baseline_comparison import BaselineComparison, Change, conservative_fit, with_baseline
-from armident.identify.diagnosis.candidates import ColumnCache
-from armident.identify.diagnosis.changes import changes, p_value_of_change, ranked
-from armident.identify.diagnosis.precision import variance_of_sum
-from armident.identify.diagnosis.regression import IvFit, relative_fit_errors
-from armident.identify.documents.identification import IdentificationDocument
+from armident.identify.diagnosis.baseline_comparison import Difference
+from armident.identify.diagnosis.changes import Change
+from armident.identify.diagnosis.criteria import Criteria
+from armident.identify.effects.link import Payload
+from armident.identify.effects.parameter_change import ParameterChange
 from armident.identify.regression.multiple_testing import holm
 
 Array = NDArray[np.float64]
 
+RANK_TOLERANCE = 1e-7
+"""Relative singular value below which a direction of normalised changes is dropped: rounding of the covariances."""
+SIZES = np.geomspace(1e-2, 1e8, 41)
+"""Sizes of a change to try, standard deviations of its best determined combination of parameters."""
+SWEEPS = 5
+"""Most passes over the sizes of several changes."""
 
-@dataclass(frozen=True)
-class NumbersFinding:
-    """Change of the plant that explains why parameters differ from a baseline.
 
-    ``effect``: ``changed_parameters`` if no entry of the catalogue explains it. ``parameters``, ``std``: changes
-    estimable one by one; includes the uncertainty of the baseline. ``p_value``: corrected for the number of candidates.
-    ``gap_before``, ``gap_after``: relative torque error on held-out data, percent, without and with this finding: of
-    the joint, or of all for the whole arm. ``confidence``: share of the posterior odds times the probability of any
-    change. ``ambiguous_with``: effects at odds below 20 to 1.
+@dataclass(frozen=True, eq=False)
+class ExplainedChange:
+    """One change of an explanation beside the others; ``own`` (m,): parameters that the motion determines one by one.
+
+    ``coefficients`` (m,): of its directions. ``odds``: logarithms of the odds of other changes in its place.
     """
 
-    effect: str
-    joint: str
-    other: str | None
-    parameters: dict[str, float]
-    std: dict[str, float]
+    change: Change
+    coefficients: Array
+    std: Array
+    own: NDArray[np.bool_]
     p_value: float
-    gap_before: float
-    gap_after: float
-    confidence: float
-    ambiguous_with: tuple[str, ...]
-    alternatives: tuple[tuple[str, str, float], ...]
-    words: str
+    odds: tuple[tuple[Change, float], ...]
+
+    @property
+    def parameters(self) -> dict[str, float]:
+        """Estimable linear parameters by name, SI."""
+        return self._named(self.change.reported(self.coefficients, self.std)[0])
+
+    @property
+    def deviations(self) -> dict[str, float]:
+        """Their standard deviations."""
+        return self._named(self.change.reported(self.coefficients, self.std)[1])
+
+    @property
+    def words(self) -> str:
+        """The change in one sentence."""
+        joint = " and ".join(self.change.joints)
+        return self.change.effect.change_in_words(joint, self.parameters, self.deviations)
+
+    def _named(self, values: Array) -> dict[str, float]:
+        names = [p.name for p in self.change.effect.linear]
+        return {name: float(v) for name, v, own in zip(names, values, self.own, strict=True) if own}
+
+    def probability(self) -> float:
+        """Share of the posterior odds among all changes in its place."""
+        return float(np.exp(-special.logsumexp([0.0, *(odds for _, odds in self.odds)])))
+
+    def rivals(self, close: float) -> list[Change]:
+        """Changes that are not excluded: within odds of ``exp(close)``."""
+        return [change for change, odds in self.odds if odds > -close]
 
 
-def stale_numbers(
-    fit: IvFit, column_cache: ColumnCache, baseline: IdentificationDocument, alpha: float = 0.01
-) -> list[NumbersFinding]:
-    """Changes of the plant since a baseline of the same robot was identified, at the false-alarm rate ``alpha``."""
-    comparison = with_baseline(conservative_fit(fit), baseline)
-    if not _stale(comparison, alpha):
-        return []
-    pool = list(changes(comparison, column_cache))
-    found: list[Change] = []
-    barred: list[Change] = []
-    while True:
-        others = ranked(comparison, found, [c for c in pool if c not in found and c not in barred])
-        passing = [other.change for other in others if other.p_value * len(pool) <= alpha]
-        if not passing:
-            break
-        best = passing[0]
-        if _closes(comparison, found, [*found, best], alpha):
-            found.append(best)
-            found = [
-                c
-                for c in found
-                if p_value_of_change(comparison, [o for o in found if o is not c], c) * len(pool) <= alpha
-            ]
-            if best not in found:
-                barred.append(best)
-        else:
-            barred.append(best)
-    findings = []
-    for k, change in enumerate(found):
-        findings.append(_described(comparison, found[:k], change, found, pool))
-    return [*findings, *_rest(comparison, found, alpha)]
+@dataclass(frozen=True, eq=False)
+class Explanation:
+    """Changes that explain a difference; without any, ``rest`` is the whole difference.
 
-
-def _stale(comparison: BaselineComparison, alpha: float) -> bool:
-    """True if all parameters together, or any of them by itself, differ; half the false alarms for either test."""
-    _, _, _, rest, free = comparison.solved([])
-    together = float(stats.chi2.sf(rest, free))
-    return together < alpha / 2 or bool(_changed_names(comparison, [], alpha / 2))
-
-
-def _changed_names(
-    comparison: BaselineComparison, changes: Sequence[Change], alpha: float
-) -> list[tuple[int, float, float]]:
-    """Known parameters that differ beyond the changes: number, difference and standard deviation, by Holm's method."""
-    stack = np.column_stack([comparison.absorbed, *(c.directions for c in changes)])
-    rest = comparison.difference - stack @ comparison.solved(changes)[0]
-    std = np.sqrt(np.diag(comparison.covariance))
-    p = 2 * stats.norm.sf(np.abs(rest) / std)
-    adjusted = holm(p)
-    return [(int(k), float(rest[k]), float(std[k])) for k in np.argsort(p) if adjusted[k] <= alpha]
-
-
-def _closes(comparison: BaselineComparison, before: Sequence[Change], after: Sequence[Change], alpha: float) -> bool:
-    """True if held-out torques follow the change."""
-    return _held_out(comparison, comparison.predicted(before), comparison.predicted(after)) > stats.norm.isf(alpha)
-
-
-def _held_out(comparison: BaselineComparison, before: Array, after: Array) -> float:
-    """Projection of the held-out residual on the change of prediction, in standard deviations.
-
-    Its variance comes from the noise, its serial correlation (Newey-West), and the baseline.
+    ``rest`` (k,): difference of parameters that is left, with the probability ``p_rest`` without a further change, and
+    ``unexplained``: numbers of those of which a significant part is left. ``share``: of the chi-square of parameters
+    and residuals beyond its expectation, that the changes explain; 1 if what is left is not significant.
     """
-    x, z, y = comparison.fit.held
-    change = z @ (after - before)
-    size = float(change @ change)
-    if size == 0.0:
-        return 0.0
-    residual = y - x @ before
-    inflation = max(1.0, variance_of_sum(change * (residual - change)) / size)
-    through = change @ x[:, comparison.known]
-    spread = float(through @ comparison.covariance0 @ through)
-    return float(change @ residual) / float(np.sqrt(size * inflation + spread))
 
+    difference: Difference
+    changes: tuple[ExplainedChange, ...]
+    rest: Array
+    p_rest: float
+    unexplained: tuple[int, ...]
+    share: float
 
-def _described(
-    comparison: BaselineComparison,
-    before: Sequence[Change],
-    change: Change,
-    found: Sequence[Change],
-    pool: Sequence[Change],
-) -> NumbersFinding:
-    """A change with its values in the model of all changes, the gaps of the order in which they were found."""
-    fit, criteria = comparison.fit, comparison.fit.study.criteria
-    others = [c for c in found if c is not change]
-    values, covariance, own, _, _ = comparison.solved([*others, change])
-    m = change.directions.shape[1]
-    names = [p.name for p in change.effect.linear]
-    known_values = {n: float(v) for n, v, o in zip(names, values[-m:], own[-m:], strict=True) if o}
-    std = {n: float(np.sqrt(v)) for n, v, o in zip(names, np.diag(covariance)[-m:], own[-m:], strict=True) if o}
-    gap_before = _gap(fit, comparison.predicted(before), change)
-    gap_after = _gap(fit, comparison.predicted([*before, change]), change)
-    p = min(1.0, p_value_of_change(comparison, others, change) * len(pool))
-    every = ranked(comparison, others, [change, *(c for c in pool if c not in found)])
-    own_score = next((s.score for s in every if s.change is change), -np.inf)
-    rivals = [s for s in every if s.change is not change]
-    share = float(np.exp(own_score - special.logsumexp([s.score for s in every]))) if every else 0.0
-    joint = _joint(fit, change)
-    return NumbersFinding(
-        effect=change.effect.name,
-        joint=joint,
-        other=None,
-        parameters=known_values,
-        std=std,
-        p_value=p,
-        gap_before=gap_before,
-        gap_after=gap_after,
-        confidence=share * (1.0 - p),
-        ambiguous_with=tuple(s.change.effect.name for s in rivals if s.score > own_score - criteria.close),
-        alternatives=tuple(
-            (s.change.effect.name, _joint(fit, s.change), s.score) for s in rivals[: criteria.alternatives]
-        ),
-        words=change.effect.change_in_words(joint, known_values, std),
-    )
-
-
-def _joint(fit: IvFit, change: Change) -> str:
-    """Name of the joint; a payload belongs to the last one, as in the configuration."""
-    joints = fit.study.joints
-    return joints[-1] if change.effect.name == "payload" else joints[change.place.joint]
-
-
-def _gap(fit: IvFit, theta: Array, change: Change) -> float:
-    """Relative torque error on held-out data, percent, of the joint or of all."""
-    overall, each = relative_fit_errors(fit, theta, held=True)
-    return overall if change.effect.scope == "arm" else float(each[change.place.joint])
-
-
-def _rest(comparison: BaselineComparison, found: Sequence[Change], alpha: float) -> list[NumbersFinding]:
-    """Finding of the changed parameters that no candidate explains, if there are any."""
-    fit = comparison.fit
-    _, _, _, left, free = comparison.solved(found)
-    p = float(stats.chi2.sf(left, free))
-    changed = _changed_names(comparison, found, alpha)
-    # All parameters together may differ without a significant single one; that is no finding.
-    if not changed:
-        return []
-    before = comparison.predicted(found)
-    if _held_out(comparison, before, fit.theta) <= stats.norm.isf(alpha):
-        return []
-    model = fit.study.model
-    names = [model.base.names[comparison.known[k]] for k, _, _ in changed]
-    numbers = Counter(m.group(1) for name in names if (m := re.search(r"(\d)r?(?:_\d+)?$", name)))
-    joint = model.robot.joints[min(int(numbers.most_common(1)[0][0]), model.n) - 1 if numbers else 0].name
-    each = "; ".join(
-        f"{name} was {comparison.theta0[k]:.4g}, differs by {rest:+.3g} (standard deviation {std:.2g})"
-        for name, (k, rest, std) in zip(names, changed, strict=True)
-    )
-    return [
-        NumbersFinding(
-            effect="changed_parameters",
-            joint=joint,
-            other=None,
-            parameters={name: rest for name, (_, rest, _) in zip(names, changed, strict=True)},
-            std={name: std for name, (_, _, std) in zip(names, changed, strict=True)},
-            p_value=p,
-            gap_before=relative_fit_errors(fit, before, held=True)[0],
-            gap_after=relative_fit_errors(fit, held=True)[0],
-            confidence=1.0 - p,
-            ambiguous_with=(),
-            alternatives=(),
-            words=f"parameters differ from the baseline, and no effect of the catalogue explains it: {each}",
+    def residual_scores(self, joint: int) -> Array | float:
+        """Change of the residual statistics of a joint, (s,), that the changes predict."""
+        return sum(
+            (c.coefficients @ c.change.scores[joint] for c in self.changes if c.change.scores is not None), start=0.0
         )
-    ]
+
+
+@dataclass(frozen=True, eq=False)
+class Competition:
+    """Candidate changes of a difference and of the residuals; ``target`` (r,): both, whitened, the parameters first."""
+
+    difference: Difference
+    target: Array
+    candidates: "tuple[Whitened, ...]"
+    criteria: Criteria
+
+    @classmethod
+    def of(
+        cls,
+        difference: Difference,
+        residuals: Sequence[tuple[Array, Array]],
+        pool: Sequence[Change],
+        criteria: Criteria,
+    ) -> "Competition":
+        """Competition of a pool; ``residuals``: of each joint the whitened difference and its change per score."""
+        target = np.concatenate([difference.whitening @ difference.values, *(own for own, _ in residuals)])
+        candidates = []
+        for change in pool:
+            scores = [np.zeros((own.size, change.sizes.size)) for own, _ in residuals]
+            if change.scores is not None:
+                scores = [per_score @ own.T for (_, per_score), own in zip(residuals, change.scores, strict=True)]
+            columns = np.vstack([difference.whitening @ change.directions, *scores]) * change.sizes
+            candidates.append(Whitened(change, columns, _prior(change, pool, criteria)))
+        return cls(difference, target, tuple(candidates), criteria)
+
+    def p_value(self) -> float:
+        """Probability of so large a part along the best candidate without a change, corrected for their number."""
+        whole = float(self.target @ self.target)
+        p = [1.0]
+        for one in self.candidates:
+            left, degrees = _rest_of(self.target, [one])
+            p.append(float(stats.chi2.sf(whole - left @ left, self.target.size - degrees)))
+        return min(1.0, min(p) * len(self.candidates))
+
+    def explained(self, alpha: float) -> Explanation:
+        """Best explanation of a difference that is significant at the level ``alpha`` of all its tests.
+
+        A further change is added while its evidence exceeds the number of candidates over ``alpha`` (Ville 1939).
+        After each, all compete once more beside the others.
+        """
+        found: list[Whitened] = []
+        while self.candidates and len(found) < self.criteria.most_findings:
+            best = self._best(found)
+            if best is None:
+                break
+            gain = _evidence_of(self.target, [*found, best]) - _evidence_of(self.target, found)
+            # The tests of the difference admit the first change; among more, each must be significant by itself.
+            if found and (gain < np.log(len(self.candidates) / alpha) or self._within_first_order(found, best)):
+                break
+            found = self._exchanged([*found, best])
+        left, degrees = _rest_of(self.target, found)
+        dispersion = max(1.0, float(left @ left) / max(degrees, 1))
+        moved = sum((one.change.directions @ v for one, v in zip(found, self._values(found), strict=True)), np.zeros(1))
+        rest = self.difference.values - moved
+        count = self.difference.whitening.shape[0]
+        own, free = _rest_of(self.target[:count], [w.of_parameters(count) for w in found])
+        p_rest = float(stats.chi2.sf(own @ own, free)) if free else 1.0
+        single = holm(2 * stats.norm.sf(np.abs(rest) / self.difference.std))
+        unexplained = tuple(int(k) for k in np.argsort(single) if single[k] < alpha)
+        changes = tuple(self._described(found, one, dispersion) for one in found)
+        excess = float(self.target @ self.target) - self.target.size
+        share = 1.0
+        if stats.chi2.sf(left @ left, degrees) < alpha:
+            share = float(np.clip(1.0 - (left @ left - degrees) / max(excess, 1e-300), 0.0, 1.0))
+        return Explanation(self.difference, changes, rest, p_rest, unexplained, share)
+
+    def _within_first_order(self, found: Sequence["Whitened"], best: "Whitened") -> bool:
+        """True if a further change takes no more than what the directions of the others leave of large changes.
+
+        Those of parameters are exact. The others hold for small changes, and for noise models without them.
+        """
+        if all(one.change.scores is None for one in found):
+            return False
+        whole = float(self.target @ self.target)
+        before, after = (float(left @ left) for left, _ in (_rest_of(self.target, w) for w in (found, [*found, best])))
+        return before - after < self.criteria.least_share * (whole - before)
+
+    def _best(self, found: Sequence["Whitened"]) -> "Whitened | None":
+        """Best physically possible candidate beside others."""
+        scores = self._scores(found)
+        for one in sorted(scores, key=lambda one: -scores[one]):
+            if _consistent(self.target, [*found, one]):
+                return one
+        return None
+
+    def _scores(self, found: Sequence["Whitened"]) -> dict["Whitened", float]:
+        """Logarithm of the posterior of each candidate beside others, up to a constant."""
+        root, half = _whitened_by(self.target, found)
+        white = root @ self.target
+        return {
+            one: _evidence(white, root @ one.columns)[0] - half + one.prior
+            for one in self.candidates
+            if one not in found
+        }
+
+    def _exchanged(self, found: list["Whitened"]) -> list["Whitened"]:
+        """Changes after each has competed beside the others, without those that the others make superfluous."""
+        for _ in range(len(found) if len(found) > 1 else 0):
+            before = list(found)
+            for one in before:
+                others = [o for o in found if o is not one]
+                best = self._best(others)
+                if best is None or best in others:
+                    continue
+                found = [best if o is one else o for o in found]
+            for one in list(found):
+                others = [o for o in found if o is not one]
+                if others and _evidence_of(self.target, others) > _evidence_of(self.target, found):
+                    found = others
+            if found == before:
+                break
+        return found
+
+    def _values(self, found: Sequence["Whitened"]) -> list[Array]:
+        """Coefficients of each change."""
+        values = _solved(self.target, found)[0]
+        return np.split(values, np.cumsum([one.change.sizes.size for one in found])[:-1]) if found else []
+
+    def _described(self, found: Sequence["Whitened"], one: "Whitened", dispersion: float) -> ExplainedChange:
+        """A change beside the others, with its odds against all candidates in its place."""
+        others = [o for o in found if o is not one]
+        m = one.change.sizes.size
+        values, covariance, own = _solved(self.target, [*others, one])
+        (before, free), (after, left) = _rest_of(self.target, others), _rest_of(self.target, [*others, one])
+        scores = self._scores(others)
+        odds = [(c.change, score - scores[one]) for c, score in scores.items() if c is not one]
+        return ExplainedChange(
+            one.change,
+            values[-m:],
+            np.sqrt(dispersion * np.diag(covariance)[-m:]),
+            own[-m:] > self.criteria.estimable,
+            float(stats.chi2.sf((before @ before - after @ after) / dispersion, max(free - left, 1))),
+            tuple(sorted(odds, key=lambda pair: -pair[1])),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Whitened:
+    """A change with its whitened directions (r, m), in units of their typical sizes, and its logarithmic prior odds."""
+
+    change: Change
+    columns: Array
+    prior: float
+
+    def of_parameters(self, count: int) -> "Whitened":
+        """The rows of the parameters."""
+        return Whitened(self.change, self.columns[:count], self.prior)
+
+
+def _prior(change: Change, pool: Sequence[Change], criteria: Criteria) -> float:
+    """Logarithm of the prior odds, divided among the places of an effect.
+
+    Loads of the flange, friction and offsets change more often than the rest, and loads of other links less.
+    """
+    alike = [c for c in pool if c.effect == change.effect]
+    common = criteria.close if isinstance(change.effect, ParameterChange) else 0.0
+    if not isinstance(change.effect, Payload):
+        return common - float(np.log(len(alike)))
+    return common if change is alike[-1] else common - criteria.close - float(np.log(len(alike) - 1))
+
+
+def _evidence(target: Array, columns: Array) -> tuple[float, float]:
+    """Logarithm of the likelihood of whitened differences (r,) with one change of the best size, and this size.
+
+    The variance of the rest is the larger of 1 and its mean square.
+    """
+    u, s, _ = np.linalg.svd(columns, full_matrices=False)
+    kept = s > RANK_TOLERANCE * max(float(s.max(initial=0.0)), 1e-300)
+    along, s = u[:, kept].T @ target, s[kept]
+    if not s.size:
+        return _log_likelihood(float(target @ target), target.size), 0.0
+    sizes = SIZES / s[0]
+    ratios = (np.outer(sizes, s)) ** 2
+    left = target @ target - (ratios / (1.0 + ratios)) @ along**2
+    values = [_log_likelihood(float(q), target.size) for q in left] - 0.5 * np.log1p(ratios).sum(axis=1)
+    best = int(np.argmax(values))
+    return float(values[best]), float(sizes[best])
+
+
+def _log_likelihood(square: float, count: int) -> float:
+    variance = max(1.0, square / count)
+    return -0.5 * (square / variance + count * float(np.log(variance)))
+
+
+def _whitened_by(target: Array, found: Sequence[Whitened]) -> tuple[Array, float]:
+    """Matrix (r, r) that whitens the difference with some changes of their best sizes, and half its log determinant.
+
+    The sizes are those of all changes together: alone, one would take the size of another, too.
+    """
+    sizes = [0.0] * len(found)
+    for _ in range(SWEEPS if len(found) > 1 else 1):
+        before = list(sizes)
+        for k, one in enumerate(found):
+            root, _ = _whitening_of([o for o in found if o is not one], [*sizes[:k], *sizes[k + 1 :]], target.size)
+            sizes[k] = _evidence(root @ target, root @ one.columns)[1]
+        if sizes == before:
+            break
+    return _whitening_of(found, sizes, target.size)
+
+
+def _whitening_of(found: Sequence[Whitened], sizes: Sequence[float], rows: int) -> tuple[Array, float]:
+    """Matrix (rows, rows) that whitens the difference with changes of given sizes, and half its log determinant."""
+    root, half = np.eye(rows), 0.0
+    for one, size in zip(found, sizes, strict=True):
+        u, s, _ = np.linalg.svd(root @ one.columns, full_matrices=False)
+        ratios = (size * s) ** 2
+        root = root - (u * (1.0 - 1.0 / np.sqrt(1.0 + ratios))) @ (u.T @ root)
+        half += 0.5 * float(np.log1p(ratios).sum())
+    return root, half
+
+
+def _evidence_of(target: Array, found: Sequence[Whitened]) -> float:
+    """Logarithm of the likelihood of a difference with some changes."""
+    root, half = _whitened_by(target, found)
+    white = root @ target
+    return _log_likelihood(float(white @ white), white.size) - half
+
+
+def _decomposed(found: Sequence[Whitened], rows: int) -> tuple[Array, Array, Array, Array]:
+    """Singular value decomposition of the columns of some changes, with the scale of each column."""
+    stack = np.hstack([one.columns for one in found]) if found else np.zeros((rows, 0))
+    scale = np.linalg.norm(stack, axis=0)
+    scale[scale == 0] = 1.0
+    u, s, vt = np.linalg.svd(stack / scale, full_matrices=False)
+    kept = s > RANK_TOLERANCE * max(float(s.max(initial=0.0)), 1e-300)
+    return u[:, kept], s[kept], vt[kept], scale
+
+
+def _rest_of(target: Array, found: Sequence[Whitened]) -> tuple[Array, int]:
+    """Whitened difference (r,) that some changes leave, and its degrees of freedom."""
+    u = _decomposed(found, target.size)[0]
+    return target - u @ (u.T @ target), target.size - u.shape[1]
+
+
+def _solved(target: Array, found: Sequence[Whitened]) -> tuple[Array, Array, Array]:
+    """Coefficients by least squares, their covariance, and the share of each in the observed directions."""
+    u, s, vt, scale = _decomposed(found, target.size)
+    sizes = np.concatenate([one.change.sizes for one in found]) / scale
+    inverse = sizes[:, None] * (vt.T / s)
+    return inverse @ (u.T @ target), inverse @ inverse.T, np.einsum("kj,kj->j", vt, vt)
+
+
+def _consistent(target: Array, found: Sequence[Whitened]) -> bool:
+    """True if the last change is physically possible, as far as the motion determines it."""
+    effect, m = found[-1].change.effect, found[-1].columns.shape[1]
+    values, covariance, own = _solved(target, found)
+    if not isinstance(effect, ParameterChange) or own[-m:].min() < 0.5:
+        return True
+    left, degrees = _rest_of(target, found)
+    return effect.consistent(values[-m:], max(1.0, float(left @ left) / max(degrees, 1)) * covariance[-m:, -m:])

@@ -2,19 +2,17 @@
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from armident.configs import RobotConfig
-from armident.identify.diagnosis.candidates import ColumnCache
-from armident.identify.diagnosis.changed_parameters import stale_numbers
+from armident.identify.diagnosis.baseline_stage import BaselineStage, against_baseline
 from armident.identify.diagnosis.criteria import Criteria
 from armident.identify.diagnosis.detection_limits import detection_limits
 from armident.identify.diagnosis.findings import (
-    changed_parameters,
     experiment_to_separate,
     findings_of,
     gap_of,
@@ -25,14 +23,22 @@ from armident.identify.diagnosis.findings import (
 )
 from armident.identify.diagnosis.lack_of_fit import ResidualDependence, unexplained
 from armident.identify.diagnosis.lack_of_fit import dependences as dependences_of
-from armident.identify.diagnosis.model_state import ModelState, with_report_part
+from armident.identify.diagnosis.model_state import ModelState, with_entries, with_report_part
 from armident.identify.diagnosis.selected import Selected
 from armident.identify.diagnosis.selection import StepwiseSelection
 from armident.identify.diagnosis.setup_stage import set_up
 from armident.identify.diagnosis.simulated import SimulatedErrors, simulated_errors
 from armident.identify.diagnosis.study import build_study
 from armident.identify.documents.base import RecordingReference, versions
-from armident.identify.documents.diagnosis import BeforeAfter, DiagnosisDocument, Finding, Gaps, Unexplained, Verdict
+from armident.identify.documents.diagnosis import (
+    BeforeAfter,
+    DiagnosisDocument,
+    Finding,
+    Gap,
+    Gaps,
+    Unexplained,
+    Verdict,
+)
 from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.effects.friction import TRANSITION
 from armident.identify.effects.recording_corrections import of_recording
@@ -98,9 +104,9 @@ def run_diagnosis(
 BEGINS = {
     "set-up": 0.0,
     "derivatives and closed loop": 0.15,
+    "changed parameters": 0.17,
     "base fit": 0.2,
     "unexplained dependences": 0.85,
-    "changed parameters": 0.9,
     "simulation": 0.9,
     "detection limits": 0.95,
 }
@@ -168,18 +174,24 @@ def _diagnose(
     stage = set_up(training, validation, robot, criteria)
     steps("derivatives and closed loop")
     study = build_study(stage.training, stage.validation, stage.robot, criteria=criteria)
+    change = BaselineStage()
+    if baseline is not None:
+        steps("changed parameters")
+        change = against_baseline(stage, baseline, criteria)
+        study = study.of_robot(with_entries(study.robot, change.entries))
+        study = replace(study, sought=change.sought, sign_given=study.sign_given or change.complete)
     steps("base fit")
     selection = StepwiseSelection(study, steps, deadline, steps.tested, shifts=stage.shifts)
     first = selection.start()
     steps("comparison of effects")
-    chosen, every = selection.run(first)
+    chosen, every = (first, ()) if change.complete else selection.run(first)
     final = with_report_part(chosen)
     # Where the instant of all torques is unknown, a delay of one drive is known to the sample only.
     conventional = [one for one in every if one.conventional(final, 0.0 if stage.shift_known else final.study.sample)]
     selected = [one for one in every if one not in conventional]
     after = gap_of(final, held=True)
     steps("unexplained dependences")
-    dependences = unexplained(final)
+    dependences = () if change.complete else unexplained(final)
     rest = [
         Unexplained(joint=d.joint, share_of_residual=d.share, varies_with=d.varies_with, hint=d.hint)
         for d in dependences
@@ -188,14 +200,10 @@ def _diagnose(
     stopped = _stopped(selection, len(named))
     doubtful = {entry.joint for entry in stage.doubtful(after)}
     explained = [(f, one) for f, one in zip(named, selected, strict=True) if f.joint not in doubtful]
-    findings = [*stage.findings, *(f for f, _ in explained)]
-    chosen_for = [*(None for _ in stage.findings), *(one for _, one in explained)]
-    left = stage.left(rest, after)
-    if baseline is not None:
-        steps("changed parameters")
-        alpha = criteria.alpha["changed_parameters"]
-        column_cache = ColumnCache(final.study, final.fit.theta)
-        findings += changed_parameters(stale_numbers(final.fit, column_cache, baseline, alpha))
+    first_findings = [*stage.findings, *change.beside([f for f, _ in explained], study.joints)]
+    findings = [*first_findings, *(f for f, _ in explained)]
+    chosen_for = [*(None for _ in first_findings), *(one for _, one in explained)]
+    left = stage.left(change.left(named, rest, study.joints), after)
     steps("simulation")
     simulated = simulated_errors(first, final)
     steps("detection limits")
@@ -208,15 +216,15 @@ def _diagnose(
         findings=findings,
         unexplained=left,
         gap=Gaps(
-            train=BeforeAfter(before=stage.as_configured(gap_of(first, held=False)), after=gap_of(final, held=False)),
-            validation=BeforeAfter(before=stage.as_configured(gap_of(first, held=True)), after=after),
+            train=_gaps(stage.as_configured(gap_of(first, held=False)), gap_of(final, held=False), change, 0),
+            validation=_gaps(stage.as_configured(gap_of(first, held=True)), after, change, 1),
         ),
         noise_floor=noise_floor(final, left),
         recommended_experiment=experiment_to_separate(findings, criteria),
         model=None,
         timing_s=steps.finish(),
         versions=versions(),
-        warnings=[*notes, *stage.warnings, *selection.study.warnings, *stopped],
+        warnings=[*notes, *stage.warnings, *change.warnings, *selection.study.warnings, *stopped],
         not_visible=undetectable(first, selection.hidden),
         detection_limits=limits,
         simulated=simulated.document(),
@@ -234,14 +242,21 @@ def _diagnose(
         measured=np.concatenate([s.y for s in held]),
         before=_predicted_for_final(final, first),
         after=_predicted(final),
-        lacking=_of_findings(_lacking, final, chosen_for, len(findings)),
-        own=_of_findings(_own, final, chosen_for, len(findings)),
+        lacking=_of_findings(_lacking, final, chosen_for),
+        own=_of_findings(_own, final, chosen_for),
         q=_sampled(final, "q"),
         qd=_sampled(final, "qd"),
-        where=dependences_of(first),
+        where=() if change.complete else dependences_of(first),
         left=dependences,
         simulated=simulated,
     )
+
+
+def _gaps(before: Gap, after: Gap, change: BaselineStage, part: int) -> BeforeAfter:
+    """Gap of a part of the data: of the baseline and with its changes, or of the models if there is none."""
+    if change.before is None or change.after is None:
+        return BeforeAfter(before=before, after=after)
+    return BeforeAfter(before=change.before[part], after=change.after[part] if change.complete else after)
 
 
 def _stopped(selection: StepwiseSelection, findings: int) -> list[str]:
@@ -292,11 +307,9 @@ def _of_findings(
     curve: Callable[[ModelState, Selected], Array | None],
     final: ModelState,
     selected: Sequence[Selected | None],
-    count: int,
 ) -> tuple[Array | None, ...]:
-    """Curves of all findings: those of the set-up and changed parameters, which come last, have none."""
-    made = [None if one is None else curve(final, one) for one in selected]
-    return (*made, *(None for _ in range(count - len(made))))
+    """Curves of all findings: those of the set-up and of changes against a baseline, which come first, have none."""
+    return tuple(None if one is None else curve(final, one) for one in selected)
 
 
 def _sampled(state: ModelState, name: str) -> Array:

@@ -7,7 +7,6 @@ from numpy.typing import NDArray
 
 from armident.identify.diagnosis.candidate_comparison import Addition, SelectionStep
 from armident.identify.diagnosis.candidates import ColumnCache, Key
-from armident.identify.diagnosis.changed_parameters import NumbersFinding
 from armident.identify.diagnosis.criteria import Criteria
 from armident.identify.diagnosis.model_state import ModelState
 from armident.identify.diagnosis.next_experiment import recommended_experiment
@@ -198,31 +197,6 @@ def undetectable(state: ModelState, hidden: frozenset[Key]) -> list[NotVisible]:
                 entry = NotVisible(effect=name, joint=joint, reason=reason, required_motion=motion_text)
                 found.setdefault((name, joint), entry)
     return list(found.values())
-
-
-def changed_parameters(numbers: Sequence[NumbersFinding]) -> list[Finding]:
-    """Return the changed parameters of a baseline as findings. ``numbers``: changes against the baseline."""
-    return [
-        Finding(
-            effect=n.effect,
-            joint=n.joint,
-            other=n.other,
-            kind="numbers",
-            parameters=n.parameters,
-            confidence=n.confidence,
-            alternatives=[Alternative(effect=e, joint=j, score=score) for e, j, score in n.alternatives],
-            gap_before=n.gap_before,
-            gap_after=n.gap_after,
-            evidence={
-                "title": known(n.effect).title if n.effect in catalogue() else "parameters that have changed",
-                "description": n.words,
-                "p_value": n.p_value,
-                "std": n.std,
-                "ambiguous_with": list(n.ambiguous_with),
-            },
-        )
-        for n in numbers
-    ]
 
 
 def experiment_to_separate(findings: Sequence[Finding], criteria: Criteria) -> str | None:

@@ -61,6 +61,7 @@ class Study:
     to the working rate. ``loop``: kind of controller; ``auxiliary``: that loop with the IDIM-LS estimate. ``sources``:
     training and validation recordings without corrections; ``signals``: derivatives of their positions. ``volume``
     (n,): see `log_volume`. ``references``: see `predictive_score.references_of`; empty before the fit.
+    ``sought``: joints at which effects are looked for; ``None``: all.
     """
 
     robot: RobotConfig
@@ -81,6 +82,7 @@ class Study:
     criteria: Criteria = field(default_factory=Criteria)
     regressors: RegressorCache = field(default_factory=RegressorCache, repr=False, compare=False)
     references: tuple[Array | None, ...] = ()
+    sought: tuple[int, ...] | None = None
 
     @property
     def recorded(self) -> tuple[Entry, ...]:
@@ -108,7 +110,7 @@ class Study:
         return self._rebuilt(self.robot, self.signals)
 
     def _rebuilt(self, robot: RobotConfig, signals: Sequence[Derivatives] | None = None) -> "Study":
-        return build_study(*self.sources, robot, signals, self.criteria)
+        return replace(build_study(*self.sources, robot, signals, self.criteria), sought=self.sought)
 
     def _with_torques(self, sources: tuple[Sequence[Experiment], Sequence[Experiment]]) -> "Study":
         """The study with torques of the same motion that were recorded or corrected otherwise."""

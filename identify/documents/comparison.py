@@ -69,6 +69,36 @@ class ComparedParameter(Document):
     essential: bool
 
 
+class NamedChange(Document):
+    """Change of the plant that explains the difference.
+
+    Parameters
+    ----------
+    effect
+        Name of the effect in the catalogue.
+    joints
+        Its joint, or the two joints of a coupling.
+    words
+        The change in one sentence.
+    parameters
+        Its parameters that the motion determines one by one, SI.
+    std
+        Their standard deviations.
+    probability
+        Posterior probability among all changes in its place, 0 to 1.
+    not_excluded
+        Other changes in its place within odds of 20 to 1, the best first.
+    """
+
+    effect: str
+    joints: list[str]
+    words: str
+    parameters: dict[str, float]
+    std: dict[str, float]
+    probability: float
+    not_excluded: list[str]
+
+
 class ComparisonDocument(Document):
     """Content of ``comparison.json``: the change test of two identifications of one robot.
 
@@ -88,6 +118,10 @@ class ComparisonDocument(Document):
         Friction or masses of a joint that changed together.
     changed_residuals
         Changes of the residuals, in words.
+    changes
+        Changes of the plant that explain the differences.
+    unexplained
+        Changes of parameters and residuals beyond these, in words.
     chi_square, degrees, p_value
         Test of all parameters together: statistic, degrees of freedom, and probability without a change.
     false_alarm_rate
@@ -112,6 +146,8 @@ class ComparisonDocument(Document):
     false_alarm_rate: float
     left_out: list[str]
     warnings: list[str]
+    changes: list[NamedChange] = Field(default_factory=list)
+    unexplained: list[str] = Field(default_factory=list)
 
     @property
     def by_joint(self) -> dict[str, list[ComparedParameter]]:
@@ -127,6 +163,8 @@ class ComparisonDocument(Document):
         test = f"chi-square {self.chi_square:.1f} of {self.degrees} degrees of freedom, p = {self.p_value:.2g}"
         names = [each.name for each in self.parameters if each.changed]
         parts = [*names, *self.changed_groups, *self.changed_residuals] or ["no single parameter significantly"]
+        if self.changes:
+            return f"{self.robot} has changed: {'; '.join(change.words for change in self.changes)} ({test})"
         if self.verdict == "changed":
             return f"{self.robot} has changed: {', '.join(parts)} ({test})"
         return f"{self.robot} has not changed significantly ({test})"

@@ -10,8 +10,8 @@ Verdict = Literal["no_gap", "explained", "partly_explained", "unexplained"]
 
 VERDICTS: dict[Verdict, str] = {
     "no_gap": "The model explains the data; these recordings show no missing effect.",
-    "explained": "The model lacks effects. The findings explain the gap; the residual left is compatible with noise.",
-    "partly_explained": "The model lacks effects. The findings explain a part of the gap.",
+    "explained": "The findings explain the gap; the residual left is compatible with noise or with the baseline.",
+    "partly_explained": "The findings explain a part of the gap.",
     "unexplained": "The model lacks something that no effect of the catalogue explains.",
 }
 """Meaning of each verdict."""
@@ -56,7 +56,7 @@ class Finding(Document):
         Estimated parameters, SI.
     confidence
         Posterior probability of the finding among all alternatives in its place, 0 to 1. Where a part of the joint's
-        error is unexplained, it is multiplied by the share that the finding explains of both.
+        error, or of the difference from a baseline, is unexplained, it is multiplied by the share that is explained.
     alternatives
         Other effects in place of the finding, the best first.
     gap_before
@@ -78,6 +78,13 @@ class Finding(Document):
     gap_before: float
     gap_after: float
     evidence: dict[str, Any]
+
+    @property
+    def probability(self) -> str:
+        """Confidence in percent, in words where it is nearly 0 or 1."""
+        if self.confidence > 0.999:
+            return "> 99.9 %"
+        return f"{100 * self.confidence:.1f} %" if self.confidence > 0.001 else "< 0.1 %"
 
 
 class Unexplained(Document):

@@ -117,6 +117,27 @@ class ResidualStatistics(Document):
     band_degrees: list[float]
 
 
+class ChangeDirection(Document):
+    """Change of the estimate by an effect that the model lacks, per unit of each of its linear parameters.
+
+    Parameters
+    ----------
+    effect
+        Name of the effect in the catalogue.
+    joint
+        Name of its joint; of an effect of the whole arm, of the first one.
+    parameters
+        Change of the parameters, for each linear parameter of the effect.
+    scores
+        Change of the ``score`` of the residual statistics of each joint, for each linear parameter.
+    """
+
+    effect: str
+    joint: str
+    parameters: list[list[float]]
+    scores: list[list[list[float]]]
+
+
 class VerdictReason(Document):
     """Defect of an identification.
 
@@ -230,6 +251,8 @@ class IdentificationDocument(Document):
         Limits of the verdict.
     residual_statistics
         Statistics of the residuals for later comparison; null in documents of former versions.
+    change_directions
+        Changes of the estimate by effects that a later comparison may find; null in documents of former versions.
     configuration
         Robot configuration that the parameters belong to; null in documents of former versions.
     held_out_error_pct
@@ -269,6 +292,7 @@ class IdentificationDocument(Document):
     transitions: dict[str, tuple[float, float, float]] | None = None
     criteria: dict[str, float] | None = None
     residual_statistics: list[ResidualStatistics] | None = None
+    change_directions: list[ChangeDirection] | None = None
     configuration: dict[str, Any] | None = None
     held_out_error_pct: float | None = None
     held_out_error_pct_by_joint: dict[str, float] | None = None

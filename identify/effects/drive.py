@@ -92,6 +92,7 @@ class DriveGainError(Correction):
     )
     scales_torque = True
     change_title = "torque constant changed since the baseline"
+    compared = True
 
     def shaft_column(self, torque: Array, motion: Motion, motor: int) -> Array:
         """Return the torque."""

@@ -154,7 +154,10 @@ class Effect(ABC):
     regressor_signals, instrument_signals
         Signals at which the columns of the regressor and its instruments are computed.
     change_title
-        Words for a change against a baseline, if base parameters absorb a part of the effect.
+        Words for a change against a baseline, if they differ from the title.
+    compared
+        True if a difference from a baseline may be this effect, of which base parameters absorb a part. It has no
+        nonlinear parameters, and its columns do not depend on the past.
     rigid_part
         Part of an exported arm that holds the effect, by its first law: ``springs``, ``gravity``, ...; empty: none.
     """
@@ -175,6 +178,7 @@ class Effect(ABC):
     regressor_signals: Signals = "measured"
     instrument_signals: Signals = "simulated"
     change_title: str = ""
+    compared: bool = False
     rigid_part: str = ""
 
     @abstractmethod

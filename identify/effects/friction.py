@@ -87,6 +87,7 @@ class AsymmetricViscousFriction(Effect):
     reference = "Janot, Gautier, Brunot 2019, Data set and reference models of EMPS"
     required_motion = "both directions of motion at several speeds"
     linear = (Linear("fva", VISCOUS, "Half the difference of the viscous friction between both directions."),)
+    compared = True
 
     def columns(self, motion: Motion, place: Place, shapes: Mapping[str, float]) -> Array:
         """Return ``qd sign(qd)``."""

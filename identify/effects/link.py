@@ -27,6 +27,7 @@ class JointSpring(Effect):
     excitation = ("range",)
     linear: tuple[Linear, ...] = (Linear("ks", ("N m/rad", "N/m"), "Stiffness: torque per joint position."),)
     rigid_part = "springs"
+    compared = True
 
     def columns(self, motion: Motion, place: Place, shapes: Mapping[str, float]) -> Array:
         """Return the position."""
@@ -37,6 +38,7 @@ class JointSpringCubic(JointSpring):
     """Spring that stiffens with its deflection."""
 
     law = "cubic"
+    compared = False
     description = "a torque that grows faster than the joint's position: a stiffening spring, a bumper, a cable harness"
     linear = (
         *JointSpring.linear,
@@ -57,6 +59,7 @@ class JointSpringTable(OverPosition, JointSpring):
         "a torque that depends on the joint's position: a spring, a gravity compensator, a stiff cable harness"
     )
     linear = values("kst", TORQUE, "torque of the spring over the position")
+    compared = False
 
     def columns(self, motion: Motion, place: Place, shapes: Mapping[str, float]) -> Array:
         """Return the functions of the table."""
@@ -64,40 +67,71 @@ class JointSpringTable(OverPosition, JointSpring):
 
 
 class Payload(ParameterChange):
-    """Other inertial parameters of the last link."""
+    """Other inertial parameters of a link."""
 
     name = "payload"
-    title = "a payload on the flange"
-    description = "the last link is heavier than in the baseline: a gripper or a workpiece is mounted"
+    title = "a payload"
+    description = (
+        "a link has another mass than in the baseline: a gripper, a workpiece or equipment is mounted, or was removed"
+    )
     reference = "Gaz, De Luca 2017, IROS, Payload estimation based on identified coefficients of robot dynamics"
     required_motion = "a baseline identified without it"
     excitation = ("load", "range")
-    scope = "arm"
     linear = tuple(
         Linear(
             f"{kind}p",
             ("kg" if kind == "m" else "kg m" if len(kind) == 2 and kind[0] == "m" else "kg m^2",) * 2,
-            f"Additional `{kind}` of the last link, in its frame, compared with the baseline.",
+            f"Additional `{kind}` of the link, in its frame, compared with the baseline.",
         )
         for kind in INERTIAL
     )
 
     def parameters(self, place: Place, n: int) -> list[str]:
-        """Return those of the last link."""
-        return [f"{kind}{n}" for kind in INERTIAL]
+        """Return those of the link."""
+        return [f"{kind}{place.joint + 1}" for kind in INERTIAL]
+
+    def sizes(self, place: Place, standard: Mapping[str, float]) -> Array:
+        """Return those of a mass at `PAYLOAD_REACH` from the origin of the link."""
+        return np.array([1.0 if kind == "m" else PAYLOAD_REACH ** (1 if kind[0] == "m" else 2) for kind in INERTIAL])
+
+    def consistent(self, values: Array, covariance: Array) -> bool:
+        """Return True if a body with positive masses, added or removed, has these ten parameters.
+
+        Its pseudo-inertia has no eigenvalue of the other sign by more than three standard deviations (Wensing, Kim,
+        Slotine 2018, IEEE Robotics and Automation Letters 3(1)).
+        """
+        basis = [_pseudo_inertia(unit) for unit in np.eye(len(INERTIAL))]
+        eigenvalues, vectors = np.linalg.eigh(sum(v * b for v, b in zip(values, basis, strict=True)))
+        slopes = np.array([[v @ b @ v for b in basis] for v in vectors.T])
+        deviations = eigenvalues / np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", slopes, covariance, slopes), 1e-300))
+        return bool(deviations.min() > -3.0 or deviations.max() < 3.0)
 
     def change_in_words(self, joint: str, values: Mapping[str, float], std: Mapping[str, float]) -> str:
-        """Return mass and centre of mass, if they are estimable."""
-        if "mp" not in values:
-            return super().change_in_words(joint, values, std)
-        mass = values["mp"]
-        words = f"{abs(mass):.3g} kg (standard deviation {std['mp']:.2g} kg) {'more' if mass > 0 else 'less'}"
-        words += " on the flange than in the baseline"
-        moments = [values.get(f"m{axis}p") for axis in "xyz"]
-        if mass > 3 * std["mp"] and None not in moments:
-            at = ", ".join(f"{moment / mass:.3f}" for moment in moments if moment is not None)
-            words += f", centre of mass at ({at}) m in the frame of the last link"
-        return words
+        """Return mass and centre of mass, or the moments of mass, as far as they are estimable."""
+        mass, moments = values.get("mp", 0.0), {name: values[name] for name in ("mxp", "myp", "mzp") if name in values}
+        if "mp" in values and abs(mass) > 3 * std["mp"]:
+            words = f"{abs(mass):.3g} kg (standard deviation {std['mp']:.2g} kg) {'more' if mass > 0 else 'less'}"
+            words += f" on the link of {joint} than in the baseline"
+            if len(moments) == 3:
+                at = ", ".join(f"{moment / mass:.3f}" for moment in moments.values())
+                words += f", centre of mass at ({at}) m in the frame of the link"
+            return words
+        words = f"another load on the link of {joint} than in the baseline"
+        each = ", ".join(f"{n[:2]} {v:+.3g} kg m (standard deviation {std[n]:.2g})" for n, v in moments.items())
+        return f"{words}: moment of mass {each}" if each else words
+
+
+PAYLOAD_REACH = 0.2
+"""Typical distance of a payload from the origin of its link, m: it relates mass, moments and inertias a priori."""
+
+
+def _pseudo_inertia(values: Array) -> Array:
+    """Return the pseudo-inertia (4, 4) of ten inertial parameters in the order of `INERTIAL`."""
+    v = dict(zip(INERTIAL, values, strict=True))
+    inertia = np.array([[v["xx"], v["xy"], v["xz"]], [v["xy"], v["yy"], v["yz"]], [v["xz"], v["yz"], v["zz"]]])
+    moment = np.array([[v["mx"], v["my"], v["mz"]]])
+    second = 0.5 * np.trace(inertia) * np.eye(3) - inertia
+    return np.block([[second, moment.T], [moment, np.array([[v["m"]]])]])
 
 
 class RotorInertia(Effect):
@@ -114,6 +148,7 @@ class RotorInertia(Effect):
     scope = "motor"
     linear = (Linear("iax", ("kg m^2", "kg"), "Motor inertia on the joint side beyond that of the model.", sign=1),)
     change_title = "motor inertia changed since the baseline"
+    compared = True
     rigid_part = "rotor inertia"
 
     def columns(self, motion: Motion, place: Place, shapes: Mapping[str, float]) -> Array:
@@ -143,6 +178,7 @@ class GravityDirection(TorqueDependent):
         Linear("tilt_y", ("rad", "rad"), "Tilt of gravity along the second axis across it (y axis of an upright arm)."),
     )
     change_title = "gravity direction changed since the baseline"
+    compared = True
     rigid_part = "gravity"
 
     def columns(self, motion: Motion, place: Place, shapes: Mapping[str, float]) -> Array:

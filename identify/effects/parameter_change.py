@@ -2,12 +2,16 @@
 
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from armident.identify.effects.effect import TORQUE, VISCOUS, Effect, Linear, Place, Shapes
 from armident.identify.robot.motion import Motion
+
+if TYPE_CHECKING:
+    from armident.identify.robot.arm import ArmModel
 
 Array = NDArray[np.float64]
 
@@ -19,10 +23,17 @@ class ParameterChange(Effect):
     def parameters(self, place: Place, n: int) -> list[str]:
         """Return the names of the standard parameters that the linear ones change, (k,)."""
 
-    def change(self, motion: Motion, place: Place) -> Array:
+    def sizes(self, place: Place, standard: Mapping[str, float]) -> Array:
+        """Return the typical ratios (k,) of the linear parameters; ``standard``: parameters of the model by name."""
+        return np.ones(len(self.linear))
+
+    def consistent(self, values: Array, covariance: Array) -> bool:
+        """Return True if the change (k,), with covariance (k, k), is physically possible."""
+        return True
+
+    def change(self, model: "ArmModel", place: Place) -> Array:
         """Return the Jacobian (b, k) of the base parameters with respect to the linear ones."""
-        model = motion.model
-        chosen = [model.names.index(name) for name in self.parameters(place, motion.n)]
+        chosen = [model.names.index(name) for name in self.parameters(place, model.n)]
         change: Array = model.base.regroup[:, chosen]
         return change
 
@@ -30,7 +41,7 @@ class ParameterChange(Effect):
         """Return the columns of the rigid model's parameters."""
         regressor = motion.model.rigid_regressor(motion.q, motion.qd, motion.qdd, sharp_sign=motion.sharp)
         # The terms of the model, last among its base parameters, do not change.
-        columns: Array = regressor @ self.change(motion, place)[: regressor.shape[2]]
+        columns: Array = regressor @ self.change(motion.model, place)[: regressor.shape[2]]
         return columns
 
     def may_be_added(self, motion: Motion, place: Place, present: Sequence[Shapes]) -> bool:
@@ -54,6 +65,10 @@ class FrictionChange(ParameterChange):
     def parameters(self, place: Place, n: int) -> list[str]:
         """Return those of the joint."""
         return [f"fv{place.joint + 1}", f"fc{place.joint + 1}"]
+
+    def sizes(self, place: Place, standard: Mapping[str, float]) -> Array:
+        """Return the friction that the joint has."""
+        return np.array([max(abs(standard[name]), 1e-3) for name in self.parameters(place, 0)])
 
 
 EFFECTS = (FrictionChange,)

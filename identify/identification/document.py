@@ -5,9 +5,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from armident.configs import RobotConfig
-from armident.daq.recording import Recording
-from armident.identify.documents.base import plain, reference, versions
+from armident.identify.documents.base import RecordingReference, plain, versions
 from armident.identify.documents.identification import (
+    ChangeDirection,
     Comparison,
     IdentificationDocument,
     ResidualStatistics,
@@ -19,7 +19,10 @@ from armident.identify.identification.identification_result import Identificatio
 
 
 def identification_document(
-    result: IdentificationResult, recordings: Sequence[Recording], robot: RobotConfig, notes: Sequence[str] = ()
+    result: IdentificationResult,
+    recordings: Sequence[RecordingReference],
+    robot: RobotConfig,
+    notes: Sequence[str] = (),
 ) -> IdentificationDocument:
     """Document of an identification; ``notes`` of the conversion precede the estimator's warnings."""
     joints = [joint.name for joint in robot.joints]
@@ -46,7 +49,7 @@ def identification_document(
         verdict=result.verdict.level,
         reasons=[VerdictReason(**plain(reason)) for reason in result.verdict.reasons],
         robot=robot.name,
-        recording=reference(recordings[0]),
+        recording=recordings[0],
         method=result.method,
         options=plain(result.options),
         parameters=parameters,
@@ -77,11 +80,12 @@ def identification_document(
             name: [float(samples), float(std)]
             for name, samples, std in zip(joints, result.delay.samples, result.delay.std, strict=True)
         },
-        further_recordings=[reference(recording) for recording in recordings[1:]] or None,
+        further_recordings=list(recordings[1:]) or None,
         bias=None if result.bias is None else dict(zip(result.names, map(float, result.bias), strict=True)),
         sign_smoothing=dict(zip(joints, (float(g) for g in result.sign_smoothing), strict=True)),
         transitions={name: (one.velocity, one.low, one.high) for name, one in result.transitions.items()} or None,
         criteria=plain(result.criteria),
         residual_statistics=[ResidualStatistics(**plain(each)) for each in result.residual_statistics] or None,
+        change_directions=[ChangeDirection(**plain(each)) for each in result.change_directions] or None,
         configuration=robot.model_dump(mode="json", by_alias=True),
     )

@@ -9,10 +9,11 @@ from numpy.typing import NDArray
 
 from armident.configs import RobotConfig
 from armident.identify.estimators.diagnostics import Diagnostics
+from armident.identify.identification.equations import Prepared
 from armident.identify.identification.held_out import held_out_errors
 from armident.identify.identification.identification_criteria import IdentificationCriteria
 from armident.identify.identification.options import Options
-from armident.identify.identification.residual_statistics import JointResidualStatistics
+from armident.identify.identification.residual_statistics import ChangeDirection, JointResidualStatistics
 from armident.identify.identification.sign_smoothing import Transition
 from armident.identify.identification.torque_delay import TorqueDelay
 from armident.identify.identification.verdict import Verdict
@@ -46,7 +47,7 @@ class IdentificationResult:
     overall and by joint (n,). ``bias`` (b,) was subtracted; ``None``: irrelevant. ``sign_smoothing`` is ``g`` (n,),
     s/rad or s/m. ``converged`` requires that the parameters explain torques better than none. ``held_out`` is ``None``
     if the rest does not determine the parameters. ``t`` (M,), s, and the torques (M, n), N m or N, are decimated
-    instants of one experiment after the other.
+    instants of one experiment after the other, of ``equations``, made from ``prepared``.
     """
 
     verdict: Verdict
@@ -85,6 +86,9 @@ class IdentificationResult:
     autocorrelation_bound: Array
     residual_statistics: tuple[JointResidualStatistics, ...] = ()
     transitions: Mapping[str, Transition] = field(default_factory=dict)
+    change_directions: tuple[ChangeDirection, ...] = ()
+    equations: Sequence[ExperimentEquations] = ()
+    prepared: Prepared | None = None
     held_out: tuple[float, Array] | None = None
 
 
@@ -121,11 +125,12 @@ class Statistics:
     bias: Array | None = None
     residuals: tuple[JointResidualStatistics, ...] = ()
     transitions: Mapping[str, Transition] = field(default_factory=dict)
+    changes: tuple[ChangeDirection, ...] = ()
 
 
 def make_result(
     options: Options,
-    model: ArmModel,
+    prepared: Prepared,
     found: MethodResult,
     ls: LeastSquares,
     statistics: Statistics,
@@ -134,7 +139,7 @@ def make_result(
     timing_s: dict[str, float],
 ) -> IdentificationResult:
     """Assemble the result; relative errors are those on the equations of IDIM-LS, and each warning is kept once."""
-    estimate, ls_blocks = found.estimate, ls.blocks
+    model, estimate, ls_blocks = prepared.model, found.estimate, ls.blocks
     joints = [joint.name for joint in model.robot.joints]
     overall, by_joint = relative_torque_errors(ls_blocks, estimate.theta)
     tests = [whiteness(series) for series in estimate.residuals]
@@ -187,6 +192,9 @@ def make_result(
         autocorrelation_bound=np.array([test.bound for test in tests]),
         residual_statistics=statistics.residuals,
         transitions=statistics.transitions,
+        change_directions=statistics.changes,
+        equations=ls_blocks,
+        prepared=prepared,
         held_out=held_out_errors(ls_blocks, estimate.theta),
     )
 

@@ -6,6 +6,7 @@ from itertools import chain
 
 from armident.configs import DataError, RobotConfig
 from armident.daq.recording import Recording
+from armident.identify.documents.base import reference
 from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.identification.document import identification_document
 from armident.identify.identification.from_recording import WHOLE, StretchRule, experiments_from_recording
@@ -59,7 +60,8 @@ def identify_recording(
             notes = [*notes, f"the set-up was not checked: {error}"]
     result = identify_experiment(experiments, robot, options or Options(), progress, setup)
     used = with_numbers(robot, result.sign_smoothing)
-    return IdentificationOutcome(recordings, used, result, identification_document(result, recordings, used, notes))
+    document = identification_document(result, [reference(recording) for recording in recordings], used, notes)
+    return IdentificationOutcome(recordings, used, result, document)
 
 
 def _checked(experiments: Sequence[Experiment]) -> Sequence[Experiment]:

@@ -162,11 +162,12 @@ def _identify(
         statistics = _statistics(prepared, found, solution)
         statistics = replace(statistics, interval_warnings=(*statistics.interval_warnings, *doubts))
         numbers = tested(found.blocks)
-        residuals = residual_statistics(prepared.part(numbers), [found.blocks[k] for k in numbers], found.estimate)
+        blocks = [found.blocks[k] for k in numbers]
+        residuals, changes = residual_statistics(prepared.part(numbers), blocks, found.estimate)
         if len(numbers) < len(found.blocks):
             text = f"Tests use {len(numbers)} of the {len(found.blocks)} stretches; the estimate uses all."
             notes.warnings.append(text)
-        statistics = replace(statistics, residuals=residuals)
+        statistics = replace(statistics, residuals=residuals, changes=changes)
         if options.physical:
             clock.enter("physical", 0.95)
             physical = nearest_consistent(model, found.estimate.theta, found.estimate.covariance)
@@ -180,7 +181,7 @@ def _identify(
         statistics = replace(statistics, essential=statistics.essential & support.supported)
     clock.done()
     statistics = replace(statistics, transitions=transitions)
-    return make_result(options, model, found, ls, statistics, (verdict, criteria), notes.warnings, clock.spent)
+    return make_result(options, prepared, found, ls, statistics, (verdict, criteria), notes.warnings, clock.spent)
 
 
 def _prepared(

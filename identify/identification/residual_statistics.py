@@ -2,15 +2,18 @@
 
 Piecewise linear functions of position, of position with direction, and of velocity describe what the model lacks. They
 are estimated beside all base parameters, weighted for serial correlation. The power in bands of frequency is the rest.
+Changes of the plant for which the model has no parameter move parameters and functions along `ChangeDirection`.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from armident.identify.effects.effect import Effect, Place
 from armident.identify.effects.free_shapes import hats
+from armident.identify.effects.registry import catalogue
 from armident.identify.identification.equations import Prepared
 from armident.identify.regression.ar_noise import ArModel
 from armident.identify.regression.equations import (
@@ -64,23 +67,46 @@ class JointResidualStatistics:
     band_degrees: Array
 
 
+@dataclass(frozen=True)
+class ChangeDirection:
+    """Change of the estimate by an effect that the model lacks, per unit of its m linear parameters.
+
+    ``parameters`` (m, b): of the parameters, which absorb a part of it; ``scores`` (n, m, k): of the scores of each
+    joint, which show the rest.
+    """
+
+    effect: str
+    joint: str
+    parameters: Array
+    scores: Array
+
+
 def residual_statistics(
     prepared: Prepared, blocks: Sequence[ExperimentEquations], estimate: Estimate
-) -> tuple[JointResidualStatistics, ...]:
-    """Statistics of the residuals of every joint; the noise models of the estimate weigh them, else fitted ones."""
+) -> tuple[tuple[JointResidualStatistics, ...], tuple[ChangeDirection, ...]]:
+    """Statistics of the residuals of every joint; the noise models of the estimate weigh them, else fitted ones.
+
+    Then the directions of changes for which the model has no parameter.
+    """
     noise: Sequence[ArModel] = estimate.noise
     if not any(ar.order for ar in noise):
         noise = noise_models(blocks, estimate.theta, estimate.covariance, MAX_AR_ORDER)
     dt = prepared.experiments[0].dt
-    motion = [(s.q[at], s.qd[at]) for s, at in zip(prepared.signals, instants(blocks, dt), strict=True)]
+    numbers = instants(blocks, dt)
+    motion = [(s.q[at], s.qd[at]) for s, at in zip(prepared.signals, numbers, strict=True)]
     keep = [block.keep for block in blocks]
     errors = residuals(blocks, estimate.theta)
     x, e = whitened([block.x for block in blocks], noise, keep), whitened(errors, noise, keep)
     scale = np.maximum(np.linalg.norm(x, axis=0), 1e-300)
     values, vectors = np.linalg.eigh((x / scale).T @ (x / scale))
     regular = values > RANK * values[-1]
-    whole = (x / scale) @ (vectors[:, regular] / np.sqrt(values[regular]))
-    found, first = [], 0
+    basis = vectors[:, regular] / np.sqrt(values[regular])
+    whole = (x / scale) @ basis
+    effects = [(e, place) for e in catalogue().values() if e.compared for place in e.places(prepared.model.n)]
+    columns = effect_columns(prepared, numbers, estimate.theta, effects)
+    changes = whitened(columns, noise, keep)
+    absorbed = whole.T @ changes
+    found, scores, first = [], [], 0
     for j, joint in enumerate(prepared.model.robot.joints):
         q, qd = [q[:, j] for q, _ in motion], [qd[:, j] for _, qd in motion]
         limits = min(float(v.min()) for v in q), max(float(v.max()) for v in q)
@@ -92,13 +118,38 @@ def residual_statistics(
         first += rows.shape[0]
         projection = whole[own].T @ rows
         score = rows.T @ e[own] - projection.T @ (whole.T @ e)
+        scores.append(rows.T @ changes[own] - projection.T @ absorbed)
         series = [np.where(k[:, j], r[:, j], 0.0) for r, k in zip(errors, keep, strict=True)]
         rate = 1.0 / float(blocks[0].t[1] - blocks[0].t[0])
         power, degrees = band_powers(series, ar)
         edges = 0.5 * rate * np.array(BANDS)
         information = rows.T @ rows - projection.T @ projection
         found.append(JointResidualStatistics(joint.name, limits, fastest, score, information, edges, power, degrees))
-    return tuple(found)
+    parameters, of_joints = (basis @ absorbed).T / scale, np.stack(scores).transpose(0, 2, 1)
+    directions, at = [], 0
+    for effect, place in effects:
+        own = slice(at, at + len(effect.linear))
+        at = own.stop
+        joint_name = prepared.model.robot.joints[place.joint].name
+        directions.append(ChangeDirection(effect.key, joint_name, parameters[own], of_joints[:, own]))
+    return tuple(found), tuple(directions)
+
+
+def effect_columns(
+    prepared: Prepared,
+    numbers: Sequence[NDArray[np.int64]],
+    theta: Array,
+    effects: Sequence[tuple[Effect, Place]],
+) -> list[Array]:
+    """Columns (M, n, m) of effects in each experiment at some samples; ``theta`` (b,) predicts their torques.
+
+    They vary as slowly as the motion, so that the filter of the equations leaves them.
+    """
+    columns = []
+    for e, s, at in zip(prepared.experiments, prepared.signals, numbers, strict=True):
+        motion = replace(prepared.model.motion(s.q[at], s.qd[at], s.qdd[at], e.dt, e.start), theta=theta)
+        columns.append(np.concatenate([effect.torque(motion, place, {}) for effect, place in effects], axis=2))
+    return columns
 
 
 def motion_functions(q: Array, qd: Array, limits: tuple[float, float], fastest: float) -> Array:

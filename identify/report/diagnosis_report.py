@@ -76,7 +76,7 @@ def _detection_limits(document: DiagnosisDocument) -> list[dict[str, str]]:
 
 def posterior_probability(finding: Finding) -> str:
     """Return the posterior probability of a finding in words, with the effects that it is ambiguous with."""
-    shown = "> 99.9 %" if finding.confidence > 0.999 else f"{100 * finding.confidence:.1f} %"
+    shown = finding.probability
     rivals = ", ".join(name.replace("_", " ") for name in finding.evidence.get("ambiguous_with", []))
     if rivals:
         return f"{shown}, ambiguous with {rivals}"

@@ -8,11 +8,19 @@ from typing import Any
 import numpy as np
 
 from armident.configs import DataError
-from armident.identify.documents.comparison import LEVEL_95, ComparedModel, ComparedParameter, ComparisonDocument
+from armident.identify.diagnosis.change_test import FALSE_ALARMS, ParameterChangeTest, compare
+from armident.identify.diagnosis.changed_parameters import ExplainedChange
+from armident.identify.diagnosis.criteria import Criteria
+from armident.identify.documents.comparison import (
+    LEVEL_95,
+    ComparedModel,
+    ComparedParameter,
+    ComparisonDocument,
+    NamedChange,
+)
 from armident.identify.documents.identification import IdentificationDocument, Parameter
 from armident.identify.effects.terms import terms_of
 from armident.identify.identification.saved_model import configuration_of
-from armident.identify.monitoring.change.change_test import FALSE_ALARMS, ParameterChangeTest, compare
 from armident.identify.monitoring.change.model_differences import model_differences
 
 
@@ -36,7 +44,8 @@ def compare_models(
                 "both with one configuration, or compare those that both have with --common"
             )
         first, second = _restricted(first, left_out), _restricted(second, left_out)
-    result = compare(first, second, false_alarms)
+    robot = None if left_out else configuration_of(*now)
+    result = compare(first, second, false_alarms, robot)
     return _document(result, (first, first_path), (second, second_path), left_out)
 
 
@@ -88,6 +97,8 @@ def _document(
         parameters=parameters,
         changed_groups=[f"{g.kind} {joint_of(g.members[0], *places)}" for g in result.changed_groups],
         changed_residuals=[each.words for each in result.changed_residuals],
+        changes=[_named(change, result) for change in result.explained],
+        unexplained=[] if result.explanation is None else _unexplained(result),
         chi_square=result.chi_square,
         degrees=result.degrees,
         p_value=result.p_joint,
@@ -95,6 +106,27 @@ def _document(
         left_out=left_out,
         warnings=_warnings(result, baseline[0], now[0], left_out),
     )
+
+
+def _named(found: ExplainedChange, result: ParameterChangeTest) -> NamedChange:
+    assert result.explanation is not None
+    rivals = found.rivals(Criteria.close)
+    return NamedChange(
+        effect=found.change.effect.name,
+        joints=list(found.change.joints),
+        words=found.words,
+        parameters=found.parameters,
+        std=found.deviations,
+        probability=found.probability() * result.explanation.share,
+        not_excluded=[f"{change.effect.name} of {' and '.join(change.joints)}" for change in rivals],
+    )
+
+
+def _unexplained(result: ParameterChangeTest) -> list[str]:
+    """Return what the changes do not explain, in words."""
+    assert result.explanation is not None
+    names = [result.parameters[k].name for k in result.explanation.unexplained]
+    return [*([", ".join(names)] if names else []), *(each.words for each in result.left.changed(result.share))]
 
 
 def _warnings(
@@ -173,6 +205,12 @@ def comparison_table(document: ComparisonDocument) -> None:
     colour = "red" if document.verdict == "changed" else "green"
     console.print(f"verdict: {document.verdict}", style=f"bold {colour}", highlight=False)
     console.print(f"{document.sentence}.", highlight=False, soft_wrap=True, markup=False)
+    for change in document.changes:
+        if change.not_excluded:
+            text = f"{change.effect} of {' and '.join(change.joints)}; not excluded: {', '.join(change.not_excluded)}"
+            console.print(text, highlight=False, soft_wrap=True, markup=False)
+    for each in document.unexplained:
+        console.print(f"not explained: {each}", highlight=False, soft_wrap=True, markup=False)
     rows = {p.name: _row(p) for p in document.parameters if p.essential or p.changed}
     # Lines of plain text: a table that does not fit into the terminal would break names.
     head = ("parameter", "before", "now", "difference", "unit")

@@ -13,9 +13,9 @@ import sqlalchemy as sa
 
 from armident.configs import ConfigError
 from armident.daq.recording import Recording
+from armident.identify.diagnosis.change_test import ParameterChangeTest
 from armident.identify.documents.files import from_json, to_json
 from armident.identify.documents.identification import IdentificationDocument
-from armident.identify.monitoring.change.change_test import ParameterChangeTest
 from armident.identify.monitoring.change.history_schema import (
     comparisons,
     engine_for,

@@ -8,9 +8,10 @@ import numpy as np
 
 from armident.configs import ConfigError
 from armident.configs.errors import FOUND
+from armident.identify.diagnosis.baseline_comparison import Inconclusive
+from armident.identify.diagnosis.change_test import ParameterChangeTest, compare
 from armident.identify.documents.files import load_document
 from armident.identify.documents.identification import IdentificationDocument
-from armident.identify.monitoring.change.change_test import Inconclusive, ParameterChangeTest, compare
 from armident.identify.monitoring.change.history import History, HistoryRun, recorded_at
 
 

@@ -14,6 +14,12 @@ SCHEMA = "armident/recursive/1"
 DRIFTED = 0.06
 """Relative change of friction that is shown as drifted although the test is silent, 1: the mean of its two changes."""
 
+BOTH_DIRECTIONS = (
+    "friction: mean of both directions; a change of one direction counts half, its other half is an offset that is not "
+    "tested; reidentify and compare test it"
+)
+"""What the friction of the table is, and what it does not show."""
+
 
 def joint_states(result: RecursiveResult) -> list[str]:
     """State of each joint: ``alarm``, ``drifted``, ``unchanged``, ``too little motion`` or ``no motion``."""
@@ -61,6 +67,7 @@ def document(result: RecursiveResult, robot: RobotConfig) -> dict[str, Any]:
             "robot": robot.name,
             "sync": result.sync,
             "motion_s": result.motion_s,
+            "friction_of": "mean of both directions",
             "joints": joints,
             "parameters": parameters,
             "gaps": result.gaps,
@@ -73,7 +80,7 @@ def document(result: RecursiveResult, robot: RobotConfig) -> dict[str, Any]:
 
 def friction_table(result: RecursiveResult, robot: RobotConfig) -> Table:
     """Return the table of ``armident watch``: one row per joint. ``result``: state of the estimator."""
-    table = Table(title=f"{robot.name}: {result.motion_s:.0f} s of motion")
+    table = Table(title=f"{robot.name}: {result.motion_s:.0f} s of motion", caption=BOTH_DIRECTIONS)
     for heading in ("joint", "excitation", "friction / reference", "evidence, nats", "state"):
         table.add_column(heading, justify="left" if heading in ("joint", "state") else "right")
     for j, (joint, state) in enumerate(zip(robot.joints, joint_states(result), strict=True)):

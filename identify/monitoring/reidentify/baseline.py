@@ -18,11 +18,23 @@ class Baseline:
     file: Path | None = None
 
     def become(self, document: IdentificationDocument) -> str:
-        """Make a run the baseline and return a message that says so."""
-        if self.file is None:
-            return f"first run of {document.robot}: it is now the baseline"
-        write_atomically(self.file, to_json(document))
-        return f"first run of {document.robot}: it is now the baseline, saved as {self.file}"
+        """Make a run the baseline and return a message that says so, and whether it is fit to be one."""
+        saved = ""
+        if self.file is not None:
+            write_atomically(self.file, to_json(document))
+            saved = f", saved as {self.file}"
+        return f"first run of {document.robot}: it is now the baseline{saved}{doubt_of(document)}"
+
+
+def doubt_of(document: IdentificationDocument) -> str:
+    """Words on a baseline whose verdict is doubtful, empty otherwise."""
+    if document.verdict != "doubtful":
+        return ""
+    first = document.reasons[0]
+    return (
+        f"; its verdict is doubtful: {first.message}. Later runs are compared with it all the same, with standard "
+        f"deviations that may be too small. Next: {first.next_step} Then renew it: --baseline FILE"
+    )
 
 
 def baseline_of(file: Path | None, history: History | None, robot: str, cell: str) -> Baseline:

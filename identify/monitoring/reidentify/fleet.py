@@ -14,12 +14,13 @@ from armident.configs import ArmidentError, ConfigError, DataError, RobotConfig,
 from armident.configs.errors import FOUND
 from armident.daq.recording import Recording, read_recording
 from armident.extras import install_line
+from armident.identify.diagnosis.change_test import ParameterChangeTest, compare
 from armident.identify.documents.files import from_json, load_document, to_json
 from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.identification.identify_recording import identify_recording
 from armident.identify.identification.options import Options, options_of
-from armident.identify.monitoring.change.change_test import ParameterChangeTest, compare
 from armident.identify.monitoring.change.history import History
+from armident.identify.monitoring.reidentify.baseline import doubt_of
 from armident.identify.monitoring.reidentify.reidentify_options import ReidentifyOptions
 from armident.identify.monitoring.reidentify.summary import change_lines
 from armident.identify.report.robot_file import write_identification
@@ -153,9 +154,9 @@ def _judged(
         if document.verdict == "unusable":
             raise DataError(f"the identification is unusable ({document.reasons[0].message})")
         baselines.setdefault(arm, first or document)
-        drift = None if first is None else compare(first, document, false_alarms)
+        drift = None if first is None else compare(first, document, false_alarms, found.robot)
         if drift is None or first is None:
-            words = (f"first run of {_name(*arm)}: the baseline", *refused)
+            words = (f"first run of {_name(*arm)}: the baseline{doubt_of(document)}", *refused)
             return Row(str(path), words=words, identification=found.path)
         refused = refused or _entered(history, found, document, (first, drift))
     except (ArmidentError, OSError, RuntimeError) as error:

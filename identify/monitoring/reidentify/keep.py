@@ -7,8 +7,8 @@ from pathlib import Path
 
 from armident.configs import ConfigError
 from armident.daq.recording import Recording
+from armident.identify.diagnosis.change_test import ParameterChangeTest
 from armident.identify.documents.identification import IdentificationDocument
-from armident.identify.monitoring.change.change_test import ParameterChangeTest
 from armident.identify.monitoring.change.history import History
 from armident.identify.monitoring.change.history_schema import wait_and_try
 from armident.identify.monitoring.reidentify.record_run import Say

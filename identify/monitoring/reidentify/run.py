@@ -21,6 +21,8 @@ from armident.configs import (
 )
 from armident.configs.errors import FOUND
 from armident.daq.recording import Recording
+from armident.identify.diagnosis.baseline_comparison import Inconclusive
+from armident.identify.diagnosis.change_test import ParameterChangeTest, compare
 from armident.identify.documents.diagnosis import DiagnosisDocument
 from armident.identify.documents.files import from_json, to_json
 from armident.identify.documents.identification import IdentificationDocument
@@ -28,7 +30,6 @@ from armident.identify.effects.terms import arm_model
 from armident.identify.excitation.point_to_point import sample_trajectory
 from armident.identify.excitation.previous_estimate import previous_estimate
 from armident.identify.identification.options import options_of
-from armident.identify.monitoring.change.change_test import Inconclusive, ParameterChangeTest, compare
 from armident.identify.monitoring.reidentify.baseline import Baseline, baseline_of
 from armident.identify.monitoring.reidentify.identify_once import identify_once
 from armident.identify.monitoring.reidentify.keep import HistoryEntry, history_or_reason, recorded_in_history
@@ -172,7 +173,11 @@ def carry_out(job: Job, announcer: StatusPublisher, say: Say, start: Start = sta
             job, recording, document, path, f"the identification is not usable ({defect})", announcer, say
         )
     try:
-        drift = None if job.baseline.document is None else compare(job.baseline.document, document, job.false_alarms)
+        drift = (
+            None
+            if job.baseline.document is None
+            else compare(job.baseline.document, document, job.false_alarms, job.robot)
+        )
     except Inconclusive as error:
         return _unexpected(job, recording, document, path, str(error), announcer, say)
     with recorded_in_history(HistoryEntry(job.store, recording, document, path, job.baseline.document, drift), say):

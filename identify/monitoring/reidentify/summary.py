@@ -5,8 +5,8 @@ import re
 import numpy as np
 
 from armident.configs import RobotConfig
+from armident.identify.diagnosis.change_test import ParameterChangeTest
 from armident.identify.documents.diagnosis import DiagnosisDocument
-from armident.identify.monitoring.change.change_test import ParameterChangeTest
 
 _NAME = re.compile(r"([a-z]+)(\d+)r?(?:_\d+)?$")
 CLEAR = 2.0
@@ -28,8 +28,9 @@ _MEANINGS = {
 
 
 def change_lines(drift: ParameterChangeTest, robot: RobotConfig) -> list[str]:
-    """One line per changed parameter, group and residual, the most significant first, or one for all together."""
-    lines = [_line(drift, name, robot) + f", p = {_p_text(_p_value(drift, name))}" for name in drift.changed]
+    """One line per change of the plant, parameter, group and residual, or one for all parameters together."""
+    lines = [f"{' and '.join(found.change.joints)}: {found.words}" for found in drift.explained]
+    lines += [_line(drift, name, robot) + f", p = {_p_text(_p_value(drift, name))}" for name in drift.changed]
     for group in drift.changed_groups:
         rest = [name for name in group.members if name not in drift.changed]
         if len(rest) == len(group.members):
@@ -76,7 +77,7 @@ def finding_lines(diagnosis: DiagnosisDocument) -> list[str]:
         text = finding.evidence.get("description")
         effect = text if isinstance(text, str) else f"{finding.effect.replace('_', ' ')} ({values})"
         lines.append(
-            f"{where}: {effect}; confidence {100 * finding.confidence:.0f} %, torque error "
+            f"{where}: {effect}; probability {finding.probability}, torque error "
             f"{finding.gap_before:.2f} % -> {finding.gap_after:.2f} %"
         )
     return lines + [f"{each.joint}: {each.hint}" for each in diagnosis.unexplained]

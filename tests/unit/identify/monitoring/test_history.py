@@ -22,7 +22,7 @@ from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.monitoring.change import history_schema
 from armident.identify.monitoring.change.history import History, recorded_at
 from tests.fixtures.postgresql import postgresql, programs
-from tests.unit.identify.monitoring.test_change_test import TRUTH, C, identified
+from tests.unit.identify.diagnosis.test_change_test import TRUTH, C, identified
 
 WEEK = datetime.timedelta(days=7)
 START = datetime.datetime(2026, 1, 5, 6, tzinfo=datetime.UTC)

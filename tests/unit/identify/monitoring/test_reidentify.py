@@ -17,10 +17,10 @@ from armident.configs import ConfigError, DataError, config_path, load_robot, lo
 from armident.configs.schema.scenario import Scenario
 from armident.daq.cli import application
 from armident.daq.recording import Recording, write_recording
+from armident.identify.diagnosis.change_test import compare
 from armident.identify.documents.files import load_document, to_json
 from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.identification.identify_recording import identify_recording
-from armident.identify.monitoring.change.change_test import compare
 from armident.identify.monitoring.change.history import History
 from armident.identify.monitoring.reidentify.baseline import baseline_of
 from armident.identify.monitoring.reidentify.fleet import cluster

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 from armident.configs import DataError
+from armident.identify.diagnosis.baseline_comparison import Inconclusive
+from armident.identify.diagnosis.change_test import FALSE_ALARMS, compare
 from armident.identify.documents.base import RecordingReference
 from armident.identify.documents.identification import IdentificationDocument, Parameter
-from armident.identify.monitoring.change.change_test import FALSE_ALARMS, Inconclusive, compare
 
 NAMES = [f"p{k}" for k in range(30)]
 TRUTH = np.linspace(0.5, 20.0, 30)

@@ -1,36 +1,33 @@
-"""Test of change between two identifications of an arm: chi-square of parameters, and residuals."""
+"""Test of change between two identifications of an arm: chi-square of parameters, residuals, and what explains them."""
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from armident.configs import DataError
+from armident.configs import RobotConfig
+from armident.identify.diagnosis.baseline_comparison import Difference, difference_of
+from armident.identify.diagnosis.changed_parameters import Competition, ExplainedChange, Explanation
+from armident.identify.diagnosis.changes import changes
+from armident.identify.diagnosis.criteria import Criteria
+from armident.identify.diagnosis.residual_test import (
+    ResidualChange,
+    ResidualTest,
+    compare_residuals,
+    residual_difference,
+    same_motion,
+)
 from armident.identify.documents.identification import IdentificationDocument, Parameter
-from armident.identify.monitoring.change.residual_test import ResidualChange, ResidualTest, compare_residuals
 from armident.identify.regression.multiple_testing import holm
 
 Array = NDArray[np.float64]
 
-FALSE_ALARMS = 1e-4
-"""Probability of a false alarm per comparison: one in 200 years of weekly runs."""
-
-RANK_TOLERANCE = 1e-9
-"""Eigenvalues of the difference's correlation, relative to the largest, that count as rounding errors."""
-
-
-MUCH_WORSE = 10.0
-"""Median ratio of standard deviations of the two identifications above which the test is inconclusive: a change by the
-three standard deviations that the better one would show is a third of a standard deviation of the worse one."""
-
-
-class Inconclusive(DataError):
-    """Two identifications cannot confirm or exclude a change."""
-
+FALSE_ALARMS = Criteria.change_rate
+"""Probability of a false alarm per comparison."""
 
 FRICTION = ("fv", "fc", "off")
 """Kinds of friction parameters of a joint or of a coupling; the others belong to its masses."""
@@ -60,6 +57,8 @@ class ParameterChangeTest:
     ``p_values`` are without a change, corrected for all parameters and groups (Holm 1979). ``chi_square`` is ``d' C^-1
     d`` with the covariance C of the difference. ``false_alarms`` is the rate of all tests, `share` that of each.
     ``groups``: friction and masses of each joint, as correlated parameters may change significantly together only.
+    ``p_changes``: of the best change of the catalogue, corrected for their number. ``explanation``: changes of the
+    plant that explain the difference; ``left``: residuals beyond these changes.
     """
 
     parameters: tuple[Parameter, ...]
@@ -73,11 +72,17 @@ class ParameterChangeTest:
     false_alarms: float
     groups: tuple[Group, ...] = ()
     residuals: ResidualTest = field(default_factory=ResidualTest)
+    p_changes: float | None = None
+    explanation: Explanation | None = None
+    left: ResidualTest = field(default_factory=ResidualTest)
 
     @property
     def share(self) -> float:
-        """False-alarm rate of each test: all parameters together; single ones and groups; residuals if compared."""
-        return self.false_alarms / (3 if self.residuals.tests else 2)
+        """False-alarm rate of each test: all parameters together; single ones and groups; then those that were made.
+
+        They are the residuals and the changes of the catalogue.
+        """
+        return self.false_alarms / (2 + bool(self.residuals.tests) + (self.p_changes is not None))
 
     @property
     def changed_residuals(self) -> tuple[ResidualChange, ...]:
@@ -97,9 +102,20 @@ class ParameterChangeTest:
         return tuple(sorted(clear, key=lambda group: group.p_value))
 
     @property
+    def parameters_changed(self) -> bool:
+        """True if a parameter, a group, all together, or along a change of the catalogue changed significantly."""
+        known = self.p_changes is not None and self.p_changes < self.share
+        return bool(self.changed or self.changed_groups) or self.p_joint < self.share or known
+
+    @property
     def drifted(self) -> bool:
-        """True if a parameter, a group, all parameters together, or the residuals changed significantly."""
-        return bool(self.changed or self.changed_groups or self.changed_residuals) or self.p_joint < self.share
+        """True if parameters or residuals changed significantly."""
+        return self.parameters_changed or bool(self.changed_residuals)
+
+    @property
+    def explained(self) -> tuple[ExplainedChange, ...]:
+        """Changes of the plant that explain the changed parameters."""
+        return () if self.explanation is None else self.explanation.changes
 
     @property
     def entry(self) -> dict[str, object]:
@@ -113,12 +129,14 @@ class ParameterChangeTest:
             "p_joint": self.p_joint,
             "structure_compared": bool(self.residuals.tests),
             "structure_note": self.residuals.reason or None,
+            "explained_by": [change.words for change in self.explained],
             "changed_residuals": [each.words for each in self.changed_residuals],
             "p_residuals": min((each.p_value for each in self.residuals.tests), default=None),
             "alpha": {
                 "all": self.false_alarms,
                 "parameters_together": self.share,
                 "parameters_and_groups": self.share,
+                "changes_of_the_catalogue": 0.0 if self.p_changes is None else self.share,
                 "residuals": self.share if self.residuals.tests else 0.0,
             },
         }
@@ -139,79 +157,66 @@ class ParameterChangeTest:
         for group in self.changed_groups:
             if not known & set(group.members):
                 parts.append(f"{group.kind} {group.place} ({', '.join(group.members)} together)")
-        parts += [each.words for each in self.changed_residuals[:1]]
+        parts += [each.words for each in self.explained] + [each.words for each in self.changed_residuals[:1]]
         what = ", ".join(parts) or "no single parameter significantly"
         return f"changed: {what} (chi-square {self.chi_square:.1f} of {self.degrees} degrees of freedom)"
 
 
 def compare(
-    baseline: IdentificationDocument, now: IdentificationDocument, false_alarms: float = FALSE_ALARMS
+    baseline: IdentificationDocument,
+    now: IdentificationDocument,
+    false_alarms: float = FALSE_ALARMS,
+    robot: RobotConfig | None = None,
+    criteria: Criteria | None = None,
 ) -> ParameterChangeTest:
     """Test two identifications of an arm with the same model for a change of its parameters.
 
-    Runs are independent, so that covariances add. All base parameters are tested. Raises DataError for different robots
-    or models; Inconclusive if one is unusable, did not converge, or is far less precise than the other.
+    Changed parameters of a ``robot`` are explained. Raises DataError and Inconclusive as `difference_of`.
     """
-    for name, document in (("the baseline", baseline), ("the identification", now)):
-        if not document.converged:
-            raise Inconclusive(
-                f"{now.robot}: {name} did not converge ({document.stop_reason}): whether the arm has changed is unknown"
-            )
-        if document.verdict == "unusable":
-            defect = document.reasons[0].message
-            raise Inconclusive(f"{now.robot}: {name} is unusable ({defect}): whether the arm has changed is unknown")
-    if baseline.robot != now.robot:
-        raise DataError(f"the baseline is of robot {baseline.robot!r}, the identification of {now.robot!r}")
-    old = {p.name: k for k, p in enumerate(baseline.parameters)}
-    new = {p.name: k for k, p in enumerate(now.parameters)}
-    if old.keys() != new.keys():
-        odd = ", ".join(sorted(old.keys() ^ new.keys())[:5])
-        raise DataError(f"{now.robot}: baseline and identification have different base parameters: {odd}")
-    order = [old[p.name] for p in now.parameters]
-    before = np.array([baseline.parameters[k].value for k in order])
-    difference = np.array([p.value for p in now.parameters]) - before
-    if not all(p.std > 0 for p in (*now.parameters, *baseline.parameters)):
-        raise DataError(f"{now.robot}: a parameter without a standard deviation cannot be compared")
-    worse = float(np.median([p.std for p in now.parameters] / np.array([baseline.parameters[k].std for k in order])))
-    if not 1.0 / MUCH_WORSE < worse < MUCH_WORSE:
-        raise Inconclusive(
-            f"{now.robot}: standard deviations are {worse:.2g} times those of the baseline: "
-            "whether the arm has changed is unknown"
-        )
-    covariance = np.array(now.covariance) + np.array(baseline.covariance)[np.ix_(order, order)]
-    std = np.sqrt(np.diag(covariance))
-    chi_square, degrees = _chi_square(difference, covariance)
-    names = [p.name for p in now.parameters]
+    criteria = criteria or Criteria()
+    difference = difference_of(baseline, now)
+    if "doubtful" in (baseline.verdict, now.verdict) and not same_motion(baseline, now):
+        difference = difference.widened(criteria.other_motion)
+    residuals = compare_residuals(baseline, now)
+    pool = [] if robot is None else list(changes(robot, now))
+    found = _tested(difference, tuple(now.parameters), false_alarms, residuals)
+    if not pool:
+        return replace(found, left=residuals)
+    competition = Competition.of(difference, residual_difference(baseline, now), pool, criteria)
+    found = replace(found, p_changes=competition.p_value())
+    if not found.drifted:
+        return replace(found, left=residuals)
+    explanation = competition.explained(found.share)
+    return replace(found, explanation=explanation, left=compare_residuals(baseline, now, explanation.residual_scores))
+
+
+def _tested(
+    difference: Difference, parameters: tuple[Parameter, ...], false_alarms: float, residuals: ResidualTest
+) -> ParameterChangeTest:
+    """Tests of all parameters together, of groups, and of single ones."""
+    names = difference.names
     places = _places(names)
-    sums = [_chi_square(difference[rows], covariance[np.ix_(rows, rows)]) for rows in places.values()]
-    single = 2 * stats.norm.sf(np.abs(difference) / std)
+    sums = [difference.chi_square(rows) for rows in places.values()]
+    single = 2 * stats.norm.sf(np.abs(difference.values) / difference.std)
     p = holm(np.concatenate([single, [stats.chi2.sf(value, dof) for value, dof in sums]]))
     groups = tuple(
         Group(kind, place, tuple(names[k] for k in rows), *found, float(chance))
         for ((kind, place), rows), found, chance in zip(places.items(), sums, p[len(names) :], strict=True)
     )
-    joint = float(stats.chi2.sf(chi_square, degrees))
+    chi_square, degrees = difference.chi_square()
     return ParameterChangeTest(
-        tuple(now.parameters),
-        before,
-        difference,
-        std,
+        parameters,
+        difference.before,
+        difference.values,
+        difference.std,
         p[: len(names)],
         chi_square,
         degrees,
-        joint,
+        difference.p_value,
         false_alarms,
         groups,
-        compare_residuals(baseline, now),
+        residuals,
     )
-
-
-def _chi_square(difference: Array, covariance: Array) -> tuple[float, int]:
-    """Return ``d' C^-1 d`` and its degrees of freedom, without eigenvalues of rounding size."""
-    std = np.sqrt(np.diag(covariance))
-    values, vectors = np.linalg.eigh(covariance / np.outer(std, std))
-    kept = values > RANK_TOLERANCE * values[-1]
-    return float(np.sum((vectors[:, kept].T @ (difference / std)) ** 2 / values[kept])), int(kept.sum())
 
 
 def _places(names: Sequence[str]) -> dict[tuple[Literal["friction", "masses"], str], list[int]]:

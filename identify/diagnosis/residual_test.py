@@ -3,7 +3,7 @@
 Free functions of the motion are tested by the difference of coefficients, bands of frequency by the ratio of powers.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 
 SAME_MOTION = 0.1
 """Largest difference of range and speed of a joint between both runs, as share of them. The model errors of a healthy
-arm cancel in the difference only if the motion is the same.
+arm cancel in the difference only if the motion of all joints is the same.
 A shift of an eighth of the range would be one knot of the functions of position."""
 
 RANK = 1e-3
@@ -64,7 +64,7 @@ class ResidualChange:
 
 @dataclass(frozen=True)
 class ResidualTest:
-    """Test of all joints and kinds; ``reason``: why structure is not compared, for all joints or some."""
+    """Test of all joints and kinds; ``reason``: why structure is not compared."""
 
     tests: tuple[ResidualChange, ...] = ()
     reason: str = ""
@@ -74,26 +74,51 @@ class ResidualTest:
         return tuple(sorted((t for t in self.tests if t.p_value < level), key=lambda t: t.p_value))
 
 
-def compare_residuals(baseline: IdentificationDocument, now: IdentificationDocument) -> ResidualTest:
-    """Test the residuals of two identifications of an arm with the same motion for a change."""
+def unchanged(joint: int) -> Array | float:
+    """No change of the scores of a joint."""
+    return 0.0
+
+
+def compare_residuals(
+    baseline: IdentificationDocument,
+    now: IdentificationDocument,
+    predicted: Callable[[int], Array | float] = unchanged,
+) -> ResidualTest:
+    """Test the residuals of two identifications of an arm with the same motion for a change.
+
+    ``predicted``: change of the scores (k,) of each joint that is explained already. The power of such a joint is not
+    tested: it contains the explained torque.
+    """
     if baseline.residual_statistics is None:
         return ResidualTest(reason=NOT_COMPARED)
     if now.residual_statistics is None:
         return ResidualTest(reason="structure is not compared: this run has no statistics of the residuals")
     before = {each.joint: each for each in baseline.residual_statistics}
-    pairs = [(before[each.joint], each) for each in now.residual_statistics if each.joint in before]
-    same = [(old, new) for old, new in pairs if _same_motion(old, new)]
+    pairs = [
+        (before[e.joint], _less(e, predicted(j))) for j, e in enumerate(now.residual_statistics) if e.joint in before
+    ]
     other = [new.joint for old, new in pairs if not _same_motion(old, new)]
-    reason = f"structure of {', '.join(other)} is not compared: the motion is not that of the baseline" if other else ""
-    tests = [test for old, new in same for test in _tests(old, new)]
+    if other:
+        return ResidualTest(
+            reason=f"structure is not compared: the motion of {', '.join(other)} is not that of the baseline"
+        )
+    variance = _variance(baseline, now)
+    tests = [test for old, new in pairs for test in _tests(old, new, variance)]
     corrected = holm(np.array([test.p_value for test in tests])) if tests else np.empty(0)
     return ResidualTest(
         tuple(
             ResidualChange(t.joint, t.kind, t.statistic, t.degrees, float(p), t.band_hz)
             for t, p in zip(tests, corrected, strict=True)
-        ),
-        reason,
+        )
     )
+
+
+def _less(new: ResidualStatistics, predicted: Array | float) -> ResidualStatistics:
+    """Statistics without a change of the scores that is explained."""
+    if not np.any(predicted):
+        return new
+    score = list(np.array(new.score) - predicted)
+    return new.model_copy(update={"score": score, "band_power": [0.0] * len(new.band_power)})
 
 
 def _same_motion(old: ResidualStatistics, new: ResidualStatistics) -> bool:
@@ -105,7 +130,16 @@ def _same_motion(old: ResidualStatistics, new: ResidualStatistics) -> bool:
     )
 
 
-def _tests(old: ResidualStatistics, new: ResidualStatistics) -> list[ResidualChange]:
+def _variance(baseline: IdentificationDocument, now: IdentificationDocument) -> float:
+    """Variance of a difference over that of the baseline's coefficient: a shorter run determines them less well."""
+    before, after = (
+        sum(each.samples for each in (document.recording, *(document.further_recordings or ())))
+        for document in (baseline, now)
+    )
+    return 1.0 + before / after if before and after else 2.0
+
+
+def _tests(old: ResidualStatistics, new: ResidualStatistics, variance: float) -> list[ResidualChange]:
     """Tests of one joint; their p-values are not corrected. Bands are left out if their limits differ."""
     k = len(new.score)
     split = 2 * k // 3
@@ -115,7 +149,7 @@ def _tests(old: ResidualStatistics, new: ResidualStatistics) -> list[ResidualCha
         ("velocity", slice(split, k)),
     )
     for kind, part in kinds:
-        value, degrees = _functions(old, new, part)
+        value, degrees = _functions(old, new, part, variance)
         chance = float(stats.chi2.sf(value, degrees)) if degrees else 1.0
         found.append(ResidualChange(new.joint, kind, value, degrees, chance))
     if not np.allclose(old.band_edges_hz, new.band_edges_hz, rtol=1e-3):
@@ -138,8 +172,16 @@ def _tests(old: ResidualStatistics, new: ResidualStatistics) -> list[ResidualCha
     return found
 
 
-def _functions(old: ResidualStatistics, new: ResidualStatistics, part: slice) -> tuple[float, int]:
-    """Chi-square of the difference of the coefficients of some functions, and its degrees of freedom.
+def _functions(old: ResidualStatistics, new: ResidualStatistics, part: slice, variance: float) -> tuple[float, int]:
+    """Chi-square of the difference of the coefficients of some functions, and its degrees of freedom."""
+    target, _ = _whitened_functions(old, new, part, variance)
+    return float(target @ target), target.size
+
+
+def _whitened_functions(
+    old: ResidualStatistics, new: ResidualStatistics, part: slice, variance: float
+) -> tuple[Array, Array]:
+    """Whitened difference (r,) of the coefficients of some functions, and its change (r, k) per score of ``new``.
 
     The noise of the baseline counts for both: a noise model of a changed arm would absorb a part of the change.
     """
@@ -147,13 +189,28 @@ def _functions(old: ResidualStatistics, new: ResidualStatistics, part: slice) ->
     score = [np.array(each.score)[part] for each in (old, new)]
     scale = np.sqrt(np.maximum(np.diag(information[0]), 1e-300))
     values, vectors = np.linalg.eigh(information[0] / np.outer(scale, scale))
+    if values[-1] <= 0.0:
+        return np.zeros(0), np.zeros((0, scale.size))
     kept = vectors[:, values > RANK * values[-1]] / scale[:, None]
-    if not kept.size or values[-1] <= 0.0:
-        return 0.0, 0
-    covariance, coefficients = [], []
-    for i, g in zip(information, score, strict=True):
-        covariance.append(np.linalg.pinv(kept.T @ i @ kept, hermitian=True))
-        coefficients.append(covariance[-1] @ (kept.T @ g))
-    difference = coefficients[1] - coefficients[0]
-    value = float(difference @ np.linalg.solve(2.0 * covariance[0], difference))
-    return max(value, 0.0), kept.shape[1]
+    before, now = (kept.T @ each @ kept for each in information)
+    root = np.linalg.cholesky(before).T / np.sqrt(variance)
+    change = root @ np.linalg.pinv(now, hermitian=True) @ kept.T
+    return change @ score[1] - root @ np.linalg.solve(before, kept.T @ score[0]), change
+
+
+def residual_difference(baseline: IdentificationDocument, now: IdentificationDocument) -> list[tuple[Array, Array]]:
+    """Whitened difference of the functions of every joint, and its change per score; empty for another motion."""
+    before = {each.joint: each for each in baseline.residual_statistics or ()}
+    same = same_motion(baseline, now)
+    return [
+        _whitened_functions(before[each.joint], each, slice(None), _variance(baseline, now))
+        if same
+        else (np.zeros(0), np.zeros((0, len(each.score))))
+        for each in now.residual_statistics or ()
+    ]
+
+
+def same_motion(baseline: IdentificationDocument, now: IdentificationDocument) -> bool:
+    """True if all joints moved alike in both runs, as far as the documents tell."""
+    before = {each.joint: each for each in baseline.residual_statistics or ()}
+    return all(e.joint in before and _same_motion(before[e.joint], e) for e in now.residual_statistics or ())
