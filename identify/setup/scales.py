@@ -8,11 +8,12 @@ from numpy.typing import NDArray
 from scipy import optimize
 
 from armident.configs import RobotConfig
-from armident.identify.setup.fit import Hypothesis
+from armident.identify.setup.fit import Hypothesis, Misfit
 from armident.identify.setup.moves import Move, scaled
 
 Array = NDArray[np.float64]
 Criterion = Callable[[Hypothesis], float]
+SlopedCriterion = Callable[[Hypothesis], Misfit]
 
 FACTORS = (0.2, 0.32, 0.5, 0.7, 0.85, 1.0, 1.18, 1.4, 2.0, 3.1, 5.0)
 """True over configured values that are tried before the refinement."""
@@ -55,19 +56,22 @@ def scale_moves(robot: RobotConfig, joint: int, h: Hypothesis, criterion: Criter
             yield made(factor)
 
 
-def torque_scales(h: Hypothesis, criterion: Criterion, starts: Sequence[Array]) -> Array | None:
+def torque_scales(h: Hypothesis, criterion: SlopedCriterion, starts: Sequence[Array]) -> Array | None:
     """Best factors (n,) of all torques together, or ``None`` if none of them is far from the others.
 
     Joints that carry the same links determine the proportions; the common factor is free.
     """
 
-    def misfit(logs: Array) -> float:
-        return criterion(replace(h, torque=np.exp(logs)[:, None] * h.torque))
+    def misfit(logs: Array) -> tuple[float, Array | None]:
+        found = criterion(replace(h, torque=np.exp(logs)[:, None] * h.torque))
+        return found.value, found.by_scale
 
+    sloped = criterion(h).by_scale is not None
     found = [
         optimize.minimize(
-            misfit,
+            misfit if sloped else lambda logs: misfit(logs)[0],
             np.log(np.abs(start)),
+            jac=sloped,
             method="L-BFGS-B",
             bounds=[(v - WIDEST, v + WIDEST) for v in np.log(np.abs(start))],
             options={"maxiter": 12, "eps": 1e-3},
