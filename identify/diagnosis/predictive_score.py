@@ -6,9 +6,10 @@ accelerations would favour a smaller inertia. Where `references_of` finds it, ch
 predicted without it (`noise_of_motion`); the rest is the same for all models.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,9 +49,8 @@ class PredictiveScore:
         b = self.fit.theta.size
         zx, zy = np.zeros((FOLDS, b, b)), np.zeros((FOLDS, b))
         for joint, rows in zip(self.fit.equations.joints, regression.rows, strict=True):
-            fold = fold_of(rows.shape[0])
-            for k in range(FOLDS):
-                sums = joint.products([rows[fold == k]])
+            for k, own in folds_of(rows.shape[0]):
+                sums = joint.products([rows[own]])
                 zx[k][np.ix_(joint.z, joint.x)] += sums[:, : joint.x.size]
                 zy[k][joint.z] += sums[:, -1]
         scale, weak = regression.solution.scale, np.diag(self._prior)
@@ -92,14 +92,17 @@ class PredictiveScore:
         for joint, change in zip(self.fit.equations.joints, self._changes, strict=True):
             width = joint.x.size
             total = sum(len(part) for part in joint.parts)
-            fold, begin, parts = fold_of(total), 0, []
-            for part in joint.parts:
-                rows, own = part[:], fold[begin : begin + len(part)]
-                errors = rows[:, -1] - np.einsum("mi,mi->m", rows[:, :width], self.folds[own][:, joint.x])
-                if change is not None:
-                    errors += noise_of_motion(joint, rows, change)[np.arange(own.size), own]
-                parts.append(errors)
-                begin += len(part)
+            rows = joint.parts[0][:] if len(joint.parts) == 1 else np.concatenate([part[:] for part in joint.parts])
+            errors = rows[:, -1].copy()
+            for k, own in folds_of(total):
+                errors[own] -= rows[own, :width] @ self.folds[k, joint.x]
+            parts = np.split(errors, np.cumsum([len(part) for part in joint.parts])[:-1])
+            if change is not None:
+                fold, begin = fold_of(total), 0
+                for part, left in zip(joint.parts, parts, strict=True):
+                    own = fold[begin : begin + len(part)]
+                    left += noise_of_motion(joint, part[:], change)[np.arange(own.size), own]
+                    begin += len(part)
             found.append(tuple(parts))
         return tuple(found)
 
@@ -187,6 +190,13 @@ class PredictiveScore:
 def fold_of(rows: int) -> NDArray[np.int64]:
     """Return the fold of each row, (R,)."""
     return np.arange(rows) * BLOCKS // max(rows, 1) % FOLDS
+
+
+def folds_of(rows: int) -> Iterator[tuple[int, slice]]:
+    """Fold and rows of each block."""
+    edges = [-(-block * rows // BLOCKS) for block in range(BLOCKS + 1)]
+    for block, span in enumerate(pairwise(edges)):
+        yield block % FOLDS, slice(*span)
 
 
 def references_of(fit: IvFit) -> tuple[Array | None, ...]:
