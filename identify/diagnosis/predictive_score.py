@@ -13,6 +13,7 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import lapack
 
 from armident.identify.diagnosis.regression import MAX_AR_ORDER, IvFit
 from armident.identify.effects.free_shapes import FreeShape
@@ -28,6 +29,10 @@ SUMS = 20
 """Blocks of the block sums: long beside the memory of the noise, enough for a variance with 19 degrees of freedom."""
 FOLDS = 10
 """Folds of the cross-validation (Hastie, Tibshirani, Friedman 2009, section 7.10)."""
+
+RANK, DETERMINED = 1e-12, 1e-10
+"""Singular value of a fold's equations, over the largest, from which a direction is determined; reciprocal condition
+from which all are, with a margin for its estimate."""
 
 LAGS = 5
 """Samples to either side in the filter between simulated and measured motion: half a period of the loop's bandwidth,
@@ -54,14 +59,8 @@ class PredictiveScore:
                 zx[k][np.ix_(joint.z, joint.x)] += sums[:, : joint.x.size]
                 zy[k][joint.z] += sums[:, -1]
         scale, weak = regression.solution.scale, np.diag(self._prior)
-        found = [
-            np.linalg.lstsq(
-                (zx.sum(0) - zx[k] + weak) / np.outer(scale, scale), (zy.sum(0) - zy[k]) / scale, rcond=1e-12
-            )[0]
-            / scale
-            for k in range(FOLDS)
-        ]
-        return np.array(found)
+        left, right = (zx.sum(0) - zx + weak) / np.outer(scale, scale), (zy.sum(0) - zy) / scale
+        return np.array([_solved(a, c) for a, c in zip(left, right, strict=True)]) / scale
 
     @cached_property
     def _prior(self) -> Array:
@@ -185,6 +184,14 @@ class PredictiveScore:
         ratio = np.log(np.maximum(less, 1e-300) / np.maximum(own, 1e-300))
         each = rows * (0.5 * ratio + self.volume - other.volume)
         return float(np.sum(each / self.inflation_over(other, noise)))
+
+
+def _solved(a: Array, c: Array) -> Array:
+    """Solution (b,) of equations (b, b); the smallest one where a fold does not determine all parameters."""
+    lu, pivots, singular = lapack.dgetrf(a)
+    if singular == 0 and lapack.dgecon(lu, np.abs(a).sum(axis=0).max())[0] > DETERMINED:
+        return np.asarray(lapack.dgetrs(lu, pivots, c)[0])
+    return np.asarray(np.linalg.lstsq(a, c, rcond=RANK)[0])
 
 
 def fold_of(rows: int) -> NDArray[np.int64]:

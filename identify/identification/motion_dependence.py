@@ -93,4 +93,6 @@ def _explained(series: Sequence[Array], bins: NDArray[np.int64]) -> tuple[float,
 
 def _shifted(series: Array, shifts: Array) -> Array:
     """A series (M,) moved in a circle by shares of its length, (S, M)."""
-    return np.stack([np.roll(series, k) for k in np.rint(shifts * series.size).astype(np.int64)])
+    size = series.size
+    every = np.lib.stride_tricks.sliding_window_view(np.concatenate([series, series]), size)
+    return np.asarray(every[size - np.rint(shifts * size).astype(np.int64)])

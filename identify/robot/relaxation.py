@@ -44,9 +44,9 @@ load, a large one takes three times as many simulations."""
 LEAST_INERTIA = 0.4
 """Fraction of its own inertia that a joint keeps at least in the compiled simulation if terms reduce inertia."""
 
-STEP = 0.5
-"""Mixing factor: fraction of the remaining difference that is added to the extrapolated load. Any from
-0.25 to 1 takes the same number of simulations within one."""
+STEP = 1.0
+"""Mixing factor: fraction of the remaining difference that is added to the extrapolated load. A loop answers a load by
+a small part of it, so that the whole difference is nearly right at once; Anderson mixing corrects the rest."""
 
 
 def simulate_with_terms(

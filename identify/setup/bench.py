@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armident.configs import DataError, RobotConfig
+from armident.identify.regression.whitening import nonzero_columns
 from armident.identify.robot.arm import ArmModel
 from armident.identify.signals.bandwidth import motion_bandwidth
 from armident.identify.signals.decimate import Decimation, design
@@ -263,7 +264,12 @@ class Bench:
             columns = [self.column(f"fv{j + 1}"), dry, *friction]
             physical[1, j, columns] = (x[:, columns] * qd[:, j, None]).mean(axis=0)
             physical[2, j, rotor] = 1.0
-        square = np.stack([x.T @ x for x in wide])
+        square = np.zeros((n, wide.shape[2], wide.shape[2]))
+        for gram, x in zip(square, wide, strict=True):
+            # A joint feels the links beyond it only, and its own friction.
+            used = nonzero_columns(x)
+            own = x[:, used]
+            gram[np.ix_(used, used)] = own.T @ own
         return Rows(wide, square, heavy, physical.reshape(3 * n, -1))
 
     def _mean_inertia(self, q: Array) -> Array:
