@@ -71,9 +71,7 @@ def _refined(h: Hypothesis, size: float, start: Array, criterion: SlopedCriterio
         return found.value, size / length * across @ along
 
     sloped = criterion(replace(h, gravity=size * start)).by_gravity is not None
-    found = optimize.minimize(
-        slope if sloped else value, np.zeros(2), jac=sloped, method="L-BFGS-B", options=REFINED
-    )
+    found = optimize.minimize(slope if sloped else value, np.zeros(2), jac=sloped, method="L-BFGS-B", options=REFINED)
     return float(found.fun), turned(np.asarray(found.x))[0]
 
 
