@@ -46,7 +46,9 @@ class IvRegression:
     @classmethod
     def of(cls, equations: Jointwise, noise: Sequence[ArModel], known: "IvRegression | None" = None) -> "IvRegression":
         """Regression under given noise models; reuses joints of ``known`` that have the same noise model."""
-        joints, rows, products = equations.joints, {}, []
+        joints = equations.joints
+        rows: dict[int, Array] = {}
+        products: list[Array] = []
         for j, (joint, ar) in enumerate(zip(joints, noise, strict=True)):
             if known is not None and known.noise[j] is ar:
                 products.append(known.products[j])

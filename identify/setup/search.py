@@ -3,6 +3,7 @@
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -329,13 +330,13 @@ class Search:
                 seen[key] = _rank(coarse, h) + 2.0 * wiring_cost(order, order @ own) / RANKED_ROWS, h
             return seen[key][0]
 
-        for own in relative:
-            if self.bench.moving.sum() <= EXHAUSTIVE:
-                for order in assignment.orders(self.bench.moving):
-                    at(order, own)
-            else:
-                for begin in assignment.usual_orders(self.bench.moving):
-                    _climb(begin, self.bench.moving, partial(at, own=own))
+        if self.bench.moving.sum() <= EXHAUSTIVE:
+            # The equations of one order of the positions serve all orders of the torques.
+            for order, own in product(assignment.orders(self.bench.moving), relative):
+                at(order, own)
+        else:
+            for own, begin in product(relative, assignment.usual_orders(self.bench.moving)):
+                _climb(begin, self.bench.moving, partial(at, own=own))
         best = sorted(seen.values(), key=lambda pair: pair[0])[: 4 * ORDERS_KEPT]
         steps = [self._made(first, "order", "joints in another order", h) for _, h in best]
         return [replace(s, probability=(1.0,), rivals=((),)) for s in sorted(steps, key=lambda s: s.rank)[:ORDERS_KEPT]]
