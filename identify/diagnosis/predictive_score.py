@@ -99,8 +99,8 @@ class PredictiveScore:
             if change is not None:
                 fold, begin = fold_of(total), 0
                 for part, left in zip(joint.parts, parts, strict=True):
-                    own = fold[begin : begin + len(part)]
-                    left += noise_of_motion(joint, part[:], change)[np.arange(own.size), own]
+                    number = fold[begin : begin + len(part)]
+                    left += noise_of_motion(joint, part[:], change)[np.arange(number.size), number]
                     begin += len(part)
             found.append(tuple(parts))
         return tuple(found)

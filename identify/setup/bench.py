@@ -268,8 +268,8 @@ class Bench:
         for gram, x in zip(square, wide, strict=True):
             # A joint feels the links beyond it only, and its own friction.
             used = nonzero_columns(x)
-            own = x[:, used]
-            gram[np.ix_(used, used)] = own.T @ own
+            felt = x[:, used]
+            gram[np.ix_(used, used)] = felt.T @ felt
         return Rows(wide, square, heavy, physical.reshape(3 * n, -1))
 
     def _mean_inertia(self, q: Array) -> Array:

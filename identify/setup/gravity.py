@@ -32,6 +32,9 @@ FIRST_TILT = 0.1
 REFINED = {"ftol": 1e-9, "gtol": 1e-4, "maxiter": 20}
 """End of the refinement: slope of the misfit per first step, and its relative change, far below `EQUAL`."""
 
+DIFFERENCE = 1e-6
+"""Difference, in first steps, from which a slope is computed where the misfit has none."""
+
 SHIFTS_S = (1e-3, 2e-3, 4e-3, 8e-3, 16e-3, 32e-3, 64e-3)
 """Shifts that are tried before the refinement, s, to both sides."""
 
@@ -62,16 +65,16 @@ def _refined(h: Hypothesis, size: float, start: Array, criterion: SlopedCriterio
     def value(sides: Array) -> float:
         return criterion(turned(sides)[0]).value
 
-    def slope(sides: Array) -> tuple[float, Array]:
+    def sloped(sides: Array) -> tuple[float, Array]:
         other, length = turned(sides)
         found = criterion(other)
-        assert found.by_gravity is not None
+        if found.by_gravity is None:
+            return found.value, np.asarray(optimize.approx_fprime(sides, value, DIFFERENCE))
         radial = other.gravity / size
         along = found.by_gravity - (found.by_gravity @ radial) * radial
-        return found.value, size / length * across @ along
+        return found.value, np.asarray(size / length * across @ along)
 
-    sloped = criterion(replace(h, gravity=size * start)).by_gravity is not None
-    found = optimize.minimize(slope if sloped else value, np.zeros(2), jac=sloped, method="L-BFGS-B", options=REFINED)
+    found = optimize.minimize(sloped, np.zeros(2), jac=True, method="L-BFGS-B", options=REFINED)
     return float(found.fun), turned(np.asarray(found.x))[0]
 
 

@@ -30,6 +30,9 @@ LEAST_GAIN = 1.3
 WIDEST = float(np.log(1e3))
 """Largest logarithm of a factor over its start: three decades."""
 
+DIFFERENCE = 1e-3
+"""Difference of a logarithm from which a slope is computed where the misfit has none."""
+
 LEAST_TORQUE = 3.0
 """Least factor of a single torque for a finding; a smaller one is an effect of the drive (`drive_gain_error`)."""
 
@@ -62,19 +65,23 @@ def torque_scales(h: Hypothesis, criterion: SlopedCriterion, starts: Sequence[Ar
     Joints that carry the same links determine the proportions; the common factor is free.
     """
 
-    def misfit(logs: Array) -> tuple[float, Array | None]:
-        found = criterion(replace(h, torque=np.exp(logs)[:, None] * h.torque))
+    def misfit(logs: Array) -> Misfit:
+        return criterion(replace(h, torque=np.exp(logs)[:, None] * h.torque))
+
+    def sloped(logs: Array) -> tuple[float, Array]:
+        found = misfit(logs)
+        if found.by_scale is None:
+            return found.value, np.asarray(optimize.approx_fprime(logs, lambda x: misfit(x).value, DIFFERENCE))
         return found.value, found.by_scale
 
-    sloped = criterion(h).by_scale is not None
     found = [
         optimize.minimize(
-            misfit if sloped else lambda logs: misfit(logs)[0],
+            sloped,
             np.log(np.abs(start)),
-            jac=sloped,
+            jac=True,
             method="L-BFGS-B",
             bounds=[(v - WIDEST, v + WIDEST) for v in np.log(np.abs(start))],
-            options={"maxiter": 12, "eps": 1e-3},
+            options={"maxiter": 12},
         )
         for start in starts
     ]
