@@ -29,8 +29,8 @@ EQUAL = 0.02
 FIRST_TILT = 0.1
 """First step of the refinement, rad: less than a third of the angle between neighbouring directions."""
 
-REFINED = {"ftol": 1e-9, "gtol": 1e-4, "maxiter": 20}
-"""End of the refinement: slope of the misfit per first step, and its relative change, far below `EQUAL`."""
+FLAT, UNCHANGED = 1e-4, 1e-9
+"""Slope of the misfit per first step, and its relative change, that end the refinement: far below `EQUAL`."""
 
 DIFFERENCE = 1e-6
 """Difference, in first steps, from which a slope is computed where the misfit has none."""
@@ -74,7 +74,13 @@ def _refined(h: Hypothesis, size: float, start: Array, criterion: SlopedCriterio
         along = found.by_gravity - (found.by_gravity @ radial) * radial
         return found.value, np.asarray(size / length * across @ along)
 
-    found = optimize.minimize(sloped, np.zeros(2), jac=True, method="L-BFGS-B", options=REFINED)
+    found = optimize.minimize(
+        sloped,
+        np.zeros(2),
+        jac=True,
+        method="L-BFGS-B",
+        options={"ftol": UNCHANGED, "gtol": FLAT, "maxiter": 20},
+    )
     return float(found.fun), turned(np.asarray(found.x))[0]
 
 

@@ -68,10 +68,13 @@ def torque_scales(h: Hypothesis, criterion: SlopedCriterion, starts: Sequence[Ar
     def misfit(logs: Array) -> Misfit:
         return criterion(replace(h, torque=np.exp(logs)[:, None] * h.torque))
 
+    def value(logs: Array) -> float:
+        return misfit(logs).value
+
     def sloped(logs: Array) -> tuple[float, Array]:
         found = misfit(logs)
         if found.by_scale is None:
-            return found.value, np.asarray(optimize.approx_fprime(logs, lambda x: misfit(x).value, DIFFERENCE))
+            return found.value, np.asarray(optimize.approx_fprime(logs, value, DIFFERENCE))
         return found.value, found.by_scale
 
     found = [
