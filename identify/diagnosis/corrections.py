@@ -19,24 +19,31 @@ REFINEMENTS = 10
 """Evaluations of the refinement between two values of the grid."""
 
 
-def screened_correction(
-    fit: IvFit, candidate: Candidate, column_cache: ColumnCache
-) -> tuple[float, tuple[float, float]]:
-    """Score statistic of an effect on the recorded torque of a motor, and two values of its parameter to start from.
+def screened_correction(fit: IvFit, candidate: Candidate, column_cache: ColumnCache) -> tuple[float, float]:
+    """Score statistic of an effect on the recorded torque of a motor, and the value of its parameter there.
 
     The statistic is the reduction of the squared whitened residual by the change of the predicted torque at the
     simulated, noise-free motion. The likelihood of corrected torques is no evidence: smoothing favours low-pass
-    filtered noise. It gives the second value, for effects so large that the predicted torque is far from the true one.
+    filtered noise.
     """
+    effect, motor, limit, grid = _tested(fit, candidate)
+    return _largest(lambda values: _at_simulated(fit, effect, motor, limit, column_cache, values), grid)
+
+
+def likely_correction(fit: IvFit, candidate: Candidate) -> float:
+    """Value with the largest likelihood: for effects so large that the predicted torque is far from the true one."""
+    effect, motor, limit, grid = _tested(fit, candidate)
+    return _largest(lambda values: _likelihoods(fit, effect, motor, limit, values), grid)[1]
+
+
+def _tested(fit: IvFit, candidate: Candidate) -> tuple[Correction, int, float, list[float]]:
+    """The effect of a candidate, its motor, the limit of its torque, and the values to test."""
     study, effect, motor = fit.study, candidate.effect, candidate.place.joint
     assert isinstance(effect, Correction)
     limit = motor_limit(study.robot, motor)
     shaft = np.linalg.inv(study.robot.transmission_matrix)[:, motor]
     recorded = np.concatenate([s.torque @ shaft for s in study.train])
-    grid = [float(value) for value in effect.values_to_test(recorded, study.dt, limit)]
-    promised, small = _largest(lambda values: _at_simulated(fit, effect, motor, limit, column_cache, values), grid)
-    _, large = _largest(lambda values: _likelihoods(fit, effect, motor, limit, values), grid)
-    return promised, (small, large)
+    return effect, motor, limit, [float(value) for value in effect.values_to_test(recorded, study.dt, limit)]
 
 
 def _at_simulated(

@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,8 +57,9 @@ class DiagnosisResult:
 
     ``robot``: configuration with the findings. ``before``, ``after``: torques of the model without and with the
     findings. ``lacking``: torques with all findings but one; ``own``: torques of each finding itself. They are ``None``
-    for findings outside the model. ``after - lacking`` differs from ``own``: other parameters compensate. ``where``,
-    ``left``: dependences of the residual without and with the findings.
+    for findings outside the model. ``after - lacking`` differs from ``own``: other parameters compensate. ``left``:
+    dependences of the residual with the findings. ``first``: model without
+    them; ``None`` where a change against a baseline is all that was found.
     """
 
     document: DiagnosisDocument
@@ -70,9 +72,17 @@ class DiagnosisResult:
     own: tuple[Array | None, ...]
     q: Array
     qd: Array
-    where: tuple[ResidualDependence, ...]
     left: tuple[ResidualDependence, ...]
     simulated: SimulatedErrors
+    first: ModelState | None
+
+    @cached_property
+    def where(self) -> tuple[ResidualDependence, ...]:
+        """Dependences of the residual without the findings; only a report needs them."""
+        if self.first is None:
+            return ()
+        with threadpool_limits(1):
+            return dependences_of(self.first)
 
 
 def run_diagnosis(
@@ -246,9 +256,9 @@ def _diagnose(
         own=_of_findings(_own, final, chosen_for),
         q=_sampled(final, "q"),
         qd=_sampled(final, "qd"),
-        where=() if change.complete else dependences_of(first),
         left=dependences,
         simulated=simulated,
+        first=None if change.complete else first,
     )
 
 

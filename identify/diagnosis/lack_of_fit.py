@@ -259,22 +259,25 @@ class LackOfFit:
         model = [[e.z[:, j] for e in self.fit.equations.train] for j in range(self.fit.study.robot.n)]
         taken: list[set[int]] = [set() for _ in model]
         noise = [noise_beyond([e[:, j] for e in errors], z) for j, z in enumerate(model)]
+        searched = set(range(len(model)))
         while True:
             joints = self._whitened(self.fit.renoised(noise))
-            changed = False
             for own, known in zip(joints, taken, strict=True):
-                found = self._clearest(own, known)
-                if found is None or len(known) == self.criteria.functions_in_noise:
+                if own.joint not in searched:
+                    continue
+                found = self._clearest(own, known) if len(known) < self.criteria.functions_in_noise else None
+                if found is None:
+                    # The noise models of the other joints hardly change its own functions.
+                    searched.remove(own.joint)
                     continue
                 known.add(found)
-                changed = True
                 columns = np.concatenate([self._sets(own.joint)[k] for k in known])
                 functions = [
                     np.concatenate([z, c[:, columns]], axis=1)
                     for z, c in zip(model[own.joint], self.columns[0][own.joint], strict=True)
                 ]
                 noise[own.joint] = noise_beyond([e[:, own.joint] for e in errors], functions)
-            if not changed:
+            if not searched:
                 return joints
 
     def _clearest(self, own: JointResidual, known: set[int]) -> int | None:

@@ -12,6 +12,7 @@ from scipy import fft
 
 from armident.identify.diagnosis.candidates import ColumnCache
 from armident.identify.diagnosis.regression import MAX_AR_ORDER, IvFit
+from armident.identify.diagnosis.study import Study
 from armident.identify.effects.free_shapes import hats
 from armident.identify.regression.ar_noise import ArModel, ar_models, lagged_sums, levinson_durbin, lowest_aic
 from armident.identify.robot.motion import Motion
@@ -26,6 +27,9 @@ PASSES = 4
 
 RANK = 1e-8
 """Power of a direction, relative to a unit column, below which functions do not span it."""
+
+SPAN = 1e-8
+"""Singular value, relative to the largest, from which smooth functions span a direction."""
 
 
 def noise_beyond(errors: Sequence[Array], functions: Sequence[Array]) -> ArModel:
@@ -81,35 +85,37 @@ def _taken(noise: ArModel, span: Sequence[Array], highest: int) -> Array:
 
 def noise_beyond_shapes(fit: IvFit, column_cache: ColumnCache) -> list[ArModel]:
     """Noise models of the residual of a fit without smooth functions of each joint's own motion."""
-    errors = fit.errors(fit.theta, held=False)
-    columns = [
-        _smooth_functions(column_cache, column_cache.motion(s, "measured"), sum(e.shape[0] for e in errors))
-        for s in fit.study.train
-    ]
-    left = [e.copy() for e in errors]
-    used = 0
-    for j in range(fit.study.robot.n):
-        stacked = np.concatenate([c[j] for c in columns])
-        shapes = np.linalg.lstsq(stacked, np.concatenate([e[:, j] for e in errors]), rcond=1e-8)[0]
-        for e, c in zip(left, columns, strict=True):
-            e[:, j] -= c[j] @ shapes
-        used += shapes.size
-    return ar_models(left, MAX_AR_ORDER, parameters=fit.theta.size + used)
+    study, errors = fit.study, fit.errors(fit.theta, held=False)
+    # The measured motion is the same for all models: one factorisation serves them.
+    key = ("smooth functions", *(s.measured for s in study.train), tuple(study.robot.sign_smoothing))
+    motions = (column_cache.motion(s, "measured") for s in study.train)
+    *spans, sizes = study.regressors.get(key, lambda: _spans([_smooth_functions(study, m) for m in motions]))
+    every = np.concatenate(errors)
+    left = np.stack([e - span @ (span.T @ e) for e, span in zip(every.T, spans, strict=True)], axis=1)
+    parts = np.split(left, np.cumsum([e.shape[0] for e in errors])[:-1])
+    return ar_models(parts, MAX_AR_ORDER, parameters=fit.theta.size + int(sizes.sum()))
 
 
-def _smooth_functions(column_cache: ColumnCache, motion: Motion, rows: int) -> list[Array]:
+def _spans(columns: Sequence[Sequence[Array]]) -> tuple[Array, ...]:
+    """Orthonormal functions (M, r) with the span of those of each joint in all stretches, and their numbers (n,)."""
+    stacked = [np.concatenate(own) for own in zip(*columns, strict=True)]
+    spans = []
+    for own in stacked:
+        span, power, _ = np.linalg.svd(own, full_matrices=False)
+        spans.append(span[:, power > SPAN * power[0]])
+    return (*spans, np.array([own.shape[1] for own in stacked]))
+
+
+def _smooth_functions(study: Study, motion: Motion) -> list[Array]:
     """Hat functions of position, of position by direction, of velocity and of time, (M, k) for each joint."""
-    knots = max(3, min(KNOTS, rows // (4 * column_cache.study.criteria.rows_per_function)))
-    out = []
+    rows = sum(s.y.shape[0] for s in study.train)
+    knots = max(3, min(KNOTS, rows // (4 * study.criteria.rows_per_function)))
+    when, out = _quantile_hats(motion.t, knots), []
     for j in range(motion.n):
         q, qd, side = motion.q[:, j], motion.qd[:, j], motion.sign[:, j, None]
         place = _quantile_hats(q, knots)
-        when = _quantile_hats(motion.t, knots)
-        out.append(
-            column_cache.study.decimation(
-                np.concatenate([place, place * side, _quantile_hats(qd, knots), when, when * side], axis=1)
-            )
-        )
+        functions = [place, place * side, _quantile_hats(qd, knots), when, when * side]
+        out.append(study.decimation(np.concatenate(functions, axis=1)))
     return out
 
 

@@ -6,12 +6,14 @@ accelerations would favour a smaller inertia. Where `references_of` finds it, ch
 predicted without it (`noise_of_motion`); the rest is the same for all models.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import lapack
 
 from armident.identify.diagnosis.regression import MAX_AR_ORDER, IvFit
 from armident.identify.effects.free_shapes import FreeShape
@@ -27,6 +29,10 @@ SUMS = 20
 """Blocks of the block sums: long beside the memory of the noise, enough for a variance with 19 degrees of freedom."""
 FOLDS = 10
 """Folds of the cross-validation (Hastie, Tibshirani, Friedman 2009, section 7.10)."""
+
+RANK, DETERMINED = 1e-12, 1e-10
+"""Singular value of a fold's equations, over the largest, from which a direction is determined; reciprocal condition
+from which all are, with a margin for its estimate."""
 
 LAGS = 5
 """Samples to either side in the filter between simulated and measured motion: half a period of the loop's bandwidth,
@@ -48,20 +54,13 @@ class PredictiveScore:
         b = self.fit.theta.size
         zx, zy = np.zeros((FOLDS, b, b)), np.zeros((FOLDS, b))
         for joint, rows in zip(self.fit.equations.joints, regression.rows, strict=True):
-            fold = fold_of(rows.shape[0])
-            for k in range(FOLDS):
-                sums = joint.products([rows[fold == k]])
+            for k, own in folds_of(rows.shape[0]):
+                sums = joint.products([rows[own]])
                 zx[k][np.ix_(joint.z, joint.x)] += sums[:, : joint.x.size]
                 zy[k][joint.z] += sums[:, -1]
         scale, weak = regression.solution.scale, np.diag(self._prior)
-        found = [
-            np.linalg.lstsq(
-                (zx.sum(0) - zx[k] + weak) / np.outer(scale, scale), (zy.sum(0) - zy[k]) / scale, rcond=1e-12
-            )[0]
-            / scale
-            for k in range(FOLDS)
-        ]
-        return np.array(found)
+        left, right = (zx.sum(0) - zx + weak) / np.outer(scale, scale), (zy.sum(0) - zy) / scale
+        return np.array([_solved(a, c) for a, c in zip(left, right, strict=True)]) / scale
 
     @cached_property
     def _prior(self) -> Array:
@@ -92,14 +91,17 @@ class PredictiveScore:
         for joint, change in zip(self.fit.equations.joints, self._changes, strict=True):
             width = joint.x.size
             total = sum(len(part) for part in joint.parts)
-            fold, begin, parts = fold_of(total), 0, []
-            for part in joint.parts:
-                rows, own = part[:], fold[begin : begin + len(part)]
-                errors = rows[:, -1] - np.einsum("mi,mi->m", rows[:, :width], self.folds[own][:, joint.x])
-                if change is not None:
-                    errors += noise_of_motion(joint, rows, change)[np.arange(own.size), own]
-                parts.append(errors)
-                begin += len(part)
+            rows = joint.parts[0][:] if len(joint.parts) == 1 else np.concatenate([part[:] for part in joint.parts])
+            errors = rows[:, -1].copy()
+            for k, own in folds_of(total):
+                errors[own] -= rows[own, :width] @ self.folds[k, joint.x]
+            parts = np.split(errors, np.cumsum([len(part) for part in joint.parts])[:-1])
+            if change is not None:
+                fold, begin = fold_of(total), 0
+                for part, left in zip(joint.parts, parts, strict=True):
+                    number = fold[begin : begin + len(part)]
+                    left += noise_of_motion(joint, part[:], change)[np.arange(number.size), number]
+                    begin += len(part)
             found.append(tuple(parts))
         return tuple(found)
 
@@ -184,9 +186,24 @@ class PredictiveScore:
         return float(np.sum(each / self.inflation_over(other, noise)))
 
 
+def _solved(a: Array, c: Array) -> Array:
+    """Solution (b,) of equations (b, b); the smallest one where a fold does not determine all parameters."""
+    lu, pivots, singular = lapack.dgetrf(a)
+    if singular == 0 and lapack.dgecon(lu, np.abs(a).sum(axis=0).max())[0] > DETERMINED:
+        return np.asarray(lapack.dgetrs(lu, pivots, c)[0])
+    return np.asarray(np.linalg.lstsq(a, c, rcond=RANK)[0])
+
+
 def fold_of(rows: int) -> NDArray[np.int64]:
     """Return the fold of each row, (R,)."""
     return np.arange(rows) * BLOCKS // max(rows, 1) % FOLDS
+
+
+def folds_of(rows: int) -> Iterator[tuple[int, slice]]:
+    """Fold and rows of each block."""
+    edges = [-(-block * rows // BLOCKS) for block in range(BLOCKS + 1)]
+    for block, span in enumerate(pairwise(edges)):
+        yield block % FOLDS, slice(*span)
 
 
 def references_of(fit: IvFit) -> tuple[Array | None, ...]:

@@ -5,12 +5,13 @@ sums contain further serial correlation (Kuensch 1989, Annals of Statistics 17(3
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
+from scipy import special
 
 from armident.identify.diagnosis.free_functions import FreeFunction
 from armident.identify.diagnosis.predictive_score import SUMS
@@ -49,7 +50,7 @@ class Projection:
     def p_value(self) -> float:
         """Both parts combined (Fisher's method)."""
         product = np.log(max(self.p_train, 1e-300)) + np.log(max(self.p_held, 1e-300))
-        return float(stats.chi2.sf(-2.0 * product, 4))
+        return float(special.chdtrc(4, -2.0 * product))
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,30 +77,42 @@ class JointResidual:
     regressor: Array
     covariance: Array
     least: float
+    _made: dict[FreeFunction | None, Projection | None] = field(default_factory=dict, init=False, repr=False)
+
+    @cached_property
+    def _size(self) -> Array:
+        """Norm of each function at the simulated motion, (K,)."""
+        return np.asarray(np.linalg.norm(self.d, axis=0))
+
+    @cached_property
+    def _scores(self) -> Array:
+        """Products of the functions beyond the model with the residual, (K,)."""
+        return np.asarray(self.z.T @ self.e)
 
     def directions(self, columns: NDArray[np.int64]) -> tuple[Array, Array, Array] | None:
-        """Orthonormal directions (R, r) of some functions beyond the model, coefficients (k, r), and powers (r,)."""
-        d, z = self.d[:, columns], self.z[:, columns]
-        scale = np.linalg.norm(d, axis=0)
+        """Combinations (k, r) of functions that are orthonormal beyond the model, coefficients (k, r), powers (r,)."""
+        z, scale = _taken(self.z, columns), self._size[columns]
         scale = np.where(scale > 0, scale, np.inf)
-        power, right = np.linalg.eigh((z / scale).T @ (z / scale))
+        power, right = np.linalg.eigh(z.T @ z / np.outer(scale, scale))
         kept = power > self.least**2
         if not kept.any():
             return None
         right, power = right[:, kept], power[kept]
-        u = (z / scale) @ right / np.sqrt(power)
+        combined = right / np.sqrt(power) / scale[:, None]
         # The estimate with the functions as regressors and ``u`` as instruments has unit variance in these directions.
-        through = right @ np.linalg.pinv(u[self.rows].T @ (d / scale) @ right) / scale[:, None]
-        return u, through, power
+        cross = combined.T @ (z[self.rows].T @ _taken(self.d, columns)) / scale
+        through = right @ np.linalg.pinv(cross @ right) / scale[:, None]
+        return combined, through, power
 
     def beyond(self, columns: NDArray[np.int64]) -> "JointResidual":
         """Residual and functions orthogonal to the functions ``columns`` (k,), too."""
         found = self.directions(columns)
         if found is None:
             return self
-        u, through, _ = found
+        combined, through, _ = found
+        u = _taken(self.z, columns) @ combined
         inside = through @ (u.T @ self.z)
-        values = through @ (u.T @ self.e)
+        values = through @ (combined.T @ self._scores[columns])
         # Instruments: z - u c with (z - u c)' d = 0 for the functions taken in.
         own = u[self.rows].T @ self.d[:, columns] @ through
         c = np.linalg.lstsq(own.T, through.T @ self.d[:, columns].T @ self.z[self.rows], rcond=None)[0]
@@ -115,21 +128,27 @@ class JointResidual:
 
     def projection(self, function: FreeFunction | None, columns: NDArray[np.int64]) -> Projection | None:
         """Projection of the residual on one set (``None``: on all functions); ``None`` if the model contains it."""
+        if function not in self._made:
+            self._made[function] = self._projection(function, columns)
+        return self._made[function]
+
+    def _projection(self, function: FreeFunction | None, columns: NDArray[np.int64]) -> Projection | None:
         found = self.directions(columns) if columns.size else None
         if found is None:
             return None
-        u, through, power = found
-        estimate = u.T @ self.e
-        p_train, inflation = significance(u[self.rows], self.e[self.rows], estimate)
+        combined, through, power = found
+        estimate = combined.T @ self._scores[columns]
+        own = _taken(self.z[self.rows], columns) @ combined
+        p_train, inflation = significance(own, self.e[self.rows], estimate)
         weights, axes = smoothing(estimate / np.sqrt(inflation), through, power, function)
         smooth = through @ axes
         values = smooth @ (weights * (axes.T @ estimate))
         covariance = inflation * (smooth * weights) @ smooth.T
-        torque = self.band[:, columns] @ values
+        torque = _taken(self.band, columns) @ values
         before = float(self.errors @ self.errors)
         removed = before - float(np.sum((self.errors - torque) ** 2))
         size = float(np.sqrt(max(removed, 0.0) / self.errors.size))
-        p_held = self._held_out(self.held[:, columns] @ values)
+        p_held = self._held_out(_taken(self.held, columns) @ values)
         return Projection(
             function, columns, self.joint, p_train, p_held, removed / max(before, 1e-300), size, values, covariance,
             torque,
@@ -147,7 +166,13 @@ class JointResidual:
         )
         through = self.regressor.T @ change
         variance = variance * max(1.0, inflation_of_sums(here, after)) + float(through @ self.covariance @ through)
-        return float(stats.t.sf(float(change @ self.held_e) / np.sqrt(max(variance, 1e-300)), SUMS - 1))
+        return float(special.stdtr(SUMS - 1, -float(change @ self.held_e) / np.sqrt(max(variance, 1e-300))))
+
+
+def _taken(functions: Array, columns: NDArray[np.int64]) -> Array:
+    """Some columns of functions: a view of neighbouring ones, which most sets are."""
+    first, last = columns[0], columns[-1] + 1
+    return functions[:, first:last] if last - first == columns.size else functions[:, columns]
 
 
 def significance(u: Array, e: Array, estimate: Array) -> tuple[float, float]:
@@ -170,7 +195,7 @@ def significance(u: Array, e: Array, estimate: Array) -> tuple[float, float]:
     equivalent = float(np.clip(trace**2 / max(squared, 1e-300), 1.0, r))
     inflation = max(1.0, trace / max(white, 1e-300))
     power = float(estimate @ estimate) / (r * inflation)
-    return float(stats.f.sf(power, equivalent, free * equivalent)), inflation
+    return float(special.fdtrc(equivalent, free * equivalent, power)), inflation
 
 
 def inflation_of_sums(change: Array, e: Array) -> float:

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armident.identify.diagnosis.candidates import Candidate, ColumnCache, Key, Shapes, candidates
-from armident.identify.diagnosis.corrections import screened_correction
+from armident.identify.diagnosis.corrections import likely_correction, screened_correction
 from armident.identify.diagnosis.model_state import ModelState
 from armident.identify.diagnosis.order_analysis import motor_orders, nearby_orders
 from armident.identify.diagnosis.screening import contained, refined, screened
@@ -52,8 +52,8 @@ def shortlist(state: ModelState, incumbent: Incumbent | None) -> Shortlist:
         found: tuple[float, Shapes] | None
         starts: Starts = ()
         if isinstance(candidate.effect, Correction):
-            statistic, starts = screened_correction(noise, candidate, column_cache)
-            found = statistic, ()
+            statistic, start = screened_correction(noise, candidate, column_cache)
+            found, starts = (statistic, ()), (start,)
         else:
             found = screened(noise, candidate, column_cache)
         if found is None:
@@ -72,7 +72,7 @@ def shortlist(state: ModelState, incumbent: Incumbent | None) -> Shortlist:
     for _, own, first, starts in (*named, *unnamed):
         candidate, found = own, first
         if starts:
-            chosen.append((candidate, (), starts))
+            chosen.append((candidate, (), (*starts, likely_correction(noise, candidate))))
             continue
         if isinstance(candidate.effect, MotorOrder):
             near = nearby_orders(state.study, candidate.place.joint, found[1][0][1])

@@ -79,14 +79,20 @@ def _explained(series: Sequence[Array], bins: NDArray[np.int64]) -> tuple[float,
     total = sum(float(e @ e) for e in series)
     if total <= 0.0:
         return 0.0, 0.0
-    counts = np.maximum(np.bincount(bins), 1)
-    rng = np.random.default_rng(0)
+    shifts = np.concatenate([[0.0], np.random.default_rng(0).uniform(LEAST_SHIFT, 1 - LEAST_SHIFT, SHIFTS)])
+    # Rows of all shifts, bin after bin.
+    order = np.argsort(bins, kind="stable")
+    counts = np.bincount(bins)
+    counts = counts[counts > 0]
+    rows = np.concatenate([_shifted(e, shifts) for e in series], axis=1)[:, order]
+    sums = np.add.reduceat(rows, np.cumsum(counts) - counts, axis=1)
+    here, *shifted = np.sum(sums**2 / counts, axis=1) / total
+    usual, spread = float(np.mean(shifted)), float(np.std(shifted))
+    return float(max(here - usual, 0.0) / max(1.0 - usual, 1e-300)), float((here - usual) / max(spread, 1e-300))
 
-    def explained(shift: float) -> float:
-        rows = np.concatenate([np.roll(e, round(shift * e.size)) for e in series])
-        return float(np.sum(np.bincount(bins, rows, counts.size) ** 2 / counts)) / total
 
-    here = explained(0.0)
-    shifted = np.array([explained(s) for s in rng.uniform(LEAST_SHIFT, 1 - LEAST_SHIFT, SHIFTS)])
-    usual, spread = float(shifted.mean()), float(shifted.std())
-    return max(here - usual, 0.0) / max(1.0 - usual, 1e-300), (here - usual) / max(spread, 1e-300)
+def _shifted(series: Array, shifts: Array) -> Array:
+    """A series (M,) moved in a circle by shares of its length, (S, M)."""
+    size = series.size
+    every = np.lib.stride_tricks.sliding_window_view(np.concatenate([series, series]), size)
+    return np.asarray(every[size - np.rint(shifts * size).astype(np.int64)])

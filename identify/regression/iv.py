@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy import linalg, signal
 
 from armident.compiled import ARITHMETIC, compiled
-from armident.identify.regression.ar_noise import ArModel
+from armident.identify.regression.ar_noise import WHITE, ArModel
 from armident.identify.regression.equations import InstrumentedEquations
 from armident.identify.regression.fir import filter_columns
 from armident.identify.regression.least_squares import column_norms
@@ -174,6 +174,11 @@ class JointEquations:
                 span = slice(first, first + CHUNK_ROWS + ar.order)
                 rows = filter_columns(ar.whitening, part[span])
                 yield rows if kept is None else rows[kept[span][ar.order :]]
+
+    @cached_property
+    def plain(self) -> Array:
+        """`products` of the rows without weights: over its variance, those under any white noise."""
+        return self.products(self.whitened(WHITE))
 
     def products(self, rows: Iterable[Array], combine: Array | None = None) -> Array:
         """``Q' [X, Q, y]`` (q, x + q + 1) of whitened rows ``[X, Z, y]``; ``Q = Z T``, or ``Z`` without T (b, b)."""

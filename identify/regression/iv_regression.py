@@ -46,18 +46,24 @@ class IvRegression:
     @classmethod
     def of(cls, equations: Jointwise, noise: Sequence[ArModel], known: "IvRegression | None" = None) -> "IvRegression":
         """Regression under given noise models; reuses joints of ``known`` that have the same noise model."""
-        joints, rows, products = equations.joints, [], []
+        joints = equations.joints
+        rows: dict[int, Array] = {}
+        products: list[Array] = []
         for j, (joint, ar) in enumerate(zip(joints, noise, strict=True)):
             if known is not None and known.noise[j] is ar:
-                rows.append(known.rows[j])
                 products.append(known.products[j])
+                if "rows" in known.__dict__:
+                    rows[j] = known.rows[j]
+            elif ar.order == 0:
+                products.append(joint.plain / ar.variance)
             else:
-                rows.append(_whitened(joint, ar))
-                products.append(joint.products(rows[-1:]))
+                rows[j] = _whitened(joint, ar)
+                products.append(joint.products([rows[j]]))
         solution = together(zip(joints, products, strict=True), equations.parameters)
         solution = replace(solution, cross=solution.cross + np.diag(equations.held_at_zero))
         made = cls(equations, tuple(noise), tuple(products), solution)
-        made.__dict__["rows"] = tuple(rows)
+        if len(rows) == len(joints):
+            made.__dict__["rows"] = tuple(rows[j] for j in range(len(joints)))
         return made
 
     @cached_property

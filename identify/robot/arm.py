@@ -3,6 +3,7 @@
 import os
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Self
 
 import numpy as np
@@ -73,7 +74,7 @@ class ArmModel:
         """Number of joints."""
         return self.robot.n
 
-    @property
+    @cached_property
     def smoothing(self) -> Floats:
         """``g`` of each joint's smoothed sign, s/rad or s/m, (n,)."""
         return self.robot.sign_smoothing

@@ -24,6 +24,9 @@ from armident.identify.signals.differentiate import Derivatives
 ROUNDS = 16
 """Maximum number of simulations: loops whose load converges take eight or fewer (tests of `identify/effects`)."""
 
+RATE = 20.0
+"""Rate at which the torque of the terms is computed, over its band: harmonics up to the tenth stay below half of it."""
+
 SETTLED = 1e-3
 """Difference between the torque of the terms and the applied load, over that torque, at which the iteration ends."""
 
@@ -41,9 +44,9 @@ load, a large one takes three times as many simulations."""
 LEAST_INERTIA = 0.4
 """Fraction of its own inertia that a joint keeps at least in the compiled simulation if terms reduce inertia."""
 
-STEP = 0.5
-"""Mixing factor: fraction of the remaining difference that is added to the extrapolated load. Any from
-0.25 to 1 takes the same number of simulations within one."""
+STEP = 1.0
+"""Mixing factor: fraction of the remaining difference that is added to the extrapolated load. A loop answers a load by
+a small part of it, so that the whole difference is nearly right at once; Anderson mixing corrects the rest."""
 
 
 def simulate_with_terms(
@@ -75,32 +78,41 @@ def simulate_with_terms(
     known = model if model.anchor is not None else model.anchored(theta)
     reference = np.ascontiguousarray(q_ref, dtype=np.float64)
     pushed = np.zeros_like(reference) if disturbance is None else np.asarray(disturbance, dtype=np.float64)
-    load: Floats = np.zeros_like(reference)
+    # One instant of ``step``: the torque is needed in its band only.
+    step = max(1, int(1.0 / (dt * RATE * band_hz)))
+    load: Floats = np.zeros_like(reference[::step])
     inertia: Floats = np.zeros(model.n)
     best: tuple[float, Simulation, Floats] | None = None
     past = _Past()
 
     def torque_at(run: Simulation | Derivatives) -> Floats:
-        return known.term_torque(known.motion(run.q, run.qd, run.qdd, dt, start), values)
+        q, qd, qdd = (np.ascontiguousarray(x[::step]) for x in (run.q, run.qd, run.qdd))
+        return known.term_torque(known.motion(q, qd, qdd, step * dt, start), values)
 
-    def held(torque: Floats, run: Simulation | Derivatives) -> Floats:
-        # The load is held during each period: take the mean of the torques at its two ends.
-        rest = torque - run.qdd * inertia
-        rest[:-1] = 0.5 * (rest[1:] + rest[:-1])
-        return _slow(rest, dt, band_hz)
+    def answer_of(torque: Floats, run: Simulation | Derivatives) -> Floats:
+        # The load is held during each period: take the torque in its middle.
+        rest = torque - run.qdd[::step] * inertia
+        rest[:-1] += 0.5 / step * (rest[1:] - rest[:-1])
+        return _slow(rest, step * dt, band_hz)
 
     def felt(torque: Floats, run: Simulation | Derivatives) -> Floats:
-        return _inertia(model, theta, run.q, _slow(torque, dt, band_hz), _slow(run.qdd, dt, band_hz))
+        slow = (_slow(x, step * dt, band_hz) for x in (torque, run.qdd[::step]))
+        return _inertia(model, theta, run.q, *slow)
+
+    def at_samples(load: Floats) -> Floats:
+        at, known_at = np.arange(reference.shape[0]), step * np.arange(load.shape[0])
+        return np.stack([np.interp(at, known_at, own) for own in load.T], axis=1)
 
     if motion is not None:
         torque = torque_at(motion)
         inertia = felt(torque, motion)
-        load = held(torque, motion)
+        load = answer_of(torque, motion)
     # Where a loop diverges, the given motion may be far from its own: begin without load. Then leave the inertia out.
     begins, restarts = motion is None, 0
     most = 1 if begins else 2
     for _ in range(rounds):
-        pushes = pushed - load @ to_motors
+        applied = at_samples(load)
+        pushes = pushed - applied @ to_motors
         run = simulate(model, theta, controller, reference, dt, disturbance=pushes, inertia=inertia, **initial)
         if run.diverged_at is not None:
             if best is not None:
@@ -110,12 +122,12 @@ def simulate_with_terms(
                 return run
             restarts += 1
             begins = restarts < most
-            load, inertia = np.zeros_like(reference), np.zeros(model.n)
+            load, inertia = np.zeros_like(load), np.zeros(model.n)
             continue
         torque = torque_at(run)
         if begins:
             inertia = felt(torque, run)
-        answer = held(torque, run)
+        answer = answer_of(torque, run)
         if begins and inertia.any():
             load, begins = answer, False
             continue
@@ -123,8 +135,9 @@ def simulate_with_terms(
         missing = answer - load
         apart = float(np.linalg.norm(missing)) / max(float(np.linalg.norm(answer)), 1e-300)
         if best is None or apart < best[0]:
-            best = apart, replace(run, tau=run.tau + load), load
-        small = np.linalg.norm(missing, axis=0) <= tolerated * np.linalg.norm(run.tau + load, axis=0)
+            best = apart, replace(run, tau=run.tau + applied), load
+        whole = (run.tau + applied)[::step]
+        small = np.linalg.norm(missing, axis=0) <= tolerated * np.linalg.norm(whole, axis=0)
         if apart < SETTLED or small.all():
             break
         load = past.next(load, missing)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy import optimize
 
 from armident.identify.setup.bench import Bench
-from armident.identify.setup.fit import FLOOR, Hypothesis, normal, physical_least_squares
+from armident.identify.setup.fit import FLOOR, Hypothesis, physical_least_squares, regressors
 
 Array = NDArray[np.float64]
 OrderCriterion = Callable[[Array], float]
@@ -21,15 +21,14 @@ def by_rows(bench: Bench, h: Hypothesis) -> Hypothesis:
     Each row is fitted to each torque of either sign; the least sum of logarithmic residuals decides (Kuhn 1955).
     """
     n = bench.n
-    found = normal(bench, h)
-    x = found.x
+    x, physical_rows = regressors(bench, h), bench.rows(h.position).physical
     y = bench.torque(h.shift) @ h.torque.T
     power = np.maximum((y**2).sum(axis=0), 1e-300)
     cost, sign = np.zeros((n, n)), np.ones((n, n))
     for m in range(n):
-        used = np.flatnonzero(np.abs(x[:, m]).max(axis=0) > 0)
-        own = np.ascontiguousarray(x[:, m, used])
-        gram, physical = own.T @ own, found.physical[m::n][:, used]
+        used = np.flatnonzero(np.abs(x[m]).max(axis=0) > 0)
+        own = x[m][:, used]
+        gram, physical = own.T @ own, physical_rows[m::n][:, used]
         for k in range(n):
             right = own.T @ y[:, k]
             shares = []
@@ -52,9 +51,9 @@ def by_friction(bench: Bench, h: Hypothesis) -> Array:
     Dry friction changes only the torque of its own joint where that joint turns round. Needs no model of the arm.
     """
     n = bench.n
-    x = bench.rows(np.eye(n)).x
-    dry = np.stack([x[:, j, bench.column(f"fc{j + 1}")] for j in range(n)], axis=1)
-    slow = np.stack([x[:, j, bench.column(f"fv{j + 1}")] for j in range(n)], axis=1)
+    x = bench.rows(np.eye(n)).wide
+    dry = np.stack([x[j, :, bench.column(f"fc{j + 1}")] for j in range(n)], axis=1)
+    slow = np.stack([x[j, :, bench.column(f"fv{j + 1}")] for j in range(n)], axis=1)
     fast = bench.kept([s.qdd for s in bench.segments])
     q = bench.kept([s.q for s in bench.segments])
     smooth = np.concatenate([np.ones((q.shape[0], 1)), q, np.sin(q), np.cos(q), fast, slow], axis=1)

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armident.configs import DataError, RobotConfig
+from armident.identify.regression.whitening import nonzero_columns
 from armident.identify.robot.arm import ArmModel
 from armident.identify.signals.bandwidth import motion_bandwidth
 from armident.identify.signals.decimate import Decimation, design
@@ -56,9 +57,12 @@ FREE_TERMS = SPRING_TERMS + ROTOR_TERMS + 3
 """Free terms of every joint beside the rigid model: springs, rotor inertia, asymmetric, quadratic and low-velocity
 friction."""
 
-MOST_KEPT = 16
-"""Largest number of assignments of positions whose equations are kept, 11 MB each for six joints. A search asks twice
-within few others: 64 save 4 % of the equations."""
+MOST_KEPT = 32
+"""Largest number of assignments of positions whose equations are kept, 5 MB each for six joints: the gear ratio and the
+position of one joint are scaled alike."""
+
+GRAMS_KEPT = 4
+"""Largest number of gravities whose normal equations are kept for each assignment: torques are changed one by one."""
 
 POSTURES = 40
 """Postures over which moments of inertia are averaged."""
@@ -83,15 +87,27 @@ class Segment:
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """Equations of all joints for one assignment of positions.
+    """Equations of all joints for one assignment of positions, and their normal equations for any gravity.
 
-    ``x`` (M, n, c): base parameters without gravity, then free terms. ``gravity`` (3, M, n, c): added to ``x`` per
-    m/s^2 along base axes. ``physical`` (2 n, c): rows with non-negative products: mean inertia, friction power.
+    ``wide`` (n, M, c + 3 h): base parameters without gravity and free terms, then what gravity along each base axis,
+    per m/s^2, adds to the columns ``heavy`` (h,). ``square``: ``wide' wide``. ``physical`` (3 n, c): rows with
+    non-negative products: mean inertia, friction power, rotor inertia. ``products``: ``wide' y``, by shifts of torques.
     """
 
-    x: Array
-    gravity: Array
+    wide: Array
+    square: Array
+    heavy: NDArray[np.int64]
     physical: Array
+    products: dict[bytes, Array] = field(default_factory=dict)
+    grams: dict[bytes, Array] = field(default_factory=dict)
+
+    def under(self, gravity: Array, wide: Array) -> Array:
+        """Regressors, or products with them, (..., c) under a gravity (3,), m/s^2, from those with all columns."""
+        h = self.heavy.size
+        c = wide.shape[-1] - 3 * h
+        found = wide[..., :c].copy()
+        found[..., self.heavy] += sum(g * wide[..., c + a * h : c + (a + 1) * h] for a, g in enumerate(gravity))
+        return found
 
 
 @dataclass(eq=False)
@@ -100,7 +116,7 @@ class Bench:
 
     ``model``: with base parameters for gravity in any direction. ``moving`` (n,): joints that move. ``period``: of the
     recordings, s. ``rows_kept``: largest number of instants. ``at_rest``: equations at all instants instead of those at
-    which all joints move. ``normals``: cache of `armident.identify.setup.fit.normal`.
+    which all joints move.
     """
 
     model: ArmModel
@@ -111,7 +127,6 @@ class Bench:
     period: float
     rows_kept: int = MOST_ROWS
     at_rest: bool = False
-    normals: dict[bytes, Any] = field(default_factory=dict, repr=False)
     _rows: dict[bytes, Rows] = field(default_factory=dict, repr=False)
     _torques: dict[bytes, Array] = field(default_factory=dict, repr=False)
 
@@ -162,6 +177,26 @@ class Bench:
         )
         return q, qd, tau
 
+    @cached_property
+    def limits(self) -> tuple[Array, Array, Array]:
+        """Largest configured positions, velocities and torques, (n,) each."""
+        limits = [joint.limits for joint in self.robot.joints]
+        most = ([max(map(abs, one.position)), one.velocity, one.torque] for one in limits)
+        position, velocity, torque = np.array(list(most), np.float64).T
+        return position, velocity, torque
+
+    @cached_property
+    def _weightless(self) -> tuple[ArmModel, ...]:
+        """The model without gravity, and with 1 m/s^2 along each base axis."""
+        return tuple(self.model.with_gravity(g) for g in (np.zeros(3), *np.eye(3)))
+
+    @cached_property
+    def _heavy(self) -> NDArray[np.int64]:
+        """Columns that gravity changes, (h,): at postures without any symmetry."""
+        q = np.random.default_rng(0).uniform(-np.pi, np.pi, (POSTURES, self.n))
+        found = np.stack([model.rigid_regressor(q, 0.0 * q, 0.0 * q) for model in self._weightless])
+        return np.flatnonzero(np.any(found[1:] != found[0], axis=(0, 1, 2)))
+
     def coarse(self, rows: int) -> "Bench":
         """Return the same signals with fewer instants. ``rows``: largest number of instants."""
         return self._with(rows, self.at_rest)
@@ -176,7 +211,17 @@ class Bench:
 
     def column(self, name: str) -> int:
         """Column of a standard parameter that is a base parameter, possibly with others regrouped into it."""
-        return list(self.model.base.independent).index(self.model.names.index(name))
+        return self._columns[name]
+
+    @cached_property
+    def _columns(self) -> dict[str, int]:
+        return {self.model.names[k]: column for column, k in enumerate(self.model.base.independent)}
+
+    @cached_property
+    def _motion(self) -> tuple[Array, Array, Array]:
+        """Recorded positions, velocities and accelerations at the instants of the rows, (M, n) each."""
+        q, qd, qdd = (self.kept([getattr(s, x) for s in self.segments]) for x in ("q", "qd", "qdd"))
+        return q, qd, qdd
 
     def torque(self, shift: Array) -> Array:
         """Recorded torques (M, n) at the instants of the rows, moved earlier by ``shift`` (n,), s."""
@@ -189,8 +234,7 @@ class Bench:
         """Equations with the joint positions ``position @ q_recorded``: signs, permutation and scale, (n, n)."""
         key = np.round(position, 9).tobytes()
         if key not in self._rows:
-            if len(self._rows) >= MOST_KEPT:
-                self._rows.clear()
+            make_room(self._rows, MOST_KEPT)
             self._rows[key] = self._make(position)
         return self._rows[key]
 
@@ -200,42 +244,53 @@ class Bench:
         return np.concatenate([self.decimation(x)[instants] for x, instants in pairs])
 
     def _make(self, position: Array) -> Rows:
-        n, b = self.n, self.rigid
-        q, qd, qdd = (self.kept([getattr(s, x) for s in self.segments]) @ position.T for x in ("q", "qd", "qdd"))
+        n, b, heavy = self.n, self.rigid, self._heavy
+        q, qd, qdd = (x @ position.T for x in self._motion)
         top = np.maximum(np.max([np.abs(s.qd @ position.T).max(axis=0) for s in self.segments], axis=0), 1e-12)
         free = self.kept([_friction(s.qd @ position.T, top) for s in self.segments])
+        weightless, *along = self._weightless
         still = np.zeros_like(q)
-        postures = np.ascontiguousarray(q[:: max(1, q.shape[0] // POSTURES)])
-        weightless = self.model.with_gravity(np.zeros(3))
-        x = np.zeros((q.shape[0], n, b + FREE_TERMS * n))
-        x[:, :, :b] = weightless.rigid_regressor(q, qd, qdd)
-        at_rest = weightless.rigid_regressor(q, still, still)
-        along = [self.model.with_gravity(axis).rigid_regressor(q, still, still) for axis in np.eye(3)]
-        gravity = np.stack(along) - at_rest
-        physical = np.zeros((3, n, x.shape[2]))
+        c = b + FREE_TERMS * n
+        wide = np.zeros((n, q.shape[0], c + 3 * heavy.size))
+        wide[:, :, :b] = weightless.rigid_regressor(q, qd, qdd).transpose(1, 0, 2)
+        at_rest = weightless.rigid_regressor(q, still, still)[:, :, heavy]
+        gravity = [model.rigid_regressor(q, still, still)[:, :, heavy] - at_rest for model in along]
+        wide[:, :, c:] = np.concatenate(gravity, axis=2).transpose(1, 0, 2)
+        inertia = self._mean_inertia(q)
+        physical = np.zeros((3, n, c))
         stroke = q - q.mean(axis=0)
         springs = np.stack([stroke, stroke**3 / np.maximum(np.abs(stroke).max(axis=0), 1e-12) ** 2], axis=2)
-        for j in range(n):
+        for j, x in enumerate(wide):
             dry = self.column(f"fc{j + 1}")
-            x[:, :, dry] = 0.0
-            x[:, j, dry] = free[:, j, 0]
+            wide[:, :, dry] = 0.0
+            x[:, dry] = free[:, j, 0]
             own = b + FREE_TERMS * j + np.arange(FREE_TERMS)
             rotor, friction = own[SPRING_TERMS], own[SPRING_TERMS + ROTOR_TERMS :]
-            x[:, j, own[:SPRING_TERMS]] = springs[:, j]
-            x[:, j, rotor] = qdd[:, j]
-            x[:, j, friction] = free[:, j, 1:]
-            push = np.zeros_like(postures)
-            push[:, j] = 1.0
-            motionless = np.zeros_like(postures)
-            unit = weightless.rigid_regressor(postures, motionless, push) - weightless.rigid_regressor(
-                postures, motionless, motionless
-            )
-            physical[0, j, :b] = unit[:, j].mean(axis=0)
+            x[:, own[:SPRING_TERMS]] = springs[:, j]
+            x[:, rotor] = qdd[:, j]
+            x[:, friction] = free[:, j, 1:]
+            physical[0, j, :b] = inertia[j]
             physical[0, j, rotor] = 1.0
             columns = [self.column(f"fv{j + 1}"), dry, *friction]
-            physical[1, j, columns] = (x[:, j, columns] * qd[:, j, None]).mean(axis=0)
+            physical[1, j, columns] = (x[:, columns] * qd[:, j, None]).mean(axis=0)
             physical[2, j, rotor] = 1.0
-        return Rows(x, gravity, physical.reshape(3 * n, -1))
+        square = np.zeros((n, wide.shape[2], wide.shape[2]))
+        for gram, x in zip(square, wide, strict=True):
+            # A joint feels the links beyond it only, and its own friction.
+            used = nonzero_columns(x)
+            felt = x[:, used]
+            gram[np.ix_(used, used)] = felt.T @ felt
+        return Rows(wide, square, heavy, physical.reshape(3 * n, -1))
+
+    def _mean_inertia(self, q: Array) -> Array:
+        """Torque of each joint per unit of its own acceleration, mean over postures of positions (M, n), (n, b)."""
+        n, model = self.n, self._weightless[0]
+        q = q[:: max(1, q.shape[0] // POSTURES)]
+        postures, still = np.tile(q, (n, 1)), np.zeros((n * q.shape[0], n))
+        push = np.repeat(np.eye(n), q.shape[0], axis=0)
+        unit = model.rigid_regressor(postures, still, push) - model.rigid_regressor(postures, still, still)
+        own = unit.reshape(n, -1, n, unit.shape[2])[np.arange(n), :, np.arange(n)]
+        return np.asarray(own.mean(axis=1))
 
 
 def make_bench(
@@ -285,6 +340,12 @@ def make_bench(
     if model is None:
         model = ArmModel.from_config(robot.model_copy(update={"gravity": tuple(GENERIC), "effects": ()}))
     return Bench(model, robot, tuple(segments), second, moving, dt)
+
+
+def make_room(kept: dict[bytes, Any], most: int) -> None:
+    """Remove the oldest entries of a cache, so that with one more it has ``most`` entries."""
+    while len(kept) >= most:
+        del kept[next(iter(kept))]
 
 
 def _shifted(x: Array, samples: Array) -> Array:

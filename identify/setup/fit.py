@@ -7,12 +7,18 @@ from numpy.typing import NDArray
 from scipy import optimize
 from scipy.linalg import lapack
 
-from armident.identify.setup.bench import Bench
+from armident.identify.setup.bench import GRAMS_KEPT, Bench, make_room
 
 Array = NDArray[np.float64]
 
 PASSES = 3
 """Iterations between parameters and the weights of the joints."""
+
+CONVERGED = 6
+"""The same where the slope of the fit is used, which assumes that they have converged."""
+
+SETTLED = 1e-4
+"""Relative change of the shares that ends these iterations: a two-hundredth of what is worth a refinement."""
 
 FLOOR = 1e-6
 """Least share of a joint's torque power that counts as residual."""
@@ -23,8 +29,8 @@ RIDGE = 1e-6
 PARTS = 4
 """Parts of the cross-validation; each consists of several blocks of time."""
 
-KEPT = 32
-"""Largest number of normal equations that are kept for repeated use."""
+KEPT = 64
+"""Largest number of shifts of the torques whose products with the regressors are kept for repeated use."""
 
 BLOCKS = 24
 """Contiguous blocks of time per experiment set: long against the memory of the residual."""
@@ -53,63 +59,100 @@ class Fit:
     theta: Array
 
 
-@dataclass(eq=False)
-class Normal:
-    """Normal equations of all rows of the model, for one assignment of positions and one gravity.
-
-    ``grams`` (n, c, c): ``X_m' X_m`` of ``x`` (M, n, c). ``products`` (n, n, c): ``X_m' y_k``, by shifts of torques.
-    """
-
-    x: Array
-    grams: Array
-    physical: Array
-    products: dict[bytes, Array]
+def _gravity(h: Hypothesis) -> Array:
+    """Gravity (3,) of the equations: accelerations scale with the clock squared, and only their proportion matters."""
+    return h.gravity * h.clock**2
 
 
-def normal(bench: Bench, h: Hypothesis) -> Normal:
-    """Return the normal equations of a hypothesis (not of its torques); repeated calls return the same object."""
-    # Accelerations scale with the clock squared; only their proportion to gravity matters to the fit.
-    gravity = h.gravity * h.clock**2
-    key = np.round(np.concatenate([h.position.ravel(), gravity]), 12).tobytes()
-    if key not in bench.normals:
-        rows = bench.rows(h.position)
-        x = rows.x.copy()
-        x[:, :, : bench.rigid] += np.einsum("a,amnb->mnb", gravity, rows.gravity)
-        each = np.ascontiguousarray(x.transpose(1, 0, 2))
-        if len(bench.normals) > KEPT:
-            bench.normals.clear()
-        bench.normals[key] = Normal(x, each.transpose(0, 2, 1) @ each, rows.physical, {})
-    found: Normal = bench.normals[key]
-    return found
+def grams_of(bench: Bench, h: Hypothesis) -> Array:
+    """``X_m' X_m`` of all rows of the model, (n, c, c)."""
+    rows, gravity = bench.rows(h.position), _gravity(h)
+    key = gravity.tobytes()
+    if key not in rows.grams:
+        make_room(rows.grams, GRAMS_KEPT)
+        rows.grams[key] = rows.under(gravity, rows.under(gravity, rows.square).transpose(0, 2, 1))
+    return rows.grams[key]
 
 
-def _products(bench: Bench, found: Normal, shift: Array) -> Array:
-    key = np.round(shift, 9).tobytes()
-    if key not in found.products:
-        y = bench.torque(shift)
-        found.products[key] = np.einsum("mic,mk->ikc", found.x, y, optimize=True)
-    return found.products[key]
+def products_of(bench: Bench, h: Hypothesis) -> Array:
+    """``X_m' y_k`` of all rows of the model with all recorded torques, (n, n, c)."""
+    return bench.rows(h.position).under(_gravity(h), _wide_products(bench, h))
+
+
+def _wide_products(bench: Bench, h: Hypothesis) -> Array:
+    """The same with all columns of `Rows.wide`."""
+    rows, key = bench.rows(h.position), np.round(h.shift, 9).tobytes()
+    if key not in rows.products:
+        make_room(rows.products, KEPT)
+        rows.products[key] = (rows.wide.transpose(0, 2, 1) @ bench.torque(h.shift)).transpose(0, 2, 1)
+    return rows.products[key]
+
+
+def regressors(bench: Bench, h: Hypothesis) -> Array:
+    """Regressors (n, M, c) of the corrected torques."""
+    rows = bench.rows(h.position)
+    return rows.under(_gravity(h), rows.wide)
 
 
 def fit_shares(bench: Bench, h: Hypothesis) -> Array:
     """Residual share of the power of every recorded torque, in sample, (n,); see `fit`."""
-    owner = np.abs(h.torque).argmax(axis=0)
-    scale = h.torque[owner, np.arange(bench.n)]
-    single = np.zeros_like(h.torque)
-    single[owner, np.arange(bench.n)] = scale
-    if not np.array_equal(single, h.torque):
-        return fit(bench, h).shares
-    found = normal(bench, h)
-    grams = found.grams[owner] / (scale**2)[:, None, None]
-    products = _products(bench, found, h.shift)[owner, np.arange(bench.n)] / scale[:, None]
-    power = np.maximum((bench.torque(h.shift) ** 2).sum(axis=0), 1e-300)
-    return _solve(grams, products, power, found.physical, bench.moving)[1]
+    known = _of_one_joint_each(bench, h)
+    return fit(bench, h).shares if known is None else _solve(*known)[1]
+
+
+@dataclass(frozen=True, eq=False)
+class Misfit:
+    """Sum of the logarithms of the residual shares of the moving joints, nats per row, and its slopes.
+
+    ``by_scale`` (n,): by the logarithm of the factor of each torque. ``by_gravity`` (3,): per m/s^2. ``None`` where a
+    recorded torque belongs to several joints.
+    """
+
+    value: float
+    by_scale: Array | None = None
+    by_gravity: Array | None = None
+
+
+def misfit(bench: Bench, h: Hypothesis) -> Misfit:
+    """Return the misfit of a hypothesis with slopes: the fitted parameters, which minimise it, do not change them."""
+    known = _of_one_joint_each(bench, h)
+    if known is None:
+        return Misfit(float(np.log(fit_shares(bench, h)[bench.moving]).sum()))
+    theta, shares = _solve(*known, passes=CONVERGED)
+    grams, products, power = known[:3]
+    weights = np.where(bench.moving & (shares > FLOOR), 1.0 / (shares * power), 0.0)
+    owner, own = np.abs(h.torque).argmax(axis=0), np.arange(bench.n)
+    by_scale = np.zeros(bench.n)
+    by_scale[owner] = 2 * weights * (products @ theta - grams @ theta @ theta)
+    # What gravity adds per m/s^2, times the residual.
+    rows, gravity = bench.rows(h.position), _gravity(h)
+    light, heavy = theta.size, theta[rows.heavy]
+    columns = np.concatenate([theta, *(g * heavy for g in gravity)])
+    recorded = h.torque[owner, own, None] * _wide_products(bench, h)[owner, own, light:]
+    left = rows.square[owner, light:] @ columns - recorded
+    by_gravity = 2 * h.clock**2 * (weights @ left).reshape(3, -1) @ heavy
+    return Misfit(float(np.log(shares[bench.moving]).sum()), by_scale, by_gravity)
+
+
+def _of_one_joint_each(bench: Bench, h: Hypothesis) -> tuple[Array, Array, Array, Array, NDArray[np.bool_]] | None:
+    """Normal equations of recorded torques that belong to one joint each, in its units; else ``None``."""
+    owner, own = np.abs(h.torque).argmax(axis=0), np.arange(bench.n)
+    scale = h.torque[owner, own]
+    if np.count_nonzero(h.torque) != np.count_nonzero(scale):
+        return None
+    grams = grams_of(bench, h)
+    if not np.array_equal(owner, own):
+        grams = grams[owner]
+    products = products_of(bench, h)[owner, own] * scale[:, None]
+    power = np.maximum((bench.torque(h.shift) ** 2).sum(axis=0), 1e-300) * scale**2
+    return grams, products, power, bench.rows(h.position).physical, bench.moving
 
 
 def equations(bench: Bench, h: Hypothesis, *, free: bool = True) -> tuple[Array, Array, Array]:
     """Regressors (M, n, c) of the recorded torques, torques (M, n), constraints (k, c); ``free``: with free terms."""
-    found = normal(bench, h)
-    x, physical = (found.x, found.physical) if free else (found.x[..., : bench.rigid], found.physical[:, : bench.rigid])
+    x, physical = regressors(bench, h).transpose(1, 0, 2), bench.rows(h.position).physical
+    if not free:
+        x, physical = x[..., : bench.rigid], physical[:, : bench.rigid]
     if not np.array_equal(h.torque, np.eye(bench.n)):
         x = np.linalg.inv(h.torque) @ x
     return x, bench.torque(h.shift), physical
@@ -160,14 +203,16 @@ def _normal(x: Array, y: Array) -> tuple[Array, Array, Array]:
 
 
 def _solve(
-    grams: Array, products: Array, power: Array, physical: Array, used: NDArray[np.bool_]
+    grams: Array, products: Array, power: Array, physical: Array, used: NDArray[np.bool_], passes: int = PASSES
 ) -> tuple[Array, Array]:
-    weights = used / power
+    weights, flat = used / power, grams.reshape(power.size, -1)
     theta, shares = np.zeros(products.shape[1]), np.ones(power.size)
-    for _ in range(PASSES):
-        theta = physical_least_squares(np.tensordot(weights, grams, 1), weights @ products, physical)
-        shares = np.maximum((power - 2 * products @ theta + grams @ theta @ theta) / power, FLOOR)
+    for _ in range(passes):
+        theta = physical_least_squares((weights @ flat).reshape(grams.shape[1:]), weights @ products, physical)
+        before, shares = shares, np.maximum((power - 2 * products @ theta + grams @ theta @ theta) / power, FLOOR)
         weights = used / (shares * power)
+        if np.all(np.abs(shares - before) < SETTLED * shares):
+            break
     return theta, shares
 
 

@@ -8,10 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import optimize
 
-from armident.identify.setup.fit import Hypothesis
+from armident.identify.setup.fit import Hypothesis, Misfit
 
 Array = NDArray[np.float64]
 Criterion = Callable[[Hypothesis], float]
+SlopedCriterion = Callable[[Hypothesis], Misfit]
 
 STANDARD = 9.81
 """Magnitude of gravity where the configuration has none, m/s^2."""
@@ -25,44 +26,62 @@ STARTS = 2
 EQUAL = 0.02
 """Difference of the misfit, nats per row, below which two directions fit equally well: 2 % of one joint's power."""
 
+FIRST_TILT = 0.1
+"""First step of the refinement, rad: less than a third of the angle between neighbouring directions."""
+
+FLAT, UNCHANGED = 1e-4, 1e-9
+"""Slope of the misfit per first step, and its relative change, that end the refinement: far below `EQUAL`."""
+
+DIFFERENCE = 1e-6
+"""Difference, in first steps, from which a slope is computed where the misfit has none."""
+
 SHIFTS_S = (1e-3, 2e-3, 4e-3, 8e-3, 16e-3, 32e-3, 64e-3)
 """Shifts that are tried before the refinement, s, to both sides."""
 
 
-def best_direction(h: Hypothesis, criterion: Criterion) -> Hypothesis:
+def best_direction(h: Hypothesis, criterion: SlopedCriterion) -> Hypothesis:
     """Return the hypothesis with the best direction of gravity, of the same magnitude.
 
     Opposite directions fit equally where first moments change sign, too: the one nearest to the configured one wins.
     """
     size = float(np.linalg.norm(h.gravity)) or STANDARD
-    tried = sorted(DIRECTIONS, key=lambda d: criterion(replace(h, gravity=size * d)))
+    tried = sorted(DIRECTIONS, key=lambda d: criterion(replace(h, gravity=size * d)).value)
     starts = [*tried[:STARTS], *([h.gravity / size] if h.gravity.any() else [])]
     found = [_refined(h, size, start, criterion) for start in starts]
-    least = min(misfit for misfit, _ in found)
-    equal = [turned for misfit, turned in found if misfit <= least + EQUAL]
+    least = min(value for value, _ in found)
+    equal = [turned for value, turned in found if value <= least + EQUAL]
     return max(equal, key=lambda turned: float(turned.gravity @ h.gravity))
 
 
-def _refined(h: Hypothesis, size: float, start: Array, criterion: Criterion) -> tuple[float, Hypothesis]:
-    """Least misfit near a direction, and its hypothesis."""
-    first, second = _across(start)
+def _refined(h: Hypothesis, size: float, start: Array, criterion: SlopedCriterion) -> tuple[float, Hypothesis]:
+    """Least misfit near a direction, and its hypothesis: a search along the plane that touches the sphere there."""
+    across = FIRST_TILT * np.array(_across(start))
 
-    def turned(angles: Array) -> Hypothesis:
-        angle = float(np.linalg.norm(angles))
-        side = (angles[0] * first + angles[1] * second) / max(angle, 1e-12)
-        return replace(h, gravity=size * (np.cos(angle) * start + np.sin(angle) * side))
+    def turned(sides: Array) -> tuple[Hypothesis, float]:
+        direction = start + sides @ across
+        length = float(np.linalg.norm(direction))
+        return replace(h, gravity=size / length * direction), length
 
-    def misfit(angles: Array) -> float:
-        return criterion(turned(angles))
+    def value(sides: Array) -> float:
+        return criterion(turned(sides)[0]).value
 
-    simplex = np.array([[0.0, 0.0], [0.2, 0.0], [0.0, 0.2]])
+    def sloped(sides: Array) -> tuple[float, Array]:
+        other, length = turned(sides)
+        found = criterion(other)
+        if found.by_gravity is None:
+            return found.value, np.asarray(optimize.approx_fprime(sides, value, DIFFERENCE))
+        radial = other.gravity / size
+        along = found.by_gravity - (found.by_gravity @ radial) * radial
+        return found.value, np.asarray(size / length * across @ along)
+
     found = optimize.minimize(
-        misfit,
+        sloped,
         np.zeros(2),
-        method="Nelder-Mead",
-        options={"initial_simplex": simplex, "xatol": 2e-3, "fatol": 1e-3, "maxfev": 80},
+        jac=True,
+        method="L-BFGS-B",
+        options={"ftol": UNCHANGED, "gtol": FLAT, "maxiter": 20},
     )
-    return float(found.fun), turned(np.asarray(found.x))
+    return float(found.fun), turned(np.asarray(found.x))[0]
 
 
 def without_gravity(h: Hypothesis) -> Hypothesis:

@@ -44,20 +44,25 @@ def torque_ratio(bench: Bench, h: Hypothesis) -> float:
 
 def _positions(bench: Bench, h: Hypothesis) -> tuple[Array, Array]:
     """Largest position of each joint over its limit, and the limits."""
-    limits = np.array([max(abs(end) for end in joint.limits.position) for joint in bench.robot.joints])
-    return np.abs(bench.recorded[0] @ h.position.T).max(axis=0) / limits, limits
+    limits = bench.limits[0]
+    return _largest(bench.recorded[0], h.position) / limits, limits
 
 
 def _velocities(bench: Bench, h: Hypothesis) -> tuple[Array, Array]:
     """Largest velocity of each joint over its limit, and the limits."""
-    limits = np.array([joint.limits.velocity for joint in bench.robot.joints])
-    return np.abs(bench.recorded[1] @ h.position.T).max(axis=0) / h.clock / limits, limits
+    limits = bench.limits[1]
+    return _largest(bench.recorded[1], h.position) / h.clock / limits, limits
 
 
 def _torques(bench: Bench, h: Hypothesis) -> tuple[Array, Array]:
     """Largest torque of each joint over its limit, and the limits."""
-    limits = np.array([joint.limits.torque for joint in bench.robot.joints])
-    return np.abs(bench.recorded[2] @ h.torque.T).max(axis=0) / limits, limits
+    limits = bench.limits[2]
+    return _largest(bench.recorded[2], h.torque) / limits, limits
+
+
+def _largest(recorded: Array, correction: Array) -> Array:
+    """Largest magnitude (n,) of each corrected signal. ``recorded``: (W, n)."""
+    return np.asarray(np.abs(recorded @ correction.T).max(axis=0))
 
 
 def plausible_factor(bench: Bench, h: Hypothesis) -> float:

@@ -8,11 +8,12 @@ from numpy.typing import NDArray
 from scipy import optimize
 
 from armident.configs import RobotConfig
-from armident.identify.setup.fit import Hypothesis
+from armident.identify.setup.fit import Hypothesis, Misfit
 from armident.identify.setup.moves import Move, scaled
 
 Array = NDArray[np.float64]
 Criterion = Callable[[Hypothesis], float]
+SlopedCriterion = Callable[[Hypothesis], Misfit]
 
 FACTORS = (0.2, 0.32, 0.5, 0.7, 0.85, 1.0, 1.18, 1.4, 2.0, 3.1, 5.0)
 """True over configured values that are tried before the refinement."""
@@ -28,6 +29,9 @@ LEAST_GAIN = 1.3
 
 WIDEST = float(np.log(1e3))
 """Largest logarithm of a factor over its start: three decades."""
+
+DIFFERENCE = 1e-3
+"""Difference of a logarithm from which a slope is computed where the misfit has none."""
 
 LEAST_TORQUE = 3.0
 """Least factor of a single torque for a finding; a smaller one is an effect of the drive (`drive_gain_error`)."""
@@ -55,22 +59,32 @@ def scale_moves(robot: RobotConfig, joint: int, h: Hypothesis, criterion: Criter
             yield made(factor)
 
 
-def torque_scales(h: Hypothesis, criterion: Criterion, starts: Sequence[Array]) -> Array | None:
+def torque_scales(h: Hypothesis, criterion: SlopedCriterion, starts: Sequence[Array]) -> Array | None:
     """Best factors (n,) of all torques together, or ``None`` if none of them is far from the others.
 
     Joints that carry the same links determine the proportions; the common factor is free.
     """
 
-    def misfit(logs: Array) -> float:
+    def misfit(logs: Array) -> Misfit:
         return criterion(replace(h, torque=np.exp(logs)[:, None] * h.torque))
+
+    def value(logs: Array) -> float:
+        return misfit(logs).value
+
+    def sloped(logs: Array) -> tuple[float, Array]:
+        found = misfit(logs)
+        if found.by_scale is None:
+            return found.value, np.asarray(optimize.approx_fprime(logs, value, DIFFERENCE))
+        return found.value, found.by_scale
 
     found = [
         optimize.minimize(
-            misfit,
+            sloped,
             np.log(np.abs(start)),
+            jac=True,
             method="L-BFGS-B",
             bounds=[(v - WIDEST, v + WIDEST) for v in np.log(np.abs(start))],
-            options={"maxiter": 12, "eps": 1e-3},
+            options={"maxiter": 12},
         )
         for start in starts
     ]

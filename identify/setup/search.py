@@ -3,13 +3,14 @@
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
 
 from armident.identify.setup import assignment, gravity, moves, scales
 from armident.identify.setup.bench import Bench
-from armident.identify.setup.fit import Hypothesis, fit, fit_shares, held_out, joint_errors
+from armident.identify.setup.fit import Hypothesis, fit, fit_shares, held_out, joint_errors, misfit
 from armident.identify.setup.plausible import log_plausibility, plausible_factor, worst_change
 from armident.identify.setup.prior import WIRING, cost, wiring_cost
 
@@ -160,8 +161,8 @@ class Search:
         return step
 
     def _taken(self, step: Step, found: list[Step]) -> Step | None:
-        """Best neighbour that is a mistake of the set-up, certain and material."""
-        for best in found[:CANDIDATES]:
+        """Best neighbour that is a mistake of the set-up, certain and material; those that rank no better are none."""
+        for best in [s for s in found[:CANDIDATES] if s.rank < step.rank]:
             taken = self._accepted(step, best, [s for s in found[: 2 * CANDIDATES] if s is not best])
             if taken is not None:
                 return taken
@@ -176,7 +177,7 @@ class Search:
                 least, together = LEAST_DROP_LATE, LEAST_TOGETHER_LATE
             else:
                 least = LEAST_DROP_EARLY
-            if abs(shift) < self.bench.period:
+            if abs(shift) < self.bench.period or gain < LEAST_ODDS or drop < least:
                 return None
             one = self._one_late(step)
             if one is not None and one.rank < best.rank:
@@ -271,7 +272,7 @@ class Search:
             yield self._made(step, "gravity_missing", "torques without gravity", gravity.without_gravity(h))
         if len(joints) > 1:
             yield from self._torque_scales(step)
-        turned = gravity.best_direction(h, self.rank)
+        turned = gravity.best_direction(h, partial(misfit, bench))
         yield self._made(step, "gravity_direction", "another direction of gravity", turned)
         for clock in CLOCKS:
             yield self._made(step, "time_unit", f"time in units of {clock:g} s", scales.with_clock(h, clock))
@@ -283,7 +284,7 @@ class Search:
         bench, h = self.bench, step.h
         ratios = np.abs(np.diag(bench.robot.transmission_matrix))
         starts = [np.ones(bench.n), *([ratios] if np.all(ratios > 0) and np.ptp(ratios) > 0 else [])]
-        factors = scales.torque_scales(h, self.rank, starts)
+        factors = scales.torque_scales(h, partial(misfit, bench), starts)
         if factors is None:
             return
         scaled = replace(h, torque=factors[:, None] * h.torque)
@@ -329,13 +330,13 @@ class Search:
                 seen[key] = _rank(coarse, h) + 2.0 * wiring_cost(order, order @ own) / RANKED_ROWS, h
             return seen[key][0]
 
-        for own in relative:
-            if self.bench.moving.sum() <= EXHAUSTIVE:
-                for order in assignment.orders(self.bench.moving):
-                    at(order, own)
-            else:
-                for begin in assignment.usual_orders(self.bench.moving):
-                    _climb(begin, self.bench.moving, partial(at, own=own))
+        if self.bench.moving.sum() <= EXHAUSTIVE:
+            # The equations of one order of the positions serve all orders of the torques.
+            for order, own in product(assignment.orders(self.bench.moving), relative):
+                at(order, own)
+        else:
+            for own, begin in product(relative, assignment.usual_orders(self.bench.moving)):
+                _climb(begin, self.bench.moving, partial(at, own=own))
         best = sorted(seen.values(), key=lambda pair: pair[0])[: 4 * ORDERS_KEPT]
         steps = [self._made(first, "order", "joints in another order", h) for _, h in best]
         return [replace(s, probability=(1.0,), rivals=((),)) for s in sorted(steps, key=lambda s: s.rank)[:ORDERS_KEPT]]

@@ -190,26 +190,26 @@ def _clipped(torques: Sequence[Array], positions: Sequence[Array]) -> tuple[floa
     total = sum(t.size for t in torques)
     for tau, q in zip(torques, positions, strict=True):
         step = np.abs(np.gradient(q))
-        moves = step > 0.02 * step.max()
-        for value, begin, end in _runs(tau, tolerance):
-            length = end - begin
-            if value >= high - tolerance or value <= low + tolerance:
-                if length >= LEAST_RUN:
-                    at += length
-                    if length > extreme:
-                        extreme, level = length, value
-            elif moves[begin:end].all():
-                elsewhere = max(elsewhere, length)
+        still = np.concatenate([[0], np.cumsum(step <= 0.02 * step.max())])
+        begins, ends = _runs(tau, tolerance)
+        values, lengths = tau[begins], ends - begins
+        outermost = (values >= high - tolerance) | (values <= low + tolerance)
+        clipped = np.where(outermost & (lengths >= LEAST_RUN), lengths, 0)
+        at += int(clipped.sum())
+        if clipped.max(initial=0) > extreme:
+            extreme, level = int(clipped.max()), float(values[np.argmax(clipped)])
+        others = lengths[~outermost & (still[ends] == still[begins])]
+        elsewhere = max(elsewhere, int(others.max(initial=0)))
     certain = extreme >= max(LEAST_RUN, RUN_RATIO * elsewhere)
     return (at / total if certain else 0.0), level
 
 
-def _runs(x: Array, tolerance: float) -> list[tuple[float, int, int]]:
-    """Runs of equal values: value, first sample and the one after the last."""
+def _runs(x: Array, tolerance: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Runs of equal values: first samples and those after the last."""
     cuts = np.flatnonzero(np.abs(np.diff(x)) > tolerance) + 1
     begins, ends = np.concatenate([[0], cuts]), np.concatenate([cuts, [x.size]])
     long = ends - begins >= 2
-    return [(float(x[b]), int(b), int(e)) for b, e in zip(begins[long], ends[long], strict=True)]
+    return begins[long], ends[long]
 
 
 def rate_findings(experiments: Sequence[Experiment], robot: RobotConfig) -> list[SetupFinding]:

@@ -15,6 +15,7 @@ from armident.identify.effects.wiring import rewired
 from armident.identify.estimators.methods import Method
 from armident.identify.identification.identify_recording import identify_recording
 from armident.identify.identification.options import Options
+from armident.identify.robot import relaxation
 from armident.identify.robot.relaxation import simulate_with_terms
 from armident.identify.robot.simulation import simulate
 from armident.identify.signals.bandpass import butterworth
@@ -125,6 +126,24 @@ def test_a_simulated_arm_feels_the_torque_that_its_own_motion_gives_a_term(
     rigid = simulate(model, theta, controller, q_ref, DT, disturbance=-_on_joint_1(own, robot))
     felt = np.abs(rigid.q - simulate(model, theta, controller, q_ref, DT).q)[:, 0].max()
     assert np.abs(found.q - rigid.q)[:, 0].max() < 0.05 * felt
+
+
+def test_the_torque_of_terms_at_the_rate_of_its_band_moves_the_arm_as_at_every_sample(
+    robot: RobotConfig, theta: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At 1 kHz a load below 5 Hz is computed at every tenth sample. Both filters differ for 0.2 s at the ends."""
+    model, q_ref = arm_model(robot), reference(robot)
+    controller = nominal_controller(model, theta, q_ref[::50], DT, 10.0)
+    entry = Effect(effect="joint_spring", joint="joint_2")
+    whole = np.append(theta, np.full(arm_model(with_effects(robot, entry)).e, 20.0))
+    extended = arm_model(with_effects(robot, entry)).anchored(whole)
+    rare = simulate_with_terms(extended, whole, controller, q_ref, DT, band_hz=5.0)
+    monkeypatch.setattr(relaxation, "RATE", 1e9)
+    dense = simulate_with_terms(extended, whole, controller, q_ref, DT, band_hz=5.0)
+    inner = slice(200, -200)
+    felt = np.abs(dense.q - simulate(model, theta, controller, q_ref, DT).q)[inner, 1].max()
+    assert 0.0 < np.abs(rare.q - dense.q)[inner].max() < 0.02 * felt
+    assert np.linalg.norm((rare.tau - dense.tau)[inner]) < 0.01 * np.linalg.norm(dense.tau[inner])
 
 
 def test_a_term_that_is_more_inertia_than_the_joint_has_itself_is_felt_at_every_instant(
