@@ -49,6 +49,7 @@ def pinocchio_model(drawn: Arm) -> Any:
     return model
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", SEEDS)
 def test_mass_matrix_and_bias_torques_are_those_of_pinocchio(seed: int) -> None:

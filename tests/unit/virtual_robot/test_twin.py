@@ -354,7 +354,13 @@ def test_a_robot_file_is_enough_for_a_recording(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("path", sorted((HERE / "robots").glob("*.yaml")), ids=lambda path: path.stem)
+@pytest.mark.parametrize(
+    "path",
+    [
+        pytest.param(path, marks=[pytest.mark.nightly] * (path.stem not in ("emps", "panda", "tx40")), id=path.stem)
+        for path in sorted((HERE / "robots").glob("*.yaml"))
+    ],
+)
 def test_every_shipped_robot_follows_a_motion_within_its_torque_limits(path: Path) -> None:
     twin = load_twin(path)
     robot, motion = twin.robot, plausible_trajectory(twin.robot)

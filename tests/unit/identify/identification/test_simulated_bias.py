@@ -30,7 +30,7 @@ def noisy(seed: int, method: Method) -> IdentificationResult:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("method", ["idim-iv", "idim-piv"])
+@pytest.mark.parametrize("method", ["idim-iv", pytest.param("idim-piv", marks=pytest.mark.nightly)])
 def test_intervals_hold_the_true_values_with_a_noisy_encoder(method: Method) -> None:
     found = [noisy(seed, method) for seed in range(RUNS)]
     errors = np.array([(f.theta - axis.TRUTH) / f.std for f in found])
