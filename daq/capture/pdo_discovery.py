@@ -31,6 +31,9 @@ IN_STEP = 0.95
 PERIOD_TOLERANCE = 0.05
 """Largest relative difference between the measured SYNC period and that of the session."""
 
+DefaultMapping = tuple[int, tuple[str, ...] | str]
+"""COB-ID of a TPDO and names of its objects, or a message in their place."""
+
 log = logging.getLogger(__name__)
 
 
@@ -96,9 +99,13 @@ def with_sent_streams(session: SessionConfig, buses: list[BusStatistics]) -> Ses
                 f"but sync.period_us of the session is {session.sync.period_us}"
             )
     by_channel = {bus.channel: bus for bus in buses}
+    known = [read_objects(drive.eds, drive.node_id) for drive in session.drives]
     streams: dict[str, Stream] = {}
     for tpdo in range(1, 5):
-        found = [_stream(session, drive, tpdo, by_channel[session.bus_of(drive).channel]) for drive in session.drives]
+        found = [
+            _stream(session, drive, default_mapping(drive, objects, tpdo), tpdo, by_channel)
+            for drive, objects in zip(session.drives, known, strict=True)
+        ]
         present = [drive for drive, stream in zip(session.drives, found, strict=True) if stream is not None]
         if not present:
             continue
@@ -126,9 +133,12 @@ def with_sent_streams(session: SessionConfig, buses: list[BusStatistics]) -> Ses
     return session.model_copy(update={"streams": streams})
 
 
-def _stream(session: SessionConfig, drive: DriveNode, tpdo: int, bus: BusStatistics) -> Stream | None:
+def _stream(
+    session: SessionConfig, drive: DriveNode, mapping: DefaultMapping, tpdo: int, buses: dict[str, BusStatistics]
+) -> Stream | None:
     """Return the stream of a drive's TPDO; ``None`` if it is not received, or does not follow SYNC."""
-    cob_id, objects = default_mapping(drive, tpdo)
+    bus = buses[session.bus_of(drive).channel]
+    cob_id, objects = mapping
     sent = bus.identifiers.get(cob_id)
     if sent is None or sent.every is None:
         return None
@@ -155,9 +165,8 @@ def _stream(session: SessionConfig, drive: DriveNode, tpdo: int, bus: BusStatist
     return Stream.model_validate({"tpdo": tpdo, "every": sent.every, "objects": objects})
 
 
-def default_mapping(drive: DriveNode, tpdo: int) -> tuple[int, tuple[str, ...] | str]:
+def default_mapping(drive: DriveNode, known: Any, tpdo: int) -> DefaultMapping:
     """Return COB-ID and object names of TPDO 1 to 4 by the EDS; a message in place of names if an object is unknown."""
-    known = read_objects(drive.eds, drive.node_id)
     cob_id = _default(known, od.TPDO_COMMUNICATION + tpdo - 1, 1)
     cob_id = od.tpdo_cob(tpdo, drive.node_id) if cob_id is None else cob_id & STANDARD_ID_MASK
     mapping = od.TPDO_MAPPING + tpdo - 1

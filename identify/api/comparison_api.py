@@ -91,7 +91,7 @@ def compare(
     Examples
     --------
     >>> import armident
-    >>> runs = [armident.simulate_recording("tx40", "tx40_excitation", seed=seed) for seed in (1, 2)]
+    >>> runs = [armident.simulate_recording("emps", "emps_excitation", seed=seed) for seed in (1, 2)]
     >>> first, second = (armident.identify(run, method="idim-iv") for run in runs)
     >>> bool(armident.compare(first, second))
     False

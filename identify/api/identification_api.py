@@ -224,10 +224,10 @@ def identify(
     Examples
     --------
     >>> import armident
-    >>> recording = armident.simulate_recording("tx40", "tx40_excitation", seed=1)
+    >>> recording = armident.simulate_recording("emps", "emps_excitation", seed=1)
     >>> result = armident.identify(recording, method="idim-ls")
     >>> result.theta.shape, result.covariance.shape
-    ((61,), (61, 61))
+    ((4,), (4, 4))
     """
     usual = {
         "method": method,

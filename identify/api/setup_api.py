@@ -111,7 +111,7 @@ def check(recordings: Recorded | Sequence[Recorded], robot: Robot | None = None)
     Examples
     --------
     >>> import armident
-    >>> recording = armident.simulate_recording("tx40", "tx40_excitation", seed=1)
+    >>> recording = armident.simulate_recording("emps", "emps_excitation", seed=1)
     >>> armident.check(recording).findings
     ()
     """

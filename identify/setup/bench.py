@@ -109,6 +109,12 @@ class Rows:
         found[..., self.heavy] += sum(g * wide[..., c + a * h : c + (a + 1) * h] for a, g in enumerate(gravity))
         return found
 
+    def of_gravity(self, values: Array) -> Array:
+        """Torques (n, M, 3) of gravity along each base axis, per m/s^2, with values of the columns (c,)."""
+        h = self.heavy.size
+        columns = self.wide[..., self.wide.shape[-1] - 3 * h :]
+        return np.asarray(columns.reshape(*columns.shape[:2], 3, h) @ values[self.heavy])
+
 
 @dataclass(eq=False)
 class Bench:

@@ -193,8 +193,7 @@ def _changes(
     last = [k for k in body if bench.model.names[k].lstrip("abcdefghijklmnopqrstuvwxyz") == str(bench.n)]
     made.append((LOAD, bench.n - 1, x @ (base.regroup[:, last] * np.where(np.isfinite(size), size, 0.0)[:, None])))
     if h.gravity.any():
-        gravity = bench.rows(h.position).gravity[..., : bench.rigid]
-        made.append((GRAVITY, None, np.einsum("amnb,b->nma", gravity[:, :, moving], theta / size)))
+        made.append((GRAVITY, None, bench.rows(h.position).of_gravity(theta / size)[moving]))
     for k, j in enumerate(moving):
         alone = np.zeros_like(x)
         alone[k] = x[k]

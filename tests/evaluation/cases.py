@@ -4,6 +4,7 @@ import hashlib
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
+from functools import cached_property
 from typing import Any, Literal
 
 from armident.configs import ConfigError
@@ -123,7 +124,7 @@ class Case:
         names = (p.effect if self.random else p.names[0] for p in self.parts)
         return " + ".join(names) or self.kind.replace("_", " against ")
 
-    @property
+    @cached_property
     def key(self) -> str:
         """Hash of all data that determine the result; half and number of a random arm, of which the rest follows."""
         if self.random:

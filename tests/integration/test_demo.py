@@ -22,6 +22,7 @@ REPOSITORY = Path(__file__).resolve().parents[2]
 PICKER = REPOSITORY / "docs" / "examples" / "integration_test" / "picker.yaml"
 
 
+@pytest.mark.slow
 def test_a_process_that_fails_is_named_with_the_end_of_what_it_printed(tmp_path: Path) -> None:
     with (
         _running("capture", ["capture", "--config", "no_such_cell.yaml"], tmp_path) as capture,
@@ -32,6 +33,7 @@ def test_a_process_that_fails_is_named_with_the_end_of_what_it_printed(tmp_path:
         capture.wait(60.0)
 
 
+@pytest.mark.slow
 def test_a_process_that_ends_before_it_is_ready_is_an_error_at_once(tmp_path: Path) -> None:
     begin = time.monotonic()
     with (
@@ -42,6 +44,7 @@ def test_a_process_that_ends_before_it_is_ready_is_an_error_at_once(tmp_path: Pa
     assert time.monotonic() - begin < 60.0
 
 
+@pytest.mark.slow
 def test_processes_do_not_outlive_the_demo(tmp_path: Path) -> None:
     with _running("worker", ["worker", "--config", "tx40_replay.yaml"], tmp_path, "worker: ready") as worker:
         process = worker.process

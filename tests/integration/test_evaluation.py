@@ -46,7 +46,7 @@ def small(tmp_path: Path) -> Path:
         "schema": "armident/suite/1",
         "runs": 1,
         "multiples": {"detectable": 1.0, "typical": 1.75, "obvious": 3.2},
-        "robots": {"emps": {"config": "emps.yaml", "trajectories": ["trajectories/emps_excitation.yaml"]}},
+        "robots": {"emps": {"config": "emps.yaml", "trajectories": ["trajectories/emps_1.yaml"]}},
         "clean": {"emps": 1},
         # a torque offset has no stiffness
         "effects": [spring, {**spring, "effect": "torque_offset"}],
@@ -64,6 +64,12 @@ def interruptible() -> Iterator[None]:
     signal.signal(signal.SIGINT, before)
 
 
+@pytest.mark.usefixtures("interruptible")
+def test_an_interrupted_run_ends_with_all_its_processes(small: Path, tmp_path: Path) -> None:
+    interrupt(("--suite", str(small), "--out", str(tmp_path / "out"), "--jobs", "1"), tmp_path / "out")
+
+
+@pytest.mark.nightly
 @pytest.mark.usefixtures("interruptible")
 def test_an_interrupted_run_continues_and_reports_findings_and_failures(small: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"

@@ -87,6 +87,7 @@ def test_tests_with_a_bus_run_in_a_guest_and_are_reported_here(tmp_path: Path) -
     assert len(list(cases)) == 7
 
 
+@pytest.mark.slow
 def test_a_bus_that_cannot_be_is_a_skip_or_a_failure(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     if have_socketcan():
         pytest.skip("this kernel has SocketCAN")

@@ -33,6 +33,7 @@ def events(rng: np.random.Generator, count: int, stalls: Stalls, silent_us: int)
     return sorted(out, key=lambda event: event[0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("captures", [200, pytest.param(3000, marks=pytest.mark.nightly)])
 def test_no_answer_before_a_silence_is_matched_to_another_sync(captures: int) -> None:
     """Ambiguous samples are near a pause."""

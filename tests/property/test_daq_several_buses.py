@@ -112,6 +112,7 @@ cuts = st.lists(st.integers(0, COUNT), max_size=5)
 kinds = st.sampled_from([(PLAIN,), (PLAIN, DEMAND), (PACKED,), (PACKED, DEMAND)])
 
 
+@pytest.mark.slow
 @given(kinds, faults, cuts)
 def test_every_sync_of_every_bus_is_received_or_in_a_gap(
     streams: tuple[TpdoStream, ...], faults: Faults, cuts: list[int]
@@ -130,6 +131,7 @@ def test_every_sync_of_every_bus_is_received_or_in_a_gap(
     assert np.array_equal(data["samples"][:, :, :6], np.array(expected, np.uint8).reshape(-1, 4, 6))
 
 
+@pytest.mark.slow
 @example((PLAIN,), Faults(tpdo={(0, 1), (0, 2), (0, 0)}, sync={(18, 1)}), [17])
 @example((PLAIN,), Faults(tpdo={(0, 1), (92, 2), (0, 0)}, sync={(102, 1)}), [101])
 @given(kinds, faults, cuts)

@@ -92,6 +92,7 @@ def in_our_frames(bodies: list[Any], theirs_in_ours: Floats) -> Floats:
     return np.array([body.toDynamicParameters()[np.argsort(TO_OURS)] for body in placed])
 
 
+@pytest.mark.slow
 @given(chains)
 def test_a_urdf_has_the_dynamics_that_pinocchio_reads_from_it(
     tmp_path_factory: pytest.TempPathFactory, chain: tuple[int, int, bool]
@@ -143,12 +144,14 @@ def assert_rules_and_qr_agree(robot: RobotConfig) -> None:
     assert np.abs(rules - mixing).max() < 1e-7
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("right_angles", [True, False])
 @given(seed=st.integers(0, 2**31), n=st.integers(1, 7))
 def test_rules_and_qr_find_the_same_base_parameters(right_angles: bool, seed: int, n: int) -> None:
     assert_rules_and_qr_agree(random_robot(np.random.default_rng(seed), n, right_angles))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("right_angles", [True, False])
 @given(seed=st.integers(0, 2**31), n=st.integers(1, 7))
 def test_rules_and_qr_find_the_same_base_parameters_of_a_urdf(

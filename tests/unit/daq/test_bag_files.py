@@ -150,6 +150,7 @@ def test_a_damaged_database_gives_its_readable_messages(tmp_path: Path) -> None:
     assert "the database is damaged" in found.remarks[-1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suffix", [".mcap", ".db3", ".mcap.zstd", ".db3.zstd"])
 def test_damaged_bags_raise_no_error_of_a_library(tmp_path: Path, suffix: str) -> None:
     make = mcap_bag if ".mcap" in suffix else sqlite_bag

@@ -79,6 +79,7 @@ def table(path: Path, *, rate: float = 500.0, unit: float = 1.0, time: float = 1
 
 
 @pytest.mark.slow
+@pytest.mark.nightly
 def test_urdf_and_csv_become_a_model_without_an_edit(tmp_path: Path, arm: Path) -> None:
     recorded = arms.recording("tx40", "tx40_excitation", 1, period=arms.FAST)
     export_recording(recorded, tmp_path / "data.csv")
@@ -207,6 +208,7 @@ def test_a_mark_in_a_list_makes_the_list_blank_and_unknown_keys_are_always_neede
         load_robot(tmp_path / "b.yaml", "identify")
 
 
+@pytest.mark.slow
 def test_python_takes_what_init_wrote_and_refuses_it_where_a_value_is_needed(tmp_path: Path, arm: Path) -> None:
     assert run("init", str(arm), "--out", str(tmp_path / "cell")).exit_code == 0
     robot = armident.load_robot(tmp_path / "cell")

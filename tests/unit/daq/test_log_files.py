@@ -84,6 +84,7 @@ def test_a_blf_that_is_cut_off_is_read_up_to_there_and_said(
     assert "of 24600 frames" in found.metadata["source_remarks"]
 
 
+@pytest.mark.slow
 def test_a_damaged_block_of_a_blf_is_a_gap(tmp_path: Path) -> None:
     path = tmp_path / "bus.blf"
     write_log(captured(9000), path)

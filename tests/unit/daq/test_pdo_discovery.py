@@ -8,6 +8,7 @@ import pytest
 from armident.configs import ConfigError, SessionConfig, load_session
 from armident.daq.capture.pdo_discovery import bus_statistics, default_mapping, with_sent_streams
 from armident.drivers.can.frames import Frames, frames
+from armident.drivers.canopen.eds import read_objects
 
 SYNCS = 500
 
@@ -92,4 +93,4 @@ def test_a_bus_without_sync_is_refused() -> None:
 
 def test_the_defaults_of_an_eds_are_names_of_streams() -> None:
     drive = load_session("tx40_cell.yaml").drives[2]
-    assert default_mapping(drive, 1) == (0x183, ("status",))
+    assert default_mapping(drive, read_objects(drive.eds, drive.node_id), 1) == (0x183, ("status",))

@@ -41,6 +41,7 @@ def stock_count(path: Path) -> int:
         return found
 
 
+@pytest.mark.slow
 def test_a_truncated_file_is_recovered_to_the_rows_that_our_reader_finds(tmp_path: Path) -> None:
     recording = make_recording(2000)
     path = tmp_path / "r.mcap"

@@ -80,6 +80,7 @@ def source_of(recording: Recording) -> Path:
     return recording.path
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "options",
     [

@@ -1,13 +1,12 @@
 """Bus load against the figures of can-utils and of Davis et al. 2007."""
 
-import subprocess
-import sys
-
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from typer.testing import CliRunner
 
 from armident.configs import ConfigError, SessionConfig, load_session
+from armident.daq.cli import application
 from armident.drivers.can.frames import FD_LENGTHS
 from armident.drivers.canopen.bus_load import (
     alternatives,
@@ -131,9 +130,8 @@ def test_each_bus_carries_its_own_drives_and_every_sync() -> None:
 
 def table(*options: str) -> str:
     """Output and errors of the command."""
-    command = [sys.executable, "-m", "armident.daq.cli", "bus-load", *options]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
-    return done.stdout + done.stderr
+    words = ["bus-load", *options]
+    return CliRunner().invoke(application(words), words).output
 
 
 def test_a_bus_with_fd_keeps_fd_at_another_bit_rate() -> None:

@@ -287,6 +287,7 @@ LINES = st.lists(
 )
 
 
+@pytest.mark.slow
 @given(lines=LINES, encoding=st.sampled_from(["utf-8", "utf-16"]))
 def test_any_text_is_an_object_dictionary_or_one_line(
     tmp_path_factory: pytest.TempPathFactory, lines: list[str], encoding: str

@@ -41,6 +41,7 @@ def test_strengths_rise_from_level_to_level() -> None:
     assert by_level == sorted(set(by_level))
 
 
+@pytest.mark.slow
 def test_every_hidden_effect_is_one_that_the_virtual_arm_takes() -> None:
     robots = {name: load_robot(arm.config) for name, arm in SUITE.robots.items()}
     once = {path: load_trajectory(path) for arm in SUITE.robots.values() for path in arm.trajectories}

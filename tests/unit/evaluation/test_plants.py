@@ -49,6 +49,8 @@ def pinocchio_model(drawn: Arm) -> Any:
     return model
 
 
+@pytest.mark.nightly
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", SEEDS)
 def test_mass_matrix_and_bias_torques_are_those_of_pinocchio(seed: int) -> None:
     drawn = replace(arm(seed), gravity=np.array([1.0, -2.0, 9.0]))
@@ -111,6 +113,7 @@ def tight_spot() -> RandomCase:
 
 
 @pytest.mark.slow
+@pytest.mark.nightly
 def test_a_case_is_the_same_every_time_and_another_number_is_another_case(tight_spot: RandomCase) -> None:
     again = make_case("development", index_of("tight_spot"))
     assert again.truth == tight_spot.truth
@@ -122,6 +125,7 @@ def test_a_case_is_the_same_every_time_and_another_number_is_another_case(tight_
 
 
 @pytest.mark.slow
+@pytest.mark.nightly
 def test_a_twin_differs_from_its_case_by_the_effect_alone(tight_spot: RandomCase) -> None:
     twin = tight_spot.twin
     assert twin is not None
@@ -133,6 +137,7 @@ def test_a_twin_differs_from_its_case_by_the_effect_alone(tight_spot: RandomCase
 
 
 @pytest.mark.slow
+@pytest.mark.nightly
 def test_the_visibility_is_the_ratio_of_the_residuals_at_the_joint(tight_spot: RandomCase) -> None:
     truth = tight_spot.truth
     j = [joint.name for joint in tight_spot.robot.joints].index(truth.joints[0])
@@ -142,6 +147,7 @@ def test_the_visibility_is_the_ratio_of_the_residuals_at_the_joint(tight_spot: R
 
 
 @pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("half", HALVES)
 def test_the_rigid_model_leaves_the_noise_of_a_healthy_arm(half: Half) -> None:
     healthy = [k for k in range(BLOCK) if kind_of(half, k)[0] == "healthy"][:4]
@@ -153,6 +159,7 @@ def test_the_rigid_model_leaves_the_noise_of_a_healthy_arm(half: Half) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.nightly
 def test_without_noise_pinocchio_explains_the_torques_of_the_simulation() -> None:
     seed = (DEVELOPMENT.entropy, 2, index_of("healthy"), 0)
     draft = draw_draft(np.random.default_rng([*seed, 0]), DEVELOPMENT, seed)
@@ -194,6 +201,7 @@ def test_friction_with_a_smooth_sign_is_that_of_the_velocity_after_the_step(spee
 
 
 @pytest.mark.slow
+@pytest.mark.nightly
 def test_the_files_of_a_case_are_read_back(tight_spot: RandomCase, tmp_path: Path) -> None:
     write_case(tight_spot, tmp_path)
     name = tight_spot.truth.name

@@ -98,6 +98,7 @@ def test_the_task_of_a_missing_recording_fails_with_its_name() -> None:
         diagnose_file(NO_FILE)
 
 
+@pytest.mark.slow
 def test_a_diagnosis_worker_that_exceeds_its_memory_limit_is_replaced_after_its_result(tmp_path: Path) -> None:
     for limit, ended in ((1 << 20, True), (64 << 30, False)):
         diagnosis = WorkerProcess("diagnosis", tmp_path / "diagnosis.log", limit)

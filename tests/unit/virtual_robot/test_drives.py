@@ -117,6 +117,7 @@ def test_a_seed_gives_the_same_recording_and_another_seed_another(tx40: RobotCon
     assert one == same != other
 
 
+@pytest.mark.slow
 def test_noise_has_the_size_of_table_6_3(tx40: RobotConfig) -> None:
     noise = Noise(tx40, PERIOD, seed=3)
     rows = [tuple(part.copy() for part in noise.next()) for _ in range(200_000)]

@@ -180,6 +180,7 @@ def lugre(extra: float, velocity: float, exponent: float, deflection: float, dam
     return law
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("effect", "law"),
     [

@@ -341,6 +341,7 @@ def test_blanks_are_assumed_and_said(tmp_path: Path) -> None:
     assert load_robot(load_session(write_twin(twin, tmp_path / "twin")).robot) == twin.robot
 
 
+@pytest.mark.slow
 def test_a_robot_file_is_enough_for_a_recording(tmp_path: Path) -> None:
     out, truth = tmp_path / "scara.mcap", tmp_path / "truth.json"
     record_robot(write_scara(tmp_path), out, truth=truth)
@@ -353,7 +354,13 @@ def test_a_robot_file_is_enough_for_a_recording(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("path", sorted((HERE / "robots").glob("*.yaml")), ids=lambda path: path.stem)
+@pytest.mark.parametrize(
+    "path",
+    [
+        pytest.param(path, marks=[pytest.mark.nightly] * (path.stem not in ("emps", "panda", "tx40")), id=path.stem)
+        for path in sorted((HERE / "robots").glob("*.yaml"))
+    ],
+)
 def test_every_shipped_robot_follows_a_motion_within_its_torque_limits(path: Path) -> None:
     twin = load_twin(path)
     robot, motion = twin.robot, plausible_trajectory(twin.robot)
@@ -366,6 +373,7 @@ def test_every_shipped_robot_follows_a_motion_within_its_torque_limits(path: Pat
     assert (np.abs(torque).max(axis=0) < [joint.limits.torque for joint in robot.joints]).all()
 
 
+@pytest.mark.slow
 def test_the_api_simulates_any_robot(panda: RobotConfig) -> None:
     motion = plausible_trajectory(panda)
     short = motion.model_copy(

@@ -145,6 +145,7 @@ def test_every_virtual_arm_has_a_noise_and_a_name() -> None:
     assert set(servo.OWN_PERIODS) <= set(noise.SIZES)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["idim-piv", "idim-iv", "didim"])
 @pytest.mark.parametrize("seed", [1, 2])
 def test_identification_recovers_the_published_parameters(method: Method, seed: int) -> None:

@@ -133,6 +133,7 @@ def test_refined_iv_keeps_the_filter_that_least_squares_loses_in_the_noise() -> 
     assert pole < 0.4
 
 
+@pytest.mark.slow
 def test_standard_deviations_are_those_of_the_scatter_under_coloured_noise() -> None:
     drive, structure = Drive(pole=0.8), Structure(filtered="velocity")
     quiet = run(drive, steps=4000)

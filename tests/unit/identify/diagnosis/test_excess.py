@@ -10,8 +10,8 @@ from armident.identify.diagnosis.excess import bursts, spectral_excess
 Array = NDArray[np.float64]
 
 DT, ROWS = 0.02, 600
-T = DT * np.arange(ROWS)
-SPEED = np.sin(2 * np.pi * 0.3 * T + 0.1)
+T: Array = DT * np.arange(ROWS, dtype=np.float64)
+SPEED: Array = np.asarray(np.sin(2 * np.pi * 0.3 * T + 0.1), dtype=np.float64)
 
 
 def noise(seed: int, constant_s: float = 0.0) -> Array:
@@ -27,17 +27,17 @@ def noise(seed: int, constant_s: float = 0.0) -> Array:
 def test_noise_of_drives_has_no_excess(constant_s: float) -> None:
     lowest = []
     for seed in range(60):
-        parts = [noise(2 * seed, constant_s)], [noise(2 * seed + 1, constant_s)]
-        spectral, moments = spectral_excess(*parts, DT), bursts(parts[0], [T], [SPEED])
-        lowest.append(min(one.p_value for one in (spectral, moments) if one is not None))
+        one, other = noise(2 * seed, constant_s), noise(2 * seed + 1, constant_s)
+        spectral, moments = spectral_excess([one], [other], DT), bursts([one], [T], [SPEED])
+        lowest.append(min(part.p_value for part in (spectral, moments) if part is not None))
     # Of 120 p-values 1.2 are below 0.01; ten or more have a probability of 1e-6.
     assert np.sum(np.array(lowest) < 0.01) < 10
     assert min(lowest) > 1e-6
 
 
 def test_a_vibration_has_its_frequency() -> None:
-    parts = [[noise(k) + 2.0 * np.sin(2 * np.pi * 3.7 * T + k)] for k in range(2)]
-    found = spectral_excess(*parts, DT)
+    one, other = (noise(k) + 2.0 * np.sin(2 * np.pi * 3.7 * T + k) for k in range(2))
+    found = spectral_excess([one], [other], DT)
     assert found is not None
     assert found.kind == "frequency"
     assert found.where[0] == pytest.approx(3.7, abs=0.1)
@@ -48,8 +48,8 @@ def test_a_vibration_has_its_frequency() -> None:
 
 
 def test_a_slow_signal_is_no_line() -> None:
-    parts = [[noise(k) + 3.0 * noise(k + 9, 1.0)] for k in range(2)]
-    found = spectral_excess(*parts, DT)
+    one, other = (noise(k) + 3.0 * noise(k + 9, 1.0) for k in range(2))
+    found = spectral_excess([one], [other], DT)
     assert found is not None
     assert found.kind == "unrecorded signal"
     assert found.where[0] < 1.0

@@ -52,6 +52,7 @@ def test_an_array_larger_than_the_memory_is_returned_all_the_same() -> None:
     assert cache.get("a", lambda: (np.ones(10),))[0].sum() == 10.0
 
 
+@pytest.mark.slow
 def test_cached_regressors_are_those_of_a_fresh_study(study: Study) -> None:
     for entries in (EFFECTS, EFFECTS[:2], EFFECTS[1:]):
         changed = study.of_robot(study.robot.model_copy(update={"effects": entries}))

@@ -114,6 +114,7 @@ def test_torques_are_interpolated_without_loss_of_high_frequencies() -> None:
         np.testing.assert_allclose(_aligned(replace(one, torque_shift=LATE))[50:-50, 0], wave[50:-50], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_the_base_fit_decides_a_shift_that_the_check_leaves_open(study: Study) -> None:
     sampled = replace(study, loop="followed").with_torque_shift(-LATE)
     # Relative to these the torques of the study are half a sample late.
@@ -129,6 +130,7 @@ def test_the_base_fit_decides_a_shift_that_the_check_leaves_open(study: Study) -
         assert not any("late by" in line for line in states[shifts].study.warnings)
 
 
+@pytest.mark.slow
 def test_a_loop_that_contains_disturbances_decides_no_shift(study: Study) -> None:
     sampled = replace(study, loop="nominal").with_torque_shift(-LATE)
     state = StepwiseSelection(sampled, shifts=(-LATE, 0.0)).start()

@@ -77,9 +77,8 @@ SAMPLE = [*EMPS, *(c for c in TX40 if c.leave_out == "couplings")]
 """All effects of the EMPS, whose diagnoses are short, and the coupling, which needs two joints."""
 
 
-def recorded(robot: str, seed: int, *effects: HiddenEffect) -> Recording:
-    """The excitation; three times on the TX40, so that a part is left for validation."""
-    repeats = 3 if robot == "tx40" else 1
+def recorded(robot: str, seed: int, *effects: HiddenEffect, repeats: int = 1) -> Recording:
+    """The excitation at 1 kHz."""
     return recording(robot, f"{robot}_excitation", seed, *effects, repeats=repeats, period=FAST, setpoint_every=1)
 
 
@@ -115,7 +114,8 @@ def first_step(data: Recording, whole: RobotConfig, known: RobotConfig) -> tuple
 def test_an_injected_effect_is_admitted_first(case: Case) -> None:
     hidden = HiddenEffect(effect=case.effect, joint=case.joint, other=case.other, parameters=case.parameters)
     known = known_of(case)
-    data = recorded(case.robot, 1, *([] if case.leave_out else [hidden]))
+    repeats = 1 if case in SAMPLE else 3
+    data = recorded(case.robot, 1, *([] if case.leave_out else [hidden]), repeats=repeats)
     selection, step = first_step(data, load_robot(case.robot), known)
     first = selection.admitted(step)
     assert first is not None, [(a.family, a.gain, a.allowed) for a in step.ranked[:3]]
@@ -139,6 +139,6 @@ def test_an_injected_effect_is_admitted_first(case: Case) -> None:
 @pytest.mark.parametrize("robot", [pytest.param("tx40", marks=pytest.mark.nightly), "emps"])
 def test_nothing_is_admitted_beside_the_model_of_a_healthy_arm(robot: str) -> None:
     config = load_robot(robot)
-    selection, step = first_step(recorded(robot, 7), config, config)
+    selection, step = first_step(recorded(robot, 7, repeats=3 if robot == "tx40" else 1), config, config)
     assert selection.admitted(step) is None
     assert np.isfinite([a.log_likelihood for a in step.ranked]).all()

@@ -124,6 +124,7 @@ def test_sep_pem_is_didim_with_white_residuals() -> None:
     assert max(whiteness(series).fraction_outside for series in refined.residuals) <= 0.15
 
 
+@pytest.mark.slow
 def test_prefilter_of_idim_piv_lowers_the_scatter_under_coloured_noise() -> None:
     plain, refined, promised = [], [], []
     for seed in range(8):

@@ -154,6 +154,7 @@ def test_a_box_around_the_arm_is_refused() -> None:
         CollisionModel(planar_arm(bodies(Box(name="room", center=(0, 0, 0), size=(5, 5, 5)))))
 
 
+@pytest.mark.slow
 def test_a_cell_without_a_way_is_refused_with_what_is_in_the_way() -> None:
     walls = [Box(center=(x, y, 0.0), size=(0.45, 0.45, 1.0)) for x in (-0.85, 0.0, 0.85) for y in (-0.85, 0.85)]
     walls += [Box(center=(x, 0.0, 0.0), size=(0.45, 1.2, 1.0)) for x in (-0.85, 0.85)]

@@ -26,6 +26,7 @@ EVALUATIONS, SEARCHES = 800, 4
     [
         ("cogging_torque", None, "cgc1", 0.8),
         ("joint_spring", None, "ks1", 0.6),
+        ("joint_spring", "position_dependent_friction", "ks1", 0.8),
     ],
 )
 def test_a_design_for_an_effect_estimates_it_more_precisely(
@@ -43,6 +44,7 @@ def test_a_design_for_an_effect_estimates_it_more_precisely(
     assert design.wanted[parameter] < better * before[parameter]
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("against", [None, "presliding_friction"])
 def test_designs_for_stribeck_friction_estimate_its_parameters_more_precisely(against: str | None) -> None:
     """Geometric mean over all linear parameters, which a design minimises, and over several random searches."""

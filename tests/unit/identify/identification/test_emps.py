@@ -82,6 +82,7 @@ def test_crc_finds_the_recorded_gains(emps: Experiment) -> None:
     assert response["fit_pct"] > 99.9
 
 
+@pytest.mark.slow
 def test_prefilter_that_contradicts_the_instruments_is_not_believed(emps: Experiment, ls: IdentificationResult) -> None:
     found = identify_experiment(emps, load_robot("emps"))
     assert found.method == "idim-piv"

@@ -29,7 +29,8 @@ def noisy(seed: int, method: Method) -> IdentificationResult:
     return identify_experiment(axis.recorded(seed, torque=1.0, position=ENCODER), axis.robot(), Options(method=method))
 
 
-@pytest.mark.parametrize("method", ["idim-iv", "idim-piv"])
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["idim-iv", pytest.param("idim-piv", marks=pytest.mark.nightly)])
 def test_intervals_hold_the_true_values_with_a_noisy_encoder(method: Method) -> None:
     found = [noisy(seed, method) for seed in range(RUNS)]
     errors = np.array([(f.theta - axis.TRUTH) / f.std for f in found])
@@ -64,6 +65,7 @@ def test_instrumental_variables_allow_for_coloured_noise() -> None:
     assert (coloured.std > 3 * white.std).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("position", [0.0, 1e-6, ENCODER])
 def test_no_decimation_does_not_step_back_on_data_of_exactly_the_model(position: float) -> None:
     experiment = axis.recorded(1, torque=0.5, position=position)
@@ -86,6 +88,7 @@ def test_document_holds_the_bias_that_was_subtracted() -> None:
     assert np.max(np.abs(found.bias) / found.std) > IdentificationCriteria.max_bias_std
 
 
+@pytest.mark.slow
 def test_instruments_pass_the_bandpass_of_the_measured_positions(monkeypatch: pytest.MonkeyPatch) -> None:
     seen = []
 

@@ -114,6 +114,7 @@ def test_documents_without_a_verdict_are_still_read() -> None:
     assert from_json(to_json(document), IdentificationDocument, "x") == document
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["idim-ls", "idim-iv", "idim-piv"])
 def test_all_signs_turned_are_physically_impossible(
     healthy: list[Experiment], arm: RobotConfig, method: Method
@@ -169,7 +170,9 @@ def test_an_arm_at_rest_is_refused_in_one_line(arm: RobotConfig) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize(
+    "method", [pytest.param(m, marks=[pytest.mark.nightly] * (m in ("cloe", "clie"))) for m in METHODS]
+)
 def test_one_moving_joint_gives_its_few_parameters(arm: RobotConfig, method: Method) -> None:
     single = recorded(arm, motion(*([0.0, angle, 0.0, 0.0, 0.0, 0.0] for angle in (0.8, -0.8, 0.4, 0.0))))
     assert moving_joints(single, arm, CRITERIA).tolist() == [False, True, False, False, False, False]
@@ -200,6 +203,7 @@ def supported_by_joint_2(robot: RobotConfig) -> set[str]:
     return {name for name, seen in zip(model.base.names, acts, strict=True) if seen}
 
 
+@pytest.mark.slow
 def test_a_motion_of_two_degrees_is_unusable_and_names_what_it_supports(arm: RobotConfig) -> None:
     wide = trajectory("tx40_excitation")
     share = np.deg2rad(2.0) / max(abs(angle) for move in wide.moves for angle in move.to)
@@ -346,6 +350,7 @@ def test_a_ripple_that_a_noise_model_could_absorb_is_named(arm: RobotConfig) -> 
     assert reason.joint == "joint_1"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("noise", ["white", "coloured"])
 def test_noise_does_not_depend_on_the_motion(healthy: list[Experiment], arm: RobotConfig, noise: str) -> None:
     """Residuals of 20 seeds, replaced by noise: at most one of 240 tests is positive at the limits of the verdict."""

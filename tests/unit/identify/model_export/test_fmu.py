@@ -85,6 +85,7 @@ def integrated(model: ExportedModel, state: Floats, torques: Floats) -> Floats:
     return np.array(rows)
 
 
+@pytest.mark.slow
 def test_an_fmu_moves_as_the_forward_dynamics_of_the_model(model: ExportedModel, fmu: Path, tmp_path: Path) -> None:
     rng = np.random.default_rng(3)
     q, dq = rng.uniform(-1.0, 1.0, (2, model.arm.n))

@@ -115,7 +115,7 @@ def test_the_long_run_variance_allows_for_serial_correlation() -> None:
 
 
 @pytest.mark.slow
-@settings(max_examples=3, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=2, suppress_health_check=[HealthCheck.too_slow])
 @given(st.integers(0, 2**32 - 1), st.integers(1, 2000))
 def test_the_cutting_into_blocks_does_not_change_a_bit(seed: int, longest: int) -> None:
     rng = np.random.default_rng(seed)
@@ -252,6 +252,7 @@ def test_a_reference_of_another_robot_or_with_effects_is_refused() -> None:
         RecursiveEstimator(ROBOT, arms.tx40_baseline(), 50.0)
 
 
+@pytest.mark.slow
 def test_the_false_alarms_of_the_sequential_test_are_as_rare_as_wanted() -> None:
     # At the limit of what is tolerated, one false alarm in 0.5 h: Lorden's bound gives 0.1 in 50 runs of 0.001 h each.
     chosen = RecursiveSettings(false_alarm_hours=1.0, level_memory_s=1e12)

@@ -2,8 +2,7 @@
 
 import datetime
 import json
-import subprocess
-import sys
+import os
 from pathlib import Path
 from typing import Any
 
@@ -91,6 +90,7 @@ def test_a_trajectory_beyond_the_limits_never_moves_anything(tmp_path: Path) -> 
         prepare(config, None, store(tmp_path), None, 1e-4)
 
 
+@pytest.mark.slow
 def test_a_torque_beyond_the_limit_is_predicted_by_the_baseline(
     tmp_path: Path, documents: dict[str, IdentificationDocument]
 ) -> None:
@@ -172,18 +172,27 @@ def fleet_in_process(folder: Path, *options: str) -> Result:
 @pytest.mark.timeout(300)
 def test_a_fleet_is_compared_in_order_and_survives_a_failed_recording(tmp_path: Path) -> None:
     """One line per recording and one history; one file is not a recording."""
+    from distributed import LocalCluster
+
     friction = hide("friction_drift", "joint_1", change=0.1, time_constant=1e-6)
     for name, seed, effects in (("a_monday", 1, ()), ("b_tuesday", 2, ()), ("d_worn", 3, (friction,))):
         write_recording(recording("emps", "emps_excitation", seed, *effects), tmp_path / f"{name}.mcap")
     (tmp_path / "c_broken.mcap").write_bytes(b"not a recording")
-    command = [sys.executable, "-m", "armident.daq.cli", *fleet_words(tmp_path, "--workers", "2")]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=250, check=False)
-    assert done.returncode == 4, done.stderr
-    monday, tuesday, broken, worn = done.stdout.splitlines()
+    # The worker is two threads of this process, which has imported everything.
+    with LocalCluster(
+        n_workers=1, threads_per_worker=2, processes=False, protocol="tcp://", dashboard_address=None
+    ) as remote:
+        done = fleet_in_process(tmp_path, "--scheduler", remote.scheduler_address, "--json")
+    assert done.exit_code == 4, done.stderr
+    monday, tuesday, broken, worn = (line for line in done.stderr.splitlines() if ".mcap: " in line)
     assert "a_monday.mcap: first run of emps: the baseline" in monday
     assert "b_tuesday.mcap: no change" in tuesday
     assert "c_broken.mcap: failed: " in broken
     assert "d_worn.mcap: CHANGED: joint_1: " in worn
+    runs = json.loads(done.stdout)["runs"]
+    assert [Path(run["recording"]).stem for run in runs] == ["a_monday", "b_tuesday", "c_broken", "d_worn"]
+    assert runs[1]["drift"]["drifted"] is False
+    assert np.isfinite(runs[1]["drift"]["chi_square"])
     with sa.create_engine(store(tmp_path)).connect() as connection:
         assert connection.execute(sa.text("select count(*) from identifications")).scalar() == 3
         assert connection.execute(sa.text("select count(*) from recordings")).scalar() == 3
@@ -194,21 +203,9 @@ def test_a_fleet_is_compared_in_order_and_survives_a_failed_recording(tmp_path: 
 
 
 @pytest.mark.slow
-def test_a_scheduler_by_address_does_the_same_work(tmp_path: Path) -> None:
-    from distributed import LocalCluster
-
-    for name, seed in (("a_monday", 1), ("b_tuesday", 2)):
-        write_recording(recording("emps", "emps_excitation", seed), tmp_path / f"{name}.mcap")
-    # The worker is a thread of this process, which has imported everything.
-    with LocalCluster(
-        n_workers=1, threads_per_worker=1, processes=False, protocol="tcp://", dashboard_address=None
-    ) as remote:
-        done = fleet_in_process(tmp_path, "--scheduler", remote.scheduler_address, "--json")
-    assert done.exit_code == 0, done.stderr
-    runs = json.loads(done.stdout)["runs"]
-    assert [Path(run["recording"]).stem for run in runs] == ["a_monday", "b_tuesday"]
-    assert runs[1]["drift"]["drifted"] is False
-    assert np.isfinite(runs[1]["drift"]["chi_square"])
+def test_workers_of_this_machine_work_in_processes_of_their_own() -> None:
+    with cluster(None, 1) as client:
+        assert client.submit(os.getpid, pure=False).result(timeout=120) != os.getpid()
 
 
 @pytest.mark.parametrize(

@@ -27,6 +27,7 @@ def page(outcome: IdentificationOutcome, tmp_path_factory: pytest.TempPathFactor
     return report.read_text(encoding="utf-8")
 
 
+@pytest.mark.slow
 def test_the_report_needs_no_other_file(page: str) -> None:
     sources = re.findall(r'(?:src|href)="([^"]*)"', page)
     assert sources

@@ -40,6 +40,7 @@ def test_the_set_up_of_the_measured_tx40_is_right(measured: list[Experiment], ro
     assert found.joints_not_understood == ()
 
 
+@pytest.mark.nightly
 def test_torques_exchanged_in_the_measured_tx40_are_found(measured: list[Experiment], robot: RobotConfig) -> None:
     order = setups.in_order(0, 2, 1, 3, 4, 5)
     found = check_setup(setups.with_torques(measured, order), robot)
