@@ -60,7 +60,7 @@ def test_the_set_up_of_the_measured_axis_is_right(shared_data: Path) -> None:
     assert [f.kind for f in found.findings] == ["torque_sign"]
 
 
-@pytest.mark.parametrize("number", [1, 3])
+@pytest.mark.parametrize("number", [pytest.param(1, marks=pytest.mark.nightly), 3])
 def test_the_set_up_of_the_measured_kuka_is_right(shared_data: Path, number: int) -> None:
     """Joints 5 and 6 carry little torque, and ripples that the model lacks leave half of it: no unit explains that."""
     file = shared_data / "kuka_lwr4" / f"measurements_{number}.npz"

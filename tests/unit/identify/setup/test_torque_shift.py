@@ -54,6 +54,7 @@ def estimate(experiments: Sequence[Experiment], robot: RobotConfig) -> TorqueShi
     return found
 
 
+@pytest.mark.slow
 def test_torques_held_until_the_next_sample_are_not_shifted(healthy: list[Experiment], arm: RobotConfig) -> None:
     found = estimate(healthy, arm)
     assert abs(found.samples) < 3 * found.std
@@ -61,6 +62,7 @@ def test_torques_held_until_the_next_sample_are_not_shifted(healthy: list[Experi
     assert found.remark == ""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("samples", [LATE, -LATE])
 def test_a_common_shift_of_half_a_sample_is_a_remark_and_no_mistake(
     healthy: list[Experiment], arm: RobotConfig, samples: float
@@ -74,6 +76,7 @@ def test_a_common_shift_of_half_a_sample_is_a_remark_and_no_mistake(
     assert ("late" if samples > 0 else "early") in found.remark
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("common", [0.0, LATE])
 def test_the_delay_of_one_joint_is_left_to_the_diagnosis(
     healthy: list[Experiment], arm: RobotConfig, common: float
@@ -102,6 +105,7 @@ def test_a_shift_is_known_where_it_tells_the_conventions_apart() -> None:
     assert not replace(either, odds=25.0, std=0.3).known
 
 
+@pytest.mark.slow
 def test_a_shift_that_was_applied_is_not_found_again(healthy: list[Experiment], arm: RobotConfig) -> None:
     moved = late(healthy, np.full(arm.n, LATE))
     again = estimate(with_torque_shift(moved, estimate(moved, arm)), arm)
@@ -109,6 +113,7 @@ def test_a_shift_that_was_applied_is_not_found_again(healthy: list[Experiment], 
     assert not again.applied
 
 
+@pytest.mark.slow
 def test_the_diagnosis_begins_with_aligned_experiments(healthy: list[Experiment], arm: RobotConfig) -> None:
     stage = set_up(late(healthy, np.full(arm.n, LATE)), (), arm, Criteria())
     assert [e.torque_shift for e in stage.training] == pytest.approx([LATE, LATE], abs=0.1)
@@ -116,6 +121,7 @@ def test_the_diagnosis_begins_with_aligned_experiments(healthy: list[Experiment]
     assert any("samples" in line for line in stage.warnings)
 
 
+@pytest.mark.slow
 def test_identify_aligns_its_equations_and_says_so(healthy: list[Experiment], arm: RobotConfig) -> None:
     moved = late(healthy, np.full(arm.n, LATE))
     options = Options(method="idim-ls")
@@ -127,12 +133,14 @@ def test_identify_aligns_its_equations_and_says_so(healthy: list[Experiment], ar
     assert not any("all torques are" in line for line in before.warnings)
 
 
+@pytest.mark.slow
 def test_parameters_do_not_move_where_no_shift_is_significant(healthy: list[Experiment], arm: RobotConfig) -> None:
     options = Options(method="idim-ls")
     one, other = (identify_experiment(healthy, arm, options, setup=s) for s in (None, check_setup(healthy, arm)))
     np.testing.assert_array_equal(one.theta, other.theta)
 
 
+@pytest.mark.slow
 def test_the_virtual_arm_with_references_is_not_shifted() -> None:
     robot = load_robot("tx40")
     experiments = experiments_from_recording(recording("tx40", "tx40_excitation", 3, period=FAST), robot)[0]
@@ -142,6 +150,7 @@ def test_the_virtual_arm_with_references_is_not_shifted() -> None:
     assert not found.applied
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("samples", "decisive"), [(4, True), (-4, False)])
 def test_torques_late_by_milliseconds_are_found_by_the_references(samples: int, decisive: bool) -> None:
     """Prediction gains too little by early torques: noise in the closed loop looks like them."""
