@@ -25,7 +25,7 @@ from armident.daq.interchange.table_files import Source
 from armident.daq.interchange.table_rows import EFFORTS, TableRows, complete_rows
 from armident.daq.interchange.text_files import listed
 from armident.daq.recording import Field, Recording, Stream, read_recording
-from armident.daq.recording.faults.repair import repair
+from armident.daq.recording.faults.repair import REPAIRS, repair
 from armident.daq.recording.faults.sign_bit import sign_bit
 from armident.daq.recording.model import Side
 
@@ -114,7 +114,8 @@ def _from_table(robot: RobotConfig, source: Source, options: ImportOptions, fact
     rows = in_si(rows, robot, options.get("units") or {})
     _refuse_immense(source, rows)
     side: Side = "motor" if motor_side else "joint"
-    rows = _repaired(rows, robot, side, options)
+    rows, repairs = _repaired(rows, robot, side, options)
+    facts = {**facts, REPAIRS: "\n".join(repairs)} if repairs else facts
     fields: dict[str, Field] = {
         name: Field(
             name, name, si_unit_of(name, robot), "motor" if name in ("current", "voltage") else side, (1.0,) * robot.n
@@ -154,8 +155,10 @@ def _from_table(robot: RobotConfig, source: Source, options: ImportOptions, fact
     return at_rate(recording, resample_hz)
 
 
-def _repaired(rows: TableRows, robot: RobotConfig, side: Side, options: ImportOptions) -> TableRows:
-    """Return the rows without wraps of their positions and without impossible rows, with a note on each kind."""
+def _repaired(
+    rows: TableRows, robot: RobotConfig, side: Side, options: ImportOptions
+) -> tuple[TableRows, tuple[str, ...]]:
+    """Return the rows without wraps of their positions and without impossible rows, and a note on each kind."""
     rate_hz = options.get("rate_hz")
     if rows.times is None or rate_hz is not None:
         times = rows.row / (rate_hz or 1.0)
@@ -166,12 +169,12 @@ def _repaired(rows: TableRows, robot: RobotConfig, side: Side, options: ImportOp
     q, demand, polled = rows.values["position"], rows.values.get("demand"), options.get("polled", False)
     found = repair(q, effort, demand, times, robot, side, polled=polled)
     if not found.notes:
-        return rows
+        return rows, ()
     values = {**rows.values, "position": found.position}
     if found.demand is not None:
         values["demand"] = found.demand
     made = replace(rows, values=values, notes=(*rows.notes, *found.notes))
-    return made.taken(~found.wrong)
+    return made.taken(~found.wrong), found.notes
 
 
 def read_rows(path: Path, robot: RobotConfig, **options: Unpack[ImportOptions]) -> tuple[Source, TableRows]:

@@ -11,7 +11,7 @@ from scipy.interpolate import CubicSpline
 from armident.configs import DataError, Joint, RobotConfig
 from armident.configs.schema.limits import ENDLESS
 from armident.daq.recording import Recording, Stream
-from armident.daq.recording.faults.repair import repaired
+from armident.daq.recording.faults.repair import REASON, repaired
 from armident.daq.recording.faults.zeros import NOTHING
 from armident.identify.identification.identification_criteria import IdentificationCriteria
 from armident.identify.identification.set_points import between_set_points
@@ -71,8 +71,9 @@ def _converted(
 ) -> tuple[Sequence[Experiment], list[str]]:
     _check_same_robot(recording.robot, robot)
     _check_counters(recording)
-    recorded = recording.samples.sync
     recording, remarks = repaired(recording)
+    left_out = [np.arange(gap.first, gap.last + 1) for gap in recording.gaps if gap.reason == REASON]
+    recorded = np.concatenate([recording.samples.sync, *left_out])
     notes = list(remarks)
     if recording.missing:
         notes.append(f"the recording is torn: {recording.missing}")

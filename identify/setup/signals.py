@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import signal
 
-from armident.configs import Joint, RobotConfig
+from armident.configs import RobotConfig
 from armident.daq.recording.faults.jumps import JumpCriteria, jumps
 from armident.daq.recording.faults.updates import held, resolution
 from armident.identify.setup.plausible import NO_LIMIT
@@ -219,7 +219,7 @@ def rate_findings(experiments: Sequence[Experiment], robot: RobotConfig) -> list
     slow = np.flatnonzero(highest * dt * LEAST_SAMPLES > 1.0)
     longest = max(experiments, key=lambda e: e.q.shape[0])
     coarse = {int(j): step for j in slow if (step := resolution(longest.q[:, j]))}
-    findings = [_coarse(robot.joints[j], step, longest.q[:, j]) for j, step in coarse.items()]
+    findings = [_coarse(robot, coarse, longest.q)] if coarse else []
     slow = np.array([j for j in slow if int(j) not in coarse], dtype=np.int64)
     if not slow.size:
         return findings
@@ -236,15 +236,17 @@ def rate_findings(experiments: Sequence[Experiment], robot: RobotConfig) -> list
     ]
 
 
-def _coarse(joint: Joint, step: float, q: Array) -> SetupFinding:
-    """Position in steps so coarse that their noise looks like a fast motion."""
-    unit = "rad" if joint.type == "revolute" else "m"
+def _coarse(robot: RobotConfig, steps: dict[int, float], q: Array) -> SetupFinding:
+    """Positions in steps (by joint) so coarse that their noise looks like a fast motion."""
+    names = tuple(robot.joints[j].name for j in steps)
+    each = [f"{step:.3g} {'rad' if robot.joints[j].type == 'revolute' else 'm'}" for j, step in steps.items()]
+    fewest = min(float(np.ptp(q[:, j])) / step for j, step in steps.items())
     message = (
-        f"the position of {joint.name} is recorded in steps of {step:.3g} {unit}, {np.ptp(q) / step:.0f} over its "
-        "motion: their noise is larger than the motion from one sample to the next"
+        f"the positions of {', '.join(names)} are recorded in steps of {', '.join(dict.fromkeys(each))}, {fewest:.0f} "
+        "and more over the motion: their noise is larger than the motion from one sample to the next"
     )
     remedy = "write positions with more decimals, or in the counts of the encoder"
-    return SetupFinding("position_resolution", (joint.name,), 1.0, message, remedy, False)
+    return SetupFinding("position_resolution", names, 1.0, message, remedy, False)
 
 
 def velocity_frequency(q: Array, dt: float) -> Array:

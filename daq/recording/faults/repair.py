@@ -16,6 +16,8 @@ Mask = NDArray[np.bool_]
 
 REASON = "impossible values"
 """Reason of the gaps that a repair leaves."""
+REPAIRS = "repairs"
+"""Key of the metadata with a line for each kind of fault that an import has repaired."""
 EFFORTS = ("torque", "current", "voltage")
 CUT = 4
 """Rows that are left out at a step of all joints: longer than the gaps that are interpolated."""
@@ -142,15 +144,19 @@ def shared_steps(position: Array, steps: Sequence[tuple[int, int, float]]) -> se
 
 
 def repaired(recording: Recording) -> tuple[Recording, tuple[str, ...]]:
-    """Return a recording with its faults repaired, the same if it has none, and a sentence for each kind."""
+    """Return a recording with its faults repaired, the same if it has none, and a sentence for each kind.
+
+    What an import has repaired is among the sentences.
+    """
+    before = tuple(line for line in recording.metadata.get(REPAIRS, "").split("\n") if line)
     samples, robot = recording.samples, recording.robot
     position = samples.named("position")
     effort = next((name for quantity in EFFORTS if (name := samples.named(quantity))), None)  # type: ignore[arg-type]
     if position is None or effort is None or samples.sync.size < 2:
-        return recording, ()
+        return recording, before
     q, tau = samples.si(position), samples.si(effort)
     if not (np.isfinite(q).all() and np.isfinite(tau).all()):
-        return recording, ()
+        return recording, before
     where = next(((n, s) for n, s in recording.streams.items() if s.named("demand") is not None), None)
     own = where is not None and where[1] is samples
     demand = samples.named("demand")
@@ -158,7 +164,7 @@ def repaired(recording: Recording) -> tuple[Recording, tuple[str, ...]]:
     times = samples.sync / recording.sample_rate_hz
     found = repair(q, tau, qr, times, robot, samples.fields[position].side)
     if not found.notes:
-        return recording, ()
+        return recording, before
     raw = dict(samples.raw)
     if not np.array_equal(found.position, q):
         raw[position] = found.position / np.asarray(samples.fields[position].scale)
@@ -177,9 +183,17 @@ def repaired(recording: Recording) -> tuple[Recording, tuple[str, ...]]:
         key = f"{samples.name}.{name}"
         if key in counters:
             counters[key] += change
-    gaps = (*recording.gaps, *(Gap(samples.name, int(k), int(k), reason=REASON) for k in lost))
+    gaps = (*recording.gaps, *(Gap(samples.name, a, b, reason=REASON) for a, b in _ranges(lost)))
     streams = {**recording.streams, samples.name: made}
-    return replace(recording, streams=streams, gaps=gaps, counters=counters), found.notes
+    return replace(recording, streams=streams, gaps=gaps, counters=counters), tuple(
+        dict.fromkeys([*before, *found.notes])
+    )
+
+
+def _ranges(sync: NDArray[np.int64]) -> list[tuple[int, int]]:
+    """First and last of each range of consecutive numbers (N,)."""
+    parts = np.split(sync, np.flatnonzero(np.diff(sync) != 1) + 1)
+    return [(int(part[0]), int(part[-1])) for part in parts if part.size]
 
 
 def _alike(wrong: Mask, names: Sequence[str]) -> list[tuple[str, NDArray[np.int64]]]:
