@@ -13,7 +13,7 @@ from armident.identify.identification.equations import Prepared
 from armident.identify.identification.held_out import held_out_errors
 from armident.identify.identification.identification_criteria import IdentificationCriteria
 from armident.identify.identification.options import Options
-from armident.identify.identification.residual_statistics import ChangeDirection, JointResidualStatistics
+from armident.identify.identification.residual_statistics import EffectDirection, JointResidualStatistics
 from armident.identify.identification.sign_smoothing import Transition
 from armident.identify.identification.torque_delay import TorqueDelay
 from armident.identify.identification.verdict import Verdict
@@ -86,7 +86,7 @@ class IdentificationResult:
     autocorrelation_bound: Array
     residual_statistics: tuple[JointResidualStatistics, ...] = ()
     transitions: Mapping[str, Transition] = field(default_factory=dict)
-    change_directions: tuple[ChangeDirection, ...] = ()
+    change_directions: tuple[EffectDirection, ...] = ()
     equations: Sequence[ExperimentEquations] = ()
     prepared: Prepared | None = None
     held_out: tuple[float, Array] | None = None
@@ -125,7 +125,7 @@ class Statistics:
     bias: Array | None = None
     residuals: tuple[JointResidualStatistics, ...] = ()
     transitions: Mapping[str, Transition] = field(default_factory=dict)
-    changes: tuple[ChangeDirection, ...] = ()
+    changes: tuple[EffectDirection, ...] = ()
 
 
 def make_result(

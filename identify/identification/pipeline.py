@@ -46,8 +46,8 @@ from armident.identify.identification.sign_smoothing import (
     law_error,
     recorded_speeds,
     unsaturated_joints,
+    with_estimated_smoothing,
     with_sign_smoothing,
-    with_transitions,
 )
 from armident.identify.identification.solvers import IdentificationProblem, Solution, decimation_of, solve
 from armident.identify.identification.support import examine_support
@@ -132,7 +132,7 @@ def _identify(
     prepared, transitions = _prepared(robot, experiments, signals, bandwidth), dict[str, Transition]()
     if given.friction.sign_smoothing is None and not has_published_filters(robot, options):
         first = _least_squares(prepared, options, bandwidth, moving, criteria, Notes())
-        robot, transitions = with_transitions(given, prepared, first.decimation, speeds, criteria)
+        robot, transitions = with_estimated_smoothing(given, prepared, first.decimation, speeds, criteria)
         if transitions:
             prepared = _prepared(robot, experiments, signals, bandwidth)
     model = prepared.model

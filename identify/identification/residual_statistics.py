@@ -2,7 +2,7 @@
 
 Piecewise linear functions of position, of position with direction, and of velocity describe what the model lacks. They
 are estimated beside all base parameters, weighted for serial correlation. The power in bands of frequency is the rest.
-Changes of the plant for which the model has no parameter move parameters and functions along `ChangeDirection`.
+Changes of the plant for which the model has no parameter move parameters and functions along `EffectDirection`.
 """
 
 from collections.abc import Sequence
@@ -68,7 +68,7 @@ class JointResidualStatistics:
 
 
 @dataclass(frozen=True)
-class ChangeDirection:
+class EffectDirection:
     """Change of the estimate by an effect that the model lacks, per unit of its m linear parameters.
 
     ``parameters`` (m, b): of the parameters, which absorb a part of it; ``scores`` (n, m, k): of the scores of each
@@ -83,7 +83,7 @@ class ChangeDirection:
 
 def residual_statistics(
     prepared: Prepared, blocks: Sequence[ExperimentEquations], estimate: Estimate
-) -> tuple[tuple[JointResidualStatistics, ...], tuple[ChangeDirection, ...]]:
+) -> tuple[tuple[JointResidualStatistics, ...], tuple[EffectDirection, ...]]:
     """Statistics of the residuals of every joint; the noise models of the estimate weigh them, else fitted ones.
 
     Then the directions of changes for which the model has no parameter.
@@ -131,7 +131,7 @@ def residual_statistics(
         own = slice(at, at + len(effect.linear))
         at = own.stop
         joint_name = prepared.model.robot.joints[place.joint].name
-        directions.append(ChangeDirection(effect.key, joint_name, parameters[own], of_joints[:, own]))
+        directions.append(EffectDirection(effect.key, joint_name, parameters[own], of_joints[:, own]))
     return tuple(found), tuple(directions)
 
 

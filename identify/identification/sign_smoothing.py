@@ -111,7 +111,7 @@ def _rounded(width: float) -> float:
     return float(f"{1 / width:.4g}")
 
 
-def with_transitions(
+def with_estimated_smoothing(
     given: RobotConfig, prepared: Prepared, decimation: Decimation, speeds: Speeds, criteria: IdentificationCriteria
 ) -> tuple[RobotConfig, dict[str, Transition]]:
     """Return the ``given`` configuration with the transitions that the torques determine, and these by joint.

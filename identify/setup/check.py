@@ -17,7 +17,7 @@ from armident.identify.setup.describe import described
 from armident.identify.setup.fit import Hypothesis, joint_errors
 from armident.identify.setup.result import SetupCheck, SetupFinding, TorqueShift
 from armident.identify.setup.search import NOT_UNDERSTOOD, STRUCTURED, Search, Step
-from armident.identify.setup.stationarity import Stretch, change_finding, spans, stretch
+from armident.identify.setup.stationarity import ChangedStretch, change_finding, spans, stretch
 from armident.identify.setup.torque_shift import SHIFT_RATE, long_torque_shift, torque_shift
 from armident.identify.signals.experiments import Experiment, check_one_rate
 
@@ -130,7 +130,7 @@ def _torque_shift(experiments: Sequence[Experiment], bench: Bench, best: Step) -
         return None
 
 
-def _stretch(bench: Bench, best: Step) -> tuple[Step, Stretch | None]:
+def _stretch(bench: Bench, best: Step) -> tuple[Step, ChangedStretch | None]:
     """Return the set-up, and the stretch of time in which the arm is another one.
 
     A change in time competes with the corrections: they go where it explains the torques as well without them.
