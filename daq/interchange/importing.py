@@ -160,11 +160,14 @@ def _repaired(
 ) -> tuple[TableRows, tuple[str, ...]]:
     """Return the rows without wraps of their positions and without impossible rows, and a note on each kind."""
     rate_hz = options.get("rate_hz")
-    if rows.times is None or rate_hz is not None:
+    if rows.times is None:
         times = rows.row / (rate_hz or 1.0)
-    else:
+    elif rate_hz is None:
         unit = options.get("time_unit") or rows.time_unit
         times = rows.times * UNITS.get(unit, 1.0)
+    else:
+        usual = float(np.median(np.diff(rows.times))) if rows.times.size > 1 else 0.0
+        times = rows.times / (usual * rate_hz) if usual > 0.0 else rows.row / rate_hz
     effort = next(rows.values[name] for name in EFFORTS if name in rows.values)
     q, demand, polled = rows.values["position"], rows.values.get("demand"), options.get("polled", False)
     found = repair(q, effort, demand, times, robot, side, polled=polled)

@@ -1,6 +1,6 @@
 """Experiments from a recording, read from a file or assembled from the stream."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -71,7 +71,10 @@ def _converted(
 ) -> tuple[Sequence[Experiment], list[str]]:
     _check_same_robot(recording.robot, robot)
     _check_counters(recording)
-    recording, remarks = repaired(recording)
+    long = recording.samples.sync.size * robot.n > stretches.beyond
+    remarks: Sequence[str] = ()
+    if not long:
+        recording, remarks = repaired(recording)
     left_out = [np.arange(gap.first, gap.last + 1) for gap in recording.gaps if gap.reason == REASON]
     recorded = np.concatenate([recording.samples.sync, *left_out])
     notes = list(remarks)
@@ -83,7 +86,6 @@ def _converted(
     has_ref = np.ones(samples.sync.size, dtype=bool) if demand is None else _has_reference(demand, samples.sync)
     if demand is None:
         notes.append(NO_REFERENCE)
-    long = samples.sync.size * robot.n > stretches.beyond
     used: list[NDArray[np.int64]] = []
     for first, last in recording.experiments():
         inside = (samples.sync >= first) & (samples.sync <= last)
@@ -115,14 +117,26 @@ def _converted(
                 _finite(samples, name, robot)
         notes.append(f"a long recording: identified in {len(used)} stretches, of which one is in memory at a time")
         begin = int(samples.sync[0])
-        experiments = OnDisk(
-            _experiments(_part(recording, rows), robot, [np.arange(rows.size)], begin)[0] for rows in used
-        )
+        experiments = OnDisk(_of_stretches(recording, robot, used, begin, notes))
     else:
         experiments = _experiments(recording, robot, used, int(samples.sync[0]))
     notes += _signal_notes(experiments, robot)
     notes += _rate_notes(recording)
     return experiments, notes
+
+
+def _of_stretches(
+    recording: Recording, robot: RobotConfig, used: Sequence[NDArray[np.int64]], begin: int, notes: list[str]
+) -> Iterator[Experiment]:
+    """Experiments of the stretches of a long recording, repaired one by one; ``notes`` takes what was repaired."""
+    for rows in used:
+        part, lines = repaired(_part(recording, rows))
+        start = (int(recording.samples.sync[rows[0]]) - begin) / recording.sample_rate_hz
+        notes += [f"in the stretch from {start:.1f} s on, {line}" for line in lines]
+        sync = part.samples.sync
+        pieces = np.split(np.arange(sync.size), np.flatnonzero(np.diff(sync) > BRIDGED + 1) + 1)
+        chosen = [piece for piece in pieces if piece.size >= MIN_PIECE_S * recording.sample_rate_hz]
+        yield from _experiments(part, robot, chosen, begin)
 
 
 def _experiments(

@@ -204,7 +204,9 @@ def relative_torque_errors(blocks: Sequence[ExperimentEquations], theta: Array) 
     errors = residuals(blocks, theta)
     miss = sum(np.sum(np.where(b.keep, e, 0.0) ** 2, axis=0) for e, b in zip(errors, blocks, strict=True))
     power = sum(np.sum(np.where(b.keep, b.y, 0.0) ** 2, axis=0) for b in blocks)
-    return 100 * float(np.sqrt(np.sum(miss) / np.sum(power))), 100 * np.sqrt(miss / np.maximum(power, 1e-300))
+    return 100 * float(np.sqrt(np.sum(miss) / max(float(np.sum(power)), 1e-300))), 100 * np.sqrt(
+        miss / np.maximum(power, 1e-300)
+    )
 
 
 def units(model: ArmModel) -> tuple[str, ...]:

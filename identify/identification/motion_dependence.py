@@ -22,6 +22,9 @@ ROWS_PER_BIN = 8
 SHIFTS = 199
 """Number of circular shifts."""
 
+TOGETHER = 200_000
+"""Rows of all shifts that are in memory together: 1.6 MB."""
+
 LEAST_SHIFT = 0.05
 """Least shift, as share of the length of an experiment."""
 
@@ -84,9 +87,12 @@ def _explained(series: Sequence[Array], bins: NDArray[np.int64]) -> tuple[float,
     order = np.argsort(bins, kind="stable")
     counts = np.bincount(bins)
     counts = counts[counts > 0]
-    rows = np.concatenate([_shifted(e, shifts) for e in series], axis=1)[:, order]
-    sums = np.add.reduceat(rows, np.cumsum(counts) - counts, axis=1)
-    here, *shifted = np.sum(sums**2 / counts, axis=1) / total
+    explained = []
+    for some in np.array_split(shifts, max(1, min(shifts.size, shifts.size * order.size // TOGETHER))):
+        rows = np.concatenate([_shifted(e, some) for e in series], axis=1)[:, order]
+        sums = np.add.reduceat(rows, np.cumsum(counts) - counts, axis=1)
+        explained.append(np.sum(sums**2 / counts, axis=1) / total)
+    here, *shifted = np.concatenate(explained)
     usual, spread = float(np.mean(shifted)), float(np.std(shifted))
     return float(max(here - usual, 0.0) / max(1.0 - usual, 1e-300)), float((here - usual) / max(spread, 1e-300))
 

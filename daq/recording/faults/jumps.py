@@ -4,7 +4,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import uniform_filter1d
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -94,7 +93,7 @@ def jumps(x: Array, dt: float, holes: Mask, fastest: float, hardest: float, crit
         criteria.accelerations * max(float(np.quantile(bends, 0.95)), limit * dt**2 if np.isfinite(limit) else 0.0),
     )
     # Single jumps raise the mean of their neighbourhood by little: a quick choice of steps to look at.
-    mean = uniform_filter1d(size, 2 * (criteria.near + criteria.aside) + 1)
+    mean = _mean(size, criteria.near + criteria.aside)
     most = float(np.quantile(changes, criteria.most))
     candidates = np.flatnonzero((size > least) & (size > criteria.ratio * np.minimum(mean / 2.0, most)))
     if not candidates.size:
@@ -136,6 +135,12 @@ def _return(y: Array, k: int, allow: float, longest: int) -> int:
         if returned > 0.5 and min(abs(apart), abs(apart - (m + 1) * slope)) <= allow * (1.0 + m / 4.0):
             return m
     return 0
+
+
+def _mean(size: Array, reach: int) -> Array:
+    """Mean (M,) of each value and of ``reach`` ones on either side; the ends are mirrored."""
+    sums = np.cumsum(np.pad(size, (reach + 1, reach), mode="symmetric"))
+    return np.asarray((sums[2 * reach + 1 :] - sums[: -2 * reach - 1]) / (2 * reach + 1))
 
 
 def _usual(size: Array, at: NDArray[np.int64], criteria: JumpCriteria) -> Array:

@@ -82,8 +82,8 @@ def test_a_diagnosed_model_is_a_robot_configuration_again(robot: RobotConfig) ->
     np.testing.assert_array_equal(term.values, [0.5])
 
 
-ELSEWHERE = ("encoder_eccentricity", "backlash", "joint_elasticity")
-"""Effects that act on all joints: an error of one position changes every torque."""
+ELSEWHERE = ("encoder_eccentricity", "backlash", "joint_elasticity", "payload")
+"""Effects that act on other joints, too: an error of one position changes every torque, a load those before it."""
 JOINT_EFFECTS = sorted(
     name for name, e in catalogue().items() if e.linear and e.scope == "joint" and name not in ELSEWHERE
 )

@@ -264,11 +264,12 @@ def test_samples_read_without_waiting_explain_the_panda_three_times_better_on_it
 ) -> None:
     position, torque = panda_files
     as_read = import_recording(position, PANDA, effort=torque, rate_hz=1000.0)
-    (rows,), _ = experiments_from_recording(as_read, PANDA)
+    rows, _ = experiments_from_recording(as_read, PANDA)
     # The stamps of the reading program span 20.9991 s.
     assert len(panda.q) == 20_999
-    assert len(rows.q) == 20_544
-    assert 3 * panda_fit.relative_error_pct < least_squares([rows], PANDA).relative_error_pct
+    # Where rows are missing, all joints step: four rows are left out at each of three places.
+    assert [len(part.q) for part in rows] == [4948, 4942, 4838, 5804]
+    assert 3 * panda_fit.relative_error_pct < least_squares(rows, PANDA).relative_error_pct
 
 
 def test_the_panda_is_explained_and_its_last_third_predicted_up_to_1_8_percent(
