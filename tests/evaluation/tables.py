@@ -227,6 +227,10 @@ def _outside(scored: Sequence[Scored], failed: Sequence[Case]) -> Iterable[Outsi
         yield Outside(label, level, len(cases), lost, **shares, most_often=most_often)
 
 
+SEEN = ("unexplained", "low_confidence")
+"""Fates of an outside effect that are right: the verdict is not `no_gap`, and no cause is named with confidence."""
+
+
 def fate(score: Score) -> str:
     """Return the column of `Outside` for an effect outside the catalogue."""
     if score.confidence >= LOW_CONFIDENCE:
@@ -239,10 +243,10 @@ def fate(score: Score) -> str:
 
 
 def is_right(case: Case, score: Score) -> bool:
-    """``True`` if the right name comes first, a healthy arm is called healthy, an outside effect is not named."""
+    """``True``: right name first; a healthy arm called healthy; an outside effect seen and not named."""
     if not case.parts:
         return calm(case, score)
-    return fate(score) != "named" if case.kind == "outside" else score.first is True
+    return fate(score) in SEEN if case.kind == "outside" else score.first is True
 
 
 def aims(scored: Sequence[Scored], failed: Sequence[Case]) -> tuple[Aim, ...]:
@@ -265,7 +269,7 @@ def aims(scored: Sequence[Scored], failed: Sequence[Case]) -> tuple[Aim, ...]:
         return (
             right("visible effects named first", "effect", 0.95),
             right("healthy arms called healthy", "clean", 0.99),
-            right("visible effects outside the catalogue not named", "outside", 0.95),
+            right("visible effects outside the catalogue seen and not named", "outside", 0.95),
             right("set-up mistakes named first", "setup", 0.98),
             aim(f"gap closed by {CLOSED:.0%} or more", gaps, 0.9),
         )
@@ -291,7 +295,7 @@ def aims(scored: Sequence[Scored], failed: Sequence[Case]) -> tuple[Aim, ...]:
         aim("healthy arms with verdict no_gap", [calm(c, s) for c, s in mine if not c.parts], 0.99),
         aim(
             "outside the catalogue, gap in the data: unexplained or low confidence",
-            [f in ("unexplained", "low_confidence") for f in outside],
+            [f in SEEN for f in outside],
             0.90,
         ),
         # A share above 1 does not compensate for another case.
