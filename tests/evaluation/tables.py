@@ -227,7 +227,7 @@ def _outside(scored: Sequence[Scored], failed: Sequence[Case]) -> Iterable[Outsi
         yield Outside(label, level, len(cases), lost, **shares, most_often=most_often)
 
 
-SEEN = ("unexplained", "low_confidence")
+SEEN_UNNAMED = ("unexplained", "low_confidence")
 """Fates of an outside effect that are right: the verdict is not `no_gap`, and no cause is named with confidence."""
 
 
@@ -246,7 +246,7 @@ def is_right(case: Case, score: Score) -> bool:
     """``True``: right name first; a healthy arm called healthy; an outside effect seen and not named."""
     if not case.parts:
         return calm(case, score)
-    return fate(score) in SEEN if case.kind == "outside" else score.first is True
+    return fate(score) in SEEN_UNNAMED if case.kind == "outside" else score.first is True
 
 
 def aims(scored: Sequence[Scored], failed: Sequence[Case]) -> tuple[Aim, ...]:
@@ -295,7 +295,7 @@ def aims(scored: Sequence[Scored], failed: Sequence[Case]) -> tuple[Aim, ...]:
         aim("healthy arms with verdict no_gap", [calm(c, s) for c, s in mine if not c.parts], 0.99),
         aim(
             "outside the catalogue, gap in the data: unexplained or low confidence",
-            [f in SEEN for f in outside],
+            [f in SEEN_UNNAMED for f in outside],
             0.90,
         ),
         # A share above 1 does not compensate for another case.

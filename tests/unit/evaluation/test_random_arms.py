@@ -98,6 +98,9 @@ def test_unnamed_terms_close_the_gap_and_name_nothing() -> None:
     assert found.named == ()
     assert is_right(outside, found)
     assert not is_right(outside, scored(outside, document(finding("backlash", "axis_1"))))
+    # Silence is wrong: the effect is in the data.
+    assert not is_right(outside, scored(outside, document(verdict="no_gap")))
+    assert is_right(outside, scored(outside, document(verdict="unexplained")))
 
 
 def test_a_healthy_arm_is_calm_without_names_and_without_a_gap() -> None:
