@@ -21,7 +21,8 @@ class Criteria:
         in 200 years of weekly runs.
     material_pct
         Least change of a joint's torque by a finding, percent of the root mean square of its torque. Smaller effects
-        are listed as negligible. Chosen by the user (``--material``).
+        are listed as negligible. Chosen by the user (``--material``). A lack of fit is material if the joint's error on
+        the report part falls by as much without it.
     least_share
         Least share of the power of a joint's predicted errors that a finding removes. A smaller one changes the error
         by less than 2 %, which is no cause of a gap.

@@ -167,7 +167,13 @@ class LackOfFit:
         """True if a dependence is significant and material."""
         j = test.joint if isinstance(test, Projection) else joint
         torque = np.concatenate([s.y[:, j] for s in self.fit.study.train])
-        size = 100.0 * test.size / max(float(np.sqrt(np.mean(torque**2))), 1e-300)
+        if isinstance(test, SpectralLine):
+            fall = test.size
+        else:
+            # By how much the held-out error of the joint falls without it.
+            error = np.concatenate([e[:, j] for e in self.fit.errors(self.fit.theta, held=True)])
+            fall = float(np.sqrt(np.mean(error**2)) * (1.0 - np.sqrt(max(1.0 - test.share, 0.0))))
+        size = 100.0 * fall / max(float(np.sqrt(np.mean(torque**2))), 1e-300)
         material = test.share >= self.criteria.least_share and size >= self.criteria.material_pct
         return material and self._significant(test)
 
