@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from armident.configs import RobotConfig
 from armident.daq.recording.faults.jumps import JumpCriteria, jumps, unwrapped
 from armident.daq.recording.faults.zeros import switched_off, zero_rows
-from armident.daq.recording.model import Gap, Recording, Side
+from armident.daq.recording.model import Gap, Quantity, Recording, Side
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -18,7 +18,7 @@ REASON = "impossible values"
 """Reason of the gaps that a repair leaves."""
 REPAIRS = "repairs"
 """Key of the metadata with a line for each kind of fault that an import has repaired."""
-EFFORTS = ("torque", "current", "voltage")
+EFFORTS: tuple[Quantity, ...] = ("torque", "current", "voltage")
 CUT = 4
 """Rows that are left out at a step of all joints: longer than the gaps that are interpolated."""
 NEAR = 8
@@ -151,7 +151,7 @@ def repaired(recording: Recording) -> tuple[Recording, tuple[str, ...]]:
     before = tuple(line for line in recording.metadata.get(REPAIRS, "").split("\n") if line)
     samples, robot = recording.samples, recording.robot
     position = samples.named("position")
-    effort = next((name for quantity in EFFORTS if (name := samples.named(quantity))), None)  # type: ignore[arg-type]
+    effort = next((name for quantity in EFFORTS if (name := samples.named(quantity))), None)
     if position is None or effort is None or samples.sync.size < 2:
         return recording, before
     q, tau = samples.si(position), samples.si(effort)

@@ -18,7 +18,7 @@ BOTH_DIRECTIONS = (
     "friction: mean of both directions; a change of one direction counts half, its other half is an offset that is not "
     "tested; reidentify and compare test it"
 )
-"""What the friction of the table is, and what it does not show."""
+"""Note under the table of friction: one-sided friction counts half in it."""
 
 
 def joint_states(result: RecursiveResult) -> list[str]:

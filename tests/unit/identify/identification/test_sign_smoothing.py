@@ -1,7 +1,7 @@
 """Smoothing of the sign by the speeds of each joint."""
 
 from collections.abc import Callable
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 import pytest
@@ -92,11 +92,15 @@ def with_friction(law: Callable[[NDArray[np.float64]], NDArray[np.float64]], see
     return Experiment(derivative(0), force + 0.2 * np.random.default_rng(seed).normal(size=force.shape), None, DT)
 
 
+def smoothed_sign(width: float, speed: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.asarray(2 / np.pi * np.arctan(speed / width))
+
+
 def test_intervals_hold_the_width_of_the_transition() -> None:
     inside = []
     for seed in range(12):
         width = 4e-4 * 1.15**seed
-        simulated = with_friction(lambda speed, w=width: 2 / np.pi * np.arctan(speed / w), seed)  # type: ignore[misc]
+        simulated = with_friction(partial(smoothed_sign, width), seed)
         found = identify_experiment(simulated, lift(), Options(method="idim-ls")).transitions["lift"]
         assert found.velocity == pytest.approx(width, rel=0.3)
         inside.append(found.low <= width <= found.high)

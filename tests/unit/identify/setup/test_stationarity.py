@@ -75,8 +75,8 @@ def test_a_part_that_is_picked_up_is_a_load_at_the_last_joint(seed: int) -> None
     for axis, c in zip("xyz", centre, strict=True):
         part[names.index(f"m{axis}3")] = mass * c
     inertia = mass * (centre @ centre * np.eye(3) - np.outer(centre, centre))
-    for (i, k), name in zip(((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)), ("xx", "xy", "xz", "yy", "yz", "zz"), strict=True):  # fmt: skip  # noqa: E501
-        part[names.index(f"{name}3")] = inertia[i, k]
+    for i, k in zip(*np.triu_indices(3), strict=True):
+        part[names.index(f"{'xyz'[i]}{'xyz'[k]}3")] = inertia[i, k]
     e, at = recorded(robot, seed), 12.0 - seed
     qd = np.gradient(e.q, e.dt, axis=0)
     smooth = np.ones(25) / 25
