@@ -236,15 +236,18 @@ def _identify_part(subject: Subject, out: Path) -> tuple[Identified, Subject]:
     log.info(f"part 1: record a virtual {robot.name} at {_rate(session)} and identify its dynamic model")
     truth_file = out / "truth.json"
     while True:
-        # The worker waits for the recording that follows; those of earlier attempts and runs are not its work.
+        # The worker waits for the recording that follows, from the stream or in its file; those of earlier attempts and
+        # runs are not its work.
         for path in out.glob("worker.sqlite*"):
             path.unlink()
-        session = session.model_copy(update={"recording": session.recording.model_copy(update={"directory": out})})
-        config = _write_session(session, out, "cell")
+        recordings = out / "recordings" / time.strftime("%Y%m%dT%H%M%S")
+        update = {"recording": session.recording.model_copy(update={"directory": recordings})}
+        config = _write_session(session.model_copy(update=update), out, "cell")
         options = ["--config", str(config), "--once", "--out", str(out)]
         with _running("worker", ["worker", *options], out, "worker: ready", PATIENT) as worker:
             log.info("worker: ready")
-            recorded = _record("capture", config, out, [*subject.robot_options, "--truth", str(truth_file)])
+            robot_options = [*subject.robot_options, "--truth", str(truth_file)]
+            recorded = _record("capture", config, out, recordings, robot_options)
             slower = _slower(session)
             if recorded.lost_share > MAX_LOST_SHARE and slower is not None:
                 log.info(
@@ -275,7 +278,8 @@ def _diagnose_part(subject: Subject, out: Path) -> Diagnosed:
             update={"setpoints": session.setpoints.model_copy(update={"repeat": subject.repeats})}
         )
     config = _write_session(session, out, "cell_worn")
-    recorded = _record("capture_worn", config, out, [*subject.robot_options, "--scenario", str(subject.scenario)])
+    robot_options = [*subject.robot_options, "--scenario", str(subject.scenario)]
+    recorded = _record("capture_worn", config, out, out / "recordings", robot_options)
     log.info("diagnosing")
     folder = out / "diagnosis"
     with _running("diagnose", ["diagnose", str(recorded.path), "--out", str(folder), "--json"], out) as diagnosis:
@@ -293,11 +297,11 @@ def _diagnose_part(subject: Subject, out: Path) -> Diagnosed:
     return Diagnosed(document, folder / "report.html", hidden)
 
 
-def _record(name: str, config: Path, out: Path, robot_options: Sequence[str]) -> Recorded:
+def _record(name: str, config: Path, out: Path, recordings: Path, robot_options: Sequence[str]) -> Recorded:
     """Start the virtual arm, capture it to the end of its trajectory, and stop it."""
     with ExitStack() as stack:
         _start_robot(config, out, stack, robot_options)
-        options = ["--config", str(config), "--out", str(out / "recordings"), "--json"]
+        options = ["--config", str(config), "--out", str(recordings), "--json"]
         capture = stack.enter_context(_running(name, ["capture", *options], out))
         # A late heartbeat ends a capture with exit code 1; on a busy machine this counts as lost samples.
         capture.wait(PART_S, accepted=(0, 1))

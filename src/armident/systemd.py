@@ -42,7 +42,7 @@ class Notifier:
     def _send(self, state: str) -> None:
         if self._socket is not None:
             try:
-                self._socket.sendto(state.encode(), self._address)
+                self._socket.sendto(state.encode(), socket.MSG_DONTWAIT, self._address)
             except OSError:
                 # The manager has ended or its buffer is full: the service goes on without it.
                 return

@@ -237,6 +237,26 @@ def test_status_tells_what_the_worker_does(captured: Recording, session: Session
     assert "identifying" in states
 
 
+def test_a_signal_at_the_end_of_the_timeout_does_not_stop_the_wait(
+    session: SessionConfig, captured: Recording, tmp_path: Path
+) -> None:
+    began, worker = time.monotonic(), Worker(session, captured.robot, tmp_path)
+
+    def late(_signal: int, _frame: object) -> None:
+        time.sleep(0.005)
+        if time.monotonic() > began + 5.0:
+            raise TimeoutError("a wait of 2 ms does not end")
+
+    before = signal.signal(signal.SIGALRM, late)
+    signal.setitimer(signal.ITIMER_REAL, 0.01, 0.0107)
+    try:
+        while time.monotonic() < began + 1.0:
+            assert worker.result(timeout=0.002) is None
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, before)
+
+
 def test_sigterm_ends_a_waiting_worker_cleanly(tmp_path: Path) -> None:
     command = [
         sys.executable,

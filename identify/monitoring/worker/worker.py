@@ -70,7 +70,8 @@ class Worker:
         self._options = options_of(session)
         self._keys = Keys(session.cell, robot.name)
         self._owner = unique_owner()
-        self._results: queue.SimpleQueue[int] = queue.SimpleQueue()
+        # Not SimpleQueue: a signal that comes as its timeout ends makes it wait forever (CPython 3.11).
+        self._results: queue.Queue[int] = queue.Queue()
         self._buffer = StreamBuffer()
         self._lock = threading.Lock()
         self._intake = Intake(session.cell, robot.name, self._folder, self._buffer, self._lock, self._refuse)

@@ -159,6 +159,8 @@ def test_states_reach_the_service_manager(tmp_path: Path, monkeypatch: pytest.Mo
         notifier.progress("SYNC 5")
         notifier.stopping()
         received = [manager.recv(200).decode() for _ in range(3)]
+        for _ in range(1000):  # a manager that reads nothing: its buffer is full, and the service goes on
+            notifier.progress("SYNC 6")
         os.unlink(tmp_path / "notify")
         notifier.progress("no manager receives this")
         notifier.close()
