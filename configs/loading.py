@@ -15,6 +15,7 @@ from armident.configs.schema.session import DriveNode, SessionConfig
 from armident.configs.schema.trajectory import Trajectory
 from armident.configs.suspected_units import suspected_units
 from armident.configs.urdf import UrdfGeometry, geometry_from_urdf, urdf_file
+from armident.configs.urdf_file import limit_places
 from armident.configs.urdf_inertials import UrdfInertials, read_inertials
 from armident.configs.urdf_shapes import UrdfShapes, read_shapes
 from armident.configs.yaml_loader import is_file, read_yaml
@@ -136,7 +137,15 @@ def _robot(path: Path) -> RobotConfig:
     suspected = suspected_units(robot, geometry="urdf" not in file_keys)
     if suspected:
         raise ConfigError(f"{path}: expected rad and m: {'; '.join(suspected[:3])}{_others(len(suspected) - 3)}")
-    return robot
+    return robot if given is None else robot.with_limit_places(_limit_places(robot, given, path))
+
+
+def _limit_places(robot: RobotConfig, given: UrdfGeometry, path: Path) -> tuple[str, ...]:
+    """File and line of the limits of velocity and torque of each joint: of the URDF, or of the file that adds to it."""
+    own = {more.name for more in given.joints if {"velocity", "torque"} & more.limits.model_fields_set}
+    names = [joint.source_name or joint.name for joint in robot.joints]
+    places = limit_places(urdf_file(given, path), names)
+    return tuple(path.name if name in own else place for name, place in zip(names, places, strict=True))
 
 
 def checked_robot(data: dict[str, Any], where: str) -> RobotConfig:

@@ -1,5 +1,6 @@
 """Reading of the XML of a URDF file."""
 
+import re
 import xml.etree.ElementTree as ET
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -55,6 +56,18 @@ def parse_urdf(file: Path) -> ET.Element:
     if root.tag == "robot":
         _check_names(file, root)
     return root
+
+
+def limit_places(file: Path, joints: Iterable[str]) -> tuple[str, ...]:
+    """File and line of the limits of joints of a URDF; the file alone where its text has none in plain sight."""
+    text = file.read_text(encoding="utf-8", errors="replace")
+    places = []
+    for joint in joints:
+        name = re.escape(joint)
+        found = re.search(rf"<joint\b[^>]*?\bname\s*=\s*[\"']{name}[\"'].*?(<limit\b|</joint>)", text, re.DOTALL)
+        line = 0 if found is None or found[1] == "</joint>" else text.count("\n", 0, found.start(1)) + 1
+        places.append(f"{file.name}, line {line}" if line else file.name)
+    return tuple(places)
 
 
 def _parsed(file: Path, content: bytes) -> ET.Element:

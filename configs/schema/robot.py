@@ -4,7 +4,7 @@ from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, model_validator
+from pydantic import Field, PrivateAttr, model_validator
 
 from armident.configs.blanks import check_filled, needed
 from armident.configs.errors import ConfigError
@@ -273,6 +273,7 @@ class RobotConfig(WithBlanks):
         None, description="filters of a published IDIM-LS fit, with a sharp sign(qd); None: from the bandwidth"
     )
     collision: Collision | None = None
+    _limit_places: tuple[str, ...] = PrivateAttr(())
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
@@ -313,6 +314,21 @@ class RobotConfig(WithBlanks):
     def n(self) -> int:
         """Number of joints."""
         return len(self.joints)
+
+    def __eq__(self, other: object) -> bool:
+        """Return ``True`` for the same robot, wherever its limits were read."""
+        return isinstance(other, RobotConfig) and self.__dict__ == other.__dict__
+
+    @property
+    def limit_places(self) -> tuple[str, ...]:
+        """File and line of each joint's limits where they come from a URDF; empty otherwise."""
+        return self._limit_places or ("",) * self.n
+
+    def with_limit_places(self, places: tuple[str, ...]) -> Self:
+        """Return the robot with the file and line of each joint's limits, which no document of it contains."""
+        made = self.model_copy()
+        made._limit_places = places
+        return made
 
     @property
     def sign_smoothing(self) -> NDArray[np.float64]:

@@ -14,6 +14,7 @@ from armident.configs.blanks import MARK, without_marks
 from armident.configs.loading import checked_robot
 from armident.configs.schema.robot import Mdh
 from armident.configs.urdf import UrdfGeometry, UrdfSource, geometry_from_urdf, joint_names
+from armident.configs.urdf_file import limit_places
 from armident.configs.urdf_tree import coarse_right_angles, moving_links, orientation, robot_name, serial_tips
 from armident.configs.yaml_loader import is_file, read_yaml
 
@@ -125,6 +126,7 @@ def _of_chain(file: Path, out: Path, base: str | None, tip: str | None) -> Geome
     urdf = {"file": os.path.relpath(part.file, out.resolve()), **part.model_dump(exclude={"file"}, exclude_none=True)}
     name = name_from(robot_name(file) or file.stem)
     robot = checked_robot({"schema": "armident/robot/1", "name": name, **made}, str(file))
+    robot = robot.with_limit_places(limit_places(file, [joint.source_name or joint.name for joint in robot.joints]))
     content: dict[str, Any] = {
         "schema": "armident/robot/1",
         "name": name,

@@ -9,6 +9,7 @@ from armident.configs.schema.robot import RobotConfig
 from armident.daq.init.geometry import UPRIGHT, Geometry
 from armident.daq.init.recorded_facts import RecordedFacts, moved
 from armident.daq.init.yaml_text import Noted
+from armident.daq.interchange.si_checks import PASSED
 
 SYNC_US = (100, 1_000_000)
 """Shortest and longest SYNC period of a session, us."""
@@ -74,6 +75,13 @@ def _joint(
             note = "reached in the recording; the arm's own limit is higher"
             own["acceleration"] = Noted(float(f"{facts.acceleration[k]:.3g}"), _once(hinted, note, note))
         made["limits"] = own
+    if facts is not None:
+        reached = {"velocity": facts.velocity[k], "torque": facts.effort[k] if facts.signal == "torque" else 0.0}
+        passed = {key: value for key, value in reached.items() if value > PASSED * getattr(joint.limits, key)}
+        for key, value in passed.items():
+            source = robot.limit_places[k] or "the source"
+            note = f"reached in the recording; {source} has {getattr(joint.limits, key):.4g}"
+            made["limits"] = {**made.get("limits", {}), key: Noted(float(f"{value:.3g}"), note)}
     known = entry.get("drive", {})
     if signal is not None and known.get("signal", "current") != signal:
         # Scales of another effort do not hold; the encoder is the same.

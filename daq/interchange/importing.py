@@ -18,7 +18,7 @@ from armident.daq.interchange.import_options import ImportOptions
 from armident.daq.interchange.lerobot import data_files
 from armident.daq.interchange.readers import check_options, reader_of
 from armident.daq.interchange.resampling import Sampled, at_rate, sampled
-from armident.daq.interchange.si_checks import OMITTED, check_units, fast_note, si_unit_of
+from armident.daq.interchange.si_checks import OMITTED, check_units, limit_notes, si_unit_of
 from armident.daq.interchange.stated_units import in_si
 from armident.daq.interchange.table_columns import NAMES
 from armident.daq.interchange.table_files import Source
@@ -145,7 +145,7 @@ def _from_table(robot: RobotConfig, source: Source, options: ImportOptions, fact
         raise type(error)(shown if shown.startswith(str(path)) else f"{path}: {shown}") from error
     notes = (*source.notes, *rows.notes, *made.notes)
     if not motor_side:
-        notes += fast_note(robot, made.values["position"], made.rate_hz)
+        notes += limit_notes(robot, made.values["position"], made.values.get("torque"), made.rate_hz)
     for note in notes:
         logging.getLogger(__name__).warning("%s: %s", path, note)
     remarks = {NOTES: "; ".join(notes)} if notes else {}

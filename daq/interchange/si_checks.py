@@ -20,6 +20,8 @@ _PLAUSIBLE = 1.5
 
 _FASTEST = 3.0
 """Velocities beyond this multiple of the joint's limit are taken as a wrong unit."""
+PASSED = 1.05
+"""Share of a limit that passes it: a limit that is rounded to two digits errs by 5 % at most."""
 _WINDOWS = 200
 """Velocities are differences over this part of the recording."""
 
@@ -84,8 +86,10 @@ def _other_unit(name: str, kind: str, shares: NDArray[np.float64]) -> str:
     )
 
 
-def fast_note(robot: RobotConfig, position: NDArray[np.float64], rate_hz: float) -> tuple[str, ...]:
-    """Return a sentence on joints whose positions (N, n) move far beyond their velocity limits, if they have one."""
+def limit_notes(
+    robot: RobotConfig, position: NDArray[np.float64], torque: NDArray[np.float64] | None, rate_hz: float
+) -> tuple[str, ...]:
+    """Return a sentence on the limits that positions and torques (N, n) pass, if there are any."""
     # An odd number of rows, so that the values of two sources in turn show.
     apart = len(position) // _WINDOWS | 1
     if len(position) <= apart:
@@ -93,12 +97,31 @@ def fast_note(robot: RobotConfig, position: NDArray[np.float64], rate_hz: float)
     limits = np.array([joint.limits.velocity or np.inf for joint in robot.joints])
     speeds = np.quantile(np.abs(position[apart:] - position[:-apart]), 0.99, axis=0) * rate_hz / apart
     fast = [joint.name for joint, share in zip(robot.joints, speeds / limits, strict=True) if share > _FASTEST]
-    if not fast:
+    if fast:
+        most = float((speeds / limits).max())
+        return (
+            f"{', '.join(fast)}: velocities of up to {most:.3g} times the limit; check for positions in degrees "
+            "(--units position=deg), times in another unit (--time-unit), or two sources of one joint",
+        )
+    peaks = np.zeros(robot.n) if torque is None else np.quantile(np.abs(torque), 0.99, axis=0)
+    passed = []
+    for joint, place, speed, peak in zip(robot.joints, robot.limit_places, speeds, peaks, strict=True):
+        revolute = joint.type == "revolute"
+        each = [
+            f"{limit:.4g} {unit}, reached {value:.3g}"
+            for value, limit, unit in (
+                (speed, joint.limits.velocity or np.inf, "rad/s" if revolute else "m/s"),
+                (peak, joint.limits.torque or np.inf, "N m" if revolute else "N"),
+            )
+            if value > PASSED * limit
+        ]
+        if each:
+            passed.append(f"{joint.name} {' and '.join(each)}{f' ({place})' if place else ''}")
+    if not passed:
         return ()
-    most = float((speeds / limits).max())
     return (
-        f"{', '.join(fast)}: velocities of up to {most:.3g} times the limit; check for positions in degrees "
-        "(--units position=deg), times in another unit (--time-unit), or two sources of one joint",
+        f"the motion passes limits, which are too small then: {', '.join(passed)}. Correct them under joints: limits "
+        "of the configuration, from which trajectories and exports take them",
     )
 
 

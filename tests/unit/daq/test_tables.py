@@ -263,7 +263,9 @@ def test_positions_in_degrees_and_torques_in_mn_m_name_the_option(tmp_path: Path
     values[:, 1 : N + 1] *= 180 / np.pi
     remarks = import_recording(written(tmp_path / "c.csv", values), endless).metadata["source_remarks"]
     assert "times the limit; check for positions in degrees (--units position=deg)" in remarks
-    assert "source_remarks" not in import_recording(written(tmp_path / "d.csv", motion()), endless).metadata
+    said = import_recording(written(tmp_path / "d.csv", motion()), endless).metadata["source_remarks"]
+    assert "joint_3 2 rad/s, reached 2.25" in said
+    assert "joint_2" not in said
 
 
 def test_a_demand_that_is_not_found_can_be_omitted(tmp_path: Path) -> None:
