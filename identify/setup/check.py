@@ -70,6 +70,7 @@ def _check(experiments: Sequence[Experiment], robot: RobotConfig) -> SetupCheck:
         return SetupCheck(tuple(findings), nothing, nothing, (), ("standstill",), None)
     findings += signals.clipped_findings(experiments, robot, moving)
     findings += signals.held_findings(experiments, robot)
+    findings += signals.one_way_findings(experiments, robot, moving)
     damaged = signals.step_findings(experiments, robot)
     if damaged:
         # No correction is right beside signals that are wrong for a part of the time.

@@ -45,6 +45,12 @@ CLIPPED_UNUSABLE = 0.05
 SHOWN = 4
 """Events that a message lists."""
 
+TURN_PARTS = 200
+"""Parts of a recording whose displacements tell the direction: a motion of 10 s at 1 Hz has ten parts each way."""
+
+ONE_WAY_SHARE = 0.01
+"""Share of a joint's travel against its main direction below which it turns one way only, as that of a held joint."""
+
 REST_REMEDY = "record a motion of all joints: armident trajectory designs one"
 
 CLIPPED_REMEDY = "record a gentler motion, or with a wider range of the torque signal"
@@ -155,6 +161,24 @@ def rest_findings(moving: NDArray[np.bool_], robot: RobotConfig) -> list[SetupFi
     verb = "does" if len(still) == 1 else "do"
     message = f"{', '.join(still)} {verb} not move: the recordings do not determine their inertia and friction"
     return [SetupFinding("joint_at_rest", still, 1.0, message, REST_REMEDY, False)]
+
+
+def one_way_findings(
+    experiments: Sequence[Experiment], robot: RobotConfig, moving: NDArray[np.bool_]
+) -> list[SetupFinding]:
+    """Return a finding for the moving joints that turn in one direction only."""
+    # Steps that the noise of the encoder does not turn round.
+    steps = np.concatenate([np.diff(e.q[:: max(1, e.q.shape[0] // TURN_PARTS)], axis=0) for e in experiments])
+    up, down = np.maximum(steps, 0.0).sum(axis=0), np.maximum(-steps, 0.0).sum(axis=0)
+    chosen = np.flatnonzero(moving & (np.minimum(up, down) < ONE_WAY_SHARE * (up + down)))
+    if not chosen.size:
+        return []
+    names = tuple(robot.joints[j].name for j in chosen)
+    message = (
+        f"{', '.join(names)} {'turns' if chosen.size == 1 else 'turn'} in one direction only: dry friction cannot be "
+        "told from an offset of the torque"
+    )
+    return [SetupFinding("one_direction", names, 1.0, message, "record a motion in both directions", False)]
 
 
 def clipped_findings(

@@ -9,6 +9,7 @@ import pytest
 from armident.configs import DataError, RobotConfig, load_robot
 from armident.identify.identification.from_recording import experiments_from_recording
 from armident.identify.setup.check import check_setup
+from armident.identify.setup.signals import one_way_findings
 from armident.identify.signals.experiments import Experiment
 from tests.fixtures import setups
 from tests.fixtures.arms import FAST, recording
@@ -268,6 +269,20 @@ def test_a_joint_at_rest_is_named_and_not_judged(arm: RobotConfig, healthy: list
     found = check_setup(parts, arm)
     assert ("joint_at_rest", ("axis_3",), False) in [(f.kind, f.joints, f.decisive) for f in found.findings]
     assert "axis_3" not in found.joints_not_understood
+
+
+def test_a_joint_that_turns_one_way_only_is_named(arm: RobotConfig, healthy: list[Experiment]) -> None:
+    moving, rng = np.ones(3, dtype=np.bool_), np.random.default_rng(0)
+    assert one_way_findings(healthy, arm, moving) == []
+    forward = []
+    for e in healthy:
+        q = e.q.copy()
+        q[:, 1] = np.cumsum(np.abs(np.gradient(e.q[:, 1]))) + 1e-4 * rng.standard_normal(len(q))
+        forward.append(replace(e, q=q))
+    (finding,) = one_way_findings(forward, arm, moving)
+    assert (finding.joints, finding.decisive) == (("axis_2",), False)
+    # There and back: the direction of the second recording counts, too.
+    assert one_way_findings([forward[0], replace(forward[0], q=-forward[0].q)], arm, moving) == []
 
 
 @pytest.mark.slow
