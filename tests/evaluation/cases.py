@@ -11,7 +11,7 @@ from armident.configs import ConfigError
 from tests.evaluation.schema import LEVELS, Level, SuiteConfig, SuiteEffect
 
 Kind = Literal["clean", "clean_baseline", "effect", "pair", "outside", "setup"]
-Half = Literal["development", "reserve"]
+Half = Literal["development", "validation", "reserve"]
 
 BASELINE_SEED = 9000
 """Noise seed of the healthy runs from which baselines are identified; no case has it."""
@@ -21,7 +21,7 @@ VISIBLE = 1.05
 """Visibility from which a random effect counts: the residual of the rigid model is 5 % larger (docs/diagnosis.md)."""
 SEEN, UNSEEN = "visible", f"below {VISIBLE}"
 """Levels of random arms."""
-BLOCK: dict[Half, int] = {"development": 88, "reserve": 176}
+BLOCK: dict[Half, int] = {"development": 88, "validation": 176, "reserve": 176}
 """Random arms of a run where no number is given; every kind has its share of 88 cases."""
 
 

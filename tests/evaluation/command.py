@@ -31,12 +31,12 @@ def suite(
         Literal["two-robots", "random"], typer.Option("--arms", help="The two virtual robots, or arms drawn at random.")
     ] = "two-robots",
     half: Annotated[
-        Literal["development", "reserve"],
-        typer.Option("--half", help="Half of the random arms; of the reserve only totals are shown and kept."),
+        Literal["development", "validation", "reserve"],
+        typer.Option("--half", help="Set of random arms; of the reserve only totals are shown and kept."),
     ] = "development",
     cases: Annotated[
         int | None,
-        typer.Option("--cases", help="First cases only. [default: all; random 88, reserve 176]", min=1),
+        typer.Option("--cases", help="First cases only. [default: all; random 88, validation and reserve 176]", min=1),
     ] = None,
     json: Annotated[bool, typer.Option("--json", help="Print only the result document on stdout.")] = False,
 ) -> None:

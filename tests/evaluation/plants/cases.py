@@ -127,7 +127,7 @@ def make_case(half: Half, index: int, *, with_twin: bool = False) -> RandomCase:
     """
     family, kind = kind_of(half, index)
     ranges = HALVES[half]
-    name = f"{'dev' if half == 'development' else 'reserve'}_{index:04d}"
+    name = f"{half}_{index:04d}"
     best: RandomCase | None = None
     for attempt in range(ATTEMPTS):
         try:

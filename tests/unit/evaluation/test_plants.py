@@ -19,7 +19,7 @@ from tests.evaluation.plants.disk import write_case, write_recordings
 from tests.evaluation.plants.draft import configuration, draw_draft
 from tests.evaluation.plants.effects import NAMED, OUTSIDE
 from tests.evaluation.plants.friction import friction_impulses, one_impulse
-from tests.evaluation.plants.halves import DEVELOPMENT, HALVES, RESERVE, Half
+from tests.evaluation.plants.halves import DEVELOPMENT, HALVES, VALIDATION, Half
 from tests.evaluation.plants.mistakes import MISTAKES
 from tests.evaluation.plants.slots import COULOMB, SMOOTHING, VISCOUS
 from tests.evaluation.plants.truth import ACCEPTED, SHARES, block
@@ -79,10 +79,11 @@ def test_every_body_exists_and_every_joint_resists(seed: int, half: Half) -> Non
 
 
 def test_the_halves_differ_in_seeds_and_ranges() -> None:
-    assert DEVELOPMENT.entropy != RESERVE.entropy
+    assert len({ranges.entropy for ranges in HALVES.values()}) == len(HALVES)
     ranges = ("mass", "length", "ratio", "dry", "noise", "bandwidth", "rates", "wider")
-    assert all(getattr(DEVELOPMENT, name) != getattr(RESERVE, name) for name in ranges)
-    assert [kind_of("development", k) for k in range(BLOCK)] != [kind_of("reserve", k) for k in range(BLOCK)]
+    assert all(getattr(DEVELOPMENT, name) != getattr(VALIDATION, name) for name in ranges)
+    orders = {tuple(kind_of(half, k) for k in range(BLOCK)) for half in HALVES}
+    assert len(orders) == len(HALVES)
 
 
 @pytest.mark.parametrize("half", HALVES)
