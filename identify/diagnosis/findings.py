@@ -18,7 +18,7 @@ from armident.identify.effects.effect import Effect
 from armident.identify.effects.parameter_change import ParameterChange
 from armident.identify.effects.registry import catalogue, known, of_entry
 from armident.identify.effects.unnamed import NAME as UNNAMED
-from armident.identify.effects.wiring import Wiring
+from armident.identify.effects.wiring import SignalMistake
 
 Array = NDArray[np.float64]
 
@@ -184,7 +184,7 @@ def undetectable(state: ModelState, hidden: frozenset[Key]) -> list[NotVisible]:
     motion = ColumnCache(study, state.fit.theta).motion(study.train[0], "measured")
     found: dict[tuple[str, str], NotVisible] = {}
     for effect in catalogue().values():
-        if isinstance(effect, Wiring) or effect.two_joints or effect.law:
+        if isinstance(effect, SignalMistake) or effect.two_joints or effect.law:
             continue
         for place in effect.places(study.robot.n):
             reason = effect.invisible(motion, place)

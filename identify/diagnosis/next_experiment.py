@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from armident.identify.effects.effect import Effect
-from armident.identify.effects.wiring import Wiring
+from armident.identify.effects.wiring import SignalMistake
 
 CONTAINS = {
     "slow": "slow moves, under a twentieth of the joint's top speed",
@@ -26,12 +26,12 @@ def recommended_experiment(effect: Effect, joint: str, rivals: Sequence[Effect] 
     parts = [CONTAINS.get(tag, tag) for tag in kinds]
     contents = parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])}, and {parts[-1]}"
     if not others:
-        if isinstance(effect, Wiring):
+        if isinstance(effect, SignalMistake):
             return f"Check the wiring and the configuration of {joint}, then record the same motion again."
         return f"To confirm {effect.title} at {joint}, record {contents}: {_command(effect, joint)}"
     rival = others[0]
     text = f"To separate {effect.title} from {rival.title} at {joint}, record {contents}"
-    if isinstance(effect, Wiring) or isinstance(rival, Wiring):
+    if isinstance(effect, SignalMistake) or isinstance(rival, SignalMistake):
         return f"{text}, after checking the wiring."
     return f"{text}: {_command(effect, joint)} --against {rival.name}"
 

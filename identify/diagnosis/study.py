@@ -16,7 +16,7 @@ from armident.identify.effects.drive import Correction
 from armident.identify.effects.recording_corrections import corrected_experiments, of_recording
 from armident.identify.effects.registry import known
 from armident.identify.effects.terms import arm_model, terms_of
-from armident.identify.effects.wiring import Wiring
+from armident.identify.effects.wiring import SignalMistake
 from armident.identify.estimators.auxiliary_model import AuxiliaryModel
 from armident.identify.estimators.idim_ls import idim_ls
 from armident.identify.identification.auxiliary_loop import closed_loop
@@ -97,7 +97,9 @@ class Study:
         changed = replace(self, robot=robot, model=self.model.with_effects_of(robot, terms_of(robot)))
         if changed.recorded == self.recorded:
             return changed
-        wiring = [[s for s in study.recorded if isinstance(known(s.effect), Wiring)] for study in (self, changed)]
+        wiring = [
+            [s for s in study.recorded if isinstance(known(s.effect), SignalMistake)] for study in (self, changed)
+        ]
         return changed._with_torques(self.sources) if wiring[0] == wiring[1] else self._rebuilt(robot)
 
     def with_torque_shift(self, samples: float) -> "Study":

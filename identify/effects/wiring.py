@@ -9,9 +9,10 @@ from numpy.typing import NDArray
 
 from armident.configs import ConfigError, RobotConfig
 from armident.configs.schema.robot import Effect as Entry
-from armident.identify.effects.effect import UNITLESS, Effect, Place, Scope, Shape, Shapes
+from armident.identify.effects.effect import POSITION, UNITLESS, Effect, Place, Scope, Shape, Shapes
 from armident.identify.robot.motion import Motion
 from armident.identify.signals.experiments import Experiment
+from armident.identify.signals.streamed import mapped
 
 Array = NDArray[np.float64]
 
@@ -22,19 +23,10 @@ JOINT_SIDE = "joint_side"
 """Parameter with the value 1 where columns in SI units on the joint side are concerned, not raw numbers of drives."""
 
 
-class Wiring(Effect):
-    """Effect that exchanges signals or changes their signs or scales, and so adds no torque."""
+class SignalMistake(Effect):
+    """Mistake of recorded signals, which adds no torque."""
 
-    scope: Scope = "motor"
     linear = ()
-
-    @abstractmethod
-    def _exchange(self, n: int, first: int, second: int, value: float) -> Array:
-        """Return the matrix (n, n) that corrects a signal; ``second`` is ``first`` without another joint."""
-
-    def on_joint_side(self, entry: Entry) -> bool:
-        """Return True if an entry concerns columns in SI units on the joint side, False for raw numbers of drives."""
-        return bool(entry.parameters.get(JOINT_SIDE))
 
     def columns(self, motion: Motion, place: Place, shapes: Mapping[str, float]) -> Array:
         """Return no columns."""
@@ -47,6 +39,20 @@ class Wiring(Effect):
     def may_be_added(self, motion: Motion, place: Place, present: Sequence[Shapes]) -> bool:
         """Return False: it is no term of a model."""
         return False
+
+
+class Wiring(SignalMistake):
+    """Effect that exchanges signals or changes their signs or scales."""
+
+    scope: Scope = "motor"
+
+    @abstractmethod
+    def _exchange(self, n: int, first: int, second: int, value: float) -> Array:
+        """Return the matrix (n, n) that corrects a signal; ``second`` is ``first`` without another joint."""
+
+    def on_joint_side(self, entry: Entry) -> bool:
+        """Return True if an entry concerns columns in SI units on the joint side, False for raw numbers of drives."""
+        return bool(entry.parameters.get(JOINT_SIDE))
 
 
 class SignError(Wiring):
@@ -119,8 +125,34 @@ class SignalScale(Wiring):
         return True
 
 
-EFFECTS = (SignError, JointOrder, SignalScale)
-BY_NAME = {effect.name: effect() for effect in EFFECTS}
+class PositionOffset(SignalMistake):
+    """Another zero of the encoder than that of the model."""
+
+    name = "position_offset"
+    title = "a position with another zero"
+    description = "the encoder's zero is not the model's: a joint homed at another mark, an encoder mounted again"
+    reference = "CiA 402-2, object 607Ch (home offset)"
+    required_motion = "motion of the joints beyond it, with the joint at several positions"
+    settings = (Shape("offset", POSITION, "True less recorded position of the joint, on the joint side."),)
+
+
+EXCHANGES = (SignError, JointOrder, SignalScale)
+EFFECTS = (*EXCHANGES, PositionOffset)
+BY_NAME = {effect.name: effect() for effect in EXCHANGES}
+
+
+def with_zeros(experiments: Sequence[Experiment], robot: RobotConfig) -> Sequence[Experiment]:
+    """Return the experiments with the zeros of the configured position offsets."""
+    names = [joint.name for joint in robot.joints]
+    offsets = np.zeros(robot.n)
+    for entry in robot.effects:
+        if entry.effect == PositionOffset.name:
+            offsets[names.index(entry.joint)] += entry.parameters.get("offset", 0.0)
+    if not offsets.any():
+        return experiments
+    return mapped(
+        lambda e: replace(e, q=e.q + offsets, q_ref=None if e.q_ref is None else e.q_ref + offsets), experiments
+    )
 
 
 def rewired(experiments: Sequence[Experiment], robot: RobotConfig) -> Sequence[Experiment]:

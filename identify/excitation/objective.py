@@ -12,7 +12,7 @@ from armident.identify.diagnosis.candidates import Shapes
 from armident.identify.effects.effect import Effect, Place
 from armident.identify.effects.parameter_change import ParameterChange
 from armident.identify.effects.registry import known
-from armident.identify.effects.wiring import Wiring
+from armident.identify.effects.wiring import SignalMistake
 from armident.identify.robot.motion import Motion
 from armident.identify.signals.decimate import Decimation
 
@@ -118,7 +118,7 @@ def weighted_rows(x: Array, sigma: ArrayLike) -> Array:
 
 def _designable(name: str, option: str) -> Effect:
     effect = known(name)
-    if isinstance(effect, Wiring):
+    if isinstance(effect, SignalMistake):
         raise ConfigError(f"{option} {name}: visible in any motion, needs no special trajectory")
     return effect
 

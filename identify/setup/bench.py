@@ -1,7 +1,7 @@
 """Equations of the rigid arm for any assignment and scale of the signals, at a rate that suits the motion."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -211,6 +211,26 @@ class Bench:
     def everywhere(self) -> "Bench":
         """The same signals with equations at all instants, also at those at which a joint is at rest."""
         return self._with(self.rows_kept, True)
+
+    def moved(self, offsets: Array) -> "Bench":
+        """Return the bench with other zeros of the positions. ``offsets`` (n,): true less recorded ones, rad or m."""
+        segments = tuple(
+            replace(s, q=s.q + offsets, q_ref=None if s.q_ref is None else s.q_ref + offsets) for s in self.segments
+        )
+        return replace(self, segments=segments, _rows={}, _torques={})
+
+    def slopes(self, position: Array, gravity: Array, values: Array, step: float) -> Array:
+        """Torques (n, n, M) by each joint's position, per rad or m, under ``gravity`` (3,): joint moved, joint, row.
+
+        ``values`` (c,): parameters. ``step``: half the difference of positions, rad or m.
+        """
+        q, qd, qdd = (x @ position.T for x in self._motion)
+        model, base = self.model.with_gravity(gravity), values[: self.rigid]
+        ends = [
+            [(model.rigid_regressor(q + sign * offset, qd, qdd) @ base).T for sign in (1.0, -1.0)]
+            for offset in step * np.eye(self.n)
+        ]
+        return np.stack([(plus - minus) / (2.0 * step) for plus, minus in ends])
 
     def _with(self, rows: int, at_rest: bool) -> "Bench":
         return Bench(self.model, self.robot, self.segments, self.decimation, self.moving, self.period, rows, at_rest)

@@ -10,15 +10,17 @@ from threadpoolctl import threadpool_limits
 
 from armident.configs import DataError, RobotConfig
 from armident.identify.effects.recording_corrections import corrected_experiments
+from armident.identify.effects.wiring import PositionOffset
 from armident.identify.setup import signals
 from armident.identify.setup.bench import Bench, make_bench
 from armident.identify.setup.clipping import clipped_torques
-from armident.identify.setup.describe import described
+from armident.identify.setup.describe import described, effects_line
 from armident.identify.setup.fit import Hypothesis, joint_errors
 from armident.identify.setup.result import SetupCheck, SetupFinding, TorqueShift
 from armident.identify.setup.search import NOT_UNDERSTOOD, STRUCTURED, Search, Step
 from armident.identify.setup.stationarity import ChangedStretch, change_finding, spans, stretch
 from armident.identify.setup.torque_shift import SHIFT_RATE, long_torque_shift, torque_shift
+from armident.identify.setup.zero_offset import zero_offset
 from armident.identify.signals.experiments import Experiment, check_one_rate
 
 Array = NDArray[np.float64]
@@ -41,6 +43,7 @@ TRIED = {
     "side": "motor side taken for joint side, and the reverse",
     "gravity_direction": "any direction of gravity",
     "gravity_missing": "torques without gravity",
+    "position_offset": "another zero of each joint's position",
     "time_unit": "time in ms, us, ns",
     "time_shift": "all torques late or early by the same time",
 }
@@ -83,7 +86,7 @@ def _check(experiments: Sequence[Experiment], robot: RobotConfig) -> SetupCheck:
     if changed is not None:
         found = described(best, robot, bench)
         findings.append(change_finding(changed, bench, best.h))
-    tried, before = search.tried, _errors(bench, _as_configured(robot))
+    tried, before = search.tried | {PositionOffset.name: bench.n}, _errors(bench, _as_configured(robot))
     setup_findings, corrected = found.findings, found.robot
     clock = best.h.clock
     if clock != 1.0:
@@ -98,6 +101,12 @@ def _check(experiments: Sequence[Experiment], robot: RobotConfig) -> SetupCheck:
     if not any(finding.kind in ("torque_unit", "side") for finding in setup_findings):
         findings += signals.small_torque_findings(experiments, robot)
     findings += _clipped(bench, best, robot, {name for finding in findings for name in finding.joints})
+    zero = zero_offset(bench, best.h) if changed is None else None
+    if zero is not None:
+        bench, entry = zero.bench, zero.entry(robot)
+        findings.append(zero.finding(robot, effects_line([entry])))
+        so_far = robot if corrected is None else corrected
+        corrected = so_far.model_copy(update={"effects": (*so_far.effects, entry)})
     lost = _not_explained(bench, best)
     after = _errors(bench, best.h)
     if changed is not None:

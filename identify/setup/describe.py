@@ -164,7 +164,7 @@ def _order(
         columns = [names[int(np.flatnonzero(order == k)[0])] for k in range(len(names))]
         message = f"the {plural} are recorded in the order {', '.join(columns)}"
     joints = tuple(names[j] for j in moved)
-    return SetupFinding("joint_order", joints, share, message, _lines(entries), True), entries
+    return SetupFinding("joint_order", joints, share, message, effects_line(entries), True), entries
 
 
 def transpositions(order: NDArray[np.int64]) -> list[tuple[int, int]]:
@@ -191,7 +191,7 @@ def _raw_exchange(step: Step, k: int, robot: RobotConfig) -> tuple[SetupFinding,
     names = [robot.joints[j].name for j in pair]
     entry = Effect(effect="joint_order", joint=names[0], other=names[1], parameters={s: 1.0 for s in signals})
     message = f"{step.words[k]}: swapped node numbers or plugs of two drives"
-    return SetupFinding("joint_order", tuple(names), step.probability[k], message, _lines([entry]), True), [entry]
+    return SetupFinding("joint_order", tuple(names), step.probability[k], message, effects_line([entry]), True), [entry]
 
 
 def _sign(
@@ -205,7 +205,7 @@ def _sign(
     if rivals:
         message += f" (equally well explained by: {'; '.join(rivals)})"
     kind = "torque_sign" if tuple(signals) == ("torque",) else "position_sign"
-    return SetupFinding(kind, tuple(joints), share, message, _lines(entries), True), entries
+    return SetupFinding(kind, tuple(joints), share, message, effects_line(entries), True), entries
 
 
 def _scale(step: Step, k: int, robot: RobotConfig, bench: Bench) -> tuple[SetupFinding, list[Effect]]:
@@ -215,7 +215,7 @@ def _scale(step: Step, k: int, robot: RobotConfig, bench: Bench) -> tuple[SetupF
     joints = [int(j) for j in np.flatnonzero(changed)]
     names = tuple(robot.joints[j].name for j in joints)
     entries = [*_linear_map(position, "position", robot), *_linear_map(torque, "torque", robot)]
-    remedy, message = _lines(entries), step.words[k]
+    remedy, message = effects_line(entries), step.words[k]
     j = joints[0]
     if family == "gear_ratio":
         configured, true = robot.transmission_matrix[j, j], robot.transmission_matrix[j, j] / position[j, j]
@@ -274,7 +274,7 @@ def _late(step: Step, k: int, robot: RobotConfig, bench: Bench) -> tuple[SetupFi
     message = f"all torques are {1000 * abs(shift):.3g} ms {direction} against the positions"
     if np.isfinite(step.shift_std):
         message += f" (standard deviation {1000 * step.shift_std:.2g} ms)"
-    remedy = _lines(entries)
+    remedy = effects_line(entries)
     return SetupFinding("time_shift", names, step.probability[k], message, remedy, step.shift_decisive), entries
 
 
@@ -317,7 +317,7 @@ def _rounded(value: float) -> float:
     return float(f"{value:.6g}")
 
 
-def _lines(entries: Sequence[Effect]) -> str:
+def effects_line(entries: Sequence[Effect]) -> str:
     """Entries of a configuration's ``effects`` in flow style, on one line."""
     each = []
     for e in entries:

@@ -36,8 +36,9 @@ class SetupFinding:
     ``kind``: ``position_sign``, ``torque_sign``, ``joint_order``, ``position_unit``, ``torque_unit``, ``time_unit``,
     ``gear_ratio``, ``side``, ``gravity_direction``, ``gravity_missing``, ``time_shift``, ``torque_clipped``,
     ``rate_too_slow``, ``standstill``, ``joint_at_rest``, ``one_direction``, ``position_step``, ``position_resolution``,
-    ``torque_held``, ``position_held``, ``torque_too_small`` or ``change_in_time``. ``probability``: share among
-    those tried. ``remedy``: correcting configuration line or option. ``decisive``: results are unusable without it.
+    ``torque_held``, ``position_held``, ``position_offset``, ``torque_too_small`` or ``change_in_time``.
+    ``probability``: share among those tried. ``remedy``: correcting configuration line or option. ``decisive``: results
+    are unusable without it.
     """
 
     kind: str

@@ -16,7 +16,7 @@ from armident.configs import RobotConfig, load_robot
 from armident.configs.schema.robot import Effect as Entry
 from armident.identify.effects.registry import catalogue
 from armident.identify.effects.terms import arm_model
-from armident.identify.effects.wiring import Wiring
+from armident.identify.effects.wiring import SignalMistake
 from armident.identify.model_export.exported_model import ExportedModel
 from armident.identify.model_export.formats import export_model
 from armident.identify.model_export.formulas import hat, instant_model
@@ -35,7 +35,7 @@ MEMORY = {
 }  # fmt: skip
 """Effects with memory, or with derivatives of the torque."""
 
-MEMORYLESS = {key for key, effect in catalogue().items() if not isinstance(effect, Wiring)} - MEMORY
+MEMORYLESS = {key for key, effect in catalogue().items() if not isinstance(effect, SignalMistake)} - MEMORY
 """All others: their torque depends on the present instant alone."""
 
 
