@@ -61,6 +61,9 @@ LEAST_SAMPLES = 10.0
 SAMPLES_UNUSABLE = 5.0
 """Samples per period below which central differences lose a fifth of the acceleration."""
 
+REACHES_ZERO = 0.01
+"""Least torque over the largest one below which it reaches zero: the noise of usual torque signals."""
+
 SLIP_REMEDY = "find out why the encoder lost counts (coupling, index, power), home the joint and record again"
 
 
@@ -84,6 +87,29 @@ def small_torque_findings(experiments: Sequence[Experiment], robot: RobotConfig)
     names = tuple(joint.name for joint in robot.joints)
     remedy = "record the torques of the motors, or give drive.gain for currents"
     return [SetupFinding("torque_too_small", names, 1.0, message, remedy, True)]
+
+
+def absolute_findings(
+    experiments: Sequence[Experiment], robot: RobotConfig, moving: NDArray[np.bool_]
+) -> list[SetupFinding]:
+    """Return a finding for torques that are never negative, and reach zero: their sign is lost, or coded otherwise.
+
+    The torque of a joint that gravity keeps above zero does not come near zero, or passes it.
+    """
+    lost = []
+    for j in np.flatnonzero(moving):
+        torques = [e.tau[:, j] for e in experiments]
+        low, high = min(float(tau.min()) for tau in torques), max(float(tau.max()) for tau in torques)
+        if 0.0 <= low <= REACHES_ZERO * high and low < high:
+            lost.append(robot.joints[j].name)
+    if not lost:
+        return []
+    message = (
+        f"the torques of {', '.join(lost)} are never negative, and reach zero: absolute values, or a sign that is a bit "
+        "of its own"
+    )
+    remedy = "record torques with their sign: check data type and mapping of the torque"
+    return [SetupFinding("torque_without_sign", tuple(lost), 1.0, message, remedy, True)]
 
 
 def step_findings(experiments: Sequence[Experiment], robot: RobotConfig) -> list[SetupFinding]:
