@@ -23,7 +23,7 @@ FEATURES = {
     "gain of plausibility": 0.0,
     "moving joints": 0.0,
 }
-"""Coefficients by feature, see `contest.Contest.features`; fitted by ``python -m tests.evaluation.setup_calibration``."""
+"""Coefficients by feature, see `Contest.features`; from ``python -m tests.evaluation.setup_calibration --out FILE``."""
 
 INTERCEPT = 0.0
 

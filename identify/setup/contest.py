@@ -100,12 +100,16 @@ class Contest:
     def _contains(self, step: Step, kind: str, joints: Sequence[int]) -> bool:
         return same_correction(kind, joints, step.h, self.found.h, each_own=self.each_own)
 
+    def own(self, joints: Sequence[int]) -> list[int]:
+        """Those of some joints that move; all that move, if none of them does."""
+        return [j for j in joints if j in self.moving] or [int(j) for j in self.moving]
+
     def features(self, kind: str, joints: Sequence[int], log_odds: float, any_value: bool) -> Array:
         """What the probability of a finding is estimated from, see `calibration.FEATURES`.
 
         ``any_value``: a factor of one joint that may have any value.
         """
-        own = [j for j in joints if j in self.moving]
+        own = self.own(joints)
         before, after = (np.maximum(e.errors, LEAST_ERROR) for e in (self.before, self.after))
         fall = np.log(before / after)
         return np.array(
@@ -156,9 +160,7 @@ def _wholes(search: Search, found: Step) -> Iterator[Step]:
             yield step
 
 
-def same_correction(
-    kind: str, joints: Sequence[int], a: Hypothesis, b: Hypothesis, *, each_own: bool = False
-) -> bool:
+def same_correction(kind: str, joints: Sequence[int], a: Hypothesis, b: Hypothesis, *, each_own: bool = False) -> bool:
     """True if two hypotheses contain the same correction of a kind at some joints.
 
     ``each_own``: of torques only the proportions between the joints count.
@@ -168,7 +170,7 @@ def same_correction(
             return not a.gravity.any() and not b.gravity.any()
         return angle_between(a.gravity, b.gravity) < SAME_DIRECTION
     if kind == "time_unit":
-        return abs(np.log(a.clock / b.clock)) < SAME_FACTOR
+        return bool(abs(np.log(a.clock / b.clock)) < SAME_FACTOR)
     if kind == "time_shift":
         x, y = (float(np.median(h.shift)) for h in (a, b))
         share, least = SAME_SHIFT
@@ -183,10 +185,10 @@ def _same_signals(kind: str, a: Array, b: Array, proportion: bool) -> bool:
     """True if rows of two corrections take the same signals, with the same sign, or in the same scale."""
     rows, first, second = np.arange(len(a)), np.abs(a).argmax(axis=1), np.abs(b).argmax(axis=1)
     if kind == "joint_order":
-        return np.array_equal(first, second)
+        return bool(np.array_equal(first, second))
     x, y = a[rows, first], b[rows, second]
     if kind in ("position_sign", "torque_sign"):
-        return np.array_equal(np.sign(x), np.sign(y))
+        return bool(np.array_equal(np.sign(x), np.sign(y)))
     off = np.log(np.abs(x)) - np.log(np.abs(y))
     if proportion:
         off = off - np.median(off)
@@ -196,4 +198,3 @@ def _same_signals(kind: str, a: Array, b: Array, proportion: bool) -> bool:
 def words_of(steps: Sequence[Step]) -> list[str]:
     """The last mistakes of steps in words, each once."""
     return list(dict.fromkeys(step.mistakes[-1].words for step in steps))
-

@@ -54,7 +54,7 @@ def described(step: Step, robot: RobotConfig, bench: Bench) -> list[Described]:
             made = [_raw_exchange(step, first, robot)]
         elif family == "time_shift":
             made = [_late(step, robot, bench)] if "time_shift" not in step.families[last:] else []
-        elif family in SCALES and not _of_a_drive(step, first):
+        elif family in SCALES and not _of_a_drive(step, first, bench):
             made = [_scale(step, first, robot, bench)]
         else:
             continue
@@ -118,12 +118,18 @@ def _groups(step: Step) -> Iterator[tuple[int, int]]:
         first = last
 
 
-def _of_a_drive(step: Step, k: int) -> bool:
-    """True for a torque constant that differs moderately: an effect of the drive (`drive_gain_error`)."""
-    if step.families[k] != "torque_scale":
+def _of_a_drive(step: Step, k: int, bench: Bench) -> bool:
+    """True for torque constants that differ moderately: effects of the drives (`drive_gain_error`).
+
+    Of a unit of every drive, those count that the motion determines.
+    """
+    logs = np.log(np.abs(np.diag(step.mistakes[k].torque)))
+    if step.families[k] == "torque_scale":
+        return bool(np.all(np.abs(logs) < np.log(LEAST_TORQUE)))
+    if step.families[k] != "torque_scales" or plausible_factor(bench, step.start) != 1.0:
         return False
-    factors = np.diag(step.mistakes[k].torque)
-    return bool(np.all(np.abs(np.log(factors)) < np.log(LEAST_TORQUE)))
+    logs = logs[_determined(step.h, bench)]
+    return bool(np.ptp(logs) < np.log(LEAST_TORQUE)) if logs.size else True
 
 
 def _mergeable(step: Step, k: int) -> bool:
@@ -153,9 +159,7 @@ def _wiring(step: Step, first: int, last: int, robot: RobotConfig) -> list[tuple
     return found
 
 
-def _order(
-    order: NDArray[np.int64], signals: Sequence[str], names: Sequence[str]
-) -> tuple[SetupFinding, list[Effect]]:
+def _order(order: NDArray[np.int64], signals: Sequence[str], names: Sequence[str]) -> tuple[SetupFinding, list[Effect]]:
     """Recorded column ``order[j]`` belongs to joint j."""
     moved = [j for j in range(len(names)) if order[j] != j]
     entries = [_entry("joint_order", names[a], signals, names[b]) for a, b in transpositions(order)]
@@ -255,7 +259,8 @@ def _determined(h: Hypothesis, bench: Bench) -> list[int]:
         return misfit(bench, replace(h, torque=scaled(n, j, factor) @ h.torque)).value - best
 
     least = 2.0 * LEAST_ODDS / RANKED_ROWS
-    return [int(j) for j in np.flatnonzero(bench.moving) if min(rise(j, 0.5), rise(j, 2.0)) > least]
+    moving = [int(j) for j in np.flatnonzero(bench.moving)]
+    return [j for j in moving if min(rise(j, 0.5), rise(j, 2.0)) > least]
 
 
 def _linear_map(matrix: Array, signal: str, robot: RobotConfig) -> list[Effect]:

@@ -8,11 +8,11 @@ from numpy.typing import NDArray
 
 from armident.configs import RobotConfig
 from armident.identify.setup.calibration import CORRECTED, NAMED, probability
-from armident.identify.setup.contest import LEAST_ERROR, WORSE, Contest, words_of
+from armident.identify.setup.contest import LEAST_ERROR, Contest, words_of
 from armident.identify.setup.describe import Described, corrected_robot, described, merged_scales
 from armident.identify.setup.plausible import LEAST_ODDS
 from armident.identify.setup.result import SetupFinding
-from armident.identify.setup.search import NOT_UNDERSTOOD, STRUCTURED, Search, Step
+from armident.identify.setup.search import LEAST_DROP, NOT_UNDERSTOOD, STRUCTURED, Search, Step
 
 Array = NDArray[np.float64]
 
@@ -21,6 +21,9 @@ NEXT_STEP = (
     "columns, the units of the drives, and the home positions of the configuration"
 )
 
+
+LEAST_FALL = float(np.exp(0.5 * LEAST_DROP))
+"""Least factor by which the error of a joint falls for a correction to copy: its residual power halves."""
 
 ANY_VALUE = frozenset({"gear_ratio", "torque_scale", "position_scale"})
 """Families of a factor of one joint that may have any value."""
@@ -48,6 +51,8 @@ def judge(search: Search, found: Step, robot: RobotConfig) -> Judged:
     sure = [part for part in judged if not any(part.places & places for places in lost)]
     kept = set().union(*(part.places for part in sure))
     named = set().union(*(part.places for part in judged))
+    # Scales of torques that the motion does not determine are none.
+    named |= {k for k, family in enumerate(whole.families) if family == "torque_scales"}
     findings = [part.finding if part in sure else _doubtful(part, contest, robot) for part in judged]
     explained = not _lost(contest.before.errors, contest.before.memory)[contest.moving].any()
     return Judged(
@@ -62,18 +67,21 @@ def _lost(errors: Array, memory: Array) -> NDArray[np.bool_]:
 
 
 def judged_part(part: Described, contest: Contest, robot: RobotConfig) -> Described:
+    """Return a finding with its probability, and whether its remedy is a correction to copy."""
     finding = part.finding
     joints = indices(finding.joints, robot)
     equal = contest.equal(finding.kind, joints)
     share = probability(features_of(part, contest, joints, equal))
-    own = [j for j in joints if j in contest.moving]
+    own = contest.own(joints)
     after, moving = contest.after, contest.moving
     explains = not _lost(after.errors[own], after.memory[own]).any()
     # A wrong scale of one joint shows at the others that carry the same links.
-    falls = bool(np.any(contest.before.errors[moving] > WORSE * after.errors[moving]))
-    # A common unit shows in the limits only.
-    falls = falls or contest.more_plausible >= LEAST_ODDS
-    message = f"{finding.message} (equally well explained by: {'; '.join(words_of(equal))})" if equal else finding.message
+    falls = bool(np.any(contest.before.errors[moving] > LEAST_FALL * after.errors[moving]))
+    # A common unit shows in the limits only, a common shift in the phase.
+    falls = falls or contest.more_plausible >= LEAST_ODDS or finding.kind == "time_shift"
+    message = (
+        f"{finding.message} (equally well explained by: {'; '.join(words_of(equal))})" if equal else finding.message
+    )
     correction = share > CORRECTED and explains and falls
     return replace(
         part,
@@ -85,13 +93,13 @@ def judged_part(part: Described, contest: Contest, robot: RobotConfig) -> Descri
 
 def features_of(part: Described, contest: Contest, joints: Sequence[int], equal: Sequence[Step]) -> Array:
     """Features of a finding of the joints, see `calibration.FEATURES`. ``equal``: set-ups that explain as much."""
-    kind, any_value = part.finding.kind, part.families <= ANY_VALUE
+    kind, any_value = part.finding.kind, bool(part.families) and part.families <= ANY_VALUE
     return contest.features(kind, joints, contest.log_odds(kind, joints, equal), any_value)
 
 
 def _doubtful(part: Described, contest: Contest, robot: RobotConfig) -> SetupFinding:
     finding = part.finding
-    own = [j for j in indices(finding.joints, robot) if j in contest.moving]
+    own = contest.own(indices(finding.joints, robot))
     worst = max(own, key=lambda j: contest.after.errors[j])
     lost = _lost(contest.before.errors, contest.before.memory)
     names = ", ".join(robot.joints[j].name for j in contest.moving if lost[j])
@@ -105,5 +113,6 @@ def _doubtful(part: Described, contest: Contest, robot: RobotConfig) -> SetupFin
 
 
 def indices(names: Sequence[str], robot: RobotConfig) -> list[int]:
+    """Return the numbers of joints."""
     known = [joint.name for joint in robot.joints]
     return [known.index(name) for name in names]

@@ -303,7 +303,12 @@ class Search:
             *moves.exchange_moves(robot, joints),
             *moves.unit_moves(robot),
             *moves.single_unit_moves(robot, joints),
-            *(move for j in joints if len(joints) > 1 for move in scales.scale_moves(robot, j, h, self.few_rank, self.rank)),
+            *(
+                move
+                for j in joints
+                if len(joints) > 1
+                for move in scales.scale_moves(robot, j, h, self.few_rank, self.rank)
+            ),
         )
         for move in singles:
             yield self._made(step, move.family, move.words, move(h), move.drives)

@@ -92,24 +92,19 @@ def small_torque_findings(experiments: Sequence[Experiment], robot: RobotConfig)
 def absolute_findings(
     experiments: Sequence[Experiment], robot: RobotConfig, moving: NDArray[np.bool_]
 ) -> list[SetupFinding]:
-    """Return a finding for torques that are never negative, and reach zero: their sign is lost, or coded otherwise.
+    """Return a finding if the torques of all moving joints are never negative: their sign is lost, or coded otherwise.
 
-    The torque of a joint that gravity keeps above zero does not come near zero, or passes it.
+    Gravity may keep one joint above zero, but not all of an arm.
     """
-    lost = []
-    for j in np.flatnonzero(moving):
-        torques = [e.tau[:, j] for e in experiments]
-        low, high = min(float(tau.min()) for tau in torques), max(float(tau.max()) for tau in torques)
-        if 0.0 <= low <= REACHES_ZERO * high and low < high:
-            lost.append(robot.joints[j].name)
-    if not lost:
+    lowest = np.min([e.tau.min(axis=0) for e in experiments], axis=0)[moving]
+    highest = np.max([e.tau.max(axis=0) for e in experiments], axis=0)[moving]
+    reached = np.any(lowest <= REACHES_ZERO * highest) and np.all(highest > 0.0)
+    if np.any(lowest < 0.0) or not reached or (moving.sum() == 1 and moving.size > 1):
         return []
-    message = (
-        f"the torques of {', '.join(lost)} are never negative, and reach zero: absolute values, or a sign that is a bit "
-        "of its own"
-    )
+    names = tuple(joint.name for joint in robot.joints)
+    message = "the torques are never negative: absolute values, or a sign that is a bit of its own"
     remedy = "record torques with their sign: check data type and mapping of the torque"
-    return [SetupFinding("torque_without_sign", tuple(lost), 1.0, message, remedy, True)]
+    return [SetupFinding("torque_without_sign", names, 1.0, message, remedy, True)]
 
 
 def step_findings(experiments: Sequence[Experiment], robot: RobotConfig) -> list[SetupFinding]:

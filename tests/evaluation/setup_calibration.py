@@ -20,7 +20,7 @@ from scipy.special import expit
 
 from armident.configs import DataError
 from armident.identify.setup import check, judge
-from armident.identify.setup.calibration import EXTREMES, FEATURES
+from armident.identify.setup.calibration import CORRECTED, EXTREMES, FEATURES
 from armident.identify.setup.contest import same_correction
 from armident.identify.setup.describe import Described
 from tests.evaluation.setup_cases import SetupCase, cases
@@ -54,7 +54,7 @@ def measured(case: SetupCase) -> dict[str, Any]:
                     same_correction(finding.kind, joints, step.h, case.truth, each_own=contest.each_own)
                     for step in (contest.found, *equal)
                 ),
-                "explains": finding.correction or finding.probability <= judge.CORRECTED,
+                "explains": finding.correction or finding.probability <= CORRECTED,
                 "x": judge.features_of(part, contest, joints, equal).tolist(),
             }
         )
@@ -137,7 +137,8 @@ def evaluate(file: Path) -> str:
         for b in range(len(BINS) - 1)
         if (own := inside == b).any()
     ]
-    copied = (p > judge.CORRECTED) & explains
+    copied = (p > CORRECTED) & explains
+    missed = int((~copied & (right > 0)).sum())
     return "\n".join(
         [
             *lines,
@@ -147,7 +148,7 @@ def evaluate(file: Path) -> str:
             "",
             f"{len(rows)} recordings of {len(set(arms.tolist()))} arms with a finding, {len(found)} findings, "
             f"ECE {expected_error(p, right):.3f}; corrections to copy: {int(copied.sum())}, "
-            f"of them right {right[copied].mean():.3f}; right findings without one: {int((~copied & (right > 0)).sum())}",
+            f"of them right {right[copied].mean():.3f}; right findings without one: {missed}",
         ]
     )
 

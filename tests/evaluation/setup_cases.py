@@ -221,11 +221,8 @@ def _case(rng: Generator, arm: int, family: str, draft: Draft | None, usual: str
         else load_robot(usual or "").model_copy(update={"couplings": (), "initial_parameters": {}})
     )
     n, gravity = robot.n, np.array(robot.gravity)
-    if draft is None:
-        runs = _usual_runs(robot, arm)
-        shape = _shape(robot, runs[0])
-    else:
-        runs, shape = (noisy(draft, 0, draft.healthy), None), draft.plant.arm
+    runs = (noisy(draft, 0, draft.healthy),) if draft else _usual_runs(robot, arm)
+    shape = draft.plant.arm if draft else _shape(robot, runs[0])
     kind, truth = family, Hypothesis(np.eye(n), np.eye(n), gravity, np.zeros(n))
     run = runs[0]
     if family in ("effect", "outside"):
@@ -265,7 +262,6 @@ def _case(rng: Generator, arm: int, family: str, draft: Draft | None, usual: str
             robot = _another_arm(rng, robot, kind)
         else:
             second = runs[1] if draft is None else simulated(draft, draft.plant, 1)
-            assert second is not None
             length = min(run.t.size, second.t.size)
             run = OTHER[kind](rng, _cut(run, length), second)
     reference = run.reference if draft is not None and draft.with_reference and family != "other" else None
@@ -311,12 +307,12 @@ def _another_arm(rng: Generator, robot: RobotConfig, kind: str) -> RobotConfig:
     return robot.model_copy(update={"joints": tuple(joints)})
 
 
-def _usual_runs(robot: RobotConfig, seed: int) -> tuple[Run, Run]:
+def _usual_runs(robot: RobotConfig, seed: int) -> tuple[Run, ...]:
     made = []
     for e in setups.record(robot, seed, dt=4e-3, duration=10.0):
-        t = e.dt * np.arange(e.q.shape[0])
+        t = np.asarray(e.dt * np.arange(e.q.shape[0]), np.float64)
         made.append(Run(t, e.q, 0.0 * e.q, 0.0 * e.q, e.q, e.tau, e.q))
-    return made[0], made[1]
+    return tuple(made)
 
 
 def _shape(robot: RobotConfig, run: Run) -> Arm:
