@@ -20,8 +20,8 @@ EQUAL = float(np.log(10.0))
 SAME_FACTOR = 0.1
 """Largest difference of the logarithms of two factors that are one correction."""
 
-SAME_PROPORTION = 0.25
-"""The same where every torque is in a unit of its own: the lightest joints determine their factor less."""
+SAME_PROPORTION = float(np.log(1.5))
+"""The same where every torque is in a unit of its own: joints that share few links determine their factor less."""
 
 SAME_DIRECTION = float(np.radians(6.0))
 """Largest angle between two directions of gravity that are one correction, rad."""
@@ -32,25 +32,20 @@ SAME_SHIFT = (0.4, 1.5e-3)
 LEAST_ERROR = 0.01
 """Error of a joint below which a smaller one is no better explanation: noise of usual torque signals."""
 
-WORSE = 1.2
-"""Factor from which on the error of a joint has become worse."""
-
 FRICTIONLESS = 1e-3
 """Friction power over that of velocity times torque (rms) below which the fit is at its bound of dissipation."""
 
 
 @dataclass(frozen=True, eq=False)
 class Explained:
-    """What a hypothesis explains: relative errors (n,) with free terms, and serial correlations (n,) of the residuals.
+    """Result of a hypothesis: relative errors (n,) with free terms, and serial correlations (n,) of the residuals.
 
-    ``frictionless``: share of the moving joints whose friction is at its bound. ``power``: mean power of all torques
-    over the product of the rms values: an arm takes more energy than it returns.
+    ``frictionless``: share of the moving joints whose friction is at its bound: they would dissipate nothing.
     """
 
     errors: Array
     memory: Array
     frictionless: float
-    power: float
 
 
 class Contest:
@@ -77,8 +72,7 @@ class Contest:
         velocity, torque = bench.recorded[1] @ h.position.T, bench.recorded[2] @ h.torque.T
         sizes = np.sqrt((velocity**2).mean(axis=0) * (torque**2).mean(axis=0))[moving]
         friction = (bench.rows(h.position).physical @ fit(bench, h).theta)[bench.n : 2 * bench.n][moving]
-        power = (velocity * torque).mean(axis=0)[moving].sum() / max(float(sizes.sum()), 1e-300)
-        return Explained(errors, memory, float(np.mean(friction < FRICTIONLESS * sizes)), float(power))
+        return Explained(errors, memory, float(np.mean(friction < FRICTIONLESS * sizes)))
 
     def equal(self, kind: str, joints: Sequence[int]) -> list[Step]:
         """Whole set-ups without this correction of the wiring that explain the recordings equally well."""
@@ -104,34 +98,20 @@ class Contest:
         """Those of some joints that move; all that move, if none of them does."""
         return [j for j in joints if j in self.moving] or [int(j) for j in self.moving]
 
-    def features(self, kind: str, joints: Sequence[int], log_odds: float, any_value: bool) -> Array:
-        """What the probability of a finding is estimated from, see `calibration.FEATURES`.
+    def features(self, log_odds: float, any_value: bool) -> Array:
+        """Features from which the probability of a finding is estimated, see `calibration.FEATURES`.
 
         ``any_value``: a factor of one joint that may have any value.
         """
-        own = self.own(joints)
-        before, after = (np.maximum(e.errors, LEAST_ERROR) for e in (self.before, self.after))
-        fall = np.log(before / after)
+        before, after = (np.maximum(e.errors[self.moving], LEAST_ERROR) for e in (self.before, self.after))
         return np.array(
             [
                 np.arcsinh(0.5 * np.clip(log_odds, -1e3, 1e3)),
-                np.log(after[own].max()),
-                np.log(after[self.moving].max()),
-                fall[own].max(),
-                fall[self.moving].max(),
-                np.mean(fall[self.moving] < -np.log(WORSE)),
-                float(len(self.found.mistakes)),
-                self.after.frictionless - self.before.frictionless,
+                np.log(after.max()),
+                np.log(before / after).max(),
                 self.after.frictionless,
-                self.after.power,
-                float((self.after.memory[own] * (after[own] / after[own].max())).max()),
-                float(kind in ("position_sign", "torque_sign", "joint_order")),
-                float(kind.startswith("gravity")),
-                float(kind.startswith("time")),
-                float(self.each_own),
                 float(any_value),
                 np.arcsinh(0.5 * self.more_plausible),
-                float(self.moving.size),
             ]
         )
 
@@ -147,6 +127,11 @@ def _wholes(search: Search, found: Step) -> Iterator[Step]:
         return key not in seen and not seen.add(key)  # type: ignore[func-returns-value]
 
     steps = [found, replace(found, mistakes=()), *(found.without({k}) for k in range(len(found.mistakes)))]
+    for k, mistake in enumerate(found.mistakes):
+        if mistake.gravity is not None:
+            # Opposite directions fit equally where the first moments may change their sign.
+            opposite = replace(mistake, gravity=-mistake.gravity)
+            steps.append(replace(found, mistakes=(*found.mistakes[:k], opposite, *found.mistakes[k + 1 :])))
     for parent, met in search.met:
         place = len(parent.mistakes)
         if found.mistakes[:place] == parent.mistakes and len(found.mistakes) > place:

@@ -1,5 +1,6 @@
 """Findings of a set-up check in words, with the lines of configuration that correct them."""
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -234,8 +235,8 @@ def _scale(step: Step, k: int, robot: RobotConfig, bench: Bench) -> tuple[SetupF
         told = _determined(step.h, bench)
         joints = told if len(told) > 1 else joints
         names = tuple(robot.joints[i].name for i in joints)
-        factors = ", ".join(f"{robot.joints[i].name} {torque[i, i] / torque[joints[0], joints[0]]:.3g}" for i in joints)
-        message += f" (per mille, or currents): by the links that they share, true over recorded is as {factors}"
+        factors = ", ".join(f"{robot.joints[i].name} {torque[i, i] / torque[joints[0], joints[0]]:.2g}" for i in joints)
+        message += f" (per mille, or currents): by the links that they share, true over recorded is about as {factors}"
         others = [robot.joints[i].name for i in np.flatnonzero(bench.moving) if i not in joints]
         message += "; the motion does not determine the common factor"
         message += f", nor that of {', '.join(others)}" if others else ""
@@ -294,8 +295,8 @@ def _late(step: Step, robot: RobotConfig, bench: Bench) -> tuple[SetupFinding, l
     message = f"all torques are {1000 * abs(shift):.3g} ms {direction} against the positions"
     if np.isfinite(step.shift_std):
         message += f" (standard deviation {1000 * step.shift_std:.2g} ms)"
-    remedy = _lines(entries)
-    return SetupFinding("time_shift", names, 1.0, message, remedy, step.shift_decisive), entries
+    share = 1.0 if step.shift_decisive else math.erf(abs(shift) / step.shift_std / math.sqrt(2.0))
+    return SetupFinding("time_shift", names, share, message, _lines(entries), step.shift_decisive), entries
 
 
 def _gravity(family: str, step: Step, robot: RobotConfig) -> SetupFinding:

@@ -69,32 +69,35 @@ def _lost(errors: Array, memory: Array) -> NDArray[np.bool_]:
 def judged_part(part: Described, contest: Contest, robot: RobotConfig) -> Described:
     """Return a finding with its probability, and whether its remedy is a correction to copy."""
     finding = part.finding
+    if not finding.decisive:
+        # A shift that the references show has the probability of its own estimate: prediction hardly tells it.
+        return part
     joints = indices(finding.joints, robot)
     equal = contest.equal(finding.kind, joints)
     share = probability(features_of(part, contest, joints, equal))
-    own = contest.own(joints)
-    after, moving = contest.after, contest.moving
-    explains = not _lost(after.errors[own], after.memory[own]).any()
+    correction = share > CORRECTED and explains(finding.kind, contest, joints)
+    message = finding.message
+    if equal:
+        message += f" (equally well explained by: {'; '.join(words_of(equal))})"
+    judged = replace(finding, message=message, probability=share, correction=correction, decisive=correction)
+    return replace(part, finding=judged)
+
+
+def explains(kind: str, contest: Contest, joints: Sequence[int]) -> bool:
+    """True if the corrected model explains the joints of a finding, and the error of a joint falls."""
+    own, moving, after = contest.own(joints), contest.moving, contest.after
+    if _lost(after.errors[own], after.memory[own]).any():
+        return False
     # A wrong scale of one joint shows at the others that carry the same links.
-    falls = bool(np.any(contest.before.errors[moving] > LEAST_FALL * after.errors[moving]))
+    falls = np.any(contest.before.errors[moving] > LEAST_FALL * after.errors[moving])
     # A common unit shows in the limits only, a common shift in the phase.
-    falls = falls or contest.more_plausible >= LEAST_ODDS or finding.kind == "time_shift"
-    message = (
-        f"{finding.message} (equally well explained by: {'; '.join(words_of(equal))})" if equal else finding.message
-    )
-    correction = share > CORRECTED and explains and falls
-    return replace(
-        part,
-        finding=replace(
-            finding, message=message, probability=share, correction=correction, decisive=finding.decisive and correction
-        ),
-    )
+    return bool(falls) or contest.more_plausible >= LEAST_ODDS or kind == "time_shift"
 
 
 def features_of(part: Described, contest: Contest, joints: Sequence[int], equal: Sequence[Step]) -> Array:
     """Features of a finding of the joints, see `calibration.FEATURES`. ``equal``: set-ups that explain as much."""
     kind, any_value = part.finding.kind, bool(part.families) and part.families <= ANY_VALUE
-    return contest.features(kind, joints, contest.log_odds(kind, joints, equal), any_value)
+    return contest.features(contest.log_odds(kind, joints, equal), any_value)
 
 
 def _doubtful(part: Described, contest: Contest, robot: RobotConfig) -> SetupFinding:

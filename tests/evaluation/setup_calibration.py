@@ -46,6 +46,8 @@ def measured(case: SetupCase) -> dict[str, Any]:
     def kept(part: Described, contest: Any, robot: Any) -> Described:
         made = given(part, contest, robot)
         finding, joints = made.finding, judge.indices(part.finding.joints, robot)
+        if not part.finding.decisive:
+            return made
         equal = contest.equal(finding.kind, joints)
         found.append(
             {
@@ -54,7 +56,7 @@ def measured(case: SetupCase) -> dict[str, Any]:
                     same_correction(finding.kind, joints, step.h, case.truth, each_own=contest.each_own)
                     for step in (contest.found, *equal)
                 ),
-                "explains": finding.correction or finding.probability <= CORRECTED,
+                "explains": judge.explains(finding.kind, contest, joints),
                 "x": judge.features_of(part, contest, joints, equal).tolist(),
             }
         )
