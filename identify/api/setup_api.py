@@ -17,7 +17,7 @@ from armident.identify.setup.result import SetupCheck
 
 @dataclass(frozen=True, repr=False)
 class CheckedSetup(Result):
-    """Mistakes of a set-up, each with its probability and the line of configuration that corrects it.
+    """Mistakes of a set-up, each with its probability and the line of configuration that corrects it, if it is certain.
 
     Parameters
     ----------
@@ -55,7 +55,7 @@ class CheckedSetup(Result):
         lines = [] if self.findings else [self._summary()]
         for finding in self.findings:
             lines.append(f"{finding.kind}: {finding.message} (probability {finding.probability:.2f})")
-            lines.append(f"  correct it by: {finding.remedy}")
+            lines.append(f"  {'correct it by' if finding.correction else 'next step'}: {finding.remedy}")
         lines += [f"remark: {note}" for note in document.repairs]
         if shift is not None and shift.applied:
             lines.append(f"remark: {shift.remark}")
@@ -99,7 +99,7 @@ def check(recordings: Recorded | Sequence[Recorded], robot: Robot | None = None)
     Returns
     -------
     CheckedSetup
-        Mistakes with their probability and the line of configuration that corrects each.
+        Mistakes with their probability, and the line of configuration that corrects each, or the next step.
 
     Raises
     ------

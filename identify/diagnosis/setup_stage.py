@@ -76,7 +76,7 @@ def set_up(
         for experiments, first in ((training, 0), (validation, len(training)))
     )
     for finding in check.findings:
-        if finding.kind in ("standstill", "position_step", "torque_too_small"):
+        if finding.kind in ("standstill", "position_step", "torque_too_small", "torque_without_sign"):
             raise DataError(f"{finding.message}; {finding.remedy}")
     corrected = robot if check.corrected_robot is None else check.corrected_robot
     tried = "; ".join(check.tried)
@@ -85,13 +85,13 @@ def set_up(
         tuple(replace(e, dt=e.dt * check.clock) for e in with_torque_shift(training, shift)),
         tuple(replace(e, dt=e.dt * check.clock) for e in with_torque_shift(validation, shift)),
         corrected,
-        tuple(f for finding in check.findings if finding.kind not in REMARKS for f in _findings(finding, check, robot)),
+        tuple(f for finding in check.findings if not _remark(finding) for f in _findings(finding, check, robot)),
         tuple(
             Unexplained(joint=name, share_of_residual=1.0, varies_with="set-up", hint=hint)
             for name in check.joints_not_understood
         ),
         (
-            *(f"{finding.message}: {finding.remedy}" for finding in check.findings if finding.kind in REMARKS),
+            *(f"{finding.message}: {finding.remedy}" for finding in check.findings if _remark(finding)),
             *([shift.remark] if shift is not None and shift.applied else []),
         ),
         check.relative_error_pct,
@@ -99,6 +99,11 @@ def set_up(
         shift is not None and shift.known,
         criteria,
     )
+
+
+def _remark(finding: SetupFinding) -> bool:
+    """True for a limit of the recordings, and for the best of what was tried, which corrects nothing."""
+    return finding.kind in REMARKS or not finding.correction
 
 
 def outside(experiments: Sequence[Experiment], stretch: Sequence[Span], first: int) -> list[Experiment]:

@@ -17,13 +17,15 @@ class SetupMistake(Document):
     joints
         Joints concerned.
     probability
-        Posterior share of the hypothesis among those tried, 0 to 1.
+        Probability that the finding is right, 0 to 1, calibrated on recordings with a known set-up.
     message
         Mistake in one sentence with figures.
     remedy
-        Line of the configuration, or option of a command, that corrects it.
+        Line of the configuration, or option of a command, that corrects it; the next step where it is no correction.
     decisive
         True if results without the correction are unusable.
+    correction
+        True if the remedy is certain enough to be copied; false for the best of what was tried.
     """
 
     kind: str
@@ -32,6 +34,7 @@ class SetupMistake(Document):
     message: str
     remedy: str
     decisive: bool
+    correction: bool = True
 
 
 class SetupDocument(Document):

@@ -311,7 +311,7 @@ class Bench:
     def _mean_inertia(self, q: Array) -> Array:
         """Torque of each joint per unit of its own acceleration, mean over postures of positions (M, n), (n, b)."""
         n, model = self.n, self._weightless[0]
-        q = q[:: max(1, q.shape[0] // POSTURES)]
+        q = q[:: max(1, q.shape[0] // POSTURES, MOST_ROWS // POSTURES)]
         postures, still = np.tile(q, (n, 1)), np.zeros((n * q.shape[0], n))
         push = np.repeat(np.eye(n), q.shape[0], axis=0)
         unit = model.rigid_regressor(postures, still, push) - model.rigid_regressor(postures, still, still)

@@ -1,6 +1,5 @@
 """Check of the set-up: wiring, units, transmission, gravity and clocks, before anything else."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -14,8 +13,10 @@ from armident.identify.effects.wiring import PositionOffset
 from armident.identify.setup import signals
 from armident.identify.setup.bench import Bench, make_bench
 from armident.identify.setup.clipping import clipped_torques
-from armident.identify.setup.describe import described, effects_line
+from armident.identify.setup.describe import effects_line
 from armident.identify.setup.fit import Hypothesis, joint_errors
+from armident.identify.setup.judge import judge
+from armident.identify.setup.prior import Mistake
 from armident.identify.setup.result import SetupCheck, SetupFinding, TorqueShift
 from armident.identify.setup.search import NOT_UNDERSTOOD, STRUCTURED, Search, Step
 from armident.identify.setup.stationarity import ChangedStretch, change_finding, spans, stretch
@@ -74,29 +75,30 @@ def _check(experiments: Sequence[Experiment], robot: RobotConfig) -> SetupCheck:
     findings += signals.clipped_findings(experiments, robot, moving)
     findings += signals.held_findings(experiments, robot)
     findings += signals.one_way_findings(experiments, robot, moving)
-    damaged = signals.step_findings(experiments, robot)
+    damaged = signals.step_findings(experiments, robot) + signals.absolute_findings(experiments, robot, moving)
     if damaged:
-        # No correction is right beside signals that are wrong for a part of the time.
+        # No correction is right beside signals that are wrong.
         bench = make_bench(experiments, robot, moving)
         errors = _errors(bench, _as_configured(robot))
         return SetupCheck((*damaged, *findings), errors, errors, (), (), None)
     bench, search, best = _searched(experiments, robot, moving)
-    found = described(best, robot, bench)
     best, changed = _stretch(bench, best)
     if changed is not None:
-        found = described(best, robot, bench)
         findings.append(change_finding(changed, bench, best.h))
+    else:
+        best = _unless_zero_explains(search, best)
+    judged = judge(search, best, robot)
     tried, before = search.tried | {PositionOffset.name: bench.n}, _errors(bench, _as_configured(robot))
-    setup_findings, corrected = found.findings, found.robot
-    clock = best.h.clock
+    setup_findings, clock = judged.findings, judged.step.h.clock
     if clock != 1.0:
         # Velocities enter friction and limits: everything else is judged with the right clock.
         experiments = [replace(e, dt=e.dt * clock) for e in experiments]
-        bench, again, best = _searched(experiments, robot, moving)
-        found = described(best, robot, bench)
+        bench, search, best = _searched(experiments, robot, moving)
+        judged = judge(search, _unless_zero_explains(search, best), robot)
         of_clock = tuple(finding for finding in setup_findings if finding.kind == "time_unit")
-        setup_findings, corrected = (*of_clock, *found.findings), found.robot
-        tried = tried | again.tried
+        setup_findings = (*of_clock, *judged.findings)
+        tried = tried | search.tried
+    best, corrected = judged.step, judged.robot
     findings += signals.rate_findings(experiments, robot)
     if not any(finding.kind in ("torque_unit", "side") for finding in setup_findings):
         findings += signals.small_torque_findings(experiments, robot)
@@ -140,13 +142,22 @@ def _torque_shift(experiments: Sequence[Experiment], bench: Bench, best: Step) -
         return None
 
 
+def _unless_zero_explains(search: Search, best: Step) -> Step:
+    """Return the set-up without corrections where another zero of one joint explains the recordings better."""
+    if not best.mistakes or best.h.clock != 1.0:
+        return best
+    configured = Step(best.start)
+    zero = zero_offset(search.bench, configured.h)
+    return configured if zero is not None and zero.gain > search.gain(configured, best)[0] else best
+
+
 def _stretch(bench: Bench, best: Step) -> tuple[Step, ChangedStretch | None]:
     """Return the set-up, and the stretch of time in which the arm is another one.
 
     A change in time competes with the corrections: they go where it explains the torques as well without them.
     """
     found = stretch(bench, best.h)
-    if best.families and best.h.clock == 1.0:
+    if best.mistakes and best.h.clock == 1.0:
         configured = Step(_as_configured(bench.robot))
         alone = stretch(bench, configured.h)
         if found is not None and alone is not None and alone.certain:
@@ -189,21 +200,20 @@ def _with_instrumented_shift(experiments: Sequence[Experiment], bench: Bench, be
     found = long_torque_shift(experiments, bench, best.h, 0.0, LONGEST_SHIFT_S)
     if found is None or not found.confirmed:
         return best
-    probability = math.erf(abs(found.samples) / found.std / math.sqrt(2.0))
+    own = np.eye(bench.n)
     named = replace(
         best,
-        families=(*best.families, "time_shift"),
-        words=(*best.words, TRIED["time_shift"]),
-        made=(*best.made, (np.eye(bench.n), np.eye(bench.n), False)),
-        rivals=(*best.rivals, ()),
-        probability=(*best.probability, probability),
+        mistakes=(*best.mistakes, Mistake("time_shift", TRIED["time_shift"], own, own, np.zeros(bench.n))),
         shift_decisive=False,
     )
     return _with_shift(named, bench, found.samples * bench.period * bench.moving, found)
 
 
 def _with_shift(step: Step, bench: Bench, more_s: NDArray[np.floating], found: TorqueShift) -> Step:
-    return replace(step, h=replace(step.h, shift=step.h.shift + more_s), shift_std=found.std * bench.period)
+    last = max(k for k, family in enumerate(step.families) if family == "time_shift")
+    mistakes = list(step.mistakes)
+    mistakes[last] = replace(mistakes[last], shift=mistakes[last].shift + more_s)
+    return replace(step, mistakes=tuple(mistakes), shift_std=found.std * bench.period)
 
 
 def _clipped(bench: Bench, best: Step, robot: RobotConfig, known: set[str]) -> list[SetupFinding]:

@@ -1,8 +1,8 @@
 """Findings of a set-up check in words, with the lines of configuration that correct them."""
 
+import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,12 +11,13 @@ from scipy import linalg
 from armident.configs import RobotConfig
 from armident.configs.schema.robot import Effect
 from armident.identify.setup.bench import Bench
-from armident.identify.setup.fit import Hypothesis
-from armident.identify.setup.plausible import plausible_factor, position_ratio, torque_ratio, velocity_ratio
-from armident.identify.setup.prior import WIRING
+from armident.identify.setup.fit import Hypothesis, misfit
+from armident.identify.setup.moves import scaled
+from armident.identify.setup.plausible import LEAST_ODDS, plausible_factor, position_ratio, torque_ratio, velocity_ratio
+from armident.identify.setup.prior import WIRING, Mistake
 from armident.identify.setup.result import SetupFinding
 from armident.identify.setup.scales import LEAST_TORQUE
-from armident.identify.setup.search import EACH_OWN, Step
+from armident.identify.setup.search import EACH_OWN, RANKED_ROWS, Step
 
 Array = NDArray[np.float64]
 
@@ -29,45 +30,63 @@ KINDS = {"torque_scale": "torque_unit", "torque_scales": "torque_unit", "positio
 CLOCK_WORDS = {1e-3: "ms", 1e-6: "us", 1e-9: "ns", 1e3: "ks"}
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Described:
-    """Findings of a search, and the configuration with their corrections as far as it can express any."""
+    """A finding in words, the ``places`` of its mistakes in the step, and the entries of ``effects`` that correct it.
 
-    findings: tuple[SetupFinding, ...]
-    robot: RobotConfig | None
+    ``values``: other fields of the configuration that correct it. ``families``: of its mistakes.
+    """
+
+    finding: SetupFinding
+    places: frozenset[int]
+    entries: tuple[Effect, ...] = ()
+    values: dict[str, object] = field(default_factory=dict)
+    families: frozenset[str] = frozenset()
 
 
-def described(step: Step, robot: RobotConfig, bench: Bench) -> Described:
-    """Return the findings of a search. ``bench``: signals, for the figures of the messages."""
-    findings: list[SetupFinding] = []
-    entries: list[Effect] = []
-    step = _scales_merged(step, bench)
+def described(step: Step, robot: RobotConfig, bench: Bench) -> list[Described]:
+    """Return the findings of a step with `merged_scales`. ``bench``: signals, for the figures of the messages."""
+    found: list[Described] = []
     for first, last in _groups(step):
-        if step.families[first] in WIRING and not step.made[first][2]:
+        family = step.families[first]
+        if family in WIRING and not step.mistakes[first].raw:
             made = _wiring(step, first, last, robot)
-        elif step.families[first] in WIRING:
+        elif family in WIRING:
             made = [_raw_exchange(step, first, robot)]
-        elif step.families[first] == "time_shift":
-            made = [_late(step, first, robot, bench)] if "time_shift" not in step.families[last:] else []
-        elif step.families[first] in SCALES and not _of_a_drive(step, first):
+        elif family == "time_shift":
+            made = [_late(step, robot, bench)] if "time_shift" not in step.families[last:] else []
+        elif family in SCALES and not _of_a_drive(step, first, bench):
             made = [_scale(step, first, robot, bench)]
         else:
             continue
-        for finding, corrections in made:
-            findings.append(finding)
-            entries += corrections
-    update: dict[str, object] = {"effects": (*robot.effects, *entries)} if entries else {}
-    share = dict(zip(step.families, step.probability, strict=True))
+        places = frozenset(range(first, last))
+        if family == "time_shift":
+            places = frozenset(k for k, f in enumerate(step.families) if f == "time_shift")
+        families = frozenset(step.families[k] for k in places)
+        found += [Described(finding, places, tuple(entries), families=families) for finding, entries in made]
     for family in [f for f in step.families if f.startswith("gravity")][-1:]:
         if family != "gravity_missing" or not step.h.gravity.any():
-            findings.append(_gravity(family, step, robot, share[family]))
-            update["gravity"] = tuple(float(round(g, 4)) for g in step.h.gravity)
+            places = frozenset(k for k, f in enumerate(step.families) if f.startswith("gravity"))
+            gravity = tuple(float(round(g, 4)) for g in step.h.gravity)
+            found.append(Described(_gravity(family, step, robot), places, values={"gravity": gravity}))
     if "time_unit" in step.families:
-        findings.append(_clock(step, robot, bench, share["time_unit"]))
-    return Described(tuple(findings), robot.model_copy(update=update) if update else None)
+        places = frozenset(k for k, f in enumerate(step.families) if f == "time_unit")
+        found.append(Described(_clock(step, robot, bench), places))
+    return found
 
 
-def _scales_merged(step: Step, bench: Bench) -> Step:
+def corrected_robot(parts: Sequence[Described], robot: RobotConfig) -> RobotConfig | None:
+    """Return the configuration with the corrections of findings that it can express; ``None`` without any."""
+    update: dict[str, object] = {}
+    for part in parts:
+        update |= part.values
+    entries = [entry for part in parts for entry in part.entries]
+    if entries:
+        update["effects"] = (*robot.effects, *entries)
+    return robot.model_copy(update=update) if update else None
+
+
+def merged_scales(step: Step, bench: Bench) -> Step:
     """Make one mistake of all scales of torques where every torque is in a unit of its own drive."""
     single = step.families.count("torque_scale")
     if "torque_scales" not in step.families and single < 2:
@@ -75,30 +94,18 @@ def _scales_merged(step: Step, bench: Bench) -> Step:
     n = bench.n
     scales = [
         k
-        for k, (family, (position, torque, _)) in enumerate(zip(step.families, step.made, strict=True))
-        if family in SCALES and np.array_equal(position, np.eye(n)) and _diagonal(torque)
+        for k, m in enumerate(step.mistakes)
+        if m.family in SCALES and np.array_equal(m.position, np.eye(n)) and _diagonal(m.torque)
     ]
     whole = np.eye(n)
     for k in scales:
-        whole = step.made[k][1] @ whole
+        whole = step.mistakes[k].torque @ whole
     logs, common = np.log(np.abs(np.diag(whole))), plausible_factor(bench, step.h)
     if common == 1.0 and np.max(np.abs(logs - np.median(logs))) < np.log(LEAST_TORQUE):
         return step
-    whole = whole * common
-    last = scales[-1]
-    kept = [k for k in range(len(step.families)) if k == last or k not in scales]
-
-    def of(values: tuple[Any, ...]) -> tuple[Any, ...]:
-        return tuple(values[k] for k in kept)
-
-    return replace(
-        step,
-        families=of(tuple("torque_scales" if k == last else f for k, f in enumerate(step.families))),
-        words=of(tuple(EACH_OWN if k == last else words for k, words in enumerate(step.words))),
-        made=of(tuple((np.eye(n), whole, False) if k == last else m for k, m in enumerate(step.made))),
-        probability=of(step.probability),
-        rivals=of(step.rivals),
-    )
+    merged = Mistake("torque_scales", EACH_OWN, np.eye(n), whole * common, np.zeros(n))
+    kept = [merged if k == scales[-1] else m for k, m in enumerate(step.mistakes) if k not in scales[:-1]]
+    return replace(step, mistakes=tuple(kept))
 
 
 def _groups(step: Step) -> Iterator[tuple[int, int]]:
@@ -112,48 +119,48 @@ def _groups(step: Step) -> Iterator[tuple[int, int]]:
         first = last
 
 
-def _of_a_drive(step: Step, k: int) -> bool:
-    """True for a torque constant that differs moderately: an effect of the drive (`drive_gain_error`)."""
-    if step.families[k] != "torque_scale":
+def _of_a_drive(step: Step, k: int, bench: Bench) -> bool:
+    """True for torque constants that differ moderately: effects of the drives (`drive_gain_error`).
+
+    Of a unit of every drive, those count that the motion determines.
+    """
+    logs = np.log(np.abs(np.diag(step.mistakes[k].torque)))
+    if step.families[k] == "torque_scale":
+        return bool(np.all(np.abs(logs) < np.log(LEAST_TORQUE)))
+    if step.families[k] != "torque_scales" or plausible_factor(bench, step.start) != 1.0:
         return False
-    factors = np.diag(step.made[k][1])
-    return bool(np.all(np.abs(np.log(factors)) < np.log(LEAST_TORQUE)))
+    logs = logs[_determined(step.h, bench)]
+    return bool(np.ptp(logs) < np.log(LEAST_TORQUE)) if logs.size else True
 
 
 def _mergeable(step: Step, k: int) -> bool:
-    return step.families[k] in WIRING and not step.made[k][2]
+    return step.families[k] in WIRING and not step.mistakes[k].raw
 
 
 def _wiring(step: Step, first: int, last: int, robot: RobotConfig) -> list[tuple[SetupFinding, list[Effect]]]:
     """Signs and orders of some mistakes together, in as few words as possible."""
     n, names = robot.n, [joint.name for joint in robot.joints]
     position, torque = np.eye(n), np.eye(n)
-    for of_position, of_torque, _ in step.made[first:last]:
-        position, torque = of_position @ position, of_torque @ torque
-    share = min(step.probability[first:last])
-    rivals = [words for some in step.rivals[first:last] for words in some]
+    for m in step.mistakes[first:last]:
+        position, torque = m.position @ position, m.torque @ torque
     orders = [np.abs(m).argmax(axis=1) for m in (position, torque)]
     turned = [np.sign(m[np.arange(n), order]) < 0 for m, order in zip((position, torque), orders, strict=True)]
     if np.array_equal(orders[0], orders[1]):
         groups: list[tuple[NDArray[np.int64], tuple[str, ...]]] = [(orders[0], ("position", "torque"))]
     else:
         groups = [(orders[0], ("position",)), (orders[1], ("torque",))]
-    found = [
-        _order(order, signals, share, names) for order, signals in groups if not np.array_equal(order, np.arange(n))
-    ]
+    found = [_order(order, signals, names) for order, signals in groups if not np.array_equal(order, np.arange(n))]
     for mask, signals in (
         (turned[0] & turned[1], ("position", "torque")),
         (turned[0] & ~turned[1], ("position",)),
         (~turned[0] & turned[1], ("torque",)),
     ):
         if mask.any():
-            found.append(_sign([names[j] for j in np.flatnonzero(mask)], signals, share, rivals))
+            found.append(_sign([names[j] for j in np.flatnonzero(mask)], signals))
     return found
 
 
-def _order(
-    order: NDArray[np.int64], signals: Sequence[str], share: float, names: Sequence[str]
-) -> tuple[SetupFinding, list[Effect]]:
+def _order(order: NDArray[np.int64], signals: Sequence[str], names: Sequence[str]) -> tuple[SetupFinding, list[Effect]]:
     """Recorded column ``order[j]`` belongs to joint j."""
     moved = [j for j in range(len(names)) if order[j] != j]
     entries = [_entry("joint_order", names[a], signals, names[b]) for a, b in transpositions(order)]
@@ -164,7 +171,7 @@ def _order(
         columns = [names[int(np.flatnonzero(order == k)[0])] for k in range(len(names))]
         message = f"the {plural} are recorded in the order {', '.join(columns)}"
     joints = tuple(names[j] for j in moved)
-    return SetupFinding("joint_order", joints, share, message, effects_line(entries), True), entries
+    return SetupFinding("joint_order", joints, 1.0, message, effects_line(entries), True), entries
 
 
 def transpositions(order: NDArray[np.int64]) -> list[tuple[int, int]]:
@@ -180,7 +187,7 @@ def transpositions(order: NDArray[np.int64]) -> list[tuple[int, int]]:
 
 
 def _raw_exchange(step: Step, k: int, robot: RobotConfig) -> tuple[SetupFinding, list[Effect]]:
-    position, torque, _ = step.made[k]
+    position, torque = step.mistakes[k].position, step.mistakes[k].torque
     ratios = robot.transmission_matrix
     at_motors = {
         "position": ratios @ position @ np.linalg.inv(ratios),
@@ -190,32 +197,28 @@ def _raw_exchange(step: Step, k: int, robot: RobotConfig) -> tuple[SetupFinding,
     pair = np.flatnonzero(np.abs(np.diag(at_motors[signals[0]])) < 1e-9)
     names = [robot.joints[j].name for j in pair]
     entry = Effect(effect="joint_order", joint=names[0], other=names[1], parameters={s: 1.0 for s in signals})
-    message = f"{step.words[k]}: swapped node numbers or plugs of two drives"
-    return SetupFinding("joint_order", tuple(names), step.probability[k], message, effects_line([entry]), True), [entry]
+    message = f"{step.mistakes[k].words}: swapped node numbers or plugs of two drives"
+    return SetupFinding("joint_order", tuple(names), 1.0, message, effects_line([entry]), True), [entry]
 
 
-def _sign(
-    joints: Sequence[str], signals: Sequence[str], share: float, rivals: Sequence[str]
-) -> tuple[SetupFinding, list[Effect]]:
+def _sign(joints: Sequence[str], signals: Sequence[str]) -> tuple[SetupFinding, list[Effect]]:
     entries = [_entry("sign_error", name, signals) for name in joints]
     verb = "have" if len(joints) > 1 or len(signals) > 1 else "has"
     message = f"{' and '.join(signals)} of {', '.join(joints)} {verb} the wrong sign"
     if len(signals) == 2:
         message += ": the joint turns opposite to its configured direction"
-    if rivals:
-        message += f" (equally well explained by: {'; '.join(rivals)})"
     kind = "torque_sign" if tuple(signals) == ("torque",) else "position_sign"
-    return SetupFinding(kind, tuple(joints), share, message, effects_line(entries), True), entries
+    return SetupFinding(kind, tuple(joints), 1.0, message, effects_line(entries), True), entries
 
 
 def _scale(step: Step, k: int, robot: RobotConfig, bench: Bench) -> tuple[SetupFinding, list[Effect]]:
     """A unit, a side or a gear ratio."""
-    family, (position, torque, _) = step.families[k], step.made[k]
+    family, position, torque = step.families[k], step.mistakes[k].position, step.mistakes[k].torque
     changed = sum(np.abs(m - np.eye(robot.n)).max(axis=1) for m in (position, torque)) > 1e-12
     joints = [int(j) for j in np.flatnonzero(changed)]
     names = tuple(robot.joints[j].name for j in joints)
     entries = [*_linear_map(position, "position", robot), *_linear_map(torque, "torque", robot)]
-    remedy, message = effects_line(entries), step.words[k]
+    remedy, message = effects_line(entries), step.mistakes[k].words
     j = joints[0]
     if family == "gear_ratio":
         configured, true = robot.transmission_matrix[j, j], robot.transmission_matrix[j, j] / position[j, j]
@@ -229,9 +232,15 @@ def _scale(step: Step, k: int, robot: RobotConfig, bench: Bench) -> tuple[SetupF
         resolution = f"counts_per_unit: {1 / position[j, j]:.3g} times the present one"
         remedy = f"joints: {names[0]}: drive: {resolution}; or {remedy}"
     elif family == "torque_scales":
-        factors = ", ".join(f"{torque[i, i]:.3g}" for i in range(robot.n))
-        message += f" (per mille, or currents): by the links that they share, true over recorded is as {factors}"
-        remedy = f"joints: drive: gain or rated of each drive by its data sheet; or {remedy}"
+        told = _determined(step.h, bench)
+        joints = told if len(told) > 1 else joints
+        names = tuple(robot.joints[i].name for i in joints)
+        factors = ", ".join(f"{robot.joints[i].name} {torque[i, i] / torque[joints[0], joints[0]]:.2g}" for i in joints)
+        message += f" (per mille, or currents): by the links that they share, true over recorded is about as {factors}"
+        others = [robot.joints[i].name for i in np.flatnonzero(bench.moving) if i not in joints]
+        message += "; the motion does not determine the common factor"
+        message += f", nor that of {', '.join(others)}" if others else ""
+        remedy = "joints: drive: gain or rated of each drive by its data sheet"
     elif len(joints) > 1:
         h = _as_configured(robot)
         message += (
@@ -240,7 +249,19 @@ def _scale(step: Step, k: int, robot: RobotConfig, bench: Bench) -> tuple[SetupF
         )
         if family == "side":
             remedy = f"armident import FILE --motor-side where positions and torques are the motors'; or {remedy}"
-    return SetupFinding(KINDS.get(family, family), names, step.probability[k], message, remedy, True), entries
+    return SetupFinding(KINDS.get(family, family), names, 1.0, message, remedy, True), entries
+
+
+def _determined(h: Hypothesis, bench: Bench) -> list[int]:
+    """Joints whose torque has a scale that the links shared with other joints determine by a factor of two."""
+    n, best = bench.n, misfit(bench, h).value
+
+    def rise(j: int, factor: float) -> float:
+        return misfit(bench, replace(h, torque=scaled(n, j, factor) @ h.torque)).value - best
+
+    least = 2.0 * LEAST_ODDS / RANKED_ROWS
+    moving = [int(j) for j in np.flatnonzero(bench.moving)]
+    return [j for j in moving if min(rise(j, 0.5), rise(j, 2.0)) > least]
 
 
 def _linear_map(matrix: Array, signal: str, robot: RobotConfig) -> list[Effect]:
@@ -264,7 +285,7 @@ def _diagonal(matrix: Array) -> bool:
     return bool(np.allclose(matrix, np.diag(np.diag(matrix))))
 
 
-def _late(step: Step, k: int, robot: RobotConfig, bench: Bench) -> tuple[SetupFinding, list[Effect]]:
+def _late(step: Step, robot: RobotConfig, bench: Bench) -> tuple[SetupFinding, list[Effect]]:
     # One drive may be late by a time of its own.
     shift = float(np.median(step.h.shift[bench.moving]))
     delay = float(f"{shift:.3g}")
@@ -274,15 +295,15 @@ def _late(step: Step, k: int, robot: RobotConfig, bench: Bench) -> tuple[SetupFi
     message = f"all torques are {1000 * abs(shift):.3g} ms {direction} against the positions"
     if np.isfinite(step.shift_std):
         message += f" (standard deviation {1000 * step.shift_std:.2g} ms)"
-    remedy = effects_line(entries)
-    return SetupFinding("time_shift", names, step.probability[k], message, remedy, step.shift_decisive), entries
+    share = 1.0 if step.shift_decisive else math.erf(abs(shift) / step.shift_std / math.sqrt(2.0))
+    return SetupFinding("time_shift", names, share, message, effects_line(entries), step.shift_decisive), entries
 
 
-def _gravity(family: str, step: Step, robot: RobotConfig, share: float) -> SetupFinding:
+def _gravity(family: str, step: Step, robot: RobotConfig) -> SetupFinding:
     names = tuple(joint.name for joint in robot.joints)
     if family == "gravity_missing":
         message = "the torques contain no gravity: the controller has subtracted its model of it"
-        return SetupFinding(family, names, share, message, "gravity: [0.0, 0.0, 0.0]", True)
+        return SetupFinding(family, names, 1.0, message, "gravity: [0.0, 0.0, 0.0]", True)
     own, found = np.array(robot.gravity), step.h.gravity
     vector = ", ".join(f"{g:.3f}" for g in found)
     if not own.any():
@@ -291,10 +312,10 @@ def _gravity(family: str, step: Step, robot: RobotConfig, share: float) -> Setup
         cosine = float(own @ found / np.linalg.norm(own) / np.linalg.norm(found))
         angle = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
         message = f"gravity acts along [{vector}] m/s^2, {angle:.1f} degrees from the configured direction"
-    return SetupFinding(family, names, share, message, f"gravity: [{vector}]", True)
+    return SetupFinding(family, names, 1.0, message, f"gravity: [{vector}]", True)
 
 
-def _clock(step: Step, robot: RobotConfig, bench: Bench, share: float) -> SetupFinding:
+def _clock(step: Step, robot: RobotConfig, bench: Bench) -> SetupFinding:
     names = tuple(joint.name for joint in robot.joints)
     unit = CLOCK_WORDS.get(step.h.clock, f"{step.h.clock:g} s")
     rate = 1.0 / (bench.period * step.h.clock)
@@ -302,7 +323,7 @@ def _clock(step: Step, robot: RobotConfig, bench: Bench, share: float) -> SetupF
         f"the time column is in {unit}, not in s: at {1 / bench.period:.4g} Hz the largest velocities are on average "
         f"{100 * velocity_ratio(bench, _as_configured(robot)):.2g} % of their limits"
     )
-    return SetupFinding("time_unit", names, share, message, f"armident import FILE --rate {rate:.6g}", True)
+    return SetupFinding("time_unit", names, 1.0, message, f"armident import FILE --rate {rate:.6g}", True)
 
 
 def _as_configured(robot: RobotConfig) -> Hypothesis:

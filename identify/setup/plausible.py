@@ -23,6 +23,9 @@ RATE_LEAST_HZ = 20.0
 SPREAD = float(np.log(2.0))
 """Standard deviation of the logarithm of these ratios beyond the range."""
 
+LEAST_ODDS = float(np.log(99.0))
+"""Least gain for a finding, nats: posterior odds of 99 to 1, a false alarm in less than 1 %."""
+
 NO_LIMIT = 1e6
 """Limits from this value on are placeholders of a file format."""
 
@@ -66,9 +69,9 @@ def _largest(recorded: Array, correction: Array) -> Array:
 
 
 def plausible_factor(bench: Bench, h: Hypothesis) -> float:
-    """Common factor that brings the torques to the middle of their plausible range, 1 inside of it."""
+    """Common factor that brings the torques to the middle of their plausible range, 1 unless they are far from it."""
     ratio = torque_ratio(bench, h)
-    return 1.0 if TORQUE[0] <= ratio <= TORQUE[1] else float(np.sqrt(TORQUE[0] * TORQUE[1])) / ratio
+    return 1.0 if _beyond(ratio, *TORQUE) >= -LEAST_ODDS else float(np.sqrt(TORQUE[0] * TORQUE[1])) / ratio
 
 
 def log_plausibility(bench: Bench, h: Hypothesis) -> float:

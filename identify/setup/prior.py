@@ -1,9 +1,13 @@
-"""Prior of the set-up hypotheses: the number of things that are wrong."""
+"""Mistakes of a set-up, their composition, and the prior of a hypothesis: the number of things that are wrong."""
 
 import math
+from collections.abc import Iterable
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+
+from armident.identify.setup.fit import Hypothesis
 
 Array = NDArray[np.float64]
 
@@ -23,18 +27,59 @@ WIRING = ("position_sign", "torque_sign", "exchange", "assignment", "order")
 """Families that only permute signals or change their signs."""
 
 
-def cost(families: tuple[str, ...], made: tuple[tuple[Array, Array, bool], ...], n: int) -> float:
-    """Negative logarithm of the prior of a hypothesis, nats; ``made``: changes, see `search.Step`.
+@dataclass(frozen=True, eq=False)
+class Mistake:
+    """One mistake: what its correction adds to those before it.
+
+    ``position``, ``torque`` (n, n) multiply the corrections. ``gravity`` (3,): replaces it, m/s^2. ``shift`` (n,), s,
+    is added and ``clock`` multiplied. ``raw``: raw numbers of drives are exchanged.
+    """
+
+    family: str
+    words: str
+    position: Array
+    torque: Array
+    shift: Array
+    gravity: Array | None = None
+    clock: float = 1.0
+    raw: bool = False
+
+
+def between(old: Hypothesis, new: Hypothesis, family: str, words: str, raw: bool = False) -> Mistake:
+    """Return the mistake that leads from one hypothesis to another."""
+    return Mistake(
+        family,
+        words,
+        new.position @ np.linalg.inv(old.position),
+        new.torque @ np.linalg.inv(old.torque),
+        new.shift - old.shift,
+        None if np.array_equal(old.gravity, new.gravity) else new.gravity,
+        new.clock / old.clock,
+        raw,
+    )
+
+
+def composed(start: Hypothesis, mistakes: Iterable[Mistake]) -> Hypothesis:
+    """Return a hypothesis with mistakes corrected one after the other."""
+    h = start
+    for m in mistakes:
+        gravity = h.gravity if m.gravity is None else m.gravity
+        h = Hypothesis(m.position @ h.position, m.torque @ h.torque, gravity, h.shift + m.shift, h.clock * m.clock)
+    return h
+
+
+def cost(mistakes: Iterable[Mistake], n: int) -> float:
+    """Negative logarithm of the prior of a hypothesis, nats.
 
     Permutations and signs are judged by their product: two ways to the same wiring cost the same.
     """
     total, position, torque = 0.0, np.eye(n), np.eye(n)
-    for family, (of_position, of_torque, raw) in zip(families, made, strict=True):
-        if family in WIRING and not raw:
-            position, torque = of_position @ position, of_torque @ torque
+    for m in mistakes:
+        if m.family in WIRING and not m.raw:
+            position, torque = m.position @ position, m.torque @ torque
         else:
-            total += MISTAKE + _place_cost(of_position, of_torque) + (RAW if raw else 0.0)
-            if family == "torque_scales":
+            total += MISTAKE + _place_cost(m.position, m.torque) + (RAW if m.raw else 0.0)
+            if m.family == "torque_scales":
                 total += n * FACTOR
     return total + wiring_cost(position, torque)
 

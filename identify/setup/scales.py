@@ -18,6 +18,9 @@ SlopedCriterion = Callable[[Hypothesis], Misfit]
 FACTORS = (0.2, 0.32, 0.5, 0.7, 0.85, 1.0, 1.18, 1.4, 2.0, 3.1, 5.0)
 """True over configured values that are tried before the refinement."""
 
+TORQUE_FACTORS = (0.067, 0.12, *FACTORS, 8.5, 15.0)
+"""The same for a torque: kgf m, kgf cm over N m, and tenths lie between them."""
+
 WORTH_REFINING = 0.02
 """Least drop of the criterion at the tried values for a refinement, nats per row."""
 
@@ -37,8 +40,10 @@ LEAST_TORQUE = 3.0
 """Least factor of a single torque for a finding; a smaller one is an effect of the drive (`drive_gain_error`)."""
 
 
-def scale_moves(robot: RobotConfig, joint: int, h: Hypothesis, criterion: Criterion) -> Iterator[Move]:
-    """Best factor of one joint for its gear ratio, its torque alone and its position alone.
+def scale_moves(
+    robot: RobotConfig, joint: int, h: Hypothesis, quick: Criterion, criterion: Criterion
+) -> Iterator[Move]:
+    """Best factor of one joint for its gear ratio, its torque alone and its position alone; ``quick`` tries many.
 
     A wrong gear ratio scales the position by ``f`` and the torque by ``1 / f``: their power stays.
     """
@@ -53,8 +58,12 @@ def scale_moves(robot: RobotConfig, joint: int, h: Hypothesis, criterion: Criter
     def position(f: float) -> Move:
         return Move("position_scale", f"scale of the position of {name}", scaled(n, joint, f), None)
 
-    for made, least in ((gear, 1.0 + LEAST_GEAR), (torque, LEAST_GAIN), (position, 1.0 + LEAST_GEAR)):
-        factor = _best(made, h, criterion)
+    for made, least, tried in (
+        (gear, 1.0 + LEAST_GEAR, FACTORS),
+        (torque, LEAST_GAIN, TORQUE_FACTORS),
+        (position, 1.0 + LEAST_GEAR, FACTORS),
+    ):
+        factor = _best(made, h, quick, criterion, tried)
         if abs(np.log(factor)) >= np.log(least):
             yield made(factor)
 
@@ -62,7 +71,7 @@ def scale_moves(robot: RobotConfig, joint: int, h: Hypothesis, criterion: Criter
 def torque_scales(h: Hypothesis, criterion: SlopedCriterion, starts: Sequence[Array]) -> Array | None:
     """Best factors (n,) of all torques together, or ``None`` if none of them is far from the others.
 
-    Joints that carry the same links determine the proportions; the common factor is free.
+    Joints that carry the same links determine the proportions; the common factor is free: the median joint has 1.
     """
 
     def misfit(logs: Array) -> Misfit:
@@ -92,24 +101,26 @@ def torque_scales(h: Hypothesis, criterion: SlopedCriterion, starts: Sequence[Ar
     logs = np.asarray(best.x)
     if np.max(np.abs(logs - np.median(logs))) < np.log(LEAST_TORQUE):
         return None
-    factors: Array = np.exp(logs)
+    factors: Array = np.exp(logs - np.median(logs))
     return factors
 
 
-def _best(made: Callable[[float], Move], h: Hypothesis, criterion: Criterion) -> float:
-    """Factor with the least misfit: the best of `FACTORS`, refined between its neighbours."""
-    values = [criterion(made(f)(h)) for f in FACTORS]
+def _best(
+    made: Callable[[float], Move], h: Hypothesis, quick: Criterion, criterion: Criterion, tried: Sequence[float]
+) -> float:
+    """Factor with the least misfit: the best of those tried, refined between its neighbours."""
+    values = [quick(made(f)(h)) for f in tried]
     k = int(np.argmin(values))
-    if values[k] > values[FACTORS.index(1.0)] - WORTH_REFINING:
+    if values[k] > values[tried.index(1.0)] - WORTH_REFINING:
         return 1.0
-    low, high = np.log(FACTORS[max(k - 1, 0)]), np.log(FACTORS[min(k + 1, len(FACTORS) - 1)])
+    low, high = np.log(tried[max(k - 1, 0)]), np.log(tried[min(k + 1, len(tried) - 1)])
     found = optimize.minimize_scalar(
         lambda v: criterion(made(float(np.exp(v)))(h)),
         bounds=(low, high),
         method="bounded",
         options={"xatol": 2e-3, "maxiter": 15},
     )
-    return float(np.exp(found.x)) if found.fun < values[k] else FACTORS[k]
+    return float(np.exp(found.x))
 
 
 def with_clock(h: Hypothesis, factor: float) -> Hypothesis:

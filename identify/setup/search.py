@@ -1,8 +1,8 @@
 """Search for the corrections of a set-up: best-first over single mistakes, and over whole permutations."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cached_property, partial
 from itertools import product
 
 import numpy as np
@@ -10,17 +10,14 @@ from numpy.typing import NDArray
 
 from armident.identify.setup import assignment, gravity, moves, scales
 from armident.identify.setup.bench import Bench
-from armident.identify.setup.fit import Hypothesis, fit, fit_shares, held_out, joint_errors, misfit
-from armident.identify.setup.plausible import log_plausibility, plausible_factor, worst_change
-from armident.identify.setup.prior import WIRING, cost, wiring_cost
+from armident.identify.setup.fit import FLOOR, Hypothesis, fit, fit_shares, held_out, joint_errors, misfit
+from armident.identify.setup.plausible import LEAST_ODDS, log_plausibility, plausible_factor, worst_change
+from armident.identify.setup.prior import Mistake, between, composed, cost, wiring_cost
 
 Array = NDArray[np.float64]
 
 MOST_MISTAKES = 6
 """Largest number of mistakes that are corrected one after the other."""
-
-LEAST_ODDS = float(np.log(99.0))
-"""Least gain of the score for a finding, nats: posterior odds of 99 to 1, a false alarm in less than 1 %."""
 
 LEAST_DROP = float(np.log(2.0))
 """Least drop of the held-out residual power for a finding, nats, summed over the joints: half of one joint's."""
@@ -34,10 +31,10 @@ LEAST_DROP_EARLY = 2.0
 """The same for torques that are early: noise in a closed loop, and current loops that lag, resemble it."""
 
 LEAST_TOGETHER = 1.5
-"""Least factor by which the structured residual shares of all joints together must fall.
+"""Least factor by which the structured residual power of one joint, and of all joints together, must fall."""
 
-Exchanging two wrist joints of a measured KUKA LWR4+ reaches 1.3 (no explanation), deliberate mistakes 2 and more.
-"""
+MOST_OF_ONE = float(np.log(4.0))
+"""Largest fall or rise of the structured residual power of one joint that counts, nats: its residual halves."""
 
 LEAST_TOGETHER_LATE = 1.2
 """The same for torques that are late: friction and gravity hardly change with a delay."""
@@ -71,14 +68,14 @@ EACH_OWN = "every torque is in a unit of its own drive"
 CANDIDATES = 4
 """Number of best-ranked mistakes whose held-out score is computed."""
 
-EQUAL = 0.1
-"""Odds to the best hypothesis from which on another one is named beside it."""
-
 ORDERS_KEPT = 2
 """Number of best orders, and of best mistakes of several joints, from which the search continues."""
 
 MOST_IN_SETS = 8
 """Largest number of joints of which all sets are tried: 247 sets with ten mistakes each take seconds."""
+
+FEW_ROWS = 150
+"""Instants with which single mistakes are ranked first; the best `CANDIDATES` times four are ranked with all."""
 
 ORDER_ROWS = 150
 """Instants with which orders are ranked: enough for residuals that differ by tens of percent."""
@@ -89,38 +86,68 @@ CLOCKS = (1e-3, 1e-6, 1e-9, 1e3)
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """A hypothesis with the mistakes that lead to it: kind, words and changes of each.
+    """A hypothesis with the mistakes that lead to it from ``start``.
 
-    ``made``: position and torque matrices (n, n); True if raw numbers are exchanged. ``rank``: criterion, in-sample
-    nats per row: lower is better. ``rivals``, ``probability``: of each mistake. ``shift_std``: of a common torque
-    shift, s; NaN if from the best prediction. ``shift_decisive``: prediction gains enough by it for a mistake.
+    ``rank``: criterion, in-sample nats per row: lower is better. ``shift_std``: of a common torque shift, s; NaN if
+    from the best prediction. ``shift_decisive``: prediction gains enough by it for a mistake.
     """
 
-    h: Hypothesis
-    families: tuple[str, ...] = ()
-    words: tuple[str, ...] = ()
-    made: tuple[tuple[Array, Array, bool], ...] = ()
+    start: Hypothesis
+    mistakes: tuple[Mistake, ...] = ()
     rank: float = np.inf
-    rivals: tuple[tuple[str, ...], ...] = ()
-    probability: tuple[float, ...] = ()
     shift_std: float = np.nan
     shift_decisive: bool = True
+
+    @cached_property
+    def h(self) -> Hypothesis:
+        """The set-up with all mistakes corrected."""
+        return composed(self.start, self.mistakes)
+
+    @property
+    def families(self) -> tuple[str, ...]:
+        """Families of the mistakes."""
+        return tuple(mistake.family for mistake in self.mistakes)
+
+    @property
+    def each_own(self) -> bool:
+        """True if every torque is in a unit of its own drive: its common factor is not determined by the motion."""
+        return "torque_scales" in self.families
+
+    def without(self, places: Collection[int]) -> "Step":
+        """Return the step without some of its mistakes."""
+        kept = tuple(mistake for k, mistake in enumerate(self.mistakes) if k not in places)
+        return replace(self, mistakes=kept, rank=np.inf)
 
 
 @dataclass(eq=False)
 class Search:
-    """Search over the hypotheses of one set of recordings; ``tried``: counts of families tried, in words."""
+    """Search over the hypotheses of one set of recordings.
+
+    ``tried``: counts of families tried. ``met``: the best hypotheses of every step, each with the step before it.
+    ``scores``: held-out shares, kept for repeated use.
+    """
 
     bench: Bench
     tried: dict[str, int] = field(default_factory=dict)
+    met: list[tuple[Step, Step]] = field(default_factory=list)
+    scores: dict[bytes, Array] = field(default_factory=dict)
 
     def rank(self, h: Hypothesis) -> float:
         """Criterion of the ranking: misfit in sample minus plausibility of the units, nats per row."""
         return _rank(self.bench, h)
 
+    @cached_property
+    def few(self) -> Bench:
+        """Few instants, with which all single mistakes are ranked first."""
+        return self.bench.coarse(FEW_ROWS)
+
+    def few_rank(self, h: Hypothesis) -> float:
+        """Criterion of the ranking with few instants."""
+        return _rank(self.few, h)
+
     def run(self, start: Hypothesis) -> Step:
         """Return the corrected set-up. ``start``: the set-up as configured."""
-        first = Step(start, rank=self.rank(start))
+        first = replace(Step(start), rank=self.rank(start))
         best = self._greedy(first)
         explained = self._explained(best.h)
         starts: list[Step] = []
@@ -131,12 +158,18 @@ class Search:
             # Several mistakes may be one that a set of joints shares.
             if not explained or len(best.families) > 1:
                 starts += self._sets(first)
+        # Several scales of torques may be parts of one of every torque.
+        if best.families.count("torque_scale") > 1:
+            scaled = composed(start, (m for m in best.mistakes if m.family == "torque_scale"))
+            begin = np.abs(np.diag(scaled.torque @ np.linalg.inv(start.torque)))
+            starts += [self._ranked(s, self.bench) for s in self._torque_scales(first, (begin,))]
         # An order or a set that explains no more than the configuration is no part of an explanation.
         starts = sorted((s for s in starts if s.rank < first.rank), key=lambda s: s.rank)
+        self.met += [(first, s) for s in starts]
         for k, step in enumerate(starts):
             other = self._greedy(step)
             needed = 0.0 if best.families else LEAST_ODDS
-            better = self._gain(best, other, self.bench.everywhere)[0] > needed
+            better = self.gain(best, other, self.bench.everywhere)[0] > needed
             if better and self._material(first.h, other.h, LEAST_TOGETHER):
                 best = other
             clear = all(0.5 * RANKED_ROWS * (s.rank - step.rank) > LEAST_ODDS for s in starts[k + 1 : k + 2])
@@ -152,8 +185,9 @@ class Search:
         return bool(np.all(errors[self.bench.moving] <= WELL_UNDERSTOOD))
 
     def _greedy(self, step: Step) -> Step:
-        while len(step.families) < MOST_MISTAKES:
-            found = sorted(self._neighbours(step), key=lambda s: s.rank)
+        while len(step.mistakes) < MOST_MISTAKES:
+            found = sorted(self._neighbours(step), key=lambda s: s.rank)[: 4 * CANDIDATES]
+            found = sorted((self._ranked(s, self.bench) for s in found), key=lambda s: s.rank)
             taken = self._taken(step, found)
             if taken is None:
                 return step
@@ -169,7 +203,7 @@ class Search:
         return None
 
     def _accepted(self, step: Step, best: Step, found: list[Step]) -> Step | None:
-        gain, drop, plausible = self._gain(step, best)
+        gain, drop, plausible = self.gain(step, best)
         least, together = LEAST_DROP, LEAST_TOGETHER
         if best.families[-1] == "time_shift":
             shift = float(best.h.shift[self.bench.moving][0] - step.h.shift[self.bench.moving][0])
@@ -183,45 +217,41 @@ class Search:
             if one is not None and one.rank < best.rank:
                 # The delay of one drive alone is an effect of its own, and no clock of the set-up.
                 best, least, together = one, LEAST_DROP, LEAST_TOGETHER
-                gain, drop, plausible = self._gain(step, best)
+                gain, drop, plausible = self.gain(step, best)
         if best.families[-1] == "gravity_direction":
-            if _angle(step.h.gravity, best.h.gravity) < LEAST_TILT:
+            if angle_between(step.h.gravity, best.h.gravity) < LEAST_TILT:
                 return None
             if drop >= CLEAR_TILT:
                 together = 1.0
         material = drop >= least and self._material(step.h, best.h, together)
         if gain < LEAST_ODDS or not (material or plausible >= LEAST_ODDS):
             return None
-        others = [s for s in found if _differs(s.h, best.h)]
-        odds = {s.words[-1]: float(np.exp(min(-self._gain(s, best)[0], 0.0))) for s in others}
-        # A symmetry of the arm makes some signs equal: that one of them is wrong is certain all the same.
-        equal = {w: p for s in others if (p := odds[w := s.words[-1]]) > EQUAL and _same_kind(s, best)}
-        share = (1.0 + sum(equal.values())) / (1.0 + sum(odds.values()) + float(np.exp(-gain)))
-        rivals = (*step.rivals, tuple(equal))
-        return replace(best, rivals=rivals, probability=(*step.probability, share))
+        self.met += [(step, other) for other in (best, *found)]
+        return best
 
     def _material(self, old: Hypothesis, new: Hypothesis, least: float) -> bool:
-        """True if a correction makes no joint implausible, and reduces the structured residual shares by a factor.
+        """True if a correction makes no joint implausible, and more joints improve by a factor than get worse.
 
         With and without the free terms: helping these alone only fits an effect that the model lacks.
         """
         if worst_change(self.bench, old, new) < -LEAST_ODDS:
             return False
-        return all(self._together(old, new, free=free) >= least for free in (True, False))
+        return all(self._improved(old, new, free=free) >= np.log(least) for free in (True, False))
 
-    def _together(self, old: Hypothesis, new: Hypothesis, *, free: bool = True) -> float:
-        """Factor by which the structured residual shares of all moving joints together fall.
+    def _improved(self, old: Hypothesis, new: Hypothesis, *, free: bool = True) -> float:
+        """Fall of the structured residual power, nats: of the joint that improves most, and of all joints together.
 
-        The covariance of neighbouring residuals is the power of their structured part, without white noise.
+        The covariance of neighbouring residuals is the power of their structured part, without white noise. Each joint
+        counts in its own residual, and as `MOST_OF_ONE` at most: a joint with little torque outvotes no two others.
         """
-        sums = []
+        powers = []
         for h in (old, new):
             residual, torque = fit(self.bench, h, free=free).residual, self.bench.torque(h.shift)
-            power = np.maximum((torque**2).sum(axis=0), 1e-300)
-            white = WHITE * (residual**2).sum(axis=0)
-            shares = np.maximum((residual[1:] * residual[:-1]).sum(axis=0), white) / power
-            sums.append(float(shares[self.bench.moving].sum()))
-        return sums[0] / max(sums[1], 1e-300)
+            white = WHITE * (residual**2).sum(axis=0) + FLOOR * (torque**2).sum(axis=0)
+            power = np.maximum((residual[1:] * residual[:-1]).sum(axis=0), white)
+            powers.append(power / np.maximum((torque**2).sum(axis=0), 1e-300))
+        falls = np.log(powers[0] / powers[1])[self.bench.moving]
+        return float(min(falls.max(), np.clip(falls, -MOST_OF_ONE, MOST_OF_ONE).sum()))
 
     def _one_late(self, step: Step) -> Step | None:
         """Best delay of one drive alone; ``None`` for a single joint."""
@@ -237,21 +267,32 @@ class Search:
             )
             for j in np.flatnonzero(self.bench.moving)
         ]
-        return min(alone, key=lambda s: s.rank)
+        return min((self._ranked(s, self.bench) for s in alone), key=lambda s: s.rank)
 
-    def _gain(self, old: Step, new: Step, bench: Bench | None = None) -> tuple[float, float, float]:
+    def gain(self, old: Step, new: Step, bench: Bench | None = None) -> tuple[float, float, float]:
         """Gain of the score, drop of the held-out residual power, and gain of plausibility, nats each."""
         bench = self.bench if bench is None else bench
         moving, n = bench.moving, bench.n
-        try:
-            before, after = held_out(bench, old.h)[moving], held_out(bench, new.h)[moving]
-        except np.linalg.LinAlgError:
+        before, after = self.held_out(old.h, bench)[moving], self.held_out(new.h, bench)[moving]
+        if not (np.isfinite(before).all() and np.isfinite(after).all()):
             return -np.inf, 0.0, 0.0
         rows = independent_rows(fit(bench, new.h).residual)[moving]
         drops = np.log(before / after)
         plausible = log_plausibility(bench, new.h) - log_plausibility(bench, old.h)
-        dearer = cost(new.families, new.made, n) - cost(old.families, old.made, n)
+        dearer = cost(new.mistakes, n) - cost(old.mistakes, n)
         return float(0.5 * rows @ drops + plausible - dearer), float(drops.sum()), plausible
+
+    def held_out(self, h: Hypothesis, bench: Bench | None = None) -> Array:
+        """Held-out residual share (n,) of every torque, see `fit.held_out`; infinite where no fit exists."""
+        bench = self.bench if bench is None else bench
+        parts = (h.position, h.torque, h.gravity, h.shift, h.clock, bench.at_rest)
+        key = b"".join(np.asarray(part).tobytes() for part in parts)
+        if key not in self.scores:
+            try:
+                self.scores[key] = held_out(bench, h)
+            except np.linalg.LinAlgError:
+                self.scores[key] = np.full(bench.n, np.inf)
+        return self.scores[key]
 
     def _neighbours(self, step: Step) -> Iterator[Step]:
         bench, h = self.bench, step.h
@@ -262,7 +303,12 @@ class Search:
             *moves.exchange_moves(robot, joints),
             *moves.unit_moves(robot),
             *moves.single_unit_moves(robot, joints),
-            *(move for j in joints if len(joints) > 1 for move in scales.scale_moves(robot, j, h, self.rank)),
+            *(
+                move
+                for j in joints
+                if len(joints) > 1
+                for move in scales.scale_moves(robot, j, h, self.few_rank, self.rank)
+            ),
         )
         for move in singles:
             yield self._made(step, move.family, move.words, move(h), move.drives)
@@ -271,7 +317,9 @@ class Search:
         if h.gravity.any():
             yield self._made(step, "gravity_missing", "torques without gravity", gravity.without_gravity(h))
         if len(joints) > 1:
-            yield from self._torque_scales(step)
+            ratios = np.abs(np.diag(robot.transmission_matrix))
+            unequal = np.all(ratios > 0) and np.ptp(ratios) > 0
+            yield from self._torque_scales(step, (np.ones(bench.n), ratios) if unequal else (np.ones(bench.n),))
         turned = gravity.best_direction(h, partial(misfit, bench))
         yield self._made(step, "gravity_direction", "another direction of gravity", turned)
         for clock in CLOCKS:
@@ -279,11 +327,9 @@ class Search:
         late = gravity.best_shift(h, self.rank, bench.period, bench.moving)
         yield self._made(step, "time_shift", "all torques late by the same time", late)
 
-    def _torque_scales(self, step: Step) -> Iterator[Step]:
+    def _torque_scales(self, step: Step, starts: Sequence[Array]) -> Iterator[Step]:
         """All torques in a unit of each drive's own: per mille of unknown rated torques, currents of the motors."""
         bench, h = self.bench, step.h
-        ratios = np.abs(np.diag(bench.robot.transmission_matrix))
-        starts = [np.ones(bench.n), *([ratios] if np.all(ratios > 0) and np.ptp(ratios) > 0 else [])]
         factors = scales.torque_scales(h, partial(misfit, bench), starts)
         if factors is None:
             return
@@ -293,15 +339,11 @@ class Search:
 
     def _made(self, step: Step, family: str, words: str, h: Hypothesis, raw: bool = False) -> Step:
         self.tried[family] = self.tried.get(family, 0) + 1
-        # What this mistake adds to the corrections before it.
-        change = (
-            h.position @ np.linalg.inv(step.h.position),
-            h.torque @ np.linalg.inv(step.h.torque),
-            raw,
-        )
-        families, made = (*step.families, family), (*step.made, change)
-        rank = self.rank(h) + 2.0 * cost(families, made, self.bench.n) / RANKED_ROWS
-        return replace(step, h=h, families=families, words=(*step.words, words), made=made, rank=rank)
+        mistake = between(step.h, h, family, words, raw)
+        return self._ranked(replace(step, mistakes=(*step.mistakes, mistake)), self.few)
+
+    def _ranked(self, step: Step, bench: Bench) -> Step:
+        return replace(step, rank=_rank(bench, step.h) + 2.0 * cost(step.mistakes, bench.n) / RANKED_ROWS)
 
     def _sets(self, first: Step) -> list[Step]:
         """Best mistakes of sign, unit or side that several joints share."""
@@ -309,8 +351,8 @@ class Search:
         if len(joints) > MOST_IN_SETS:
             return []
         made = [self._made(first, move.family, move.words, move(first.h)) for move in moves.set_moves(robot, joints)]
-        best = sorted(made, key=lambda s: s.rank)[:ORDERS_KEPT]
-        return [replace(s, probability=(1.0,), rivals=((),)) for s in best]
+        best = sorted(made, key=lambda s: s.rank)[: 4 * ORDERS_KEPT]
+        return sorted((self._ranked(s, self.bench) for s in best), key=lambda s: s.rank)[:ORDERS_KEPT]
 
     def _orders(self, first: Step) -> list[Step]:
         """Best orders of all joints, with torques in the order of positions, or as their friction assigns them."""
@@ -339,7 +381,7 @@ class Search:
                 _climb(begin, self.bench.moving, partial(at, own=own))
         best = sorted(seen.values(), key=lambda pair: pair[0])[: 4 * ORDERS_KEPT]
         steps = [self._made(first, "order", "joints in another order", h) for _, h in best]
-        return [replace(s, probability=(1.0,), rivals=((),)) for s in sorted(steps, key=lambda s: s.rank)[:ORDERS_KEPT]]
+        return sorted((self._ranked(s, self.bench) for s in steps), key=lambda s: s.rank)[:ORDERS_KEPT]
 
 
 def _rank(bench: Bench, h: Hypothesis) -> float:
@@ -362,21 +404,10 @@ def _climb(order: Array, moving: NDArray[np.bool_], criterion: "assignment.Order
         order, least = swapped[k], values[k]
 
 
-def _angle(a: Array, b: Array) -> float:
+def angle_between(a: Array, b: Array) -> float:
     """Angle between two vectors (3,), rad; pi where one of them is zero."""
     sizes = float(np.linalg.norm(a) * np.linalg.norm(b))
     return float(np.arccos(np.clip(a @ b / sizes, -1.0, 1.0))) if sizes > 0 else float(np.pi)
-
-
-def _differs(a: Hypothesis, b: Hypothesis) -> bool:
-    """True if two hypotheses correct the signals differently."""
-    same = np.allclose(a.position, b.position, rtol=0.05) and np.allclose(a.torque, b.torque, rtol=0.05)
-    return not (same and np.allclose(a.gravity, b.gravity, atol=0.5) and a.clock == b.clock)
-
-
-def _same_kind(a: Step, b: Step) -> bool:
-    """True if both last mistakes are mistakes of the wiring, or both of the units."""
-    return (a.families[-1] in WIRING) == (b.families[-1] in WIRING)
 
 
 def independent_rows(residual: Array) -> Array:

@@ -67,6 +67,9 @@ LEAST_SAMPLES = 10.0
 SAMPLES_UNUSABLE = 5.0
 """Samples per period below which central differences lose a fifth of the acceleration."""
 
+REACHES_ZERO = 0.01
+"""Least torque over the largest one below which it reaches zero: the noise of usual torque signals."""
+
 SLIP_REMEDY = "find out why the encoder lost counts (coupling, index, power), home the joint and record again"
 
 
@@ -90,6 +93,24 @@ def small_torque_findings(experiments: Sequence[Experiment], robot: RobotConfig)
     names = tuple(joint.name for joint in robot.joints)
     remedy = "record the torques of the motors, or give drive.gain for currents"
     return [SetupFinding("torque_too_small", names, 1.0, message, remedy, True)]
+
+
+def absolute_findings(
+    experiments: Sequence[Experiment], robot: RobotConfig, moving: NDArray[np.bool_]
+) -> list[SetupFinding]:
+    """Return a finding if the torques of all moving joints are never negative: their sign is lost, or coded otherwise.
+
+    Gravity may keep one joint above zero, but not all of an arm.
+    """
+    lowest = np.min([e.tau.min(axis=0) for e in experiments], axis=0)[moving]
+    highest = np.max([e.tau.max(axis=0) for e in experiments], axis=0)[moving]
+    reached = np.any(lowest <= REACHES_ZERO * highest) and np.all(highest > 0.0)
+    if np.any(lowest < 0.0) or not reached or (moving.sum() == 1 and moving.size > 1):
+        return []
+    names = tuple(joint.name for joint in robot.joints)
+    message = "the torques are never negative: absolute values, or a sign that is a bit of its own"
+    remedy = "record torques with their sign: check data type and mapping of the torque"
+    return [SetupFinding("torque_without_sign", names, 1.0, message, remedy, True)]
 
 
 def step_findings(experiments: Sequence[Experiment], robot: RobotConfig) -> list[SetupFinding]:

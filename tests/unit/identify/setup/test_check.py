@@ -107,6 +107,7 @@ MISTAKES: dict[str, tuple[Made, str, tuple[str, ...]]] = {
         "torque_unit",
         EVERY,
     ),
+    "kgf m": (lambda e, r: setups.with_torques(e, setups.scaled(AXES, 1, 1 / 9.80665)), "torque_unit", ("axis_2",)),
     "torques of the motors": (motor_torques, "side", EVERY),
     "gear ratio": (
         lambda e, r: setups.with_torques(

@@ -1,0 +1,31 @@
+"""Probability of a finding: a logistic map of what the competition and the corrected model show."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+FEATURES = {
+    "odds": 0.36,
+    "error left at any joint": -0.47,
+    "fall of the error of the joint that improves most": 0.84,
+    "share of joints without friction": -3.4,
+    "factor of any value": -0.24,
+    "gain of plausibility": 0.62,
+}
+"""Coefficients by feature, see `Contest.features`; from ``python -m tests.evaluation.setup_calibration --out FILE``."""
+
+INTERCEPT = -3.03
+
+EXTREMES = (0.01, 0.995)
+"""Least and largest probability: a thousand findings do not tell more."""
+
+CORRECTED = 0.95
+"""Probability from which on a correction is printed to copy, and applied."""
+
+NAMED = 0.5
+"""Probability below which a finding is none where the rigid model explains the set-up as configured."""
+
+
+def probability(features: NDArray[np.float64]) -> float:
+    """Probability that a finding is right."""
+    log_odds = INTERCEPT + float(np.array(list(FEATURES.values())) @ features)
+    return float(np.clip(1.0 / (1.0 + np.exp(-log_odds)), *EXTREMES))

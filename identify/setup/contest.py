@@ -1,0 +1,185 @@
+"""Competition of whole set-ups: the share of them that contains a correction, and what the corrected model explains."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import logsumexp
+
+from armident.identify.setup.fit import Hypothesis, fit, joint_errors
+from armident.identify.setup.plausible import log_plausibility
+from armident.identify.setup.prior import WIRING, cost
+from armident.identify.setup.search import Search, Step, angle_between, independent_rows
+
+Array = NDArray[np.float64]
+
+EQUAL = float(np.log(10.0))
+"""Nats below the best set-up down to which another one explains the recordings equally well."""
+
+SAME_FACTOR = 0.1
+"""Largest difference of the logarithms of two factors that are one correction."""
+
+SAME_PROPORTION = float(np.log(1.5))
+"""The same where every torque is in a unit of its own: joints that share few links determine their factor less."""
+
+SAME_DIRECTION = float(np.radians(6.0))
+"""Largest angle between two directions of gravity that are one correction, rad."""
+
+SAME_SHIFT = (0.4, 1.5e-3)
+"""Largest difference of two common shifts that are one correction: share of the larger, and s."""
+
+LEAST_ERROR = 0.01
+"""Error of a joint below which a smaller one is no better explanation: noise of usual torque signals."""
+
+FRICTIONLESS = 1e-3
+"""Friction power over that of velocity times torque (rms) below which the fit is at its bound of dissipation."""
+
+
+@dataclass(frozen=True, eq=False)
+class Explained:
+    """Result of a hypothesis: relative errors (n,) with free terms, and serial correlations (n,) of the residuals.
+
+    ``frictionless``: share of the moving joints whose friction is at its bound: they would dissipate nothing.
+    """
+
+    errors: Array
+    memory: Array
+    frictionless: float
+
+
+class Contest:
+    """Whole set-ups with their log weights: the found one first, those without one mistake, rivals, the configured."""
+
+    def __init__(self, search: Search, found: Step, *, each_own: bool = False) -> None:
+        """``found``: the step that the search ended with. ``each_own``: every torque is in a unit of its own drive."""
+        self.bench, self.found, self.each_own = search.bench, found, each_own
+        self.moving = np.flatnonzero(self.bench.moving)
+        self.rows = independent_rows(fit(self.bench, found.h).residual)[self.moving]
+        self.wholes = list(_wholes(search, found))
+        self.weights = np.array([self._weight(search, step) for step in self.wholes])
+        self.before, self.after = (self._explained(h) for h in (found.start, found.h))
+        self.more_plausible = log_plausibility(self.bench, found.h) - log_plausibility(self.bench, found.start)
+
+    def _weight(self, search: Search, step: Step) -> float:
+        shares = search.held_out(step.h)[self.moving]
+        fitted = -0.5 * self.rows @ np.log(shares) if np.isfinite(shares).all() else -np.inf
+        return float(fitted + log_plausibility(self.bench, step.h) - cost(step.mistakes, self.bench.n))
+
+    def _explained(self, h: Hypothesis) -> Explained:
+        bench, moving = self.bench, self.moving
+        errors, memory = joint_errors(bench.everywhere, h, free=True)
+        velocity, torque = bench.recorded[1] @ h.position.T, bench.recorded[2] @ h.torque.T
+        sizes = np.sqrt((velocity**2).mean(axis=0) * (torque**2).mean(axis=0))[moving]
+        friction = (bench.rows(h.position).physical @ fit(bench, h).theta)[bench.n : 2 * bench.n][moving]
+        return Explained(errors, memory, float(np.mean(friction < FRICTIONLESS * sizes)))
+
+    def equal(self, kind: str, joints: Sequence[int]) -> list[Step]:
+        """Whole set-ups without this correction of the wiring that explain the recordings equally well."""
+        least = self.weights[0] - EQUAL
+        return [
+            step
+            for step, weight in zip(self.wholes[1:], self.weights[1:], strict=True)
+            if weight > least and step.mistakes and step.mistakes[-1].family in WIRING
+            and kind in ("position_sign", "torque_sign", "joint_order") and not self._contains(step, kind, joints)
+        ]  # fmt: skip
+
+    def log_odds(self, kind: str, joints: Sequence[int], equal: Sequence[Step]) -> float:
+        """Log odds of a finding: weight of the whole set-ups that contain it, or are equal, over that of the others."""
+        inside = [self._contains(step, kind, joints) or step in equal for step in self.wholes]
+        outside = self.weights[~np.array(inside)]
+        most = float(logsumexp(outside)) if outside.size else -np.inf
+        return float(logsumexp(self.weights[inside])) - most
+
+    def _contains(self, step: Step, kind: str, joints: Sequence[int]) -> bool:
+        return same_correction(kind, joints, step.h, self.found.h, each_own=self.each_own)
+
+    def own(self, joints: Sequence[int]) -> list[int]:
+        """Those of some joints that move; all that move, if none of them does."""
+        return [j for j in joints if j in self.moving] or [int(j) for j in self.moving]
+
+    def features(self, log_odds: float, any_value: bool) -> Array:
+        """Features from which the probability of a finding is estimated, see `calibration.FEATURES`.
+
+        ``any_value``: a factor of one joint that may have any value.
+        """
+        before, after = (np.maximum(e.errors[self.moving], LEAST_ERROR) for e in (self.before, self.after))
+        return np.array(
+            [
+                np.arcsinh(0.5 * np.clip(log_odds, -1e3, 1e3)),
+                np.log(after.max()),
+                np.log(before / after).max(),
+                self.after.frictionless,
+                float(any_value),
+                np.arcsinh(0.5 * self.more_plausible),
+            ]
+        )
+
+
+def _wholes(search: Search, found: Step) -> Iterator[Step]:
+    """The found set-up, those with a mistake less or another one in its place, and those that the search has met."""
+    seen: set[bytes] = set()
+
+    def new(step: Step) -> bool:
+        h = step.h
+        parts = (h.position, h.torque, h.gravity, h.shift)
+        key = b"".join(np.round(part, 6).tobytes() for part in parts) + np.float64(h.clock).tobytes()
+        return key not in seen and not seen.add(key)  # type: ignore[func-returns-value]
+
+    steps = [found, replace(found, mistakes=()), *(found.without({k}) for k in range(len(found.mistakes)))]
+    for k, mistake in enumerate(found.mistakes):
+        if mistake.gravity is not None:
+            # Opposite directions fit equally where the first moments may change their sign.
+            opposite = replace(mistake, gravity=-mistake.gravity)
+            steps.append(replace(found, mistakes=(*found.mistakes[:k], opposite, *found.mistakes[k + 1 :])))
+    for parent, met in search.met:
+        place = len(parent.mistakes)
+        if found.mistakes[:place] == parent.mistakes and len(found.mistakes) > place:
+            # A rival of one mistake competes together with the mistakes that were found after it.
+            later = found.mistakes[place + 1 :]
+            steps.append(replace(found, mistakes=(*parent.mistakes, *later, met.mistakes[-1])))
+        else:
+            steps.append(met)
+    for step in steps:
+        if new(step):
+            yield step
+
+
+def same_correction(kind: str, joints: Sequence[int], a: Hypothesis, b: Hypothesis, *, each_own: bool = False) -> bool:
+    """True if two hypotheses contain the same correction of a kind at some joints.
+
+    ``each_own``: of torques only the proportions between the joints count.
+    """
+    if kind.startswith("gravity"):
+        if not (a.gravity.any() and b.gravity.any()):
+            return not a.gravity.any() and not b.gravity.any()
+        return angle_between(a.gravity, b.gravity) < SAME_DIRECTION
+    if kind == "time_unit":
+        return bool(abs(np.log(a.clock / b.clock)) < SAME_FACTOR)
+    if kind == "time_shift":
+        x, y = (float(np.median(h.shift)) for h in (a, b))
+        share, least = SAME_SHIFT
+        return x * y > 0 and abs(x - y) <= max(share * max(abs(x), abs(y)), least)
+    return all(
+        _same_signals(kind, getattr(a, signal)[list(joints)], getattr(b, signal)[list(joints)], proportion)
+        for signal, proportion in (("position", False), ("torque", each_own))
+    )
+
+
+def _same_signals(kind: str, a: Array, b: Array, proportion: bool) -> bool:
+    """True if rows of two corrections take the same signals, with the same sign, or in the same scale."""
+    rows, first, second = np.arange(len(a)), np.abs(a).argmax(axis=1), np.abs(b).argmax(axis=1)
+    if kind == "joint_order":
+        return bool(np.array_equal(first, second))
+    x, y = a[rows, first], b[rows, second]
+    if kind in ("position_sign", "torque_sign"):
+        return bool(np.array_equal(np.sign(x), np.sign(y)))
+    off = np.log(np.abs(x)) - np.log(np.abs(y))
+    if proportion:
+        off = off - np.median(off)
+    return bool(np.abs(off).max() <= (SAME_PROPORTION if proportion else SAME_FACTOR))
+
+
+def words_of(steps: Sequence[Step]) -> list[str]:
+    """The last mistakes of steps in words, each once."""
+    return list(dict.fromkeys(step.mistakes[-1].words for step in steps))

@@ -1,0 +1,121 @@
+"""Findings of a search with their probabilities: what is corrected, what is only named, and what is left."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armident.configs import RobotConfig
+from armident.identify.setup.calibration import CORRECTED, NAMED, probability
+from armident.identify.setup.contest import LEAST_ERROR, Contest, words_of
+from armident.identify.setup.describe import Described, corrected_robot, described, merged_scales
+from armident.identify.setup.plausible import LEAST_ODDS
+from armident.identify.setup.result import SetupFinding
+from armident.identify.setup.search import LEAST_DROP, NOT_UNDERSTOOD, STRUCTURED, Search, Step
+
+Array = NDArray[np.float64]
+
+NEXT_STEP = (
+    "move one joint at a time, and compare direction, angle and torque of each with the arm; check the order of the "
+    "columns, the units of the drives, and the home positions of the configuration"
+)
+
+
+LEAST_FALL = float(np.exp(0.5 * LEAST_DROP))
+"""Least factor by which the error of a joint falls for a correction to copy: its residual power halves."""
+
+ANY_VALUE = frozenset({"gear_ratio", "torque_scale", "position_scale"})
+"""Families of a factor of one joint that may have any value."""
+
+
+@dataclass(frozen=True)
+class Judged:
+    """Findings; the step with the mistakes that are corrected; the configuration with these corrections, if any."""
+
+    findings: tuple[SetupFinding, ...]
+    step: Step
+    robot: RobotConfig | None
+
+
+def judge(search: Search, found: Step, robot: RobotConfig) -> Judged:
+    """Return what of a search is certain enough to be corrected, and what is only the best that was tried."""
+    whole = merged_scales(found, search.bench)
+    parts = described(whole, robot, search.bench)
+    if not parts:
+        return Judged((), found, None)
+    contest = Contest(search, found, each_own=whole.each_own)
+    judged = [judged_part(part, contest, robot) for part in parts]
+    # Signs and orders of one group are corrected together.
+    lost = [part.places for part in judged if not part.finding.correction]
+    sure = [part for part in judged if not any(part.places & places for places in lost)]
+    kept = set().union(*(part.places for part in sure))
+    named = set().union(*(part.places for part in judged))
+    # Scales of torques that the motion does not determine are none.
+    named |= {k for k, family in enumerate(whole.families) if family == "torque_scales"}
+    findings = [part.finding if part in sure else _doubtful(part, contest, robot) for part in judged]
+    explained = not _lost(contest.before.errors, contest.before.memory)[contest.moving].any()
+    return Judged(
+        tuple(f for f in findings if f.correction or f.probability >= NAMED or not explained),
+        whole.without(named - kept) if kept else replace(found, mistakes=()),
+        corrected_robot(sure, robot),
+    )
+
+
+def _lost(errors: Array, memory: Array) -> NDArray[np.bool_]:
+    return (errors > NOT_UNDERSTOOD) & (memory > STRUCTURED)
+
+
+def judged_part(part: Described, contest: Contest, robot: RobotConfig) -> Described:
+    """Return a finding with its probability, and whether its remedy is a correction to copy."""
+    finding = part.finding
+    if not finding.decisive:
+        # A shift that the references show has the probability of its own estimate: prediction hardly tells it.
+        return part
+    joints = indices(finding.joints, robot)
+    equal = contest.equal(finding.kind, joints)
+    share = probability(features_of(part, contest, joints, equal))
+    correction = share > CORRECTED and explains(finding.kind, contest, joints)
+    message = finding.message
+    if equal:
+        message += f" (equally well explained by: {'; '.join(words_of(equal))})"
+    judged = replace(finding, message=message, probability=share, correction=correction, decisive=correction)
+    return replace(part, finding=judged)
+
+
+def explains(kind: str, contest: Contest, joints: Sequence[int]) -> bool:
+    """True if the corrected model explains the joints of a finding, and the error of a joint falls."""
+    own, moving, after = contest.own(joints), contest.moving, contest.after
+    if _lost(after.errors[own], after.memory[own]).any():
+        return False
+    # A wrong scale of one joint shows at the others that carry the same links.
+    falls = np.any(contest.before.errors[moving] > LEAST_FALL * after.errors[moving])
+    # A common unit shows in the limits only, a common shift in the phase.
+    return bool(falls) or contest.more_plausible >= LEAST_ODDS or kind == "time_shift"
+
+
+def features_of(part: Described, contest: Contest, joints: Sequence[int], equal: Sequence[Step]) -> Array:
+    """Features of a finding of the joints, see `calibration.FEATURES`. ``equal``: set-ups that explain as much."""
+    kind, any_value = part.finding.kind, bool(part.families) and part.families <= ANY_VALUE
+    return contest.features(contest.log_odds(kind, joints, equal), any_value)
+
+
+def _doubtful(part: Described, contest: Contest, robot: RobotConfig) -> SetupFinding:
+    finding = part.finding
+    own = contest.own(indices(finding.joints, robot))
+    worst = max(own, key=lambda j: contest.after.errors[j])
+    lost = _lost(contest.before.errors, contest.before.memory)
+    names = ", ".join(robot.joints[j].name for j in contest.moving if lost[j])
+    doubt = f"the rigid model does not explain {names}" if names else "the rigid model explains every joint"
+    message = (
+        f"{doubt}; the best of what was tried is: {finding.message}, which leaves "
+        f"{100 * max(contest.after.errors[worst], LEAST_ERROR):.0f} % of the torque of {robot.joints[worst].name} "
+        f"({100 * contest.before.errors[worst]:.0f} % as configured)"
+    )
+    return replace(finding, message=message, remedy=NEXT_STEP, correction=False, decisive=False)
+
+
+def indices(names: Sequence[str], robot: RobotConfig) -> list[int]:
+    """Return the numbers of joints."""
+    known = [joint.name for joint in robot.joints]
+    return [known.index(name) for name in names]
