@@ -118,14 +118,6 @@ class Contest:
 
 def _wholes(search: Search, found: Step) -> Iterator[Step]:
     """The found set-up, those with a mistake less or another one in its place, and those that the search has met."""
-    seen: set[bytes] = set()
-
-    def new(step: Step) -> bool:
-        h = step.h
-        parts = (h.position, h.torque, h.gravity, h.shift)
-        key = b"".join(np.round(part, 6).tobytes() for part in parts) + np.float64(h.clock).tobytes()
-        return key not in seen and not seen.add(key)  # type: ignore[func-returns-value]
-
     steps = [found, replace(found, mistakes=()), *(found.without({k}) for k in range(len(found.mistakes)))]
     for k, mistake in enumerate(found.mistakes):
         if mistake.gravity is not None:
@@ -140,9 +132,18 @@ def _wholes(search: Search, found: Step) -> Iterator[Step]:
             steps.append(replace(found, mistakes=(*parent.mistakes, *later, met.mistakes[-1])))
         else:
             steps.append(met)
+    seen: set[bytes] = set()
     for step in steps:
-        if new(step):
+        key = _key(step.h)
+        if key not in seen:
+            seen.add(key)
             yield step
+
+
+def _key(h: Hypothesis) -> bytes:
+    """Return the same bytes for equal set-ups."""
+    parts = (h.position, h.torque, h.gravity, h.shift)
+    return b"".join(np.round(part, 6).tobytes() for part in parts) + np.float64(h.clock).tobytes()
 
 
 def same_correction(kind: str, joints: Sequence[int], a: Hypothesis, b: Hypothesis, *, each_own: bool = False) -> bool:
