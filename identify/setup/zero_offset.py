@@ -14,9 +14,10 @@ from armident.configs.schema.robot import Effect
 from armident.identify.effects.wiring import PositionOffset
 from armident.identify.setup.bench import Bench
 from armident.identify.setup.fit import RIDGE, Hypothesis, fit, held_out, regressors
+from armident.identify.setup.plausible import LEAST_ODDS
 from armident.identify.setup.prior import MISTAKE
 from armident.identify.setup.result import SetupFinding
-from armident.identify.setup.search import LEAST_DROP, LEAST_ODDS, independent_rows
+from armident.identify.setup.search import LEAST_DROP, independent_rows
 
 Array = NDArray[np.float64]
 
