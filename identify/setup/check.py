@@ -15,7 +15,7 @@ from armident.identify.setup.bench import Bench, make_bench
 from armident.identify.setup.clipping import clipped_torques
 from armident.identify.setup.describe import effects_line
 from armident.identify.setup.fit import Hypothesis, joint_errors
-from armident.identify.setup.judge import judge
+from armident.identify.setup.judge import NEXT_STEP, judge
 from armident.identify.setup.prior import Mistake
 from armident.identify.setup.result import SetupCheck, SetupFinding, TorqueShift
 from armident.identify.setup.search import NOT_UNDERSTOOD, STRUCTURED, Search, Step
@@ -103,11 +103,13 @@ def _check(experiments: Sequence[Experiment], robot: RobotConfig) -> SetupCheck:
     if not any(finding.kind in ("torque_unit", "side") for finding in setup_findings):
         findings += signals.small_torque_findings(experiments, robot)
     findings += _clipped(bench, best, robot, {name for finding in findings for name in finding.joints})
-    zero = zero_offset(bench, best.h) if changed is None else None
+    doubtful = changed is not None or not all(finding.correction for finding in setup_findings)
+    zero = None if doubtful else zero_offset(bench, best.h)
     if zero is not None:
-        bench, entry = zero.bench, zero.entry(robot)
-        findings.append(zero.finding(robot, effects_line([entry])))
-        so_far = robot if corrected is None else corrected
+        entry = zero.entry(robot)
+        findings.append(zero.finding(robot, effects_line([entry]) if zero.certain else NEXT_STEP))
+    if zero is not None and zero.certain:
+        bench, so_far = zero.bench, robot if corrected is None else corrected
         corrected = so_far.model_copy(update={"effects": (*so_far.effects, entry)})
     lost = _not_explained(bench, best)
     after = _errors(bench, best.h)

@@ -13,6 +13,7 @@ from armident.configs import RobotConfig
 from armident.configs.schema.robot import Effect
 from armident.identify.effects.wiring import PositionOffset
 from armident.identify.setup.bench import Bench
+from armident.identify.setup.calibration import CORRECTED
 from armident.identify.setup.fit import RIDGE, Hypothesis, fit, held_out, regressors
 from armident.identify.setup.plausible import LEAST_ODDS
 from armident.identify.setup.prior import MISTAKE
@@ -39,6 +40,9 @@ SETTLED = float(np.radians(0.05))
 CANDIDATES = 3
 """Joints whose offset is found exactly, of those that the first step prefers."""
 
+RIGHT = 0.97
+"""Share of right findings: 94 of 95 on development arms, of which 2 by a rival (``setup_zeros`` of tests/evaluation)."""
+
 SEEN = 1e-6
 """Share of the torque's change by an offset that the other parameters leave, below which it is rounding."""
 
@@ -63,8 +67,13 @@ class ZeroOffset:
         value = float(f"{self.offset:.4g}")
         return Effect(effect=PositionOffset.name, joint=robot.joints[self.joint].name, parameters={"offset": value})
 
+    @property
+    def certain(self) -> bool:
+        """True if the correction may be applied."""
+        return self.probability > CORRECTED
+
     def finding(self, robot: RobotConfig, remedy: str) -> SetupFinding:
-        """Return the mistake in words. ``remedy``: line of the configuration that corrects it."""
+        """Return the mistake in words. ``remedy``: line of the configuration that corrects it, or the next step."""
         names = [joint.name for joint in robot.joints]
         rivals = f"; or that of {', '.join(names[j] for j in self.rivals)}" if self.rivals else ""
         message = (
@@ -72,7 +81,9 @@ class ZeroOffset:
             f"{np.degrees(self.offset):+.3g} degrees off the recorded one (standard deviation "
             f"{np.degrees(self.std):.2g}){rivals}"
         )
-        return SetupFinding(PositionOffset.name, (names[self.joint],), self.probability, message, remedy, False)
+        return SetupFinding(
+            PositionOffset.name, (names[self.joint],), self.probability, message, remedy, False, self.certain
+        )
 
 
 def zero_offset(bench: Bench, h: Hypothesis) -> ZeroOffset | None:
@@ -99,7 +110,7 @@ def zero_offset(bench: Bench, h: Hypothesis) -> ZeroOffset | None:
     best = found[0]
     odds = [float(np.exp(min(one.gain - best.gain, 0.0))) for one in found[1:]]
     rivals = tuple(one.joint for one, ratio in zip(found[1:], odds, strict=True) if ratio > np.exp(-LEAST_ODDS))
-    return replace(best, probability=1.0 / (1.0 + sum(odds) + float(np.exp(-best.gain))), rivals=rivals)
+    return replace(best, probability=RIGHT / (1.0 + sum(odds) + float(np.exp(-best.gain))), rivals=rivals)
 
 
 def _exact(bench: Bench, h: Hypothesis, j: int, step: float) -> tuple[float, float, Bench]:
