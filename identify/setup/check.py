@@ -93,7 +93,7 @@ def _check(experiments: Sequence[Experiment], robot: RobotConfig) -> SetupCheck:
         tried = tried | search.tried
     best, corrected = judged.step, judged.robot
     findings += signals.rate_findings(experiments, robot)
-    if not any(finding.kind in ("torque_unit", "side") for finding in setup_findings):
+    if not any(finding.kind in ("torque_unit", "side") and finding.decisive for finding in setup_findings):
         findings += signals.small_torque_findings(experiments, robot)
     findings += _clipped(bench, best, robot, {name for finding in findings for name in finding.joints})
     lost = _not_explained(bench, best)

@@ -92,7 +92,12 @@ class Contest:
         return float(logsumexp(self.weights[inside])) - most
 
     def _contains(self, step: Step, kind: str, joints: Sequence[int]) -> bool:
-        return same_correction(kind, joints, step.h, self.found.h, each_own=self.each_own)
+        h = step.h
+        if step.each_own and not self.each_own:
+            # The common factor of a unit of every drive is free.
+            sizes = [np.abs(one.torque).max(axis=1)[self.moving] for one in (h, self.found.h)]
+            h = replace(h, torque=h.torque / float(np.median(sizes[0] / sizes[1])))
+        return same_correction(kind, joints, h, self.found.h, each_own=self.each_own)
 
     def own(self, joints: Sequence[int]) -> list[int]:
         """Those of some joints that move; all that move, if none of them does."""

@@ -79,7 +79,9 @@ def judged_part(part: Described, contest: Contest, robot: RobotConfig) -> Descri
     message = finding.message
     if equal:
         message += f" (equally well explained by: {'; '.join(words_of(equal))})"
-    judged = replace(finding, message=message, probability=share, correction=correction, decisive=correction)
+    # Signals far beyond the limits are unusable, whatever unit is right.
+    decisive = correction or (share >= NAMED and contest.more_plausible >= LEAST_ODDS)
+    judged = replace(finding, message=message, probability=share, correction=correction, decisive=decisive)
     return replace(part, finding=judged)
 
 
@@ -101,18 +103,24 @@ def features_of(part: Described, contest: Contest, joints: Sequence[int], equal:
 
 
 def _doubtful(part: Described, contest: Contest, robot: RobotConfig) -> SetupFinding:
+    """Return a finding as the best of what was tried, without a line to copy."""
     finding = part.finding
     own = contest.own(indices(finding.joints, robot))
     worst = max(own, key=lambda j: contest.after.errors[j])
     lost = _lost(contest.before.errors, contest.before.memory)
     names = ", ".join(robot.joints[j].name for j in contest.moving if lost[j])
+    implausible = contest.more_plausible >= LEAST_ODDS
     doubt = f"the rigid model does not explain {names}" if names else "the rigid model explains every joint"
+    if implausible:
+        doubt = "the signals are far beyond the limits of the configuration"
     message = (
         f"{doubt}; the best of what was tried is: {finding.message}, which leaves "
         f"{100 * max(contest.after.errors[worst], LEAST_ERROR):.0f} % of the torque of {robot.joints[worst].name} "
         f"({100 * contest.before.errors[worst]:.0f} % as configured)"
     )
-    return replace(finding, message=message, remedy=NEXT_STEP, correction=False, decisive=False)
+    return replace(
+        finding, message=message, remedy=NEXT_STEP, correction=False, decisive=finding.decisive and implausible
+    )
 
 
 def indices(names: Sequence[str], robot: RobotConfig) -> list[int]:

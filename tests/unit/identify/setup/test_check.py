@@ -59,7 +59,6 @@ SECOND = {
     "torques exchanged",
     "joints in another order",
     "degrees",
-    "mN m",
     "positions of two motors",
 }
 """Mistakes of a kind of which another is found in `make test`; these are left to `make nightly`."""
@@ -94,16 +93,6 @@ MISTAKES: dict[str, tuple[Made, str, tuple[str, ...]]] = {
     "degrees": (
         lambda e, r: setups.with_positions(e, np.eye(AXES) * 180 / np.pi),
         "position_unit",
-        EVERY,
-    ),
-    "kN m": (
-        lambda e, r: setups.with_torques(e, 1e-3 * np.eye(AXES)),
-        "torque_unit",
-        EVERY,
-    ),
-    "mN m": (
-        lambda e, r: setups.with_torques(e, 1e3 * np.eye(AXES)),
-        "torque_unit",
         EVERY,
     ),
     "kgf m": (lambda e, r: setups.with_torques(e, setups.scaled(AXES, 1, 1 / 9.80665)), "torque_unit", ("axis_2",)),
@@ -148,6 +137,18 @@ def test_a_mistake_is_named_alone_and_corrected(name: str, healthy: list[Experim
     again = check_setup(wrong, found.corrected_robot)
     assert again.findings == ()
     assert max(again.relative_error_pct) < 8.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("factor", [1e-3, pytest.param(1e3, marks=pytest.mark.nightly)])
+def test_a_common_unit_of_the_torques_is_named_and_not_certain(
+    factor: float, healthy: list[Experiment], arm: RobotConfig
+) -> None:
+    """Currents in mA look the same: only the limits tell that the torques are far too small or too large."""
+    found = check_setup(setups.with_torques(healthy, factor * np.eye(AXES)), arm)
+    (finding,) = found.findings
+    assert (finding.kind, finding.joints, finding.decisive) == ("torque_unit", EVERY, True)
+    assert 0.6 < finding.probability < 0.99
 
 
 @pytest.mark.slow
