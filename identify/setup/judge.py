@@ -25,9 +25,6 @@ NEXT_STEP = (
 LEAST_FALL = float(np.exp(0.5 * LEAST_DROP))
 """Least factor by which the error of a joint falls for a correction to copy: its residual power halves."""
 
-ANY_VALUE = frozenset({"gear_ratio", "torque_scale", "position_scale"})
-"""Families of a factor of one joint that may have any value."""
-
 
 @dataclass(frozen=True)
 class Judged:
@@ -74,7 +71,7 @@ def judged_part(part: Described, contest: Contest, robot: RobotConfig) -> Descri
         return part
     joints = indices(finding.joints, robot)
     equal = contest.equal(finding.kind, joints)
-    share = probability(features_of(part, contest, joints, equal))
+    share = probability(features_of(finding, contest, joints, equal))
     correction = share > CORRECTED and explains(finding.kind, contest, joints)
     message = finding.message
     if equal:
@@ -96,10 +93,9 @@ def explains(kind: str, contest: Contest, joints: Sequence[int]) -> bool:
     return bool(falls) or contest.more_plausible >= LEAST_ODDS or kind == "time_shift"
 
 
-def features_of(part: Described, contest: Contest, joints: Sequence[int], equal: Sequence[Step]) -> Array:
+def features_of(finding: SetupFinding, contest: Contest, joints: Sequence[int], equal: Sequence[Step]) -> Array:
     """Features of a finding of the joints, see `calibration.FEATURES`. ``equal``: set-ups that explain as much."""
-    kind, any_value = part.finding.kind, bool(part.families) and part.families <= ANY_VALUE
-    return contest.features(contest.log_odds(kind, joints, equal), any_value)
+    return contest.features(contest.log_odds(finding.kind, joints, equal))
 
 
 def _doubtful(part: Described, contest: Contest, robot: RobotConfig) -> SetupFinding:

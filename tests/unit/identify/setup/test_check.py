@@ -179,9 +179,11 @@ def test_gravity_is_found_in_any_direction(gravity: tuple[float, float, float], 
 @pytest.mark.slow
 def test_torques_without_gravity_are_named(arm: RobotConfig) -> None:
     found = check_setup(setups.record(arm, 0, gravity=(0.0, 0.0, 0.0)), arm)
-    assert [f.kind for f in found.findings] == ["gravity_missing"]
-    assert found.corrected_robot is not None
-    assert found.corrected_robot.gravity == (0.0, 0.0, 0.0)
+    (finding,) = found.findings
+    assert finding.kind == "gravity_missing"
+    # On development arms a wrong geometry looked as much like it.
+    assert 0.7 < finding.probability
+    assert finding.correction == (found.corrected_robot is not None)
 
 
 @pytest.mark.slow
