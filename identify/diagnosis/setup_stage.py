@@ -79,7 +79,7 @@ def set_up(
     for finding in check.findings:
         if finding.kind in ("standstill", "position_step", "torque_too_small", "torque_without_sign"):
             raise DataError(f"{finding.message}; {finding.remedy}")
-    corrected = robot if check.corrected_robot is None else check.corrected_robot
+    corrected = robot if check.likely_robot is None else check.likely_robot
     tried = "; ".join(check.tried)
     hint = f"set-up doubtful: the rigid model leaves more than a third of this torque in every set-up tried: {tried}"
     return SetupStage(
@@ -130,7 +130,7 @@ def outside(experiments: Sequence[Experiment], stretch: Sequence[Span], first: i
 def _findings(finding: SetupFinding, check: SetupCheck, robot: RobotConfig) -> Iterator[Finding]:
     """A finding of the set-up with the names of the catalogue: one for each joint where signs and delays are meant."""
     names = [joint.name for joint in robot.joints]
-    corrected = robot if check.corrected_robot is None else check.corrected_robot
+    corrected = robot if check.likely_robot is None else check.likely_robot
     entries = corrected.effects[len(robot.effects) :]
     evidence = {
         "title": finding.kind.replace("_", " "),

@@ -28,11 +28,15 @@ LEAST_FALL = float(np.exp(0.5 * LEAST_DROP))
 
 @dataclass(frozen=True)
 class Judged:
-    """Findings; the step with the mistakes that are corrected; the configuration with these corrections, if any."""
+    """Findings; the step with the mistakes that are corrected; the configuration with these corrections, if any.
+
+    ``likely``: the configuration with the corrections that are more likely right than wrong.
+    """
 
     findings: tuple[SetupFinding, ...]
     step: Step
     robot: RobotConfig | None
+    likely: RobotConfig | None
 
 
 def judge(search: Search, found: Step, robot: RobotConfig) -> Judged:
@@ -40,12 +44,15 @@ def judge(search: Search, found: Step, robot: RobotConfig) -> Judged:
     whole = merged_scales(found, search.bench)
     parts = described(whole, robot, search.bench)
     if not parts:
-        return Judged((), found, None)
+        return Judged((), found, None, None)
     contest = Contest(search, found, each_own=whole.each_own)
     judged = [judged_part(part, contest, robot) for part in parts]
-    # Signs and orders of one group are corrected together.
-    lost = [part.places for part in judged if not part.finding.correction]
-    sure = [part for part in judged if not any(part.places & places for places in lost)]
+    sure = _together(judged, [part.finding.correction for part in judged])
+    likely = [
+        part.finding.correction
+        or (part.finding.probability >= NAMED and explains(part.finding.kind, contest, _joints(part, robot)))
+        for part in judged
+    ]
     kept = set().union(*(part.places for part in sure))
     named = set().union(*(part.places for part in judged))
     # Scales of torques that the motion does not determine are none.
@@ -56,7 +63,18 @@ def judge(search: Search, found: Step, robot: RobotConfig) -> Judged:
         tuple(f for f in findings if f.correction or f.probability >= NAMED or not explained),
         whole.without(named - kept) if kept else replace(found, mistakes=()),
         corrected_robot(sure, robot),
+        corrected_robot(_together(judged, likely), robot),
     )
+
+
+def _together(parts: Sequence[Described], good: Sequence[bool]) -> list[Described]:
+    """Those of the parts that are good, with all that share their mistakes: signs and orders are corrected together."""
+    bad = [part.places for part, is_good in zip(parts, good, strict=True) if not is_good]
+    return [part for part in parts if not any(part.places & places for places in bad)]
+
+
+def _joints(part: Described, robot: RobotConfig) -> list[int]:
+    return indices(part.finding.joints, robot)
 
 
 def _lost(errors: Array, memory: Array) -> NDArray[np.bool_]:

@@ -32,7 +32,7 @@ MOST_JOINTS = 5
 """Largest number of joints of the arms: the check of seven takes ten times as long."""
 FOLDS = 8
 """Groups of arms; the findings of each are judged by coefficients of the others."""
-RIDGE = 1.0
+RIDGE = 0.5
 """Weight of the squared coefficients of standardised features, in findings."""
 BINS = (0.0, 0.5, 0.9, 0.95, 0.99, 1.0)
 """Edges of the printed probabilities in the table."""
