@@ -9,6 +9,7 @@ from armident.configs import DataError, RobotConfig
 from armident.identify.diagnosis.criteria import Criteria
 from armident.identify.documents.diagnosis import Finding, Gap, Unexplained
 from armident.identify.identification.from_recording import MIN_PIECE_S
+from armident.identify.setup.calibration import NAMED
 from armident.identify.setup.check import check_setup
 from armident.identify.setup.result import CONVENTIONS, SetupCheck, SetupFinding, Span, with_torque_shift
 from armident.identify.signals.experiments import Experiment
@@ -78,7 +79,7 @@ def set_up(
     for finding in check.findings:
         if finding.kind in ("standstill", "position_step", "torque_too_small", "torque_without_sign"):
             raise DataError(f"{finding.message}; {finding.remedy}")
-    corrected = robot if check.corrected_robot is None else check.corrected_robot
+    corrected = robot if check.likely_robot is None else check.likely_robot
     tried = "; ".join(check.tried)
     hint = f"set-up doubtful: the rigid model leaves more than a third of this torque in every set-up tried: {tried}"
     return SetupStage(
@@ -102,8 +103,8 @@ def set_up(
 
 
 def _remark(finding: SetupFinding) -> bool:
-    """True for a limit of the recordings, and for the best of what was tried, which corrects nothing."""
-    return finding.kind in REMARKS or not finding.correction
+    """True for a limit of the recordings, and for the best of what was tried if it is more likely wrong than right."""
+    return finding.kind in REMARKS or (not finding.correction and finding.probability < NAMED)
 
 
 def outside(experiments: Sequence[Experiment], stretch: Sequence[Span], first: int) -> list[Experiment]:
@@ -129,7 +130,7 @@ def outside(experiments: Sequence[Experiment], stretch: Sequence[Span], first: i
 def _findings(finding: SetupFinding, check: SetupCheck, robot: RobotConfig) -> Iterator[Finding]:
     """A finding of the set-up with the names of the catalogue: one for each joint where signs and delays are meant."""
     names = [joint.name for joint in robot.joints]
-    corrected = robot if check.corrected_robot is None else check.corrected_robot
+    corrected = robot if check.likely_robot is None else check.likely_robot
     entries = corrected.effects[len(robot.effects) :]
     evidence = {
         "title": finding.kind.replace("_", " "),
@@ -156,17 +157,17 @@ def _findings(finding: SetupFinding, check: SetupCheck, robot: RobotConfig) -> I
     of_joint = {(e.effect, e.joint): e.parameters for e in entries}
     if finding.kind in SIGNALS:
         for joint in finding.joints:
-            yield made("sign_error", joint, dict(of_joint["sign_error", joint]))
+            yield made("sign_error", joint, dict(of_joint.get(("sign_error", joint), {})))
     elif finding.kind == "change_in_time":
         for joint in finding.joints:
             yield made(finding.kind, joint, {})
     elif finding.kind == "time_shift":
         for joint in finding.joints:
-            yield made("time_delay", joint, dict(of_joint["time_delay", joint]))
+            yield made("time_delay", joint, dict(of_joint.get(("time_delay", joint), {})))
     elif finding.kind == "joint_order":
         first, second = finding.joints[:2]
-        parameters = next(e.parameters for e in entries if e.effect == "joint_order" and e.joint in finding.joints)
-        yield made("joint_order", first, dict(parameters), second)
+        parameters = [e.parameters for e in entries if e.effect == "joint_order" and e.joint in finding.joints]
+        yield made("joint_order", first, dict(parameters[0]) if parameters else {}, second)
     elif finding.kind == "gravity_direction":
         axes = zip(("gravity_x", "gravity_y", "gravity_z"), corrected.gravity, strict=True)
         worst = max(finding.joints, key=lambda name: check.relative_error_pct[names.index(name)])

@@ -98,9 +98,9 @@ def _check(experiments: Sequence[Experiment], robot: RobotConfig) -> SetupCheck:
         of_clock = tuple(finding for finding in setup_findings if finding.kind == "time_unit")
         setup_findings = (*of_clock, *judged.findings)
         tried = tried | search.tried
-    best, corrected = judged.step, judged.robot
+    best = judged.step
     findings += signals.rate_findings(experiments, robot)
-    if not any(finding.kind in ("torque_unit", "side") for finding in setup_findings):
+    if not any(finding.kind in ("torque_unit", "side") and finding.decisive for finding in setup_findings):
         findings += signals.small_torque_findings(experiments, robot)
     findings += _clipped(bench, best, robot, {name for finding in findings for name in finding.joints})
     doubtful = changed is not None or not all(finding.correction for finding in setup_findings)
@@ -126,7 +126,8 @@ def _check(experiments: Sequence[Experiment], robot: RobotConfig) -> SetupCheck:
         corrected_error_pct=after,
         joints_not_understood=lost,
         tried=tuple(words for family, words in TRIED.items() if family in tried),
-        corrected_robot=corrected,
+        corrected_robot=judged.robot,
+        likely_robot=judged.likely,
         clock=clock,
         torque_shift=None if lost else _torque_shift(experiments, bench, best),
         stretch=() if changed is None else spans(changed, bench),

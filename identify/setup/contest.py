@@ -8,8 +8,9 @@ from numpy.typing import NDArray
 from scipy.special import logsumexp
 
 from armident.identify.setup.fit import Hypothesis, fit, joint_errors
+from armident.identify.setup.moves import signs_of
 from armident.identify.setup.plausible import log_plausibility
-from armident.identify.setup.prior import WIRING, cost
+from armident.identify.setup.prior import WIRING, Mistake, cost
 from armident.identify.setup.search import Search, Step, angle_between, independent_rows
 
 Array = NDArray[np.float64]
@@ -92,17 +93,19 @@ class Contest:
         return float(logsumexp(self.weights[inside])) - most
 
     def _contains(self, step: Step, kind: str, joints: Sequence[int]) -> bool:
-        return same_correction(kind, joints, step.h, self.found.h, each_own=self.each_own)
+        h = step.h
+        if step.each_own and not self.each_own:
+            # The common factor of a unit of every drive is free.
+            sizes = [np.abs(one.torque).max(axis=1)[self.moving] for one in (h, self.found.h)]
+            h = replace(h, torque=h.torque / float(np.median(sizes[0] / sizes[1])))
+        return same_correction(kind, joints, h, self.found.h, each_own=self.each_own)
 
     def own(self, joints: Sequence[int]) -> list[int]:
         """Those of some joints that move; all that move, if none of them does."""
         return [j for j in joints if j in self.moving] or [int(j) for j in self.moving]
 
-    def features(self, log_odds: float, any_value: bool) -> Array:
-        """Features from which the probability of a finding is estimated, see `calibration.FEATURES`.
-
-        ``any_value``: a factor of one joint that may have any value.
-        """
+    def features(self, log_odds: float) -> Array:
+        """Features from which the probability of a finding is estimated, see `calibration.FEATURES`."""
         before, after = (np.maximum(e.errors[self.moving], LEAST_ERROR) for e in (self.before, self.after))
         return np.array(
             [
@@ -110,7 +113,6 @@ class Contest:
                 np.log(after.max()),
                 np.log(before / after).max(),
                 self.after.frictionless,
-                float(any_value),
                 np.arcsinh(0.5 * self.more_plausible),
             ]
         )
@@ -120,10 +122,11 @@ def _wholes(search: Search, found: Step) -> Iterator[Step]:
     """The found set-up, those with a mistake less or another one in its place, and those that the search has met."""
     steps = [found, replace(found, mistakes=()), *(found.without({k}) for k in range(len(found.mistakes)))]
     for k, mistake in enumerate(found.mistakes):
-        if mistake.gravity is not None:
+        if mistake.gravity is not None and mistake.gravity.any():
             # Opposite directions fit equally where the first moments may change their sign.
             opposite = replace(mistake, gravity=-mistake.gravity)
             steps.append(replace(found, mistakes=(*found.mistakes[:k], opposite, *found.mistakes[k + 1 :])))
+    steps += _other_signs(search, found)
     for parent, met in search.met:
         place = len(parent.mistakes)
         if found.mistakes[:place] == parent.mistakes and len(found.mistakes) > place:
@@ -144,6 +147,23 @@ def _key(h: Hypothesis) -> bytes:
     """Return the same bytes for equal set-ups."""
     parts = (h.position, h.torque, h.gravity, h.shift)
     return b"".join(np.round(part, 6).tobytes() for part in parts) + np.float64(h.clock).tobytes()
+
+
+def _other_signs(search: Search, found: Step) -> Iterator[Step]:
+    """The found set-up with the other signals of its turned joints: symmetries exchange position and torque."""
+    places = [k for k, family in enumerate(found.families) if family in ("position_sign", "torque_sign")]
+    if not places:
+        return
+    position, torque = (
+        np.prod([np.diag(getattr(found.mistakes[k], signal)) for k in places], axis=0)
+        for signal in ("position", "torque")
+    )
+    turned = np.flatnonzero(position * torque < 0) if np.any(position * torque < 0) else np.flatnonzero(torque < 0)
+    own = np.eye(search.bench.n)
+    for move in signs_of(search.bench.robot, [int(j) for j in turned]):
+        signals = (own if m is None else m for m in (move.position, move.torque))
+        other = Mistake(move.family, move.words, *signals, np.zeros(search.bench.n))
+        yield replace(found, mistakes=(*found.without(places).mistakes, other))
 
 
 def same_correction(kind: str, joints: Sequence[int], a: Hypothesis, b: Hypothesis, *, each_own: bool = False) -> bool:

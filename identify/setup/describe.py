@@ -34,14 +34,13 @@ CLOCK_WORDS = {1e-3: "ms", 1e-6: "us", 1e-9: "ns", 1e3: "ks"}
 class Described:
     """A finding in words, the ``places`` of its mistakes in the step, and the entries of ``effects`` that correct it.
 
-    ``values``: other fields of the configuration that correct it. ``families``: of its mistakes.
+    ``values``: other fields of the configuration that correct it.
     """
 
     finding: SetupFinding
     places: frozenset[int]
     entries: tuple[Effect, ...] = ()
     values: dict[str, object] = field(default_factory=dict)
-    families: frozenset[str] = frozenset()
 
 
 def described(step: Step, robot: RobotConfig, bench: Bench) -> list[Described]:
@@ -62,8 +61,7 @@ def described(step: Step, robot: RobotConfig, bench: Bench) -> list[Described]:
         places = frozenset(range(first, last))
         if family == "time_shift":
             places = frozenset(k for k, f in enumerate(step.families) if f == "time_shift")
-        families = frozenset(step.families[k] for k in places)
-        found += [Described(finding, places, tuple(entries), families=families) for finding, entries in made]
+        found += [Described(finding, places, tuple(entries)) for finding, entries in made]
     for family in [f for f in step.families if f.startswith("gravity")][-1:]:
         if family != "gravity_missing" or not step.h.gravity.any():
             places = frozenset(k for k, f in enumerate(step.families) if f.startswith("gravity"))

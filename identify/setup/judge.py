@@ -25,17 +25,18 @@ NEXT_STEP = (
 LEAST_FALL = float(np.exp(0.5 * LEAST_DROP))
 """Least factor by which the error of a joint falls for a correction to copy: its residual power halves."""
 
-ANY_VALUE = frozenset({"gear_ratio", "torque_scale", "position_scale"})
-"""Families of a factor of one joint that may have any value."""
-
 
 @dataclass(frozen=True)
 class Judged:
-    """Findings; the step with the mistakes that are corrected; the configuration with these corrections, if any."""
+    """Findings; the step with the mistakes that are corrected; the configuration with these corrections, if any.
+
+    ``likely``: the configuration with the corrections that are more likely right than wrong.
+    """
 
     findings: tuple[SetupFinding, ...]
     step: Step
     robot: RobotConfig | None
+    likely: RobotConfig | None
 
 
 def judge(search: Search, found: Step, robot: RobotConfig) -> Judged:
@@ -43,12 +44,15 @@ def judge(search: Search, found: Step, robot: RobotConfig) -> Judged:
     whole = merged_scales(found, search.bench)
     parts = described(whole, robot, search.bench)
     if not parts:
-        return Judged((), found, None)
+        return Judged((), found, None, None)
     contest = Contest(search, found, each_own=whole.each_own)
     judged = [judged_part(part, contest, robot) for part in parts]
-    # Signs and orders of one group are corrected together.
-    lost = [part.places for part in judged if not part.finding.correction]
-    sure = [part for part in judged if not any(part.places & places for places in lost)]
+    sure = _together(judged, [part.finding.correction for part in judged])
+    likely = [
+        part.finding.correction
+        or (part.finding.probability >= NAMED and explains(part.finding.kind, contest, _joints(part, robot)))
+        for part in judged
+    ]
     kept = set().union(*(part.places for part in sure))
     named = set().union(*(part.places for part in judged))
     # Scales of torques that the motion does not determine are none.
@@ -59,7 +63,18 @@ def judge(search: Search, found: Step, robot: RobotConfig) -> Judged:
         tuple(f for f in findings if f.correction or f.probability >= NAMED or not explained),
         whole.without(named - kept) if kept else replace(found, mistakes=()),
         corrected_robot(sure, robot),
+        corrected_robot(_together(judged, likely), robot),
     )
+
+
+def _together(parts: Sequence[Described], good: Sequence[bool]) -> list[Described]:
+    """Those of the parts that are good, with all that share their mistakes: signs and orders are corrected together."""
+    bad = [part.places for part, is_good in zip(parts, good, strict=True) if not is_good]
+    return [part for part in parts if not any(part.places & places for places in bad)]
+
+
+def _joints(part: Described, robot: RobotConfig) -> list[int]:
+    return indices(part.finding.joints, robot)
 
 
 def _lost(errors: Array, memory: Array) -> NDArray[np.bool_]:
@@ -74,12 +89,14 @@ def judged_part(part: Described, contest: Contest, robot: RobotConfig) -> Descri
         return part
     joints = indices(finding.joints, robot)
     equal = contest.equal(finding.kind, joints)
-    share = probability(features_of(part, contest, joints, equal))
+    share = probability(features_of(finding, contest, joints, equal))
     correction = share > CORRECTED and explains(finding.kind, contest, joints)
     message = finding.message
     if equal:
         message += f" (equally well explained by: {'; '.join(words_of(equal))})"
-    judged = replace(finding, message=message, probability=share, correction=correction, decisive=correction)
+    # Signals far beyond the limits are unusable, whatever unit is right.
+    decisive = correction or (share >= NAMED and contest.more_plausible >= LEAST_ODDS)
+    judged = replace(finding, message=message, probability=share, correction=correction, decisive=decisive)
     return replace(part, finding=judged)
 
 
@@ -94,25 +111,30 @@ def explains(kind: str, contest: Contest, joints: Sequence[int]) -> bool:
     return bool(falls) or contest.more_plausible >= LEAST_ODDS or kind == "time_shift"
 
 
-def features_of(part: Described, contest: Contest, joints: Sequence[int], equal: Sequence[Step]) -> Array:
+def features_of(finding: SetupFinding, contest: Contest, joints: Sequence[int], equal: Sequence[Step]) -> Array:
     """Features of a finding of the joints, see `calibration.FEATURES`. ``equal``: set-ups that explain as much."""
-    kind, any_value = part.finding.kind, bool(part.families) and part.families <= ANY_VALUE
-    return contest.features(contest.log_odds(kind, joints, equal), any_value)
+    return contest.features(contest.log_odds(finding.kind, joints, equal))
 
 
 def _doubtful(part: Described, contest: Contest, robot: RobotConfig) -> SetupFinding:
+    """Return a finding as the best of what was tried, without a line to copy."""
     finding = part.finding
     own = contest.own(indices(finding.joints, robot))
     worst = max(own, key=lambda j: contest.after.errors[j])
     lost = _lost(contest.before.errors, contest.before.memory)
     names = ", ".join(robot.joints[j].name for j in contest.moving if lost[j])
+    implausible = contest.more_plausible >= LEAST_ODDS
     doubt = f"the rigid model does not explain {names}" if names else "the rigid model explains every joint"
+    if implausible:
+        doubt = "the signals are far beyond the limits of the configuration"
     message = (
         f"{doubt}; the best of what was tried is: {finding.message}, which leaves "
         f"{100 * max(contest.after.errors[worst], LEAST_ERROR):.0f} % of the torque of {robot.joints[worst].name} "
         f"({100 * contest.before.errors[worst]:.0f} % as configured)"
     )
-    return replace(finding, message=message, remedy=NEXT_STEP, correction=False, decisive=False)
+    return replace(
+        finding, message=message, remedy=NEXT_STEP, correction=False, decisive=finding.decisive and implausible
+    )
 
 
 def indices(names: Sequence[str], robot: RobotConfig) -> list[int]:

@@ -43,12 +43,13 @@ class Move:
 def sign_moves(robot: RobotConfig, joints: Sequence[int]) -> Iterator[Move]:
     """Signals with the wrong sign: of one joint, and of all. ``joints``: indices of the joints that move."""
     for j in joints:
-        yield from _signs(robot, (j,))
+        yield from signs_of(robot, (j,))
     if len(joints) > 1:
-        yield from _signs(robot, range(robot.n), "all joints")
+        yield from signs_of(robot, range(robot.n), "all joints")
 
 
-def _signs(robot: RobotConfig, joints: Sequence[int], where: str = "") -> Iterator[Move]:
+def signs_of(robot: RobotConfig, joints: Sequence[int], where: str = "") -> Iterator[Move]:
+    """Wrong signs of some joints: of their positions, of their torques, and of both."""
     turned = np.eye(robot.n)
     turned[list(joints), list(joints)] = -1.0
     where = where or _names(robot, joints)
@@ -64,7 +65,7 @@ def set_moves(robot: RobotConfig, joints: Sequence[int]) -> Iterator[Move]:
     """
     for size in range(2, len(joints) + 1):
         for chosen in combinations(joints, size):
-            yield from _signs(robot, chosen)
+            yield from signs_of(robot, chosen)
             yield from _units(robot, chosen)
 
 

@@ -146,7 +146,8 @@ class SetupCheck:
     ``relative_error_pct``, ``corrected_error_pct`` (n,): norm of the rigid model's torque residual over the torque,
     before and after correction. ``joints_not_understood``: over a third of the torque left, with no explanation.
     ``clock``: true over recorded duration. ``torque_shift``: common shift by less than a sample or two. ``stretch``:
-    the part of the time in which the arm is another one.
+    the part of the time in which the arm is another one. ``likely_robot``: with the corrections that are more likely
+    right than wrong, which a diagnosis goes on with.
     """
 
     findings: tuple[SetupFinding, ...]
@@ -158,6 +159,7 @@ class SetupCheck:
     clock: float = 1.0
     torque_shift: TorqueShift | None = None
     stretch: tuple[Span, ...] = ()
+    likely_robot: RobotConfig | None = None
 
 
 def with_torque_shift(experiments: Sequence[Experiment], shift: TorqueShift | None) -> Sequence[Experiment]:

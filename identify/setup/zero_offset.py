@@ -41,7 +41,7 @@ CANDIDATES = 3
 """Joints whose offset is found exactly, of those that the first step prefers."""
 
 RIGHT = 0.97
-"""Share of right findings: 94 of 95 on development arms, of which 2 by a rival (``setup_zeros`` of tests/evaluation)."""
+"""Share of right findings: 94 of 95 on development arms, 2 of them by a rival (``tests.evaluation.setup_zeros``)."""
 
 SEEN = 1e-6
 """Share of the torque's change by an offset that the other parameters leave, below which it is rounding."""

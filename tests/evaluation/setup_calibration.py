@@ -32,7 +32,7 @@ MOST_JOINTS = 5
 """Largest number of joints of the arms: the check of seven takes ten times as long."""
 FOLDS = 8
 """Groups of arms; the findings of each are judged by coefficients of the others."""
-RIDGE = 1.0
+RIDGE = 0.5
 """Weight of the squared coefficients of standardised features, in findings."""
 BINS = (0.0, 0.5, 0.9, 0.95, 0.99, 1.0)
 """Edges of the printed probabilities in the table."""
@@ -57,7 +57,7 @@ def measured(case: SetupCase) -> dict[str, Any]:
                     for step in (contest.found, *equal)
                 ),
                 "explains": judge.explains(finding.kind, contest, joints),
-                "x": judge.features_of(part, contest, joints, equal).tolist(),
+                "x": judge.features_of(finding, contest, joints, equal).tolist(),
             }
         )
         return made

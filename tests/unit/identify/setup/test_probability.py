@@ -85,7 +85,7 @@ def test_a_probability_rises_with_the_odds_and_falls_with_the_error_left() -> No
         return probability(features)
 
     assert at("odds", 7.0) > at("odds", 0.0)
-    assert at("error left at its joints", np.log(0.5)) < at("error left at its joints", np.log(0.05))
+    assert at("error left at any joint", np.log(0.5)) < at("error left at any joint", np.log(0.05))
     assert EXTREMES[0] <= at("odds", -1e3) < at("odds", 1e3) <= EXTREMES[1]
 
 
