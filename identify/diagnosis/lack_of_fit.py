@@ -161,6 +161,9 @@ class LackOfFit:
         return _by_share(found)
 
     def _significant(self, test: Projection | SpectralLine | Excess) -> bool:
+        if isinstance(test, Excess):
+            # Nothing was selected by it, and an event need not be in the other data.
+            return test.p_value < self.level
         return test.p_value < self.level and test.p_held < self.criteria.held_out_level and test.share > 0
 
     def _reported(self, test: Projection | SpectralLine | Excess, joint: int | None = None) -> bool:
@@ -169,6 +172,8 @@ class LackOfFit:
         torque = np.concatenate([s.y[:, j] for s in self.fit.study.train])
         if isinstance(test, SpectralLine):
             fall = test.size
+        elif isinstance(test, Excess):
+            fall = test.error * (1.0 - np.sqrt(max(1.0 - test.share, 0.0)))
         else:
             # By how much the held-out error of the joint falls without it.
             error = np.concatenate([e[:, j] for e in self.fit.errors(self.fit.theta, held=True)])
@@ -207,14 +212,16 @@ class LackOfFit:
     def _excesses(self, joint: int) -> list[Excess]:
         """Parts of a joint's residual that are no broadband noise, the largest one first."""
         study = self.fit.study
-        train, held = ([e[:, joint] for e in self.fit.errors(self.fit.theta, held=part)] for part in (False, True))
-        found = [spectral_excess(train, held, study.dt * study.decimation.factor)]
-        for errors, stretches in ((train, study.train), (held, study.held)):
+        found: list[Excess | None] = []
+        for held, stretches in ((False, study.train), (True, study.held)):
+            errors = [e[:, joint] for e in self.fit.errors(self.fit.theta, held=held)]
             at = [study.decimation.instants(s.measured.qd.shape[0]) for s in stretches]
             velocities = [s.measured.qd[rows, joint] for s, rows in zip(stretches, at, strict=True)]
             moments = bursts(errors, [s.t for s in stretches], velocities)
-            if moments is not None and moments.share >= self.criteria.burst_share:
-                found.append(moments)
+            found += [moments if moments is not None and moments.share >= self.criteria.burst_share else None]
+            if not held:
+                # Errors of the parameters give held-out residuals the spectrum of the motion.
+                found += [spectral_excess(errors, velocities, study.dt * study.decimation.factor)]
         return sorted((one for one in found if one is not None), key=lambda one: -one.share)[:1]
 
     def _of_excess(self, joint: int, excess: Excess) -> ResidualDependence:
