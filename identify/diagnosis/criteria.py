@@ -89,9 +89,10 @@ class Criteria:
     motion_share
         Share of the dependence on the motion altogether that single variables have to explain, so that it is not
         listed beside them: the greater part.
-    burst_share
-        Least share of the residual's power in bursts that are reported: they are most of the error. Stick-slip of
-        healthy arms, which the smoother of the velocity does not follow, has less.
+    event_share
+        Least share of the residual's power in bursts, and in signals of the report part, that are reported: they are
+        most of the error. Stick-slip of healthy arms, which the smoother of the velocity does not follow, has less, and
+        so have errors of the parameters in the report part.
     line_level
         Significance level from which a spectral line is searched in the references: as the usual false-alarm rate.
     reference_line
@@ -145,7 +146,7 @@ class Criteria:
     functions_in_noise: int = 3
     most_unexplained: int = 2
     motion_share: float = 0.5
-    burst_share: float = 0.5
+    event_share: float = 0.5
     line_level: float = 0.01
     reference_line: float = 100.0
     modulated_line: float = 0.1

@@ -157,7 +157,8 @@ class LackOfFit:
             lines = [self._of_line(k, line) for k, line in self.lines if k == j and self._reported(line, j)]
             found += lines
             if not here and not lines:
-                found += [self._of_excess(j, excess) for excess in self._excesses(j) if self._reported(excess, j)]
+                events = [event for event in self._excesses(j) if self._reported(event, j)]
+                found += [self._of_excess(j, event) for event in events[:1]]
         return _by_share(found)
 
     def _significant(self, test: Projection | SpectralLine | Excess) -> bool:
@@ -212,17 +213,17 @@ class LackOfFit:
     def _excesses(self, joint: int) -> list[Excess]:
         """Parts of a joint's residual that are no broadband noise, the largest one first."""
         study = self.fit.study
-        found: list[Excess | None] = []
+        found: list[tuple[Excess | None, float]] = []
         for held, stretches in ((False, study.train), (True, study.held)):
             errors = [e[:, joint] for e in self.fit.errors(self.fit.theta, held=held)]
             at = [study.decimation.instants(s.measured.qd.shape[0]) for s in stretches]
             velocities = [s.measured.qd[rows, joint] for s, rows in zip(stretches, at, strict=True)]
             moments = bursts(errors, [s.t for s in stretches], velocities)
-            found += [moments if moments is not None and moments.share >= self.criteria.burst_share else None]
-            if not held:
-                # Errors of the parameters give held-out residuals the spectrum of the motion.
-                found += [spectral_excess(errors, velocities, study.dt * study.decimation.factor)]
-        return sorted((one for one in found if one is not None), key=lambda one: -one.share)[:1]
+            signal = spectral_excess(errors, velocities, study.dt * study.decimation.factor)
+            # Errors of the parameters give held-out residuals the spectrum of the motion.
+            found += [(moments, self.criteria.event_share), (signal, self.criteria.event_share if held else 0.0)]
+        events = [one for one, least in found if one is not None and one.share >= least]
+        return sorted(events, key=lambda one: -one.share)
 
     def _of_excess(self, joint: int, excess: Excess) -> ResidualDependence:
         curve = Curve(excess.x, excess.value, excess.noise)
@@ -307,8 +308,8 @@ class LackOfFit:
 
     @cached_property
     def tests(self) -> int:
-        """Number of all tests: every set of functions; of each joint all together, two of spectra, two of bursts."""
-        return sum(len(own) + 4 for own in self.functions)
+        """Number of all tests: sets of functions; of each joint all together, a line, two of spectra, two of bursts."""
+        return sum(len(own) + 6 for own in self.functions)
 
     def _whitened(self, fit: IvFit) -> tuple[JointResidual, ...]:
         blocks, rows = fit.equations.held, fit.regression.rows_of
