@@ -162,11 +162,6 @@ class Criteria:
         changed = min(0.25 * rate, self.change_rate)
         return {"selection": 0.5 * rate, "lack_of_fit": 0.25 * rate, "changed_parameters": changed}
 
-    @property
-    def ambiguous_odds(self) -> float:
-        """Odds up to which another explanation is ambiguous."""
-        return float(np.exp(self.close))
-
     def selection_level(self, tests: int) -> float:
         """Significance level of the selection for one of a number of candidates."""
         return self.alpha["selection"] / max(tests, 1)

@@ -1,8 +1,8 @@
 """Torques that no recorded motion explains: parts of the residual that are not broadband noise of drives and encoders.
 
-Such noise has the spectrum of its filters and the same power at all times. A noise model would take a vibration, a slow
-signal or a contact for noise: here the spectrum is compared with that of drives and encoders, and the power with that of
-other moments.
+Such noise has the spectrum of its filters and the same power at all times. A noise model would take a vibration, a
+slow signal or a contact for noise: here the spectrum is compared with that of drives and encoders, and the power with
+that of other moments.
 """
 
 from collections.abc import Sequence
@@ -24,8 +24,8 @@ NOISE_TIME_CONSTANTS = (0.0, 0.002, 0.005, 0.01, 0.02, 0.035, 0.05)
 """Time constants of noise, s: torque filters and current loops of drives have less. What is slower is a signal."""
 
 RISES = tuple((rise, power) for power in (2, 4) for rise in (0.0, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0))
-"""Noise of differentiated encoders at the Nyquist frequency over the level at zero, and the power of its rise: twice the
-number of derivatives."""
+"""Noise of differentiated encoders at the Nyquist frequency over the level at zero, and the power of its rise: twice
+the number of derivatives."""
 
 HIGHEST = 0.7
 """Highest frequency over the Nyquist frequency: the filter of the comparison begins to fall there."""
@@ -117,9 +117,9 @@ def spectral_excess(series: Sequence[Array], velocities: Sequence[Array], dt: fl
 
 
 def _noise_level(f: Array, power: Array, used: NDArray[np.int64], dt: float) -> Array:
-    """Spectrum (F,) of drives and encoders: white, of one time constant, and rising; least absolute error of logarithms.
+    """Spectrum (F,) of drives and encoders: white, of one time constant, and rising.
 
-    So a band, however wide, that is not the greater part of the frequencies does not move the level.
+    Least absolute errors of the logarithms: a band that is not the greater part of the frequencies does not move it.
     """
     best, level = np.inf, np.zeros(0)
     for constant in NOISE_TIME_CONSTANTS:
