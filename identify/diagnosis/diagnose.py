@@ -21,7 +21,7 @@ from armident.identify.diagnosis.findings import (
     noise_floor,
     undetectable,
 )
-from armident.identify.diagnosis.lack_of_fit import ResidualDependence, unexplained
+from armident.identify.diagnosis.lack_of_fit import LackOfFit, ResidualDependence
 from armident.identify.diagnosis.lack_of_fit import dependences as dependences_of
 from armident.identify.diagnosis.model_state import ModelState, with_entries, with_report_part
 from armident.identify.diagnosis.probabilities import judged
@@ -203,7 +203,8 @@ def _diagnose(
     selected = [one for one in every if one not in conventional]
     after = gap_of(final, held=True)
     steps("unexplained dependences")
-    dependences = () if change.complete else unexplained(final)
+    fit_test = LackOfFit(final.fit)
+    dependences, small = ((), ()) if change.complete else (fit_test.unexplained, fit_test.immaterial)
     rest = [
         Unexplained(joint=d.joint, share_of_residual=d.share, varies_with=d.varies_with, hint=d.hint)
         for d in dependences
@@ -242,7 +243,7 @@ def _diagnose(
         not_visible=undetectable(first, selection.hidden),
         detection_limits=limits,
         simulated=simulated.document(),
-        negligible=negligible(final, conventional, last, selection.immaterial),
+        negligible=negligible(final, conventional, last, selection.immaterial, small),
         sign_smoothing=dict(zip(study.joints, map(float, first.robot.sign_smoothing), strict=True)),
         transitions={e.joint: e.parameters["velocity"] for e in final.robot.effects if e.effect == TRANSITION},
         criteria=asdict(criteria),

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from armident.identify.diagnosis.candidate_comparison import Addition, SelectionStep
 from armident.identify.diagnosis.candidates import ColumnCache, Key
 from armident.identify.diagnosis.criteria import Criteria
+from armident.identify.diagnosis.lack_of_fit import ResidualDependence
 from armident.identify.diagnosis.model_state import ModelState
 from armident.identify.diagnosis.next_experiment import recommended_experiment
 from armident.identify.diagnosis.precision import standard_deviations
@@ -17,6 +18,7 @@ from armident.identify.documents.diagnosis import Alternative, Finding, Gap, Neg
 from armident.identify.effects.effect import Effect
 from armident.identify.effects.parameter_change import ParameterChange
 from armident.identify.effects.registry import catalogue, known, of_entry
+from armident.identify.effects.unnamed import NAME as UNNAMED
 from armident.identify.effects.wiring import Wiring
 
 Array = NDArray[np.float64]
@@ -129,9 +131,13 @@ def negligible(
     final: ModelState,
     conventional: Sequence[Selected],
     step: SelectionStep | None,
-    immaterial: Sequence[Addition] = (),
+    immaterial: Sequence[Addition],
+    dependences: Sequence[tuple[ResidualDependence, float]],
 ) -> list[Negligible]:
-    """Return the significant effects that are no cause: too small, or within the sampling convention of drives."""
+    """Return what is significant and no cause: too small, or within the sampling convention of drives.
+
+    ``dependences``: of residuals, with the fall of the error without them, percent.
+    """
     found: dict[Key, Negligible] = {}
     small = [*(one.addition for one in conventional), *immaterial]
     if step is not None:
@@ -147,7 +153,17 @@ def negligible(
                 share_of_residual=addition.share,
             )
             found.setdefault(addition.family, entry)
-    return list(found.values())
+    rest = [
+        Negligible(
+            effect=UNNAMED,
+            joint=d.joint,
+            varies_with=d.varies_with,
+            change_of_torque_pct=fall,
+            share_of_residual=d.share,
+        )
+        for d, fall in dependences
+    ]
+    return [*found.values(), *rest]
 
 
 def gap_of(state: ModelState, *, held: bool) -> Gap:

@@ -101,14 +101,6 @@ def dependences(state: Fitted) -> tuple[ResidualDependence, ...]:
     return LackOfFit(state.fit).dependences
 
 
-def unexplained(state: Fitted) -> tuple[ResidualDependence, ...]:
-    """Significant and material dependences, each in addition to the ones before it, largest share first.
-
-    So a variable correlated with a stronger one (speed with torque, for example) is not listed again.
-    """
-    return LackOfFit(state.fit).unexplained
-
-
 @dataclass(frozen=True, eq=False)
 class LackOfFit:
     """All tests of the residual of one fit. ``fit``: fit of the model."""
@@ -135,9 +127,12 @@ class LackOfFit:
         found = [self._dependence(p, self.joints[p.joint]) for p in best.values()]
         return _by_share([*found, *(self._of_line(*line) for line in self.lines if self._significant(line[1]))])
 
-    @property
+    @cached_property
     def unexplained(self) -> tuple[ResidualDependence, ...]:
-        """Significant and material dependences, each in addition to the ones before it, largest share first."""
+        """Significant and material dependences, each in addition to the ones before it, largest share first.
+
+        So a variable correlated with a stronger one (speed with torque, for example) is not listed again.
+        """
         found: list[ResidualDependence] = []
         for j, own in enumerate(self.joints):
             mine = [p for p in self.projections if p.joint == j and self._reported(p)]
@@ -161,6 +156,19 @@ class LackOfFit:
                 found += [self._of_excess(j, event) for event in events[:1]]
         return _by_share(found)
 
+    @property
+    def immaterial(self) -> tuple[tuple[ResidualDependence, float], ...]:
+        """Largest significant dependence of each joint that has no material one, and the fall of its error, percent."""
+        found = []
+        for j, own in enumerate(self.joints):
+            mine = [p for p in self.projections if p.joint == j and p.function is not None]
+            small = [(self._fall(p, j), self._dependence(p, own)) for p in filter(self._significant, mine)]
+            events = filter(self._significant, self._excesses(j))
+            small += [(self._fall(event, j), self._of_excess(j, event)) for event in events]
+            found += [max(small, key=lambda one: one[0])] if small else []
+        reported = {d.joint for d in self.unexplained}
+        return tuple((d, fall) for fall, d in found if d.joint not in reported)
+
     def _significant(self, test: Projection | SpectralLine | Excess) -> bool:
         if isinstance(test, Excess):
             # Nothing was selected by it, and an event need not be in the other data.
@@ -170,18 +178,22 @@ class LackOfFit:
     def _reported(self, test: Projection | SpectralLine | Excess, joint: int | None = None) -> bool:
         """True if a dependence is significant and material."""
         j = test.joint if isinstance(test, Projection) else joint
-        torque = np.concatenate([s.y[:, j] for s in self.fit.study.train])
+        assert j is not None
+        large = test.share >= self.criteria.least_share and self._fall(test, j) >= self.criteria.material_pct
+        return large and self._significant(test)
+
+    def _fall(self, test: Projection | SpectralLine | Excess, joint: int) -> float:
+        """By how much the error of a joint falls without a dependence, percent of its torque."""
+        torque = np.concatenate([s.y[:, joint] for s in self.fit.study.train])
+        left = 1.0 - np.sqrt(max(1.0 - test.share, 0.0))
         if isinstance(test, SpectralLine):
             fall = test.size
         elif isinstance(test, Excess):
-            fall = test.error * (1.0 - np.sqrt(max(1.0 - test.share, 0.0)))
+            fall = test.error * left
         else:
-            # By how much the held-out error of the joint falls without it.
-            error = np.concatenate([e[:, j] for e in self.fit.errors(self.fit.theta, held=True)])
-            fall = float(np.sqrt(np.mean(error**2)) * (1.0 - np.sqrt(max(1.0 - test.share, 0.0))))
-        size = 100.0 * fall / max(float(np.sqrt(np.mean(torque**2))), 1e-300)
-        material = test.share >= self.criteria.least_share and size >= self.criteria.material_pct
-        return material and self._significant(test)
+            error = np.concatenate([e[:, joint] for e in self.fit.errors(self.fit.theta, held=True)])
+            fall = float(np.sqrt(np.mean(error**2))) * left
+        return float(100.0 * fall / max(float(np.sqrt(np.mean(torque**2))), 1e-300))
 
     def _dependence(self, p: Projection, own: JointResidual) -> ResidualDependence:
         """Dependence with its curve."""

@@ -144,22 +144,25 @@ class Unexplained(Document):
 
 
 class Negligible(Document):
-    """Effect that is significant and smaller than what counts as a cause; it is not in the model.
+    """Effect or dependence that is significant and smaller than what counts as a cause; it is not in the model.
 
     Parameters
     ----------
     effect
-        Name of the effect.
+        Name of the effect; ``unnamed`` for a dependence of the residual.
     joint
         Name of the joint.
+    varies_with
+        Variable of a dependence.
     change_of_torque_pct
-        Its torque in percent of that of the joint.
+        Torque of an effect, or fall of the error without a dependence, in percent of the torque of the joint.
     share_of_residual
         Share of the power of the joint's residual that it removes, 0 to 1.
     """
 
     effect: str
     joint: str
+    varies_with: str | None = None
     change_of_torque_pct: float
     share_of_residual: float
 
@@ -299,8 +302,8 @@ class DiagnosisDocument(Document):
         Errors of the simulated closed loop, arm and controller along the reference trajectory, with both models,
         percent of the measured motion and torques.
     negligible
-        Effects that are significant and change the torque by less than ``--material``, or the error by less than 2 %.
-        They are no cause, and not in the model.
+        Effects and dependences that are significant and change the torque by less than ``--material``, or the error by
+        less than 2 %. They are no cause, and not in the model.
     sign_smoothing
         ``g`` of each joint's ``sign(qd) -> (2/pi) atan(g qd)``, s/rad or s/m.
     transitions

@@ -20,7 +20,6 @@ from armident.identify.diagnosis.probabilities import (
     FILE,
     NOTHING,
     STATES,
-    UNNAMED,
     Calibration,
     features,
     joint_outcomes,
@@ -28,6 +27,7 @@ from armident.identify.diagnosis.probabilities import (
     state_of,
 )
 from armident.identify.documents.diagnosis import DiagnosisDocument, Finding
+from armident.identify.effects.unnamed import NAME as UNNAMED
 from tests.evaluation.cases import VISIBLE
 from tests.evaluation.run import RESULTS
 from tests.evaluation.store import Store
