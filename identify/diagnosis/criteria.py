@@ -93,6 +93,8 @@ class Criteria:
         Least share of the residual's power in bursts, and in signals of the report part, that are reported: they are
         most of the error. Stick-slip of healthy arms, which the smoother of the velocity does not follow, has less, and
         so have errors of the parameters in the report part.
+    reversal
+        Velocity under which dry friction reverses, in velocities of its transition: four fifths of it are there then.
     line_level
         Significance level from which a spectral line is searched in the references: as the usual false-alarm rate.
     reference_line
@@ -147,6 +149,7 @@ class Criteria:
     most_unexplained: int = 2
     motion_share: float = 0.5
     event_share: float = 0.5
+    reversal: float = 3.0
     line_level: float = 0.01
     reference_line: float = 100.0
     modulated_line: float = 0.1

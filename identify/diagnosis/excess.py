@@ -75,14 +75,16 @@ class Excess:
     noise: Array
 
 
-def spectral_excess(series: Sequence[Array], velocities: Sequence[Array], dt: float) -> Excess | None:
+def spectral_excess(
+    series: Sequence[Array], velocities: Sequence[Array], dt: float, slow: float = 0.0
+) -> Excess | None:
     """Band of frequencies with most power over what noise of drives and encoders has there; the longest series counts.
 
-    ``series``: residuals (M,) of one joint in the band of the comparison, zero at rest. Times about reversals, where
-    dry friction has no model, are left out.
+    ``series``: residuals (M,) of one joint in the band of the comparison, zero at rest. Times about reversals and under
+    the velocity ``slow``, where dry friction has no model, are left out.
     """
     e, qd = max(zip(series, velocities, strict=True), key=lambda pair: pair[0].size)
-    away = np.where(_turning(e, qd), 0.0, e)
+    away = np.where(_turning(e, qd, slow), 0.0, e)
     power = periodogram(hann_window(e.size) * away)
     f = np.arange(power.size) / (e.size * dt)
     used = np.flatnonzero((f > 0.0) & (f < HIGHEST * 0.5 / dt))
@@ -104,12 +106,14 @@ def spectral_excess(series: Sequence[Array], velocities: Sequence[Array], dt: fl
     inside[first:last] = True
     beyond = np.zeros(power.size)
     beyond[used] = np.where(inside, more, 0.0)
-    peak, share = int(np.argmax(beyond)), max(float(beyond.sum() / power.sum()), 0.0)
+    # Of the whole residual: a signal is there about reversals, too, and so are larger errors.
+    rms = float(np.sqrt(np.mean(e[e != 0.0] ** 2)))
+    part = float(np.mean(away[away != 0.0] ** 2)) / rms**2
+    peak, share = int(np.argmax(beyond)), max(part * float(beyond.sum() / power.sum()), 0.0)
     # A line is as narrow as the window allows; wider, it is a signal with a spectrum of its own.
     line = peak > NARROW and beyond[peak - NARROW // 2 : peak + NARROW // 2 + 1].sum() > MOST * beyond.sum()
     around = slice(max(peak - SHOWN, 0), peak + SHOWN)
     value, noise = (np.sqrt(2.0 * dt * one[around]) for one in (power, level))
-    rms = float(np.sqrt(np.mean(e[e != 0.0] ** 2)))
     return Excess(
         "frequency" if line else "unrecorded signal", p_value, share, rms,
         (float(f[peak]),), f[around], value, noise,
@@ -134,21 +138,23 @@ def _noise_level(f: Array, power: Array, used: NDArray[np.int64], dt: float) -> 
     return level
 
 
-def _turning(e: Array, qd: Array) -> NDArray[np.bool_]:
-    """True for samples about a reversal or rest, (M,)."""
-    turns = np.append(False, np.sign(qd[1:]) != np.sign(qd[:-1])) | (e == 0.0)
+def _turning(e: Array, qd: Array, slow: float) -> NDArray[np.bool_]:
+    """True for samples about a reversal, rest, or slow motion, (M,)."""
+    turns = np.append(False, np.sign(qd[1:]) != np.sign(qd[:-1])) | (e == 0.0) | (np.abs(qd) < slow)
     return np.asarray(np.convolve(turns, np.ones(WINDOW + 1), mode="same") > 0.0)
 
 
-def bursts(series: Sequence[Array], times: Sequence[Array], velocities: Sequence[Array]) -> Excess | None:
+def bursts(
+    series: Sequence[Array], times: Sequence[Array], velocities: Sequence[Array], slow: float = 0.0
+) -> Excess | None:
     """Moments with more power than the others, of the residual (M,) of one joint with its times and velocities (M,).
 
-    Times about rest and reversals, where dry friction has no model, are left out.
+    Times about rest, reversals and under the velocity ``slow``, where dry friction has no model, are left out.
     """
     powers, moments = [], []
     for e, t, qd in zip(series, times, velocities, strict=True):
         count = e.size // WINDOW
-        used = ~_turning(e, qd)[: count * WINDOW].reshape(count, WINDOW).any(axis=1)
+        used = ~_turning(e, qd, slow)[: count * WINDOW].reshape(count, WINDOW).any(axis=1)
         powers.append(np.mean(e[: count * WINDOW].reshape(count, WINDOW) ** 2, axis=1)[used])
         moments.append(t[: count * WINDOW : WINDOW][used])
     power, moment = np.concatenate(powers), np.concatenate(moments)

@@ -14,6 +14,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from armident.configs.schema.robot import Effect as Entry
 from armident.identify.diagnosis.criteria import Criteria
 from armident.identify.diagnosis.excess import Excess, bursts, spectral_excess
 from armident.identify.diagnosis.free_functions import FINE, FreeFunction, free_functions, in_band
@@ -23,6 +24,7 @@ from armident.identify.diagnosis.regression import IvFit
 from armident.identify.diagnosis.spectral_lines import SpectralLine, bandwidth_of_motion, lines_of_joints
 from armident.identify.diagnosis.stretch import MotionStretch
 from armident.identify.diagnosis.variables import Kind, hint_of, unit_of_variable
+from armident.identify.effects.friction import TRANSITION
 from armident.identify.regression.whitening import rows_of_joints
 from armident.identify.robot.motion import Motion
 from armident.identify.signals.periodogram import hann_window, periodogram
@@ -225,17 +227,23 @@ class LackOfFit:
     def _excesses(self, joint: int) -> list[Excess]:
         """Parts of a joint's residual that are no broadband noise, the largest one first."""
         study = self.fit.study
+        transitions = [e.parameters["velocity"] for e in study.robot.effects if self._reverses(e, joint)]
+        slow = self.criteria.reversal * max(1.0 / float(study.robot.sign_smoothing[joint]), *transitions, 0.0)
         found: list[tuple[Excess | None, float]] = []
         for held, stretches in ((False, study.train), (True, study.held)):
             errors = [e[:, joint] for e in self.fit.errors(self.fit.theta, held=held)]
             at = [study.decimation.instants(s.measured.qd.shape[0]) for s in stretches]
             velocities = [s.measured.qd[rows, joint] for s, rows in zip(stretches, at, strict=True)]
-            moments = bursts(errors, [s.t for s in stretches], velocities)
-            signal = spectral_excess(errors, velocities, study.dt * study.decimation.factor)
+            moments = bursts(errors, [s.t for s in stretches], velocities, slow)
+            signal = spectral_excess(errors, velocities, study.dt * study.decimation.factor, slow)
             # Errors of the parameters give held-out residuals the spectrum of the motion.
             found += [(moments, self.criteria.event_share), (signal, self.criteria.event_share if held else 0.0)]
         events = [one for one, least in found if one is not None and one.share >= least]
         return sorted(events, key=lambda one: -one.share)
+
+    def _reverses(self, entry: Entry, joint: int) -> bool:
+        """True for the entry with the transition of a joint's dry friction."""
+        return entry.effect == TRANSITION and entry.joint == self.fit.study.joints[joint]
 
     def _of_excess(self, joint: int, excess: Excess) -> ResidualDependence:
         curve = Curve(excess.x, excess.value, excess.noise)

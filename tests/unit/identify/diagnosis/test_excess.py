@@ -70,6 +70,19 @@ def test_a_resonance_over_two_octaves_does_not_count_as_noise_of_its_surrounding
     assert found.p_value < 1e-6
 
 
+def test_a_signal_beside_larger_errors_at_reversals_is_a_small_share() -> None:
+    turns = np.flatnonzero(np.sign(SPEED[1:]) != np.sign(SPEED[:-1]))
+    rough = noise(0) + 2.0 * np.sin(2 * np.pi * 3.7 * T)
+    alone = spectral_excess([rough], [SPEED], DT)
+    for turn in turns:
+        rough[turn - 1 : turn + 3] += 15.0
+    found = spectral_excess([rough], [SPEED], DT)
+    assert alone is not None
+    assert found is not None
+    assert found.p_value < 1e-6
+    assert found.share < 0.5 * alone.share
+
+
 def test_contact_is_bursts_at_their_times() -> None:
     touched = noise(0)
     for begin in (2.2, 7.4):
