@@ -89,10 +89,9 @@ class Criteria:
     motion_share
         Share of the dependence on the motion altogether that single variables have to explain, so that it is not
         listed beside them: the greater part.
-    event_share
-        Least share of the residual's power in bursts, and in signals of the report part, that are reported: they are
-        most of the error. Stick-slip of healthy arms, which the smoother of the velocity does not follow, has less, and
-        so have errors of the parameters in the report part.
+    burst_share
+        Least share of the residual's power in bursts that are reported: they are most of the error. Stick-slip of
+        healthy arms, which the smoother of the velocity does not follow, has less.
     reversal
         Velocity under which dry friction reverses, in velocities of its transition: four fifths of it are there then.
     line_level
@@ -148,7 +147,7 @@ class Criteria:
     functions_in_noise: int = 3
     most_unexplained: int = 2
     motion_share: float = 0.5
-    event_share: float = 0.5
+    burst_share: float = 0.5
     reversal: float = 3.0
     line_level: float = 0.01
     reference_line: float = 100.0

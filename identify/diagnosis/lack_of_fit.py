@@ -34,6 +34,9 @@ Array = NDArray[np.float64]
 NORMAL = 1.4826
 """Standard deviation of a normal variable over the median of its absolute value."""
 
+RANK = 1e-10
+"""Singular value of a joint's regressor over the largest below which it is a rounding error."""
+
 OCTAVES = (0.0, 0.125, 0.25, 0.5, 1.0, 2.0, 4.0)
 """Edges of the frequencies of the spectrum of a dependence on the motion, over the bandwidth of the motion."""
 
@@ -229,17 +232,20 @@ class LackOfFit:
         study = self.fit.study
         transitions = [e.parameters["velocity"] for e in study.robot.effects if self._reverses(e, joint)]
         slow = self.criteria.reversal * max(1.0 / float(study.robot.sign_smoothing[joint]), *transitions, 0.0)
-        found: list[tuple[Excess | None, float]] = []
+        found: list[Excess] = []
         for held, stretches in ((False, study.train), (True, study.held)):
             errors = [e[:, joint] for e in self.fit.errors(self.fit.theta, held=held)]
+            if held:
+                errors = _refitted(errors, [e.z[:, joint] for e in self.fit.equations.held])
             at = [study.decimation.instants(s.measured.qd.shape[0]) for s in stretches]
             velocities = [s.measured.qd[rows, joint] for s, rows in zip(stretches, at, strict=True)]
             moments = bursts(errors, [s.t for s in stretches], velocities, slow)
+            if moments is not None and moments.share >= self.criteria.burst_share:
+                found.append(moments)
             signal = spectral_excess(errors, velocities, study.dt * study.decimation.factor, slow)
-            # Errors of the parameters give held-out residuals the spectrum of the motion.
-            found += [(moments, self.criteria.event_share), (signal, self.criteria.event_share if held else 0.0)]
-        events = [one for one, least in found if one is not None and one.share >= least]
-        return sorted(events, key=lambda one: -one.share)
+            if signal is not None:
+                found.append(signal)
+        return sorted(found, key=lambda one: -one.share)
 
     def _reverses(self, entry: Entry, joint: int) -> bool:
         """True for the entry with the transition of a joint's dry friction."""
@@ -389,6 +395,17 @@ class LackOfFit:
                 chosen.append(own)
                 left -= own.size
         return np.concatenate(chosen) if chosen else np.arange(0)
+
+
+def _refitted(errors: Sequence[Array], regressors: Sequence[Array]) -> list[Array]:
+    """Errors (M,) of a joint without what other parameters of the model explain, whose regressors are (M, b).
+
+    Errors of the parameters give the residual of other data the spectrum of the motion.
+    """
+    x, e = np.concatenate(regressors), np.concatenate(errors)
+    x = x / np.maximum(np.linalg.norm(x, axis=0), 1e-300)
+    left = e - x @ np.linalg.lstsq(x, e, rcond=RANK)[0]
+    return np.split(left, np.cumsum([one.size for one in errors])[:-1])
 
 
 def limited(residual: Array, joints: Sequence[slice], deviations: float) -> Array:

@@ -6,6 +6,7 @@ from numpy.typing import NDArray
 from scipy import signal
 
 from armident.identify.diagnosis.excess import bursts, spectral_excess
+from armident.identify.diagnosis.spectral_lines import has_line
 
 Array = NDArray[np.float64]
 
@@ -107,3 +108,14 @@ def test_a_joint_at_rest_has_none() -> None:
     rest = np.zeros(ROWS)
     assert spectral_excess([rest], [SPEED], DT) is None
     assert bursts([rest], [T], [SPEED]) is None
+
+
+@pytest.mark.parametrize(("frequency", "own"), [(28.2, False), (100.0, True)])
+def test_a_line_of_measured_motion_is_one_of_set_points_only_at_their_rate(frequency: float, own: bool) -> None:
+    sample = 1.0 / 400.0
+    t = sample * np.arange(4000)
+    rng = np.random.default_rng(0)
+    motion = np.sin(2.0 * t) + 1e-6 * rng.normal(size=t.size) + 1e-5 * np.sin(2 * np.pi * frequency * t)
+    assert has_line(motion, sample, frequency, 0.1, 100.0, recorded=True)
+    assert has_line(motion, sample, frequency, 0.1, 100.0, recorded=False) is own
+    assert not has_line(motion, sample, 61.3, 0.1, 100.0, recorded=True)
