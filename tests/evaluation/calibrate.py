@@ -45,6 +45,8 @@ PRIOR = 0.5
 """Count added to each outcome of a state (Jeffreys)."""
 TEMPERS = (0.03, 0.1, 0.2, 0.3, 0.5, 1.0)
 """Powers of the odds among other names that are tried."""
+DRAWS = 400
+"""Draws of right and wrong findings for the error of calibration by chance."""
 BINS, PER_BIN = 10, 10
 """Most bins with equal numbers of findings in the table of calibration, and fewest findings of one."""
 
@@ -162,12 +164,16 @@ def cross_fitted(entries: Sequence[Entry]) -> list[tuple[Entry, Calibration]]:
 
 @dataclass(frozen=True)
 class Figures:
-    """How well probabilities and sets hold; ``ece``: expected calibration error; ``visible``: of visible effects."""
+    """How well probabilities and sets hold; ``ece``: expected calibration error, ``by_chance``: if they were right.
+
+    ``coverage``: share of the sets that hold the truth; ``visible``: of those of visible effects.
+    """
 
     cases: int
     findings: int
     right: float
     ece: float
+    by_chance: float
     sets: int
     coverage: float
     visible: float
@@ -186,21 +192,28 @@ def figures(entries: Sequence[Entry], rows: list[tuple[str, ...]]) -> Figures:
         if e.finding is not None and e.state == "named":
             p.append(e.outcomes(c)[e.finding.effect])
             y.append(float(e.right))
-    order = np.argsort(p)
-    ece = 0.0
-    for part in np.array_split(order, max(1, min(BINS, len(p) // PER_BIN))):
-        mean, share = float(np.mean(np.array(p)[part])), float(np.mean(np.array(y)[part]))
-        ece += abs(mean - share) * part.size / len(p)
-        low, high = np.array(p)[part].min(), np.array(p)[part].max()
-        rows.append((f"{low:.2f} to {high:.2f}", str(part.size), f"{mean:.2f}", f"{share:.2f}"))
+    said, right = np.array(p), np.array(y)
+    parts = np.array_split(np.argsort(said), max(1, min(BINS, said.size // PER_BIN)))
+    for part in parts:
+        low, high = said[part].min(), said[part].max()
+        rows.append(
+            (f"{low:.2f} to {high:.2f}", str(part.size), f"{said[part].mean():.2f}", f"{right[part].mean():.2f}")
+        )
+    drawn = np.random.default_rng(0).random((DRAWS, said.size)) < said
     told = [(e, c.likely(e.outcomes(c))) for e, c in levelled if e.state != "clear"]
     hits = [e.truth in found for e, found in told]
     seen = [hit for (e, _), hit in zip(told, hits, strict=True) if e.visible and e.truth != NOTHING]
     size = [float(len(found)) for _, found in told]
     return Figures(
-        len({e.case for e in entries}), len(p), float(np.mean(y)), ece, len(told), float(np.mean(hits)),
+        len({e.case for e in entries}), said.size, float(right.mean()), _calibration_error(said, right, parts),
+        float(np.mean([_calibration_error(said, one, parts) for one in drawn])), len(told), float(np.mean(hits)),
         float(np.mean(seen)), float(np.mean(size)),
     )  # fmt: skip
+
+
+def _calibration_error(said: Array, right: NDArray[Any], parts: Sequence[NDArray[np.int64]]) -> float:
+    """Mean difference of probability and share of right ones over the bins (Naeini, Cooper, Hauskrecht 2015, AAAI)."""
+    return float(sum(abs(said[part].mean() - right[part].mean()) * part.size for part in parts) / said.size)
 
 
 def read(folder: Path) -> list[Entry]:
