@@ -94,7 +94,7 @@ class Finding(Document):
 
 
 class Explanation(Document):
-    """What may be missing at a joint, in the place of one finding where there is one.
+    """Possible causes at a joint, in the place of one finding where there is one.
 
     Parameters
     ----------
