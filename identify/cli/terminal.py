@@ -179,9 +179,10 @@ def diagnosis_table(document: DiagnosisDocument) -> None:
             table.add_row(where, f.effect, values, f.probability, closed)
         print_table(table, console)
         for f in document.findings:
-            rivals = f.evidence.get("ambiguous_with", [])
-            unsure = f"; ambiguous with {', '.join(rivals)}" if rivals else ""
-            console.print(f"{f.joint}: {f.evidence['description']}{unsure}", highlight=False)
+            console.print(f"{f.joint}: {f.evidence['description']}", highlight=False)
+    for e in document.explanations:
+        if e.doubtful:
+            console.print(f"{e.joint}: 90 % set: {e.sentence}", highlight=False, soft_wrap=True)
     for u in document.unexplained:
         console.print(
             f"unexplained: {u.joint}, {100 * u.share_of_residual:.0f} % of its residual varies with {u.varies_with}",

@@ -60,9 +60,13 @@ class Confirmation:
         """True if the errors are smaller with the effect."""
         return self.reduction > 0.0
 
-    def is_material(self, criteria: Criteria) -> bool:
-        """True if the errors of one joint on which it acts fall by enough, relative to them and to its torque."""
-        enough = (self.share >= criteria.least_share) & (self.change >= criteria.material_pct)
+    def is_material(self, criteria: Criteria, *, named: bool) -> bool:
+        """True if the errors of one joint on which it acts fall by enough, relative to them and to its torque.
+
+        A term without a name is lack of fit, and judged as that: the error itself falls by `material_pct`.
+        """
+        size = self.change if named else self.before - self.best
+        enough = (self.share >= criteria.least_share) & (size >= criteria.material_pct)
         return bool((enough & self.acts).any())
 
 

@@ -92,6 +92,8 @@ class Criteria:
     burst_share
         Least share of the residual's power in bursts that are reported: they are most of the error. Stick-slip of
         healthy arms, which the smoother of the velocity does not follow, has less.
+    reversal
+        Velocity under which dry friction reverses, in velocities of its transition: four fifths of it are there then.
     line_level
         Significance level from which a spectral line is searched in the references: as the usual false-alarm rate.
     reference_line
@@ -146,6 +148,7 @@ class Criteria:
     most_unexplained: int = 2
     motion_share: float = 0.5
     burst_share: float = 0.5
+    reversal: float = 3.0
     line_level: float = 0.01
     reference_line: float = 100.0
     modulated_line: float = 0.1
@@ -160,11 +163,6 @@ class Criteria:
         rate = self.false_alarm_rate
         changed = min(0.25 * rate, self.change_rate)
         return {"selection": 0.5 * rate, "lack_of_fit": 0.25 * rate, "changed_parameters": changed}
-
-    @property
-    def ambiguous_odds(self) -> float:
-        """Odds up to which another explanation is ambiguous."""
-        return float(np.exp(self.close))
 
     def selection_level(self, tests: int) -> float:
         """Significance level of the selection for one of a number of candidates."""

@@ -17,14 +17,14 @@ from armident.identify.diagnosis.findings import (
     experiment_to_separate,
     findings_of,
     gap_of,
-    less_certain,
     negligible,
     noise_floor,
     undetectable,
 )
-from armident.identify.diagnosis.lack_of_fit import ResidualDependence, unexplained
+from armident.identify.diagnosis.lack_of_fit import LackOfFit, ResidualDependence
 from armident.identify.diagnosis.lack_of_fit import dependences as dependences_of
 from armident.identify.diagnosis.model_state import ModelState, with_entries, with_report_part
+from armident.identify.diagnosis.probabilities import judged
 from armident.identify.diagnosis.selected import Selected
 from armident.identify.diagnosis.selection import StepwiseSelection
 from armident.identify.diagnosis.setup_stage import set_up
@@ -123,6 +123,8 @@ BEGINS = {
 """Share of the time before each stage; the steps of the selection lie between."""
 SELECTION = (0.22, 0.85)
 """Shares of the time at the begin and at the end of the selection."""
+LIKELY = 0.5
+"""Probability of a name that explains something: more probably right than wrong."""
 STEP = 0.4
 """Share of the remaining selection that one step takes: their number is unknown, and mostly one to six."""
 
@@ -201,12 +203,13 @@ def _diagnose(
     selected = [one for one in every if one not in conventional]
     after = gap_of(final, held=True)
     steps("unexplained dependences")
-    dependences = () if change.complete else unexplained(final)
+    fit_test = LackOfFit(final.fit)
+    dependences, small = ((), ()) if change.complete else (fit_test.unexplained, fit_test.immaterial)
     rest = [
         Unexplained(joint=d.joint, share_of_residual=d.share, varies_with=d.varies_with, hint=d.hint)
         for d in dependences
     ]
-    named = less_certain(findings_of(final, selected), rest)
+    named = findings_of(final, selected, rest)
     stopped = _stopped(selection, len(named))
     doubtful = {entry.joint for entry in stage.doubtful(after)}
     explained = [(f, one) for f, one in zip(named, selected, strict=True) if f.joint not in doubtful]
@@ -214,6 +217,7 @@ def _diagnose(
     findings = [*first_findings, *(f for f, _ in explained)]
     chosen_for = [*(None for _ in first_findings), *(one for _, one in explained)]
     left = stage.left(change.left(named, rest, study.joints), after)
+    findings, explanations = judged(findings, left, study.joints)
     steps("simulation")
     simulated = simulated_errors(first, final)
     steps("detection limits")
@@ -224,6 +228,7 @@ def _diagnose(
         recordings=list(recordings),
         verdict=_verdict(findings, left),
         findings=findings,
+        explanations=explanations,
         unexplained=left,
         gap=Gaps(
             train=_gaps(stage.as_configured(gap_of(first, held=False)), gap_of(final, held=False), change, 0),
@@ -238,7 +243,7 @@ def _diagnose(
         not_visible=undetectable(first, selection.hidden),
         detection_limits=limits,
         simulated=simulated.document(),
-        negligible=negligible(final, conventional, last, selection.immaterial),
+        negligible=negligible(final, conventional, last, selection.immaterial, small),
         sign_smoothing=dict(zip(study.joints, map(float, first.robot.sign_smoothing), strict=True)),
         transitions={e.joint: e.parameters["velocity"] for e in final.robot.effects if e.effect == TRANSITION},
         criteria=asdict(criteria),
@@ -282,11 +287,13 @@ def _stopped(selection: StepwiseSelection, findings: int) -> list[str]:
 
 
 def _verdict(findings: Sequence[Finding], left: Sequence[Unexplained]) -> Verdict:
-    """Verdict: terms without a name close the gap, and explain nothing."""
-    unnamed = bool(left) or any(f.effect == UNNAMED for f in findings)
-    if any(f.effect != UNNAMED for f in findings):
-        return "partly_explained" if unnamed else "explained"
-    return "unexplained" if unnamed else "no_gap"
+    """Verdict: terms without a name, and names that are more probably wrong than right, explain nothing."""
+    explains = [f.effect != UNNAMED and f.confidence >= LIKELY for f in findings]
+    if not findings and not left:
+        return "no_gap"
+    if not any(explains):
+        return "unexplained"
+    return "partly_explained" if left or not all(explains) else "explained"
 
 
 def _predicted(state: ModelState) -> Array:

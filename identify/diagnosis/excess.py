@@ -1,7 +1,8 @@
 """Torques that no recorded motion explains: parts of the residual that are not broadband noise of drives and encoders.
 
-Such noise has a smooth spectrum and the same power at all times. A noise model would take a vibration, a slow signal or
-a contact for noise: here the spectrum is compared with its surroundings, and the power with that of other moments.
+Such noise has the spectrum of its filters and the same power at all times. A noise model would take a vibration, a
+slow signal or a contact for noise: here the spectrum is compared with that of drives and encoders, and the power with
+that of other moments.
 """
 
 from collections.abc import Sequence
@@ -16,9 +17,18 @@ from armident.identify.signals.periodogram import hann_window, periodogram
 
 Array = NDArray[np.float64]
 
-SURROUNDINGS = 20
-"""Least number of frequencies at either side whose median is the level of the noise; above, as many as half of those
-below: the spectrum of noise with one time constant is nearly linear in the frequency over such a range."""
+LEAST_FREQUENCIES = 40
+"""Fewest frequencies from which the level of the noise is estimated: its median is known within a quarter then."""
+
+NOISE_TIME_CONSTANTS = (0.0, 0.002, 0.005, 0.01, 0.02, 0.035, 0.05)
+"""Time constants of noise, s: torque filters and current loops of drives have less. What is slower is a signal."""
+
+RISES = tuple((rise, power) for power in (2, 4) for rise in (0.0, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0))
+"""Noise of differentiated encoders at the Nyquist frequency over the level at zero, and the power of its rise: twice
+the number of derivatives."""
+
+HIGHEST = 0.7
+"""Highest frequency over the Nyquist frequency: the filter of the comparison begins to fall there."""
 
 PER_FREQUENCY = 1.5
 """Frequencies of a Hann window that count as one independent one."""
@@ -28,6 +38,12 @@ NARROW = 6
 
 MOST = 0.9
 """Share of the power beyond noise that a line has within `NARROW` frequencies."""
+
+CLEAR = 1e-3
+"""Probability below which a further band, found among all, is no noise."""
+
+SHOWN = 40
+"""Frequencies to either side of the strongest one in a figure."""
 
 WINDOW = 8
 """Equations whose mean power is that of a moment: about four periods at the highest frequency of the comparison."""
@@ -43,107 +59,106 @@ LOG_2 = float(np.log(2.0))
 
 @dataclass(frozen=True)
 class Excess:
-    """Part of one joint's residual beyond broadband noise, of the training or of the held-out data.
+    """Part of one joint's residual beyond broadband noise; an event, which other data need not repeat.
 
-    ``share`` of the residual's power; ``size``: rms, N m or N. ``where``: frequency, Hz, or the first moments, s.
-    ``x``, ``value``, ``noise`` (G,): amplitude over frequency or time, and that of the noise.
+    ``share`` of the power of the residual, whose rms is ``error``, N m or N. ``where``: frequency, Hz, or the first
+    moments, s. ``x``, ``value``, ``noise`` (G,): amplitude over frequency or time, and that of the noise.
     """
 
     kind: Literal["frequency", "unrecorded signal", "bursts"]
     p_value: float
-    p_held: float
     share: float
-    size: float
+    error: float
     where: tuple[float, ...]
     x: Array
     value: Array
     noise: Array
 
 
-def spectral_excess(train: Sequence[Array], held: Sequence[Array], dt: float) -> Excess | None:
-    """Frequencies with more power than their surroundings, by the most significant band; none in a short recording.
+def spectral_excess(
+    series: Sequence[Array], velocities: Sequence[Array], dt: float, slow: float = 0.0
+) -> Excess | None:
+    """Band of frequencies with most power over what noise of drives and encoders has there; the longest series counts.
 
-    ``train``, ``held``: residuals (M,) of one joint in the band of the comparison, zero at rest; the longest counts.
+    ``series``: residuals (M,) of one joint in the band of the comparison, zero at rest. Times about reversals and under
+    the velocity ``slow``, where dry friction has no model, are left out.
     """
-    longest, unseen = max(train, key=lambda e: e.size), max(held, key=lambda e: e.size)
-    if not (longest.any() and unseen.any()):
+    e, qd = max(zip(series, velocities, strict=True), key=lambda pair: pair[0].size)
+    away = np.where(_turning(e, qd, slow), 0.0, e)
+    power = periodogram(hann_window(e.size) * away)
+    f = np.arange(power.size) / (e.size * dt)
+    used = np.flatnonzero((f > 0.0) & (f < HIGHEST * 0.5 / dt))
+    if used.size < LEAST_FREQUENCIES or not away.any():
         return None
-    own, other = _Spectrum.of(longest, dt), _Spectrum.of(unseen, dt)
-    sums = np.append(0.0, np.cumsum(own.ratio))
-    p_value, start, width, tried = 1.0, 1, 0, 0
-    for wide in (2**k for k in range(max(own.f.size // 4, 1).bit_length())):
-        starts = np.arange(1, own.f.size - wide + 1, max(1, wide // 2))
-        p = own.chance((sums[starts + wide] - sums[starts]) / wide, starts + wide // 2, wide)
-        tried += starts.size
-        if p.min(initial=1.0) < p_value:
-            p_value, start, width = float(p.min()), int(starts[np.argmin(p)]), wide
-    inside = np.flatnonzero(np.abs(other.f - own.f[start] - 0.5 * width * own.f[1]) <= 0.5 * (width + 1) * own.f[1])
-    if width == 0 or inside.size == 0:
-        return None
-    p_held = float(other.chance(other.ratio[inside].mean()[None], inside[[inside.size // 2]], inside.size)[0])
-    numbers = np.arange(own.f.size)
-    strong = (own.chance(own.ratio, numbers, 1) * own.f.size < 1.0) | (numbers >= start) & (numbers < start + width)
-    strong[0] = False
-    beyond = np.where(strong, np.maximum(own.power - own.level, 0.0), 0.0)
-    share, peak = float(beyond.sum() / np.sum(own.power)), int(np.argmax(beyond))
+    level = _noise_level(f, power, used, dt)
+    ratio, more = power[used] / level[used], power[used] - level[used]
+    sums, excess = (np.append(0.0, np.cumsum(one)) for one in (ratio, more))
+    widths = [2**k for k in range((used.size // 4).bit_length())]
+    bands = np.array([(k, k + w) for w in widths for k in range(0, used.size - w + 1, max(1, w // 2))])
+    wide = bands[:, 1] - bands[:, 0]
+    mean = (sums[bands[:, 1]] - sums[bands[:, 0]]) / wide
+    p = stats.f.sf(mean, 2.0 * np.maximum(1.0, wide / PER_FREQUENCY), 2.0 * used.size / PER_FREQUENCY * LOG_2**2)
+    p_value = min(1.0, bands.shape[0] * float(p.min()))
+    # Of the bands that are no noise, either, the one with most power beyond it.
+    power_of = excess[bands[:, 1]] - excess[bands[:, 0]]
+    first, last = bands[int(np.argmax(np.where(p <= max(p.min(), CLEAR / p.size), power_of, -np.inf)))]
+    inside = np.exp(-ratio) * used.size < 1.0
+    inside[first:last] = True
+    beyond = np.zeros(power.size)
+    beyond[used] = np.where(inside, more, 0.0)
+    # Of the whole residual: a signal is there about reversals, too, and so are larger errors.
+    rms = float(np.sqrt(np.mean(e[e != 0.0] ** 2)))
+    part = float(np.mean(away[away != 0.0] ** 2)) / rms**2
+    peak, share = int(np.argmax(beyond)), max(part * float(beyond.sum() / power.sum()), 0.0)
     # A line is as narrow as the window allows; wider, it is a signal with a spectrum of its own.
-    line = beyond[max(peak - NARROW // 2, 0) : peak + NARROW // 2 + 1].sum() > MOST * beyond.sum()
-    narrow = line and peak > NARROW
-    around = slice(max(peak - 2 * SURROUNDINGS, 0), peak + 2 * SURROUNDINGS)
-    value, noise = (np.sqrt(2.0 * dt * one[around]) for one in (own.power, own.level))
+    line = peak > NARROW and beyond[peak - NARROW // 2 : peak + NARROW // 2 + 1].sum() > MOST * beyond.sum()
+    around = slice(max(peak - SHOWN, 0), peak + SHOWN)
+    value, noise = (np.sqrt(2.0 * dt * one[around]) for one in (power, level))
     return Excess(
-        "frequency" if narrow else "unrecorded signal", min(1.0, tried * p_value), p_held, share,
-        float(np.sqrt(share * np.mean(longest[longest != 0.0] ** 2))), (float(own.f[peak]),),
-        own.f[around], value, noise,
+        "frequency" if line else "unrecorded signal", p_value, share, rms,
+        (float(f[peak]),), f[around], value, noise,
     )  # fmt: skip
 
 
-@dataclass(frozen=True, eq=False)
-class _Spectrum:
-    """Power of a series at frequencies ``f``, Hz, the level of the noise there, and the ratio of both, (F,) each."""
+def _noise_level(f: Array, power: Array, used: NDArray[np.int64], dt: float) -> Array:
+    """Spectrum (F,) of drives and encoders: white, of one time constant, and rising.
 
-    f: Array
-    power: Array
-    level: Array
-    neighbours: NDArray[np.int64]
-
-    @classmethod
-    def of(cls, e: Array, dt: float) -> "_Spectrum":
-        power = periodogram(hann_window(e.size) * e)
-        numbers = np.arange(power.size)
-        half = np.maximum(SURROUNDINGS, numbers // 2)
-        first, last = np.maximum(numbers - half, 1), np.minimum(numbers + half + 1, power.size)
-        # At the ends of the band as many neighbours as elsewhere.
-        first = np.maximum(np.minimum(first, power.size - 2 * half), 1)
-        last = np.minimum(np.maximum(last, 2 * half), power.size)
-        level = np.array([np.median(power[a:b]) for a, b in zip(first, last, strict=True)]) / LOG_2
-        return cls(numbers / (e.size * dt), power, np.maximum(level, 1e-300), last - first)
-
-    @property
-    def ratio(self) -> Array:
-        return self.power / self.level
-
-    def chance(self, mean: Array, at: NDArray[np.int64], width: int) -> Array:
-        """Probability of so large a mean ratio over ``width`` frequencies about those numbered ``at``, in noise."""
-        own = 2.0 * max(1.0, width / PER_FREQUENCY)
-        return np.asarray(stats.f.sf(mean, own, 2.0 * self.neighbours[at] / PER_FREQUENCY * LOG_2**2))
+    Least absolute errors of the logarithms: a band that is not the greater part of the frequencies does not move it.
+    """
+    best, level = np.inf, np.zeros(0)
+    for constant in NOISE_TIME_CONSTANTS:
+        falling = 1.0 / (1.0 + (2.0 * np.pi * constant * f) ** 2)
+        for rise, order in RISES:
+            shape = falling + rise * (2.0 * dt * f) ** order
+            ratio = power[used] / shape[used]
+            median = max(float(np.median(ratio)), 1e-300)
+            loss = float(np.mean(np.abs(np.log(np.maximum(ratio / median, 1e-300)))))
+            if loss < best:
+                best, level = loss, shape * median / LOG_2
+    return level
 
 
-def bursts(series: Sequence[Array], times: Sequence[Array], velocities: Sequence[Array]) -> Excess | None:
+def _turning(e: Array, qd: Array, slow: float) -> NDArray[np.bool_]:
+    """True for samples about a reversal, rest, or slow motion, (M,)."""
+    turns = np.append(False, np.sign(qd[1:]) != np.sign(qd[:-1])) | (e == 0.0) | (np.abs(qd) < slow)
+    return np.asarray(np.convolve(turns, np.ones(WINDOW + 1), mode="same") > 0.0)
+
+
+def bursts(
+    series: Sequence[Array], times: Sequence[Array], velocities: Sequence[Array], slow: float = 0.0
+) -> Excess | None:
     """Moments with more power than the others, of the residual (M,) of one joint with its times and velocities (M,).
 
-    Times about rest and reversals, where dry friction has no model, are left out.
+    Times about rest, reversals and under the velocity ``slow``, where dry friction has no model, are left out.
     """
     powers, moments = [], []
     for e, t, qd in zip(series, times, velocities, strict=True):
         count = e.size // WINDOW
-        turns = np.append(False, np.sign(qd[1:]) != np.sign(qd[:-1])) | (e == 0.0)
-        near = np.convolve(turns, np.ones(WINDOW + 1), mode="same") > 0.0
-        used = ~near[: count * WINDOW].reshape(count, WINDOW).any(axis=1)
+        used = ~_turning(e, qd, slow)[: count * WINDOW].reshape(count, WINDOW).any(axis=1)
         powers.append(np.mean(e[: count * WINDOW].reshape(count, WINDOW) ** 2, axis=1)[used])
         moments.append(t[: count * WINDOW : WINDOW][used])
     power, moment = np.concatenate(powers), np.concatenate(moments)
-    if power.size < 2 * SURROUNDINGS:
+    if power.size < LEAST_FREQUENCIES:
         return None
     free = _independent(series)
     usual = float(np.median(power) * free / stats.chi2.median(free))
@@ -155,11 +170,10 @@ def bursts(series: Sequence[Array], times: Sequence[Array], velocities: Sequence
         return None
     share = float(np.sum(power[strong] - usual) / np.sum(power))
     first = strong[np.argsort(-power[strong])][:LISTED]
-    rms = float(np.sqrt(share * power.mean()))
+    error = float(np.sqrt(power.mean()))
     level = np.full(power.size, np.sqrt(usual))
     when = tuple(np.sort(moment[first]).tolist())
-    # An event needs no confirmation by other data: nothing was selected by it.
-    return Excess("bursts", float(min(1.0, p.min())), 0.0, share, rms, when, moment, np.sqrt(power), level)
+    return Excess("bursts", float(min(1.0, p.min())), share, error, when, moment, np.sqrt(power), level)
 
 
 def _independent(series: Sequence[Array]) -> float:

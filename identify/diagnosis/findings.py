@@ -1,4 +1,4 @@
-"""Selected effects as entries of the document: parameters, confidence, alternatives, undetectable effects."""
+"""Selected effects as entries of the document: parameters, evidence, alternatives, undetectable effects."""
 
 from collections.abc import Mapping, Sequence
 
@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from armident.identify.diagnosis.candidate_comparison import Addition, SelectionStep
 from armident.identify.diagnosis.candidates import ColumnCache, Key
 from armident.identify.diagnosis.criteria import Criteria
+from armident.identify.diagnosis.lack_of_fit import ResidualDependence
 from armident.identify.diagnosis.model_state import ModelState
 from armident.identify.diagnosis.next_experiment import recommended_experiment
 from armident.identify.diagnosis.precision import standard_deviations
@@ -23,19 +24,25 @@ from armident.identify.effects.wiring import SignalMistake
 Array = NDArray[np.float64]
 
 
-def findings_of(final: ModelState, selected: Sequence[Selected]) -> list[Finding]:
-    """Return the findings of a selection, in its order. ``selected``: effects of the selection."""
+def findings_of(final: ModelState, selected: Sequence[Selected], left: Sequence[Unexplained]) -> list[Finding]:
+    """Return the findings of a selection, in its order; `judged` gives them their probabilities.
+
+    ``selected``: effects of the selection. ``left``: dependences of the residual with them.
+    """
     deviations = standard_deviations(final)
     entries = list(final.robot.effects)
     values = final.with_values().effects
+    rest = _known_shares(left)
     found = []
     for one in selected:
         number = entries.index(one.entry)
-        found.append(_finding(final, one, values[number].parameters, deviations[number]))
+        found.append(_finding(final, one, values[number].parameters, deviations[number], rest))
     return found
 
 
-def _finding(final: ModelState, one: Selected, parameters: Mapping[str, float], std: dict[str, float]) -> Finding:
+def _finding(
+    final: ModelState, one: Selected, parameters: Mapping[str, float], std: dict[str, float], rest: Mapping[str, float]
+) -> Finding:
     addition, report = one.addition, one.confirmation
     assert report is not None
     effect, place = of_entry(one.entry), addition.candidate.place
@@ -46,25 +53,27 @@ def _finding(final: ModelState, one: Selected, parameters: Mapping[str, float], 
     chance = min(1.0, one.step.tests * float(np.exp(-addition.gain)))
     rivals = one.step.rivals(addition)
     odds = tempered_odds(one.step, addition)
-    ambiguous = final.study.criteria.ambiguous_odds
+    name = final.study.joints[joint]
+    before, after = float(report.before[joint]), float(report.best[joint])
+    taken, unknown = max(before**2 - after**2, 0.0), rest.get(name, 0.0) * after**2
     return Finding(
         effect=effect.name,
         law=effect.law,
-        joint=final.study.joints[joint] if effect.scope == "arm" else one.entry.joint,
+        joint=name if effect.scope == "arm" else one.entry.joint,
         other=one.entry.other,
         kind="structure",
         parameters=dict(parameters),
-        confidence=(1.0 - chance) * (1.0 / (1.0 + sum(odds.values())) if addition.named else 1.0),
+        confidence=0.0,
         alternatives=_alternatives(final, addition, rivals),
-        gap_before=float(report.before[joint]),
-        gap_after=float(report.best[joint]),
+        gap_before=before,
+        gap_after=after,
         evidence={
             "title": effect.title,
             "description": effect.description,
             "reference": effect.reference,
             "score": addition.gain,
             "p_value": report.p_value,
-            "gap_joint": final.study.joints[joint],
+            "gap_joint": name,
             "gap_at_measured_motion": float(report.after[joint]),
             "p_value_selection": chance,
             "p_value_parameters": one.p_value,
@@ -73,25 +82,17 @@ def _finding(final: ModelState, one: Selected, parameters: Mapping[str, float], 
             "change_of_torque_pct": addition.material_pct,
             "std": std,
             "units": _units(effect, final.robot.joints[place.joint].type == "prismatic"),
-            "ambiguous_with": [key[0] for key, ratio in odds.items() if addition.named and ratio * ambiguous > 1.0],
+            # Of the error that is known not to be noise; what is left may be the rest of another effect.
+            "share_explained": taken / (taken + unknown) if unknown > 0.0 else 1.0,
+            "margin": -float(np.log(max([*odds.values(), 1e-300]))),
+            "odds": {
+                key[0]: ratio
+                for key, ratio in odds.items()
+                if key[0] != effect.name
+                and (known(key[0]).scope == "arm" or not {joint, place.joint}.isdisjoint(key[1:]))
+            },
         },
     )
-
-
-def less_certain(findings: Sequence[Finding], left: Sequence[Unexplained]) -> list[Finding]:
-    """Return findings whose confidence allows for an effect outside the catalogue.
-
-    It is at most the share of the error's known non-noise power that the finding explains, unless it has no name.
-    """
-    known_shares = _known_shares(left)
-    found = []
-    for one in findings:
-        rest = known_shares.get(one.evidence["gap_joint"], 0.0) * one.gap_after**2
-        taken = max(one.gap_before**2 - one.gap_after**2, 0.0)
-        share = taken / (taken + rest) if one.effect != UNNAMED and rest > 0.0 else 1.0
-        evidence = {**one.evidence, "share_explained": share}
-        found.append(one.model_copy(update={"confidence": share * one.confidence, "evidence": evidence}))
-    return found
 
 
 def _known_shares(left: Sequence[Unexplained]) -> dict[str, float]:
@@ -130,9 +131,13 @@ def negligible(
     final: ModelState,
     conventional: Sequence[Selected],
     step: SelectionStep | None,
-    immaterial: Sequence[Addition] = (),
+    immaterial: Sequence[Addition],
+    dependences: Sequence[tuple[ResidualDependence, float]],
 ) -> list[Negligible]:
-    """Return the significant effects that are no cause: too small, or within the sampling convention of drives."""
+    """Return what is significant and no cause: too small, or within the sampling convention of drives.
+
+    ``dependences``: of residuals, with the fall of the error without them, percent.
+    """
     found: dict[Key, Negligible] = {}
     small = [*(one.addition for one in conventional), *immaterial]
     if step is not None:
@@ -148,7 +153,17 @@ def negligible(
                 share_of_residual=addition.share,
             )
             found.setdefault(addition.family, entry)
-    return list(found.values())
+    rest = [
+        Negligible(
+            effect=UNNAMED,
+            joint=d.joint,
+            varies_with=d.varies_with,
+            change_of_torque_pct=fall,
+            share_of_residual=d.share,
+        )
+        for d, fall in dependences
+    ]
+    return [*found.values(), *rest]
 
 
 def gap_of(state: ModelState, *, held: bool) -> Gap:
@@ -200,10 +215,10 @@ def undetectable(state: ModelState, hidden: frozenset[Key]) -> list[NotVisible]:
 
 
 def experiment_to_separate(findings: Sequence[Finding], criteria: Criteria) -> str | None:
-    """Return the experiment that separates a finding from a close rival or raises a low confidence, if needed."""
+    """Return the experiment that separates a finding from the other names of its set, or raises a low probability."""
     named = [f for f in findings if f.effect in catalogue()]
     for finding in named:
-        rivals = [known(name) for name in finding.evidence.get("ambiguous_with", [])]
+        rivals = [known(name) for name in finding.evidence.get("ambiguous_with", []) if name in catalogue()]
         if rivals:
             return recommended_experiment(known(finding.effect), finding.joint, rivals)
     doubtful = [f for f in named if f.kind == "structure" and f.confidence < criteria.doubtful]

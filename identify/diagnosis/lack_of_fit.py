@@ -14,6 +14,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from armident.configs.schema.robot import Effect as Entry
 from armident.identify.diagnosis.criteria import Criteria
 from armident.identify.diagnosis.excess import Excess, bursts, spectral_excess
 from armident.identify.diagnosis.free_functions import FINE, FreeFunction, free_functions, in_band
@@ -23,6 +24,7 @@ from armident.identify.diagnosis.regression import IvFit
 from armident.identify.diagnosis.spectral_lines import SpectralLine, bandwidth_of_motion, lines_of_joints
 from armident.identify.diagnosis.stretch import MotionStretch
 from armident.identify.diagnosis.variables import Kind, hint_of, unit_of_variable
+from armident.identify.effects.friction import TRANSITION
 from armident.identify.regression.whitening import rows_of_joints
 from armident.identify.robot.motion import Motion
 from armident.identify.signals.periodogram import hann_window, periodogram
@@ -31,6 +33,9 @@ Array = NDArray[np.float64]
 
 NORMAL = 1.4826
 """Standard deviation of a normal variable over the median of its absolute value."""
+
+RANK = 1e-10
+"""Singular value of a joint's regressor over the largest below which it is a rounding error."""
 
 OCTAVES = (0.0, 0.125, 0.25, 0.5, 1.0, 2.0, 4.0)
 """Edges of the frequencies of the spectrum of a dependence on the motion, over the bandwidth of the motion."""
@@ -101,14 +106,6 @@ def dependences(state: Fitted) -> tuple[ResidualDependence, ...]:
     return LackOfFit(state.fit).dependences
 
 
-def unexplained(state: Fitted) -> tuple[ResidualDependence, ...]:
-    """Significant and material dependences, each in addition to the ones before it, largest share first.
-
-    So a variable correlated with a stronger one (speed with torque, for example) is not listed again.
-    """
-    return LackOfFit(state.fit).unexplained
-
-
 @dataclass(frozen=True, eq=False)
 class LackOfFit:
     """All tests of the residual of one fit. ``fit``: fit of the model."""
@@ -135,9 +132,12 @@ class LackOfFit:
         found = [self._dependence(p, self.joints[p.joint]) for p in best.values()]
         return _by_share([*found, *(self._of_line(*line) for line in self.lines if self._significant(line[1]))])
 
-    @property
+    @cached_property
     def unexplained(self) -> tuple[ResidualDependence, ...]:
-        """Significant and material dependences, each in addition to the ones before it, largest share first."""
+        """Significant and material dependences, each in addition to the ones before it, largest share first.
+
+        So a variable correlated with a stronger one (speed with torque, for example) is not listed again.
+        """
         found: list[ResidualDependence] = []
         for j, own in enumerate(self.joints):
             mine = [p for p in self.projections if p.joint == j and self._reported(p)]
@@ -157,25 +157,48 @@ class LackOfFit:
             lines = [self._of_line(k, line) for k, line in self.lines if k == j and self._reported(line, j)]
             found += lines
             if not here and not lines:
-                found += [self._of_excess(j, excess) for excess in self._excesses(j) if self._reported(excess, j)]
+                events = [event for event in self._excesses(j) if self._reported(event, j)]
+                found += [self._of_excess(j, event) for event in events[:1]]
         return _by_share(found)
 
+    @property
+    def immaterial(self) -> tuple[tuple[ResidualDependence, float], ...]:
+        """Largest significant dependence of each joint that has no material one, and the fall of its error, percent."""
+        found = []
+        for j, own in enumerate(self.joints):
+            mine = [p for p in self.projections if p.joint == j and p.function is not None]
+            small = [(self._fall(p, j), self._dependence(p, own)) for p in filter(self._significant, mine)]
+            events = filter(self._significant, self._excesses(j))
+            small += [(self._fall(event, j), self._of_excess(j, event)) for event in events]
+            found += [max(small, key=lambda one: one[0])] if small else []
+        reported = {d.joint for d in self.unexplained}
+        return tuple((d, fall) for fall, d in found if d.joint not in reported)
+
     def _significant(self, test: Projection | SpectralLine | Excess) -> bool:
+        if isinstance(test, Excess):
+            # Nothing was selected by it, and an event need not be in the other data.
+            return test.p_value < self.level
         return test.p_value < self.level and test.p_held < self.criteria.held_out_level and test.share > 0
 
     def _reported(self, test: Projection | SpectralLine | Excess, joint: int | None = None) -> bool:
         """True if a dependence is significant and material."""
         j = test.joint if isinstance(test, Projection) else joint
-        torque = np.concatenate([s.y[:, j] for s in self.fit.study.train])
+        assert j is not None
+        large = test.share >= self.criteria.least_share and self._fall(test, j) >= self.criteria.material_pct
+        return large and self._significant(test)
+
+    def _fall(self, test: Projection | SpectralLine | Excess, joint: int) -> float:
+        """By how much the error of a joint falls without a dependence, percent of its torque."""
+        torque = np.concatenate([s.y[:, joint] for s in self.fit.study.train])
+        left = 1.0 - np.sqrt(max(1.0 - test.share, 0.0))
         if isinstance(test, SpectralLine):
             fall = test.size
+        elif isinstance(test, Excess):
+            fall = test.error * left
         else:
-            # By how much the held-out error of the joint falls without it.
-            error = np.concatenate([e[:, j] for e in self.fit.errors(self.fit.theta, held=True)])
-            fall = float(np.sqrt(np.mean(error**2)) * (1.0 - np.sqrt(max(1.0 - test.share, 0.0))))
-        size = 100.0 * fall / max(float(np.sqrt(np.mean(torque**2))), 1e-300)
-        material = test.share >= self.criteria.least_share and size >= self.criteria.material_pct
-        return material and self._significant(test)
+            error = np.concatenate([e[:, joint] for e in self.fit.errors(self.fit.theta, held=True)])
+            fall = float(np.sqrt(np.mean(error**2))) * left
+        return float(100.0 * fall / max(float(np.sqrt(np.mean(torque**2))), 1e-300))
 
     def _dependence(self, p: Projection, own: JointResidual) -> ResidualDependence:
         """Dependence with its curve."""
@@ -207,15 +230,26 @@ class LackOfFit:
     def _excesses(self, joint: int) -> list[Excess]:
         """Parts of a joint's residual that are no broadband noise, the largest one first."""
         study = self.fit.study
-        train, held = ([e[:, joint] for e in self.fit.errors(self.fit.theta, held=part)] for part in (False, True))
-        found = [spectral_excess(train, held, study.dt * study.decimation.factor)]
-        for errors, stretches in ((train, study.train), (held, study.held)):
+        transitions = [e.parameters["velocity"] for e in study.robot.effects if self._reverses(e, joint)]
+        slow = self.criteria.reversal * max(1.0 / float(study.robot.sign_smoothing[joint]), *transitions, 0.0)
+        found: list[Excess] = []
+        for held, stretches in ((False, study.train), (True, study.held)):
+            errors = [e[:, joint] for e in self.fit.errors(self.fit.theta, held=held)]
+            if held:
+                errors = _refitted(errors, [e.z[:, joint] for e in self.fit.equations.held])
             at = [study.decimation.instants(s.measured.qd.shape[0]) for s in stretches]
             velocities = [s.measured.qd[rows, joint] for s, rows in zip(stretches, at, strict=True)]
-            moments = bursts(errors, [s.t for s in stretches], velocities)
+            moments = bursts(errors, [s.t for s in stretches], velocities, slow)
             if moments is not None and moments.share >= self.criteria.burst_share:
                 found.append(moments)
-        return sorted((one for one in found if one is not None), key=lambda one: -one.share)[:1]
+            signal = spectral_excess(errors, velocities, study.dt * study.decimation.factor, slow)
+            if signal is not None:
+                found.append(signal)
+        return sorted(found, key=lambda one: -one.share)
+
+    def _reverses(self, entry: Entry, joint: int) -> bool:
+        """True for the entry with the transition of a joint's dry friction."""
+        return entry.effect == TRANSITION and entry.joint == self.fit.study.joints[joint]
 
     def _of_excess(self, joint: int, excess: Excess) -> ResidualDependence:
         curve = Curve(excess.x, excess.value, excess.noise)
@@ -300,8 +334,8 @@ class LackOfFit:
 
     @cached_property
     def tests(self) -> int:
-        """Number of all tests: every set of functions; of each joint all together, two of spectra, two of bursts."""
-        return sum(len(own) + 4 for own in self.functions)
+        """Number of all tests: sets of functions; of each joint all together, a line, two of spectra, two of bursts."""
+        return sum(len(own) + 6 for own in self.functions)
 
     def _whitened(self, fit: IvFit) -> tuple[JointResidual, ...]:
         blocks, rows = fit.equations.held, fit.regression.rows_of
@@ -361,6 +395,17 @@ class LackOfFit:
                 chosen.append(own)
                 left -= own.size
         return np.concatenate(chosen) if chosen else np.arange(0)
+
+
+def _refitted(errors: Sequence[Array], regressors: Sequence[Array]) -> list[Array]:
+    """Errors (M,) of a joint without what other parameters of the model explain, whose regressors are (M, b).
+
+    Errors of the parameters give the residual of other data the spectrum of the motion.
+    """
+    x, e = np.concatenate(regressors), np.concatenate(errors)
+    x = x / np.maximum(np.linalg.norm(x, axis=0), 1e-300)
+    left = e - x @ np.linalg.lstsq(x, e, rcond=RANK)[0]
+    return np.split(left, np.cumsum([one.size for one in errors])[:-1])
 
 
 def limited(residual: Array, joints: Sequence[slice], deviations: float) -> Array:

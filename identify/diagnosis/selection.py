@@ -313,7 +313,7 @@ class StepwiseSelection:
                 failed, key=lambda one: 1.0 if one[0].confirmation is None else one[0].confirmation.p_value
             )
             assert gone.confirmation is not None
-            if not gone.confirmation.is_material(self.criteria):
+            if not gone.confirmation.is_material(self.criteria, named=gone.addition.named):
                 self.immaterial = (*self.immaterial, gone.addition)
             found = tuple(one for one in found if one.entry is not gone.entry)
 
@@ -323,7 +323,8 @@ class StepwiseSelection:
         assert report is not None
         determined = one.p_value < self.criteria.selection_level(one.step.tests)
         significant = report.p_value < self.criteria.confirmation_level
-        return determined and significant and report.smaller and report.is_material(self.criteria)
+        material = report.is_material(self.criteria, named=one.addition.named)
+        return determined and significant and report.smaller and material
 
 
 def _order(one: Selected) -> tuple[bool, float]:

@@ -9,6 +9,7 @@ from scipy import stats
 
 from armident.identify.diagnosis.stretch import MotionStretch
 from armident.identify.diagnosis.study import Study
+from armident.identify.identification.options import CONTROLLERS
 from armident.identify.signals.periodogram import hann_window, periodogram
 
 Array = NDArray[np.float64]
@@ -107,14 +108,27 @@ def of_references(study: Study, frequency: float) -> bool:
 
     The motion modulates the line, so its width is a share of the bandwidth of the motion.
     """
-    wide = study.criteria.modulated_line * bandwidth_of_motion(study)
-    for reference in study.auxiliary.references:
-        for joint in np.diff(reference, 2, axis=0).T:
-            spectrum = _Spectrum.of(joint, study.sample)
-            near = np.abs(spectrum.f - frequency) <= max(wide, 2 * PADDING * spectrum.f[1])
-            if np.any(spectrum.power[near] > study.criteria.reference_line * spectrum.background[near]):
-                return True
-    return False
+    wide, criteria = study.criteria.modulated_line * bandwidth_of_motion(study), study.criteria
+    recorded = study.loop in CONTROLLERS
+    every = (joint for reference in study.auxiliary.references for joint in reference.T)
+    return any(
+        has_line(joint, study.sample, frequency, wide, criteria.reference_line, recorded=recorded) for joint in every
+    )
+
+
+def has_line(reference: Array, sample: float, frequency: float, wide: float, least: float, *, recorded: bool) -> bool:
+    """Return true if a reference (N,) has a line within ``wide``, Hz, with ``least`` times the power around it.
+
+    Where none is recorded, the measured motion stands for it, which a vibration shakes, too: set points come once in a
+    whole number of samples.
+    """
+    spectrum = _Spectrum.of(np.diff(reference, 2), sample)
+    sharp = 2 * PADDING * spectrum.f[1]
+    samples = 1.0 / (frequency * sample)
+    if not recorded and abs(samples - round(samples)) > samples * sharp / frequency:
+        return False
+    near = np.abs(spectrum.f - frequency) <= max(wide, sharp)
+    return bool(np.any(spectrum.power[near] > least * spectrum.background[near]))
 
 
 def _chance(ratio: float, stretches: int) -> float:

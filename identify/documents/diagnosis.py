@@ -17,6 +17,13 @@ VERDICTS: dict[Verdict, str] = {
 """Meaning of each verdict."""
 
 
+def _percent(probability: float) -> str:
+    """Probability in percent, in words where it is nearly 0 or 1."""
+    if probability > 0.999:
+        return "> 99.9 %"
+    return f"{100 * probability:.1f} %" if probability > 0.001 else "< 0.1 %"
+
+
 class Alternative(Document):
     """Another effect in place of a finding.
 
@@ -55,8 +62,9 @@ class Finding(Document):
     parameters
         Estimated parameters, SI.
     confidence
-        Posterior probability of the finding among all alternatives in its place, 0 to 1. Where a part of the joint's
-        error, or of the difference from a baseline, is unexplained, it is multiplied by the share that is explained.
+        Probability that the finding is right, 0 to 1: calibrated on simulated arms; of a term without a name, that
+        something is missing at all. Of a change against a baseline, its share of the posterior odds, times the share
+        of the difference that is explained.
     alternatives
         Other effects in place of the finding, the best first.
     gap_before
@@ -82,9 +90,36 @@ class Finding(Document):
     @property
     def probability(self) -> str:
         """Confidence in percent, in words where it is nearly 0 or 1."""
-        if self.confidence > 0.999:
-            return "> 99.9 %"
-        return f"{100 * self.confidence:.1f} %" if self.confidence > 0.001 else "< 0.1 %"
+        return _percent(self.confidence)
+
+
+class Explanation(Document):
+    """Possible causes at a joint, in the place of one finding where there is one.
+
+    Parameters
+    ----------
+    joint
+        Name of the joint.
+    names
+        Calibrated probability of each explanation: names of effects; ``unnamed``: something that has no name here;
+        ``nothing``. Their sum is 1.
+    likely
+        Smallest set of these that holds the truth in nine cases of ten, the most probable one first.
+    """
+
+    joint: str
+    names: dict[str, float]
+    likely: list[str]
+
+    @property
+    def doubtful(self) -> bool:
+        """True if the set has several members, or one without a name."""
+        return self.likely != ["nothing"] and (len(self.likely) > 1 or "unnamed" in self.likely)
+
+    @property
+    def sentence(self) -> str:
+        """Members of the set with their probabilities, in words."""
+        return ", ".join(f"{name.replace('_', ' ')} {_percent(self.names[name])}" for name in self.likely)
 
 
 class Unexplained(Document):
@@ -109,22 +144,25 @@ class Unexplained(Document):
 
 
 class Negligible(Document):
-    """Effect that is significant and smaller than what counts as a cause; it is not in the model.
+    """Effect or dependence that is significant and smaller than what counts as a cause; it is not in the model.
 
     Parameters
     ----------
     effect
-        Name of the effect.
+        Name of the effect; ``unnamed`` for a dependence of the residual.
     joint
         Name of the joint.
+    varies_with
+        Variable of a dependence.
     change_of_torque_pct
-        Its torque in percent of that of the joint.
+        Torque of an effect, or fall of the error without a dependence, in percent of the torque of the joint.
     share_of_residual
         Share of the power of the joint's residual that it removes, 0 to 1.
     """
 
     effect: str
     joint: str
+    varies_with: str | None = None
     change_of_torque_pct: float
     share_of_residual: float
 
@@ -237,6 +275,8 @@ class DiagnosisDocument(Document):
         Summary of findings and unexplained parts.
     findings
         Effects that the model lacks, those with a name first.
+    explanations
+        For every joint, and every finding of it, what may be missing there, with probabilities and a 90 % set.
     unexplained
         Parts of a joint's residual that depend on a variable, without a known effect.
     gap
@@ -262,8 +302,8 @@ class DiagnosisDocument(Document):
         Errors of the simulated closed loop, arm and controller along the reference trajectory, with both models,
         percent of the measured motion and torques.
     negligible
-        Effects that are significant and change the torque by less than ``--material``, or the error by less than 2 %.
-        They are no cause, and not in the model.
+        Effects and dependences that are significant and change the torque by less than ``--material``, or the error by
+        less than 2 %. They are no cause, and not in the model.
     sign_smoothing
         ``g`` of each joint's ``sign(qd) -> (2/pi) atan(g qd)``, s/rad or s/m.
     transitions
@@ -295,3 +335,4 @@ class DiagnosisDocument(Document):
     transitions: dict[str, float] | None = None
     criteria: dict[str, float] | None = None
     alpha: dict[str, float] | None = None
+    explanations: list[Explanation] = Field(default_factory=list)

@@ -75,7 +75,7 @@ def _detection_limits(document: DiagnosisDocument) -> list[dict[str, str]]:
 
 
 def posterior_probability(finding: Finding) -> str:
-    """Return the posterior probability of a finding in words, with the effects that it is ambiguous with."""
+    """Return the probability of a finding in words, with the other effects of its set."""
     shown = finding.probability
     rivals = ", ".join(name.replace("_", " ") for name in finding.evidence.get("ambiguous_with", []))
     if rivals:

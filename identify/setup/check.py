@@ -98,7 +98,7 @@ def _check(experiments: Sequence[Experiment], robot: RobotConfig) -> SetupCheck:
         of_clock = tuple(finding for finding in setup_findings if finding.kind == "time_unit")
         setup_findings = (*of_clock, *judged.findings)
         tried = tried | search.tried
-    best = judged.step
+    best, corrected, likely = judged.step, judged.robot, judged.likely
     findings += signals.rate_findings(experiments, robot)
     if not any(finding.kind in ("torque_unit", "side") and finding.decisive for finding in setup_findings):
         findings += signals.small_torque_findings(experiments, robot)
@@ -109,8 +109,11 @@ def _check(experiments: Sequence[Experiment], robot: RobotConfig) -> SetupCheck:
         entry = zero.entry(robot)
         findings.append(zero.finding(robot, effects_line([entry]) if zero.certain else NEXT_STEP))
     if zero is not None and zero.certain:
-        bench, so_far = zero.bench, robot if corrected is None else corrected
-        corrected = so_far.model_copy(update={"effects": (*so_far.effects, entry)})
+        bench = zero.bench
+        corrected, likely = (
+            (one or robot).model_copy(update={"effects": (*(one or robot).effects, entry)})
+            for one in (corrected, likely)
+        )
     lost = _not_explained(bench, best)
     after = _errors(bench, best.h)
     if changed is not None:
@@ -126,8 +129,8 @@ def _check(experiments: Sequence[Experiment], robot: RobotConfig) -> SetupCheck:
         corrected_error_pct=after,
         joints_not_understood=lost,
         tried=tuple(words for family, words in TRIED.items() if family in tried),
-        corrected_robot=judged.robot,
-        likely_robot=judged.likely,
+        corrected_robot=corrected,
+        likely_robot=likely,
         clock=clock,
         torque_shift=None if lost else _torque_shift(experiments, bench, best),
         stretch=() if changed is None else spans(changed, bench),

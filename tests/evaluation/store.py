@@ -145,6 +145,12 @@ class Store:
             result = self._results.get(key)
         return None if result is None or result.error is not None else result
 
+    @property
+    def results(self) -> list[CaseResult]:
+        """All results and failures."""
+        with self._lock:
+            return list(self._results.values())
+
     def failure(self, key: str) -> CaseResult | None:
         """Return the last failure of a case; ``None`` if it has a result or has not been run."""
         with self._lock:

@@ -6,6 +6,7 @@ from numpy.typing import NDArray
 from scipy import signal
 
 from armident.identify.diagnosis.excess import bursts, spectral_excess
+from armident.identify.diagnosis.spectral_lines import has_line
 
 Array = NDArray[np.float64]
 
@@ -27,8 +28,8 @@ def noise(seed: int, constant_s: float = 0.0) -> Array:
 def test_noise_of_drives_has_no_excess(constant_s: float) -> None:
     lowest = []
     for seed in range(60):
-        one, other = noise(2 * seed, constant_s), noise(2 * seed + 1, constant_s)
-        spectral, moments = spectral_excess([one], [other], DT), bursts([one], [T], [SPEED])
+        one = noise(seed, constant_s)
+        spectral, moments = spectral_excess([one], [SPEED], DT), bursts([one], [T], [SPEED])
         lowest.append(min(part.p_value for part in (spectral, moments) if part is not None))
     # Of 120 p-values 1.2 are below 0.01; ten or more have a probability of 1e-6.
     assert np.sum(np.array(lowest) < 0.01) < 10
@@ -36,25 +37,51 @@ def test_noise_of_drives_has_no_excess(constant_s: float) -> None:
 
 
 def test_a_vibration_has_its_frequency() -> None:
-    one, other = (noise(k) + 2.0 * np.sin(2 * np.pi * 3.7 * T + k) for k in range(2))
-    found = spectral_excess([one], [other], DT)
+    found = spectral_excess([noise(0) + 2.0 * np.sin(2 * np.pi * 3.7 * T)], [SPEED], DT)
     assert found is not None
     assert found.kind == "frequency"
     assert found.where[0] == pytest.approx(3.7, abs=0.1)
     assert found.p_value < 1e-6
-    assert found.p_held < 1e-3
-    # Its rms is 1.41, that of the noise 1.
-    assert found.size == pytest.approx(np.sqrt(2.0), rel=0.15)
+    # It has twice the power of the noise.
+    assert found.share == pytest.approx(2.0 / 3.0, abs=0.1)
 
 
 def test_a_slow_signal_is_no_line() -> None:
-    one, other = (noise(k) + 3.0 * noise(k + 9, 1.0) for k in range(2))
-    found = spectral_excess([one], [other], DT)
+    found = spectral_excess([noise(0) + 2.0 * noise(9, 1.0)], [SPEED], DT)
     assert found is not None
     assert found.kind == "unrecorded signal"
     assert found.where[0] < 1.0
-    assert found.p_value < 1e-3
+    assert found.p_value < 1e-6
     assert found.share > 0.4
+
+
+def test_a_step_of_the_offset_is_a_signal() -> None:
+    found = spectral_excess([noise(1) + np.where(T > 7.0, 1.0, 0.0)], [SPEED], DT)
+    assert found is not None
+    assert found.kind == "unrecorded signal"
+    assert found.p_value < 1e-4
+
+
+def test_a_resonance_over_two_octaves_does_not_count_as_noise_of_its_surroundings() -> None:
+    band = signal.butter(2, [1.5, 4.5], "bandpass", fs=1.0 / DT, output="sos")
+    wide = signal.sosfilt(band, noise(2))
+    found = spectral_excess([noise(1) + 2.5 * wide / wide.std()], [SPEED], DT)
+    assert found is not None
+    assert 1.0 < found.where[0] < 5.5
+    assert found.p_value < 1e-6
+
+
+def test_a_signal_beside_larger_errors_at_reversals_is_a_small_share() -> None:
+    turns = np.flatnonzero(np.sign(SPEED[1:]) != np.sign(SPEED[:-1]))
+    rough = noise(0) + 2.0 * np.sin(2 * np.pi * 3.7 * T)
+    alone = spectral_excess([rough], [SPEED], DT)
+    for turn in turns:
+        rough[turn - 1 : turn + 3] += 15.0
+    found = spectral_excess([rough], [SPEED], DT)
+    assert alone is not None
+    assert found is not None
+    assert found.p_value < 1e-6
+    assert found.share < 0.5 * alone.share
 
 
 def test_contact_is_bursts_at_their_times() -> None:
@@ -79,5 +106,16 @@ def test_errors_at_reversals_are_no_bursts() -> None:
 
 def test_a_joint_at_rest_has_none() -> None:
     rest = np.zeros(ROWS)
-    assert spectral_excess([rest], [rest], DT) is None
+    assert spectral_excess([rest], [SPEED], DT) is None
     assert bursts([rest], [T], [SPEED]) is None
+
+
+@pytest.mark.parametrize(("frequency", "own"), [(28.2, False), (100.0, True)])
+def test_a_line_of_measured_motion_is_one_of_set_points_only_at_their_rate(frequency: float, own: bool) -> None:
+    sample = 1.0 / 400.0
+    t = sample * np.arange(4000)
+    rng = np.random.default_rng(0)
+    motion = np.sin(2.0 * t) + 1e-6 * rng.normal(size=t.size) + 1e-5 * np.sin(2 * np.pi * frequency * t)
+    assert has_line(motion, sample, frequency, 0.1, 100.0, recorded=True)
+    assert has_line(motion, sample, frequency, 0.1, 100.0, recorded=False) is own
+    assert not has_line(motion, sample, 61.3, 0.1, 100.0, recorded=True)

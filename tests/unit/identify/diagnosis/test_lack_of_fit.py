@@ -13,7 +13,7 @@ from armident.configs import load_robot
 from armident.configs.schema.scenario import HiddenEffect
 from armident.identify.diagnosis.criteria import Criteria
 from armident.identify.diagnosis.free_functions import free_functions
-from armident.identify.diagnosis.lack_of_fit import LackOfFit, ResidualDependence, limited
+from armident.identify.diagnosis.lack_of_fit import LackOfFit, limited
 from armident.identify.diagnosis.noise_beyond import noise_beyond
 from armident.identify.diagnosis.regression import IvFit, fit_model
 from armident.identify.diagnosis.spectral_lines import strongest_line
@@ -92,16 +92,15 @@ def test_healthy_arms_have_no_dependence() -> None:
 
 
 @cache
-def strange() -> tuple[tuple[ResidualDependence, ...], tuple[ResidualDependence, ...]]:
-    """Dependences of the residual of an arm with two effects outside the catalogue, and the unexplained ones."""
+def strange() -> LackOfFit:
+    """Tests of an arm with two effects outside the catalogue."""
     bump = HiddenEffect(effect="torque_bump", joint="joint_2", parameters={"torque": BUMP, "position": 0.3})
     ripple = HiddenEffect(effect="mains_ripple", joint="joint_3", parameters={"amplitude": 1.0, "frequency": 100.0})
-    found = LackOfFit(fit_model(studied("tx40", "tx40_excitation", bump, ripple, seed=40, repeats=3)))
-    return found.dependences, found.unexplained
+    return LackOfFit(fit_model(studied("tx40", "tx40_excitation", bump, ripple, seed=40, repeats=3)))
 
 
 def test_a_bump_has_its_place_and_its_height() -> None:
-    (bump,) = [d for d in strange()[0] if d.joint == "joint_2" and d.varies_with == "position"]
+    (bump,) = [d for d in strange().dependences if d.joint == "joint_2" and d.varies_with == "position"]
     assert bump.unit == "rad"
     assert bump.p_value < 1e-6
     assert bump.share > 0.02
@@ -115,8 +114,19 @@ def test_a_bump_has_its_place_and_its_height() -> None:
     assert f"most at {bump.curve.x[peak]:.3g} rad" in bump.hint
 
 
+def test_a_bump_below_the_limit_of_the_user_is_too_small_to_matter() -> None:
+    large = strange()
+    assert not {d.joint for d in large.unexplained} & {d.joint for d, _ in large.immaterial}
+    study = large.fit.study
+    found = LackOfFit(large.fit.of_study(replace(study, criteria=replace(study.criteria, material_pct=50.0))))
+    assert found.unexplained == ()
+    small = {d.joint: (d.varies_with, fall) for d, fall in found.immaterial}
+    assert small["joint_2"][0] == "position"
+    assert 0.2 < small["joint_2"][1] < 50.0
+
+
 def test_a_mains_line_beyond_the_band_of_the_comparison_is_found() -> None:
-    (line,) = [d for d in strange()[0] if d.kind == "frequency"]
+    (line,) = [d for d in strange().dependences if d.kind == "frequency"]
     assert line.joint == "joint_3"
     assert line.curve.x[int(np.argmax(line.curve.value))] == pytest.approx(100.0, abs=0.1)
     # The mean of neighbouring samples, which belongs to the position between them, keeps cos(pi f dt) of a line.
@@ -124,7 +134,10 @@ def test_a_mains_line_beyond_the_band_of_the_comparison_is_found() -> None:
 
 
 def test_each_unexplained_dependence_is_listed_once() -> None:
-    assert {(d.joint, d.varies_with) for d in strange()[1]} == {("joint_2", "position"), ("joint_3", "frequency")}
+    assert {(d.joint, d.varies_with) for d in strange().unexplained} == {
+        ("joint_2", "position"),
+        ("joint_3", "frequency"),
+    }
 
 
 def test_every_set_of_functions_has_its_own_key_and_a_hint() -> None:
