@@ -160,8 +160,8 @@ def _other_signs(search: Search, found: Step) -> Iterator[Step]:
     turned = np.flatnonzero(position * torque < 0) if np.any(position * torque < 0) else np.flatnonzero(torque < 0)
     own = np.eye(search.bench.n)
     for move in signs_of(search.bench.robot, [int(j) for j in turned]):
-        signals = (own if m is None else m for m in (move.position, move.torque))
-        other = Mistake(move.family, move.words, *signals, np.zeros(search.bench.n))
+        position, torque = (own if m is None else m for m in (move.position, move.torque))
+        other = Mistake(move.family, move.words, position, torque, np.zeros(search.bench.n))
         yield replace(found, mistakes=(*found.without(places).mistakes, other))
 
 
