@@ -219,7 +219,8 @@ def _with_shift(step: Step, bench: Bench, more_s: NDArray[np.floating], found: T
     last = max(k for k, family in enumerate(step.families) if family == "time_shift")
     mistakes = list(step.mistakes)
     mistakes[last] = replace(mistakes[last], shift=mistakes[last].shift + more_s)
-    return replace(step, mistakes=tuple(mistakes), shift_std=found.std * bench.period)
+    std = found.std * bench.period
+    return replace(step, mistakes=tuple(mistakes), shift_std=std, shift_measured=found.instrumented)
 
 
 def _clipped(bench: Bench, best: Step, robot: RobotConfig, known: set[str]) -> list[SetupFinding]:

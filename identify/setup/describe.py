@@ -293,7 +293,7 @@ def _late(step: Step, robot: RobotConfig, bench: Bench) -> tuple[SetupFinding, l
     message = f"all torques are {1000 * abs(shift):.3g} ms {direction} against the positions"
     if np.isfinite(step.shift_std):
         message += f" (standard deviation {1000 * step.shift_std:.2g} ms)"
-    share = 1.0 if step.shift_decisive else math.erf(abs(shift) / step.shift_std / math.sqrt(2.0))
+    share = math.erf(abs(shift) / step.shift_std / math.sqrt(2.0)) if step.shift_measured else 1.0
     return SetupFinding("time_shift", names, share, message, effects_line(entries), step.shift_decisive), entries
 
 

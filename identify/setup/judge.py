@@ -84,7 +84,7 @@ def _lost(errors: Array, memory: Array) -> NDArray[np.bool_]:
 def judged_part(part: Described, contest: Contest, robot: RobotConfig) -> Described:
     """Return a finding with its probability, and whether its remedy is a correction to copy."""
     finding = part.finding
-    if not finding.decisive:
+    if finding.kind == "time_shift" and contest.found.shift_measured:
         # A shift that the references show has the probability of its own estimate: prediction hardly tells it.
         return part
     joints = indices(finding.joints, robot)

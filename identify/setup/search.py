@@ -89,7 +89,8 @@ class Step:
     """A hypothesis with the mistakes that lead to it from ``start``.
 
     ``rank``: criterion, in-sample nats per row: lower is better. ``shift_std``: of a common torque shift, s; NaN if
-    from the best prediction. ``shift_decisive``: prediction gains enough by it for a mistake.
+    from the best prediction. ``shift_decisive``: prediction gains enough by it for a mistake. ``shift_measured``: by
+    undisturbed references.
     """
 
     start: Hypothesis
@@ -97,6 +98,7 @@ class Step:
     rank: float = np.inf
     shift_std: float = np.nan
     shift_decisive: bool = True
+    shift_measured: bool = False
 
     @cached_property
     def h(self) -> Hypothesis:
