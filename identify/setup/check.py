@@ -81,6 +81,11 @@ def _check(experiments: Sequence[Experiment], robot: RobotConfig) -> SetupCheck:
         bench = make_bench(experiments, robot, moving)
         errors = _errors(bench, _as_configured(robot))
         return SetupCheck((*damaged, *findings), errors, errors, (), (), None)
+    rates = signals.rate_findings(experiments, robot)
+    if _noise_alone(rates, experiments, robot, moving):
+        errors = _errors(make_bench(experiments, robot, moving), _as_configured(robot))
+        names = tuple(joint.name for joint, moves in zip(robot.joints, moving, strict=True) if moves)
+        return SetupCheck((*rates, *findings), errors, errors, names, (), None)
     bench, search, best = _searched(experiments, robot, moving)
     best, changed = _stretch(bench, best)
     if changed is not None:
@@ -93,13 +98,14 @@ def _check(experiments: Sequence[Experiment], robot: RobotConfig) -> SetupCheck:
     if clock != 1.0:
         # Velocities enter friction and limits: everything else is judged with the right clock.
         experiments = [replace(e, dt=e.dt * clock) for e in experiments]
+        rates = signals.rate_findings(experiments, robot)
         bench, search, best = _searched(experiments, robot, moving)
         judged = judge(search, _unless_zero_explains(search, best), robot)
         of_clock = tuple(finding for finding in setup_findings if finding.kind == "time_unit")
         setup_findings = (*of_clock, *judged.findings)
         tried = tried | search.tried
     best, corrected, likely = judged.step, judged.robot, judged.likely
-    findings += signals.rate_findings(experiments, robot)
+    findings += rates
     if not any(finding.kind in ("torque_unit", "side") and finding.decisive for finding in setup_findings):
         findings += signals.small_torque_findings(experiments, robot)
     findings += _clipped(bench, best, robot, {name for finding in findings for name in finding.joints})
@@ -135,6 +141,17 @@ def _check(experiments: Sequence[Experiment], robot: RobotConfig) -> SetupCheck:
         torque_shift=None if lost else _torque_shift(experiments, bench, best),
         stretch=() if changed is None else spans(changed, bench),
     )
+
+
+def _noise_alone(
+    rates: Sequence[SetupFinding], experiments: Sequence[Experiment], robot: RobotConfig, moving: NDArray[np.bool_]
+) -> bool:
+    """True if the steps of the positions are most of what every moving joint shows: no set-up can be judged by them."""
+    coarse = {name for finding in rates if finding.kind == "position_resolution" for name in finding.joints}
+    if not all(joint.name in coarse for joint, moves in zip(robot.joints, moving, strict=True) if moves):
+        return False
+    errors, _ = joint_errors(make_bench(experiments, robot, moving), _as_configured(robot), free=True)
+    return bool(np.all(errors[moving] > NOT_UNDERSTOOD))
 
 
 def _torque_shift(experiments: Sequence[Experiment], bench: Bench, best: Step) -> TorqueShift | None:
