@@ -11,7 +11,7 @@ from scipy import stats
 
 from armident.configs import RobotConfig
 from armident.identify.diagnosis.baseline_comparison import Difference, difference_of
-from armident.identify.diagnosis.changed_parameters import Competition, ExplainedChange, Explanation
+from armident.identify.diagnosis.changed_parameters import Attribution, Competition, ExplainedChange
 from armident.identify.diagnosis.changes import changes
 from armident.identify.diagnosis.criteria import Criteria
 from armident.identify.diagnosis.residual_test import (
@@ -73,7 +73,7 @@ class ParameterChangeTest:
     groups: tuple[Group, ...] = ()
     residuals: ResidualTest = field(default_factory=ResidualTest)
     p_changes: float | None = None
-    explanation: Explanation | None = None
+    explanation: Attribution | None = None
     left: ResidualTest = field(default_factory=ResidualTest)
 
     @property

@@ -75,7 +75,7 @@ class ExplainedChange:
 
 
 @dataclass(frozen=True, eq=False)
-class Explanation:
+class Attribution:
     """Changes that explain a difference; without any, ``rest`` is the whole difference.
 
     ``rest`` (k,): difference of parameters that is left, with the probability ``p_rest`` without a further change, and
@@ -134,7 +134,7 @@ class Competition:
             p.append(float(stats.chi2.sf(whole - left @ left, self.target.size - degrees)))
         return min(1.0, min(p) * len(self.candidates))
 
-    def explained(self, alpha: float) -> Explanation:
+    def explained(self, alpha: float) -> Attribution:
         """Best explanation of a difference that is significant at the level ``alpha`` of all its tests.
 
         A further change is added while its evidence exceeds the number of candidates over ``alpha`` (Ville 1939).
@@ -164,7 +164,7 @@ class Competition:
         share = 1.0
         if stats.chi2.sf(left @ left, degrees) < alpha:
             share = float(np.clip(1.0 - (left @ left - degrees) / max(excess, 1e-300), 0.0, 1.0))
-        return Explanation(self.difference, changes, rest, p_rest, unexplained, share)
+        return Attribution(self.difference, changes, rest, p_rest, unexplained, share)
 
     def _within_first_order(self, found: Sequence["Whitened"], best: "Whitened") -> bool:
         """True if a further change takes no more than what the directions of the others leave of large changes.

@@ -98,7 +98,7 @@ def outcomes(finding: Finding, known: Calibration) -> dict[str, float]:
     return ({finding.effect: right} if named else {}) | {name: (1.0 - right) * share for name, share in found.items()}
 
 
-def state_of(left: bool, beside: bool) -> str:
+def joint_state(left: bool, beside: bool) -> str:
     """Return the state of a joint without a finding. ``beside``: another joint has one."""
     return "clear" if not left else "left_beside" if beside else "left"
 
@@ -140,7 +140,7 @@ def judged(
     rest = {entry.joint for entry in left}
     for joint in joints:
         if all(entry.joint != joint for entry in entries):
-            names = joint_outcomes(state_of(joint in rest, bool(findings)), known)
+            names = joint_outcomes(joint_state(joint in rest, bool(findings)), known)
             entries.append(Explanation(joint=joint, names=_sorted(names), likely=known.likely(names)))
     return probable, sorted(entries, key=lambda entry: joints.index(entry.joint))
 

@@ -15,7 +15,7 @@ from armident.identify.setup.bench import Bench, make_bench
 from armident.identify.setup.clipping import clipped_torques
 from armident.identify.setup.describe import effects_line
 from armident.identify.setup.fit import Hypothesis, joint_errors
-from armident.identify.setup.judge import NEXT_STEP, judge
+from armident.identify.setup.judge import NEXT_STEP, judged_search
 from armident.identify.setup.prior import Mistake
 from armident.identify.setup.result import SetupCheck, SetupFinding, TorqueShift
 from armident.identify.setup.search import NOT_UNDERSTOOD, STRUCTURED, Search, Step
@@ -92,7 +92,7 @@ def _check(experiments: Sequence[Experiment], robot: RobotConfig) -> SetupCheck:
         findings.append(change_finding(changed, bench, best.h))
     else:
         best = _unless_zero_explains(search, best)
-    judged = judge(search, best, robot)
+    judged = judged_search(search, best, robot)
     tried, before = search.tried | {PositionOffset.name: bench.n}, _errors(bench, _as_configured(robot))
     setup_findings, clock = judged.findings, judged.step.h.clock
     if clock != 1.0:
@@ -100,7 +100,7 @@ def _check(experiments: Sequence[Experiment], robot: RobotConfig) -> SetupCheck:
         experiments = [replace(e, dt=e.dt * clock) for e in experiments]
         rates = signals.rate_findings(experiments, robot)
         bench, search, best = _searched(experiments, robot, moving)
-        judged = judge(search, _unless_zero_explains(search, best), robot)
+        judged = judged_search(search, _unless_zero_explains(search, best), robot)
         of_clock = tuple(finding for finding in setup_findings if finding.kind == "time_unit")
         setup_findings = (*of_clock, *judged.findings)
         tried = tried | search.tried

@@ -27,7 +27,7 @@ LEAST_FALL = float(np.exp(0.5 * LEAST_DROP))
 
 
 @dataclass(frozen=True)
-class Judged:
+class JudgedSearch:
     """Findings; the step with the mistakes that are corrected; the configuration with these corrections, if any.
 
     ``likely``: the configuration with the corrections that are more likely right than wrong.
@@ -39,12 +39,12 @@ class Judged:
     likely: RobotConfig | None
 
 
-def judge(search: Search, found: Step, robot: RobotConfig) -> Judged:
+def judged_search(search: Search, found: Step, robot: RobotConfig) -> JudgedSearch:
     """Return what of a search is certain enough to be corrected, and what is only the best that was tried."""
     whole = merged_scales(found, search.bench)
     parts = described(whole, robot, search.bench)
     if not parts:
-        return Judged((), found, None, None)
+        return JudgedSearch((), found, None, None)
     contest = Contest(search, found, each_own=whole.each_own)
     judged = [judged_part(part, contest, robot) for part in parts]
     sure = _together(judged, [part.finding.correction for part in judged])
@@ -59,7 +59,7 @@ def judge(search: Search, found: Step, robot: RobotConfig) -> Judged:
     named |= {k for k, family in enumerate(whole.families) if family == "torque_scales"}
     findings = [part.finding if part in sure else _doubtful(part, contest, robot) for part in judged]
     explained = not _lost(contest.before.errors, contest.before.memory)[contest.moving].any()
-    return Judged(
+    return JudgedSearch(
         tuple(f for f in findings if f.correction or f.probability >= NAMED or not explained),
         whole.without(named - kept) if kept else replace(found, mistakes=()),
         corrected_robot(sure, robot),

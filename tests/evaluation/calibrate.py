@@ -23,8 +23,8 @@ from armident.identify.diagnosis.probabilities import (
     Calibration,
     features,
     joint_outcomes,
+    joint_state,
     outcomes,
-    state_of,
 )
 from armident.identify.documents.diagnosis import DiagnosisDocument, Finding
 from armident.identify.effects.unnamed import NAME as UNNAMED
@@ -97,7 +97,7 @@ def entries_of(number: int, document: DiagnosisDocument, hidden: Mapping[str, An
         # What acts on the whole arm may be found at any joint.
         if joint not in taken and (joints or explained):
             here = not explained and joint in joints
-            state = state_of(joint in left, bool(document.findings))
+            state = joint_state(joint in left, bool(document.findings))
             yield Entry(number, state, None, UNNAMED if here else NOTHING, seen and here)
 
 

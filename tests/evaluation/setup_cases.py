@@ -6,6 +6,7 @@ truth is the correction that the recording needs: the identity where nothing, or
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,8 +56,8 @@ def _one_factor(quantity: str, value: Callable[[Generator], float]) -> Callable[
     def draw(rng: Generator, arm: Arm) -> SetUp:
         j, factor = int(rng.integers(arm.n)), np.ones(arm.n)
         factor[j] = value(rng)
-        values: dict[str, Floats] = {quantity: factor}
-        return SetUp((j,), recorded=lambda run: scaled(run, **values))  # type: ignore[arg-type]
+        values: dict[str, Any] = {quantity: factor}
+        return SetUp((j,), recorded=lambda run: scaled(run, **values))
 
     return draw
 
