@@ -109,7 +109,7 @@ def spectral_excess(
     # Of the whole residual: a signal is there about reversals, too, and so are larger errors.
     rms = float(np.sqrt(np.mean(e[e != 0.0] ** 2)))
     part = float(np.mean(away[away != 0.0] ** 2)) / rms**2
-    peak, share = int(np.argmax(beyond)), max(part * float(beyond.sum() / power.sum()), 0.0)
+    peak, share = int(np.argmax(beyond)), float(np.clip(part * beyond.sum() / power.sum(), 0.0, 1.0))
     # A line is as narrow as the window allows; wider, it is a signal with a spectrum of its own.
     line = peak > NARROW and beyond[peak - NARROW // 2 : peak + NARROW // 2 + 1].sum() > MOST * beyond.sum()
     around = slice(max(peak - SHOWN, 0), peak + SHOWN)
