@@ -164,7 +164,8 @@ def test_the_base_imports_nothing_of_the_extras(base: Path, tmp_path: Path) -> N
 def test_the_wheel_holds_the_machine_code_of_every_kernel(built: Built, base: Path, tmp_path: Path) -> None:
     found = {name.rpartition("/")[2] for name in built.names if name.endswith(".code")}
     subprocess.run([sys.executable, "-m", "armident.compiled"], check=True, timeout=600)
-    assert found == {path.name for path in SHIPPED.iterdir()}
+    # Tests that ran in this checkout have left kernels of their own.
+    assert found == {path.name for path in SHIPPED.iterdir() if not path.name.startswith("tests.")}
     script = str(REPOSITORY / "tests" / "tools" / "matched_streams.py")
     ours = _run([str(base / "python"), script], tmp_path)
     assert ours.returncode == 0, ours.stderr
