@@ -25,7 +25,7 @@ MOST_EVIDENCE = 100.0
 """Evidence in nats that counts as certain."""
 
 STATES = ("named", "unnamed", "left", "left_beside", "clear")
-"""What a diagnosis finds at a joint: a name, a term without one, only a dependence of the residual (without or with a
+"""States of a joint after a diagnosis: a name, a term without one, only a dependence of the residual (without or with a
 finding at another joint, whose disturbance of the motion it may be), and nothing."""
 
 

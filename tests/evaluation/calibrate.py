@@ -53,7 +53,7 @@ BINS, PER_BIN = 10, 10
 
 @dataclass(frozen=True)
 class Entry:
-    """What a diagnosis says at one joint of a case, and the true outcome there.
+    """Result of a diagnosis at one joint of a case, and the true outcome there.
 
     ``finding`` is ``None`` at a joint without one; ``state``: see `STATES`. ``visible``: a visible effect is here.
     """
@@ -164,7 +164,7 @@ def cross_fitted(entries: Sequence[Entry]) -> list[tuple[Entry, Calibration]]:
 
 @dataclass(frozen=True)
 class Figures:
-    """How well probabilities and sets hold; ``ece``: expected calibration error, ``by_chance``: if they were right.
+    """Figures of probabilities and sets on arms; ``ece``: expected calibration error, ``by_chance``: if they were right.
 
     ``coverage``: share of the sets that hold the truth; ``visible``: of those of visible effects.
     """

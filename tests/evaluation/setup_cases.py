@@ -317,7 +317,7 @@ def _usual_runs(robot: RobotConfig, seed: int) -> tuple[Run, ...]:
 
 
 def _shape(robot: RobotConfig, run: Run) -> Arm:
-    """What the mistakes need to know of an arm, from a recording of it."""
+    """Return the facts of an arm, from a recording of it, that the mistakes need."""
     n, none = robot.n, np.zeros(0)
     prismatic = np.array([joint.type == "prismatic" for joint in robot.joints], np.int64)
     ratio = np.abs(np.diag(robot.transmission_matrix))
