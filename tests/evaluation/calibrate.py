@@ -164,7 +164,7 @@ def cross_fitted(entries: Sequence[Entry]) -> list[tuple[Entry, Calibration]]:
 
 @dataclass(frozen=True)
 class Figures:
-    """Figures of probabilities and sets on arms; ``ece``: expected calibration error, ``by_chance``: if they were right.
+    """Figures of probabilities and sets; ``ece``: expected calibration error, ``by_chance``: if they were right.
 
     ``coverage``: share of the sets that hold the truth; ``visible``: of those of visible effects.
     """
