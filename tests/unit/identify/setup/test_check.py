@@ -20,16 +20,6 @@ Made = Callable[[list[Experiment], RobotConfig], list[Experiment]]
 
 
 @pytest.fixture(scope="module")
-def arm() -> RobotConfig:
-    return setups.random_arm(3, AXES)
-
-
-@pytest.fixture(scope="module")
-def healthy(arm: RobotConfig) -> list[Experiment]:
-    return setups.record(arm, 0)
-
-
-@pytest.fixture(scope="module")
 def tx40() -> RobotConfig:
     return load_robot("tx40")
 

@@ -21,16 +21,6 @@ AXES = 3
 GRAVITY = np.array([0.0, 0.0, -9.81])
 
 
-@pytest.fixture(scope="module")
-def arm() -> RobotConfig:
-    return setups.random_arm(3, AXES)
-
-
-@pytest.fixture(scope="module")
-def healthy(arm: RobotConfig) -> list[Experiment]:
-    return setups.record(arm, 0)
-
-
 def hypothesis(position: tuple[float, ...] = (1, 1, 1), torque: tuple[float, ...] = (1, 1, 1)) -> Hypothesis:
     return Hypothesis(np.diag(position), np.diag(torque), GRAVITY, np.zeros(AXES))
 
