@@ -137,7 +137,18 @@ def _robot(path: Path) -> RobotConfig:
     suspected = suspected_units(robot, geometry="urdf" not in file_keys)
     if suspected:
         raise ConfigError(f"{path}: expected rad and m: {'; '.join(suspected[:3])}{_others(len(suspected) - 3)}")
-    return robot if given is None else robot.with_limit_places(_limit_places(robot, given, path))
+    if given is None:
+        return robot
+    return robot.with_urdf_facts(_limit_places(robot, given, path), _first_moments(given, path))
+
+
+def _first_moments(given: UrdfGeometry, path: Path) -> dict[str, float]:
+    """Masses and first moments of a URDF, as `RobotConfig.first_moments` has them; none where they are wrong."""
+    try:
+        found = read_inertials(urdf_file(given, path), given.urdf.base, given.urdf.tip)
+    except ConfigError:
+        return {}  # only those who need the masses say what is wrong with them
+    return {} if found.massless else {name: v for name, v in found.standard.items() if name.startswith("m")}
 
 
 def _limit_places(robot: RobotConfig, given: UrdfGeometry, path: Path) -> tuple[str, ...]:

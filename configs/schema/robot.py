@@ -274,6 +274,7 @@ class RobotConfig(WithBlanks):
     )
     collision: Collision | None = None
     _limit_places: tuple[str, ...] = PrivateAttr(())
+    _first_moments: dict[str, float] = PrivateAttr(default_factory=dict)
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
@@ -324,10 +325,15 @@ class RobotConfig(WithBlanks):
         """File and line of each joint's limits where they come from a URDF; empty otherwise."""
         return self._limit_places or ("",) * self.n
 
-    def with_limit_places(self, places: tuple[str, ...]) -> Self:
-        """Return the robot with the file and line of each joint's limits, which no document of it contains."""
+    @property
+    def first_moments(self) -> dict[str, float]:
+        """Masses and first moments ``mx1`` to ``m6`` of the URDF, kg and kg m; empty without a mass in every link."""
+        return self._first_moments
+
+    def with_urdf_facts(self, limit_places: tuple[str, ...], first_moments: dict[str, float] | None = None) -> Self:
+        """Return the robot with facts of its URDF that no document of it contains."""
         made = self.model_copy()
-        made._limit_places = places
+        made._limit_places, made._first_moments = limit_places, first_moments or {}
         return made
 
     @property

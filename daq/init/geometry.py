@@ -126,7 +126,7 @@ def _of_chain(file: Path, out: Path, base: str | None, tip: str | None) -> Geome
     urdf = {"file": os.path.relpath(part.file, out.resolve()), **part.model_dump(exclude={"file"}, exclude_none=True)}
     name = name_from(robot_name(file) or file.stem)
     robot = checked_robot({"schema": "armident/robot/1", "name": name, **made}, str(file))
-    robot = robot.with_limit_places(limit_places(file, [joint.source_name or joint.name for joint in robot.joints]))
+    robot = robot.with_urdf_facts(limit_places(file, [joint.source_name or joint.name for joint in robot.joints]))
     content: dict[str, Any] = {
         "schema": "armident/robot/1",
         "name": name,

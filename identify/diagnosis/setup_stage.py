@@ -16,7 +16,15 @@ from armident.identify.signals.experiments import Experiment
 
 SIGNALS = {"position_sign": "position", "torque_sign": "torque"}
 
-REMARKS = ("rate_too_slow", "joint_at_rest", "one_direction", "torque_held", "position_held", "position_resolution")
+REMARKS = (
+    "rate_too_slow",
+    "joint_at_rest",
+    "one_direction",
+    "torque_held",
+    "position_held",
+    "position_resolution",
+    "unusual_weight",
+)
 """Kinds of finding that become warnings: they limit the recordings and are no mistake of the model."""
 
 

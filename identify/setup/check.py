@@ -21,6 +21,7 @@ from armident.identify.setup.result import SetupCheck, SetupFinding, TorqueShift
 from armident.identify.setup.search import NOT_UNDERSTOOD, STRUCTURED, Search, Step
 from armident.identify.setup.stationarity import ChangedStretch, change_finding, spans, stretch
 from armident.identify.setup.torque_shift import SHIFT_RATE, long_torque_shift, torque_shift
+from armident.identify.setup.weight import weight_findings
 from armident.identify.setup.zero_offset import zero_offset
 from armident.identify.signals.experiments import Experiment, check_one_rate
 
@@ -121,6 +122,8 @@ def _check(experiments: Sequence[Experiment], robot: RobotConfig) -> SetupCheck:
             for one in (corrected, likely)
         )
     lost = _not_explained(bench, best)
+    if not lost and changed is None and not any(finding.decisive for finding in findings):
+        findings += weight_findings(bench, best.h, robot)
     after = _errors(bench, best.h)
     if changed is not None:
         after = tuple(min(error, 100.0 * float(left)) for error, left in zip(after, changed.left, strict=True))
