@@ -57,8 +57,11 @@ def weight_findings(bench: Bench, h: Hypothesis, robot: RobotConfig) -> list[Set
             return [SetupFinding("unusual_weight", names, 1.0, message, f"{REMEDY} Or correct the masses", False)]
     if any(joint.type != "revolute" for joint in robot.joints[shoulder:]):
         return []
-    reach = sum(float(np.hypot(*_lengths(robot, j))) for j in range(shoulder + 1, robot.n))
-    moment = sum(float(np.hypot(*(_value(bench, found.theta, f"{m}{j + 1}") for m in ("mx", "my")))) for j in carrying)
+    reach = sum(float(np.hypot(joint.mdh.d, joint.mdh.r)) for joint in robot.joints[shoulder + 1 :])
+    moment = sum(
+        float(np.hypot(_value(bench, found.theta, f"mx{j}"), _value(bench, found.theta, f"my{j}")))
+        for j in carrying + 1
+    )
     if moment >= LIGHTEST * reach**3:
         return []
     message = (
@@ -85,8 +88,3 @@ def _value(bench: Bench, theta: Array, name: str) -> float:
     independent = bench.model.base.independent
     found = [float(theta[k]) for k, column in enumerate(independent) if bench.model.names[column] == name]
     return found[0] if found else 0.0
-
-
-def _lengths(robot: RobotConfig, joint: int) -> tuple[float, float]:
-    mdh = robot.joints[joint].mdh
-    return mdh.d, mdh.r

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from armident.configs import RobotConfig
 from armident.daq.recording.faults.jumps import JumpCriteria, jumps, unwrapped
+from armident.daq.recording.faults.stale import frozen_before, frozen_efforts, repeated_efforts, repeated_rows
 from armident.daq.recording.faults.zeros import switched_off, zero_rows
 from armident.daq.recording.model import Gap, Quantity, Recording, Side
 
@@ -74,6 +75,7 @@ def repair(
     demand = None if demand is None else demand.copy()
     notes: list[str] = []
     lasting: list[tuple[int, int, float]] = []
+    stale: Mask = np.repeat(repeated_rows(position, effort)[:, None], robot.n, axis=1)
     wrong = np.zeros((times.size, robot.n), dtype=np.bool_)
     for j, joint in enumerate(robot.joints):
         if joint.type == "revolute":
@@ -89,7 +91,13 @@ def repair(
         limits = (joint.limits.velocity, joint.limits.acceleration) if side == "joint" else (np.inf, np.inf)
         found = jumps(position[:, j], dt, holes, *limits, criteria)
         wrong[:, j] = found.wrong
-        lasting += [(j, row, size) for row, size in found.steps]
+        for row, size in found.steps:
+            if frozen := frozen_before(position[:, j], row, criteria):
+                stale[slice(*frozen), j] = True
+            elif not stale[row - 1, j]:
+                lasting.append((j, row, size))
+    for chosen, rows in _alike(stale, names):
+        notes.append(f"the position of {chosen} is not renewed {_times(rows, at)}: left out as gaps")
     cuts = set() if polled else shared_steps(position, lasting)
     for row in sorted(cuts):
         notes.append(
@@ -108,7 +116,14 @@ def repair(
     elsewhere = np.asarray(zeros & ~known[:, None], dtype=np.bool_)
     for chosen, rows in _alike(elsewhere, names):
         notes.append(f"the torque of {chosen} is 0 {_times(rows, at)}, between rows where it is not: left out as gaps")
-    out = np.asarray((wrong | zeros).any(axis=1), dtype=np.bool_)
+    kept = frozen_efforts(effort, position) & ~stale
+    for chosen, rows in _alike(kept, names):
+        notes.append(f"the torque of {chosen} is the same while the joint moves {_times(rows, at)}: left out as gaps")
+    copied = repeated_efforts(effort, position)
+    if copied.any():
+        rows = np.flatnonzero(copied)
+        notes.append(f"the torques repeat earlier ones, value by value, {_times(rows, at)}: left out as gaps")
+    out = np.asarray((wrong | zeros | stale | kept).any(axis=1) | copied, dtype=np.bool_)
     off = np.zeros(times.size, dtype=np.bool_)
     for begin, end in switched_off(effort, dt, criteria):
         off[begin:end] = True

@@ -35,11 +35,11 @@ def zero_rows(effort: Array, holes: Mask, criteria: JumpCriteria) -> Mask:
     for j in np.flatnonzero(used):
         far[:, j] = _far(effort[:, j], zero[:, j], holes, criteria)
     together = zero[:, used].all(axis=1) & (used.sum() > 1)
-    for begin, end in _runs(together):
+    for begin, end in runs(together):
         if end - begin <= criteria.longest and far[begin:end].any():
             found[begin:end, used] = True
     if found.any() and found.any(axis=1).sum() >= 0.5 * together.sum():
-        for begin, end in _runs(together):
+        for begin, end in runs(together):
             found[begin:end, used] |= end - begin <= criteria.longest
     return found | far
 
@@ -58,7 +58,7 @@ def switched_off(effort: Array, dt: float, criteria: JumpCriteria) -> list[tuple
     far: Mask = np.asarray((np.abs(x) > criteria.ratio * usual).any(axis=1), dtype=np.bool_)
     return [
         (begin, end)
-        for begin, end in _runs(zero)
+        for begin, end in runs(zero)
         if (end - begin) * dt >= LEAST_OFF_S
         and end - begin > criteria.longest
         and (begin > 0 or end < len(x))
@@ -75,7 +75,7 @@ def _far(x: Array, zero: Mask, holes: Mask, criteria: JumpCriteria) -> Mask:
     if not changes.size:
         return found
     least = criteria.ratio * float(np.quantile(changes, criteria.quantile))
-    for begin, end in _runs(zero):
+    for begin, end in runs(zero):
         if begin == 0 or end == x.size or end - begin > criteria.longest or holes[begin - 1 : end].any():
             continue
         before, after = x[begin - 1], x[end]
@@ -83,7 +83,7 @@ def _far(x: Array, zero: Mask, holes: Mask, criteria: JumpCriteria) -> Mask:
     return found
 
 
-def _runs(mask: Mask) -> list[tuple[int, int]]:
+def runs(mask: Mask) -> list[tuple[int, int]]:
     """First row, and the one after the last, of each run of true rows."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]])))
     return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]

@@ -111,6 +111,43 @@ def test_torques_of_zero_between_others_are_left_out(tx40: RobotConfig, joint: i
     assert len(result.notes) == 1
 
 
+@pytest.mark.parametrize("seed", SEEDS)
+def test_signals_that_are_not_renewed_are_left_out_while_they_are(tx40: RobotConfig, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    t, q, tau = motion(rng, 1000.0)
+    # full motion: sin(0.4 t) is above a half from 1.4 to 6.4 s
+    begin, length, j = int(rng.integers(1500, 5000)), int(rng.integers(30, 800)), int(rng.integers(6))
+    rows = np.arange(begin, begin + length)
+    signals = [(q, tau), (q,), (tau,)][int(rng.integers(3))]
+    joints = slice(None) if len(signals) == 2 or rng.random() < 0.5 else j
+    for signal in signals:
+        signal[rows, joints] = signal[begin - 1, joints]
+    result = found(t, q, tau, tx40)
+    assert result.wrong[rows].all()
+    assert result.wrong.sum() <= length + 10  # the joint is back on its way soon after a freeze
+    assert any("renewed" in note or "is the same" in note for note in result.notes)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_torques_that_repeat_earlier_ones_are_left_out(tx40: RobotConfig, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    t, q, tau = motion(rng, 1000.0)
+    begin, length = int(rng.integers(3000, 5000)), int(rng.integers(100, 1000))
+    rows = np.arange(begin, begin + length)
+    tau[rows] = tau[rows - 1100]
+    result = found(t, q, tau, tx40)
+    assert np.flatnonzero(result.wrong).tolist() == rows.tolist()
+    assert "repeat earlier ones" in result.notes[0]
+
+
+def test_a_motion_that_repeats_itself_exactly_is_no_fault(tx40: RobotConfig) -> None:
+    t, q, tau = motion(np.random.default_rng(5), 1000.0)
+    part = slice(1500, 3500)
+    q[part] += np.linspace(0, 1, 2000)[:, None] * (q[part.start] - q[part.stop])
+    twice = np.concatenate([q[part], q[part]]), np.concatenate([tau[part], tau[part]])
+    assert found(t[:4000], *twice, tx40).notes == ()
+
+
 def test_impossible_rows_are_gaps_of_the_recording_and_are_interpolated(tx40: RobotConfig) -> None:
     from armident.identify.identification.from_recording import experiments_from_recording
 

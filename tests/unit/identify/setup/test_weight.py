@@ -73,9 +73,7 @@ URDF = """<robot name="two">
 LOWER = '<inertial><mass value="{mass}"/><inertia ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/></inertial>'
 
 
-@pytest.mark.parametrize(
-    ("lower", "moment"), [(LOWER.format(mass=2), 0.6), ("", None), (LOWER.format(mass=-1), None)]
-)
+@pytest.mark.parametrize(("lower", "moment"), [(LOWER.format(mass=2), 0.6), ("", None), (LOWER.format(mass=-1), None)])
 def test_first_moments_are_read_where_every_link_has_a_mass(tmp_path: Path, lower: str, moment: float | None) -> None:
     (tmp_path / "two.urdf").write_text(URDF.format(inertial=lower))
     config = tmp_path / "two.yaml"
