@@ -28,6 +28,9 @@ SLOW = 0.2
 REPEATED = 20
 """Rows in the same order as earlier that are a copy: noise repeats a value of twelve bits so often once in 10^70."""
 
+HELD = 0.2
+"""Share of rows equal to the one before above which all signals are held: half of the rows with a period of two."""
+
 MOST_ROWS = 10_000
 """Rows that tell the usual velocity."""
 
@@ -43,6 +46,8 @@ def repeated_rows(position: Array, effort: Array) -> Mask:
         same = np.diff(x) == 0
         equal &= same
         chance += float(np.log(max(same.mean(), 1.0 / same.size)))
+    if equal.mean() > HELD:
+        return found
     moves = _moves(position)
     for begin, end in runs(equal):
         likely = (end - begin) * chance > np.log(MOST_CHANCE) - np.log(len(equal))
