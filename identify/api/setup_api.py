@@ -69,7 +69,7 @@ class CheckedSetup(Result):
         if document.unexplained_joints:
             names = ", ".join(document.unexplained_joints)
             lines.append(f"not explained: the rigid model leaves more than a third of the torque of {names}")
-            lines.append(f"  tried: {'; '.join(document.tried)}")
+            lines += [f"  tried: {'; '.join(document.tried)}"] if document.tried else []
         return "\n".join(lines)
 
     def _html(self) -> str:

@@ -17,7 +17,6 @@ from scipy.linalg import lapack
 
 from armident.identify.diagnosis.regression import MAX_AR_ORDER, IvFit
 from armident.identify.effects.free_shapes import FreeShape
-from armident.identify.effects.friction import CoulombTransition
 from armident.identify.effects.terms import effect_terms
 from armident.identify.regression.ar_noise import ArModel, ar_models
 from armident.identify.regression.iv import JointEquations
@@ -65,16 +64,13 @@ class PredictiveScore:
 
     @cached_property
     def _prior(self) -> Array:
-        """Inverse prior variances (b,) of free shapes and transitions of dry friction; zero for other parameters.
-
-        A fold may lack a part of the range of a shape, or most of the reversals.
-        """
+        """Inverse prior variances (b,) of free shapes, for folds that do not visit a part of their range; else zero."""
         study = self.fit.study
         inverse = np.zeros(self.fit.theta.size)
         errors = np.concatenate(self.fit.left)
         at = inverse.size - study.model.e
         for term in effect_terms(study.model):
-            if isinstance(term.effect, FreeShape | CoulombTransition):
+            if isinstance(term.effect, FreeShape):
                 size = float(np.mean(errors[:, term.place.joint] ** 2))
                 inverse[at : at + len(term.names)] = 1.0 / max(size, 1e-300)
             at += len(term.names)

@@ -4,7 +4,13 @@ import numpy as np
 
 from armident.configs.schema.robot import Effect as Entry
 from armident.identify.diagnosis.candidates import ColumnCache, Shapes
-from armident.identify.diagnosis.model_state import Fitter, ModelState, fitted_in_loop_of, with_entries, without_entry
+from armident.identify.diagnosis.model_state import (
+    Fitter,
+    ModelState,
+    fitted_in_loop_of,
+    with_entries,
+    without_entry,
+)
 from armident.identify.effects.effect import SIGN_TOLERANCE, Place
 from armident.identify.effects.friction import TRANSITION
 from armident.identify.effects.registry import known
@@ -12,6 +18,8 @@ from armident.identify.effects.terms import entry_of
 
 STEPS = tuple(0.5**k for k in range(1, 6))
 """Steps of the pattern search: logarithm of the velocity, and lead in samples. The last one is 3 %."""
+CURVE = "stribeck_friction/table"
+"""Free curve of friction over speed."""
 ROUNDS = 4
 """Most rounds with one step."""
 
@@ -36,7 +44,34 @@ def with_transitions(state: ModelState, model: Fitter) -> ModelState:
         for place, entry in search.entries(search.chosen).items()
         if _clear(made, model(without_entry(made.robot, entry), made), entry, place.joint)
     ]
-    return model(with_entries(state.robot, kept), state) or state
+    return model(with_entries(state.robot, _beside_curve(made, kept, model)), state) or state
+
+
+def _beside_curve(state: ModelState, entries: list[Entry], model: Fitter) -> list[Entry]:
+    """Those of the transitions that no free curve of friction over speed replaces.
+
+    Few reversals do not determine a transition: it may take the place of friction that falls with the speed. Beside the
+    curve it is negative then, and the curve alone leaves less than half of the residual's power.
+    """
+    motion = ColumnCache(state.study, state.fit.theta).motion(state.study.train[0], "measured")
+    curve = known(CURVE)
+
+    def curves(some: list[Entry]) -> list[Entry]:
+        places = [Place(state.study.joints.index(str(entry.joint))) for entry in some]
+        return [entry_of(curve, place, state.robot, dict(curve.grid(motion, place)[0])) for place in places]
+
+    both = model(with_entries(state.robot, curves(entries)), state)
+    if both is None:
+        return entries
+    names, at = both.study.model.base.names, state.study.joints.index
+    negative = [e for e in entries if both.fit.theta[names.index(both.term_of(e).names[0])] <= 0.0]
+    rest = state.robot.model_copy(update={"effects": tuple(e for e in state.robot.effects if e not in negative)})
+    alone = model(with_entries(rest, curves(negative)), state) if negative else None
+    if alone is None:
+        return entries
+    power, before = (np.mean(np.concatenate(one.fit.left) ** 2, axis=0) for one in (alone, state))
+    replaced = power < (1.0 - state.study.criteria.named_share) * before
+    return [e for e in entries if e not in negative or not replaced[at(str(e.joint))]]
 
 
 class _Search:

@@ -75,3 +75,16 @@ def test_the_lead_moves_the_reversal_of_friction_to_earlier_times(base: ModelSta
     falls = np.flatnonzero((late[:-1] > 0.0) & (late[1:] <= 0.0))
     assert falls.size
     assert np.median(early[falls]) < 0.0 < np.median(late[falls])
+
+
+def test_a_transition_that_stands_for_friction_falling_with_the_speed_is_dropped() -> None:
+    """Few reversals determine no transition; Stribeck friction would hide behind it."""
+    robot = random_arm(3, 3)
+    (e, _) = setups.record(robot, 0, noise=0.01, duration=4.0)
+    dry = setups.physical_parameters(robot, 0)[list(arm_model(robot).names).index("fc1")]
+    v = np.gradient(e.q, e.dt, axis=0)[:, 0]
+    speed, tau = v / np.abs(v).max(), e.tau.copy()
+    tau[:, 0] += 2.0 * dry * np.tanh(speed / 0.003) * np.exp(-np.abs(speed) / 0.2)
+    study = build_study([replace(e, tau=tau)], [], robot)
+    state = with_transitions(fitted(study, study.robot, None), lambda one, before: fitted(study, one, before))
+    assert {entry.joint for entry in state.robot.effects} == set(study.joints[1:])
