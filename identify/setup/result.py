@@ -20,7 +20,8 @@ CERTAIN = 20.0
 """Odds of one convention over the other from which the shift is known."""
 
 SHORTEST = 0.1
-"""Shortest shift that is corrected, samples: derivatives and interpolation err by some hundredths."""
+"""Shortest shift that is corrected, samples: derivatives and interpolation err by some hundredths. A shift of 0.1
+changes a torque that has 20 samples in a period by 3 %."""
 
 LONGEST = 1.0
 """Longest shift that is corrected without a finding, samples: longer ones are `time_shift`, a mistake of the set-up."""

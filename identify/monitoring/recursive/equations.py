@@ -20,7 +20,8 @@ Array = NDArray[np.float64]
 ROWS = 8
 """Decimated rows per piece of the stream."""
 SLOWEST_LAG_S = 0.5
-"""Upper limit of the lag of a drive behind its reference, s."""
+"""Upper limit of the lag of a drive behind its reference, s: a position loop with a gain of 2 1/s, where drives have 5
+and more. It bounds the first estimates, of few samples."""
 SHORTEST_RATE = 10.0
 """Least sampling rate, in closed-loop bandwidths (thesis section 2.3.1)."""
 EARLIER = 2

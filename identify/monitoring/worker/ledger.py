@@ -27,7 +27,8 @@ LEASE_S = 6.0
 BUSY_S = 10.0
 """Longest wait for another process that writes the ledger, s."""
 MOST_ATTEMPTS = 12
-"""Number of workers that may end during one identification before the recording is given up."""
+"""Number of workers that may end during one identification before the recording is given up. If every second worker
+ends for another reason, such as a restart, a good recording is given up once in 4000."""
 
 State = Literal["waiting", "done", "failed"]
 
