@@ -40,25 +40,9 @@ _FIRST_JOINT = 3
 
 @dataclass(frozen=True)
 class StreamLayout:
-    """Layout of one stream: its joints, its fields and the dtypes of their raw values.
+    """Layout of one stream: SYNCs per sample, joints (columns), fields and numpy dtype names of their raw values.
 
-    Parameters
-    ----------
-    name
-        Name of the stream.
-    every
-        Number of SYNCs from one sample to the next.
-    joints
-        Names of the joints, in the order of the columns.
-    fields
-        Fields in the order of the message.
-    dtypes
-        Numpy dtype name of each field's raw values.
-
-    Raises
-    ------
-    DataError
-        If a dtype is not supported, or a field has not one scale factor per joint.
+    Raises DataError if a dtype is not supported, or a field has not one scale factor per joint.
     """
 
     name: str
@@ -76,15 +60,7 @@ class StreamLayout:
 
     @classmethod
     def of(cls, stream: Stream, joints: Sequence[str]) -> "StreamLayout":
-        """Return the layout of a stream in memory.
-
-        Parameters
-        ----------
-        stream
-            The stream.
-        joints
-            Names of its joints, in the order of the columns.
-        """
+        """Return the layout of a stream in memory; ``joints``: names in the order of the columns."""
         fields = tuple(stream.fields.values())
         return cls(
             stream.name, stream.every, tuple(joints), fields, tuple(stream.raw[f.name].dtype.name for f in fields)
@@ -135,13 +111,7 @@ class StreamLayout:
 
     @classmethod
     def from_json(cls, text: str) -> "StreamLayout":
-        """Return the layout from its JSON.
-
-        Raises
-        ------
-        DataError
-            If the text is not a layout.
-        """
+        """Return the layout from its JSON; DataError if the text is none."""
         try:
             data = json.loads(text)
             fields = tuple(
@@ -228,18 +198,9 @@ class StreamLayout:
     def pack(
         self, channel_id: int, sync: NDArray[np.int64], t_ns: NDArray[np.int64], raw: Mapping[str, NDArray[Any]]
     ) -> NDArray[Any]:
-        """Return the message records of a batch, (N,) in the dtype of :attr:`record`.
+        """Return the message records of a batch on an MCAP channel, (N,) in the dtype of :attr:`record`.
 
-        Parameters
-        ----------
-        channel_id
-            MCAP channel of the stream.
-        sync
-            SYNC numbers, (N,).
-        t_ns
-            Receive times of the SYNCs, ns UTC, (N,).
-        raw
-            Raw values of every field, (N, n) each.
+        SYNC numbers (N,), their receive times (N,), ns UTC, and raw values (N, n) of every field.
         """
         dtype, template, _ = self.record
         rows = np.frombuffer(bytearray(template * len(sync)), dtype=dtype)
@@ -261,21 +222,9 @@ class StreamLayout:
         t_ns: NDArray[np.int64],
         raw: Mapping[str, NDArray[Any]],
     ) -> None:
-        """Write the content of message records into arrays.
+        """Write the content of message records (N,) into arrays: SYNC numbers, times (ns UTC), raw values by field.
 
-        Parameters
-        ----------
-        rows
-            Message records, (N,) in the dtype of :attr:`record`.
-        sync, t_ns
-            Output: SYNC numbers and receive times (ns UTC), (N,).
-        raw
-            Output: raw values of every field, (N, n) each.
-
-        Raises
-        ------
-        DataError
-            If a record does not have the layout of the stream's channel.
+        Raises DataError if a record does not have the layout of the stream's channel.
         """
         octets = np.frombuffer(rows, dtype=np.uint8)
         template, mask = self._pattern(len(rows))
@@ -309,32 +258,12 @@ class StreamLayout:
         return []
 
     def last_sync(self, data: bytes, at: int, count: int) -> int:
-        """Return the SYNC number of the last record of a run.
-
-        Parameters
-        ----------
-        data
-            Uncompressed records of a chunk.
-        at
-            Position of the first record of the run, bytes.
-        count
-            Number of records in the run.
-        """
+        """Return the SYNC number of the last of ``count`` records from byte ``at`` of an uncompressed chunk."""
         dtype = self.record[0]
         return int(np.frombuffer(data, dtype, count=1, offset=at + (count - 1) * dtype.itemsize)["sync"][0])
 
     def run_length(self, data: bytes, at: int, channel_id: int) -> int:
-        """Return the number of consecutive records of this stream.
-
-        Parameters
-        ----------
-        data
-            Uncompressed records of a chunk.
-        at
-            Position of the first record, bytes.
-        channel_id
-            MCAP channel of the stream.
-        """
+        """Return the number of consecutive records of this stream from byte ``at`` of an uncompressed chunk."""
         dtype, template, _ = self.record
         limit = (len(data) - at) // dtype.itemsize
         opcode, length = RECORD_HEAD.unpack_from(template)

@@ -36,12 +36,8 @@ class _Events:
 class TriggeredSeries:
     """Replacement for :class:`RecordingSeries` that creates files only on a trigger.
 
-    Parameters
-    ----------
-    begin
-        Creates the files of an event, by the number of the event (from 1).
-    before_ns, after_ns
-        Time written before and after a trigger, ns. A trigger during an event prolongs it.
+    ``begin``: creates the files of an event by its number, from 1. Rows from ``before_ns`` before to ``after_ns`` after
+    a trigger are written; a trigger during an event prolongs it.
     """
 
     def __init__(self, begin: Callable[[int], RecordingSeries], before_ns: int, after_ns: int) -> None:
@@ -57,27 +53,13 @@ class TriggeredSeries:
         self._limits: tuple[int | None, int | None] | None = None
 
     def limit(self, max_bytes: int | None, max_ns: int | None) -> None:
-        """Set the limits at which a new file of an event begins.
-
-        Parameters
-        ----------
-        max_bytes
-            Size, bytes; ``None``: no limit.
-        max_ns
-            Time span, ns; ``None``: no limit.
-        """
+        """Set the size in bytes and the time span in ns at which a new file of an event begins; ``None``: no limit."""
         self._limits = max_bytes, max_ns
         if self._series is not None:
             self._series.limit(max_bytes, max_ns)
 
     def keep(self, before_ns: int, after_ns: int) -> None:
-        """Set the time written around later triggers.
-
-        Parameters
-        ----------
-        before_ns, after_ns
-            Time before and after a trigger, ns.
-        """
+        """Set the time before and after later triggers that is written, ns."""
         self._before_ns, self._after_ns = before_ns, after_ns
 
     @property
@@ -106,13 +88,7 @@ class TriggeredSeries:
         self._open(t_ns)
 
     def rotate(self, t_ns: int) -> Path | None:
-        """End an event that is over at ``t_ns`` (ns UTC), or begin a new file if the current one is full.
-
-        Returns
-        -------
-        Path or None
-            The file that was finished, if one was.
-        """
+        """End an event that is over at ``t_ns`` (ns UTC), or begin a new file; return the finished one."""
         if self._until is not None and self._series is None:
             self._open(t_ns)
         if self._series is None or self._until is None:
@@ -126,19 +102,7 @@ class TriggeredSeries:
     def append(
         self, stream: str, sync: NDArray[np.int64], t_ns: NDArray[np.int64], raw: Mapping[str, NDArray[Any]]
     ) -> None:
-        """Add rows to a stream, in the current event's file or in memory.
-
-        Parameters
-        ----------
-        stream
-            Name of the stream.
-        sync
-            SYNC numbers, (N,).
-        t_ns
-            Receive times of the SYNCs, ns UTC, (N,).
-        raw
-            Raw values of every field, (N, n) each.
-        """
+        """Add rows to a stream, in the current event's file or in memory, as :meth:`RecordingWriter.append`."""
         if len(sync) == 0:
             return
         if self._series is not None:
@@ -147,15 +111,7 @@ class TriggeredSeries:
         self._keep(_Rows(stream, sync, t_ns, raw), int(t_ns[-1]))
 
     def add_gaps(self, gaps: Sequence[Gap], t_ns: int) -> None:
-        """Record gaps.
-
-        Parameters
-        ----------
-        gaps
-            The gaps.
-        t_ns
-            Time at which they were found, ns UTC.
-        """
+        """Record gaps that were found at ``t_ns``, ns UTC."""
         if self._series is not None:
             self._series.add_gaps(gaps, t_ns)
         else:
@@ -183,13 +139,7 @@ class TriggeredSeries:
             self._series.flush()
 
     def close(self, counters: Mapping[str, int]) -> None:
-        """Finish the current event's file, with the counters of the whole capture.
-
-        Raises
-        ------
-        ConfigError
-            If the end of the file cannot be written. The file remains readable as a truncated one.
-        """
+        """Finish the current event's file, as :meth:`RecordingWriter.close`, with the counters of the whole capture."""
         if self._series is not None:
             self._series.close(counters)
 

@@ -19,26 +19,12 @@ RETRY_NS = 10_000_000_000
 
 
 class RecordingSeries:
-    """Writes one capture to consecutive files.
+    """Writes one capture to consecutive files; ConfigError if the first cannot be created.
 
     A file is closed, with its index, after the next one has been created. If that fails (disk full, directory removed),
     rows continue in the old file, :attr:`problem` describes the error, and the next attempt follows after ``RETRY_NS``.
-
-    Parameters
-    ----------
-    begin
-        Creates part k, counted from 1, at a path.
-    directory, name
-        Directory and base name of the files: ``NAME.mcap``, or ``NAME.0001.mcap`` and so on where a limit is set.
-    max_bytes
-        Size at which a new file begins, bytes; ``None``: no limit.
-    max_ns
-        Time span at which a new file begins, ns; ``None``: no limit.
-
-    Raises
-    ------
-    ConfigError
-        If the first file cannot be created.
+    ``begin``: creates part k, from 1, at a path. Files are ``NAME.mcap``, or ``NAME.0001.mcap`` and so on where a limit
+    of bytes or ns is set.
     """
 
     def __init__(
@@ -74,25 +60,11 @@ class RecordingSeries:
         return self._writer.problem or self._problem
 
     def limit(self, max_bytes: int | None, max_ns: int | None) -> None:
-        """Set the limits at which a new file begins.
-
-        Parameters
-        ----------
-        max_bytes
-            Size, bytes; ``None``: no limit.
-        max_ns
-            Time span, ns; ``None``: no limit.
-        """
+        """Set the size in bytes and the time span in ns at which a new file begins; ``None``: no limit."""
         self._max_bytes, self._max_ns = max_bytes, max_ns
 
     def rotate(self, t_ns: int) -> Path | None:
-        """Begin a new file if the current one is full at ``t_ns``, the time (ns UTC) of the next rows.
-
-        Returns
-        -------
-        Path or None
-            The file that was finished, if one was.
-        """
+        """Begin a new file if the current one is full at ``t_ns``, ns UTC, of the next rows; return the old one."""
         if self._since is None:
             self._since = t_ns
         if not self._full(t_ns) or (self._not_before is not None and t_ns < self._not_before):
@@ -113,31 +85,11 @@ class RecordingSeries:
     def append(
         self, stream: str, sync: NDArray[np.int64], t_ns: NDArray[np.int64], raw: Mapping[str, NDArray[Any]]
     ) -> None:
-        """Add rows to a stream; parameters as of :meth:`RecordingWriter.append`.
-
-        Parameters
-        ----------
-        stream
-            Name of the stream.
-        sync
-            SYNC numbers, (N,).
-        t_ns
-            Receive times of the SYNCs, ns UTC, (N,).
-        raw
-            Raw values of every field, (N, n) each.
-        """
+        """Add rows to a stream, as :meth:`RecordingWriter.append`."""
         self._writer.append(stream, sync, t_ns, raw)
 
     def add_gaps(self, gaps: Sequence[Gap], t_ns: int) -> None:
-        """Record gaps.
-
-        Parameters
-        ----------
-        gaps
-            The gaps.
-        t_ns
-            Time at which they were found, ns UTC.
-        """
+        """Record gaps that were found at ``t_ns``, ns UTC."""
         self._writer.add_gaps(gaps, t_ns)
 
     def add_marks(self, marks: Sequence[Mark]) -> None:
@@ -153,13 +105,7 @@ class RecordingSeries:
         self._writer.flush()
 
     def close(self, counters: Mapping[str, int]) -> None:
-        """Finish the last file, with the counters of the whole capture.
-
-        Raises
-        ------
-        ConfigError
-            If the end of the file cannot be written. The file remains readable as a truncated one.
-        """
+        """Finish the last file, as :meth:`RecordingWriter.close`, with the counters of the whole capture."""
         self._writer.close(counters)
 
     def finish(self) -> None:
@@ -170,13 +116,7 @@ class RecordingSeries:
         """Do nothing: this series writes all rows, without a trigger at ``t_ns``."""
 
     def keep(self, before_ns: int, after_ns: int) -> None:
-        """Do nothing: this series writes all rows, not only those around triggers.
-
-        Parameters
-        ----------
-        before_ns, after_ns
-            Ignored.
-        """
+        """Do nothing: this series writes all rows, not only those around triggers."""
 
     def abort(self) -> None:
         """Close and delete the current file, of a capture that did not begin."""

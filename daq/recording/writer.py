@@ -52,33 +52,12 @@ _EVENTS = {
 
 
 class RecordingWriter:
-    """Writes a recording.
+    """Writes a recording to a new file; ConfigError if it cannot be created.
 
     Rows are gathered, written as one zstd chunk with its message indexes per ``chunk_ns``, and synced to the disk: a
     killed process or a power loss costs no more than that. If a chunk cannot be written completely (disk full), it is
-    removed again, its rows are counted in :attr:`lost_rows`, and writing continues.
-
-    Parameters
-    ----------
-    path
-        The file; must not exist yet.
-    robot, session
-        Configurations that are stored in the file.
-    sample_rate_hz
-        Rate of SYNC, 1/s.
-    layouts
-        One per stream.
-    metadata
-        Facts about the capture that are stored in the file.
-    chunk_ns
-        Longest time that a chunk spans, ns.
-    preview_hz
-        Rate of the preview channels in SI units (`preview`), 1/s; 0: none.
-
-    Raises
-    ------
-    ConfigError
-        If the file cannot be created.
+    removed again, its rows are counted in :attr:`lost_rows`, and writing continues. ``metadata``: facts about the
+    capture. ``preview_hz``: rate of the preview channels in SI units (`preview`), 1/s; 0: none.
     """
 
     def __init__(
@@ -178,16 +157,7 @@ class RecordingWriter:
     ) -> None:
         """Add rows to a stream.
 
-        Parameters
-        ----------
-        stream
-            Name of the stream.
-        sync
-            SYNC numbers, (N,).
-        t_ns
-            Receive times of the SYNCs, ns UTC, (N,).
-        raw
-            Raw values of every field, (N, n) each.
+        SYNC numbers (N,), their receive times (N,), ns UTC, and raw values (N, n) of every field.
         """
         if len(sync) == 0:
             return
@@ -207,15 +177,7 @@ class RecordingWriter:
         self._flush_if_full()
 
     def add_gaps(self, gaps: Sequence[Gap], t_ns: int) -> None:
-        """Record gaps.
-
-        Parameters
-        ----------
-        gaps
-            The gaps.
-        t_ns
-            Time at which they were found, ns UTC.
-        """
+        """Record gaps that were found at ``t_ns``, ns UTC."""
         for gap in gaps:
             self._event(GAPS_TOPIC, gap.first, t_ns, asdict(gap))
             self._unwritten.events.append((GAPS_TOPIC, gap.first, asdict(gap)))
@@ -282,17 +244,9 @@ class RecordingWriter:
             self._event(topic, sync, self._last_ns, event)
 
     def close(self, counters: Mapping[str, int]) -> None:
-        """Write the rest, the counters and the summary; the file is complete afterwards.
+        """Write the rest, the counters of the capture and the summary; the file is complete afterwards.
 
-        Parameters
-        ----------
-        counters
-            Counters of the capture.
-
-        Raises
-        ------
-        ConfigError
-            If the end of the file cannot be written. The file remains readable as a truncated one.
+        Raises ConfigError if the end cannot be written; the file remains readable as a truncated one.
         """
         try:
             self.flush()

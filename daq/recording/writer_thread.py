@@ -94,18 +94,8 @@ class QueuedSeries:
 
     A disk that stalls for seconds (worn memory card, busy server) costs memory, no samples. When ``most_bytes`` wait,
     rows are left out until memory is free: they count in :attr:`lost_rows` and become gaps, like rows that a full disk
-    refuses. Properties report the state after the last piece of work.
-
-    Parameters
-    ----------
-    series
-        Series to write; it must not be used elsewhere.
-    every
-        By stream, the number of SYNCs from one row to the next.
-    chunk_ns
-        Time for which rows are gathered before they are written, ns.
-    most_bytes
-        Largest memory for waiting rows, bytes.
+    refuses. Properties report the state after the last piece of work. ``every``: SYNCs per row, by stream.
+    ``chunk_ns``: time for which rows are gathered.
     """
 
     def __init__(
@@ -163,15 +153,7 @@ class QueuedSeries:
         return self._chunk.bytes + self._put_bytes - self._done_bytes
 
     def limit(self, max_bytes: int | None, max_ns: int | None) -> None:
-        """Set the limits at which a new file begins.
-
-        Parameters
-        ----------
-        max_bytes
-            Size, bytes; ``None``: no limit.
-        max_ns
-            Time span, ns; ``None``: no limit.
-        """
+        """Set the size in bytes and the time span in ns at which a new file begins; ``None``: no limit."""
         self._enqueue(lambda: self._series.limit(max_bytes, max_ns))
 
     def gather(self, chunk_ns: int) -> None:
@@ -179,13 +161,7 @@ class QueuedSeries:
         self._chunk_ns = chunk_ns
 
     def keep(self, before_ns: int, after_ns: int) -> None:
-        """Set the time written around later triggers.
-
-        Parameters
-        ----------
-        before_ns, after_ns
-            Time before and after a trigger, ns.
-        """
+        """Set the time before and after later triggers that is written, ns."""
         self._enqueue(lambda: self._series.keep(before_ns, after_ns))
 
     def trigger(self, t_ns: int) -> None:
@@ -200,11 +176,7 @@ class QueuedSeries:
     def append(self, rows: Mapping[str, Columns]) -> None:
         """Add rows of the same time to several streams, which no file divides; the arrays must not change afterwards.
 
-        Parameters
-        ----------
-        rows
-            By stream: SYNC numbers, (N,), receive times of the SYNCs, ns UTC, (N,), and raw values of every field,
-            (N, n) each.
+        By stream: SYNC numbers (N,), their receive times (N,), ns UTC, and raw values (N, n) of every field.
         """
         sizes = {
             stream: sync.nbytes + t_ns.nbytes + sum(values.nbytes for values in raw.values())
@@ -228,15 +200,7 @@ class QueuedSeries:
             self._hand_over()
 
     def add_gaps(self, gaps: Sequence[Gap], t_ns: int) -> None:
-        """Record gaps.
-
-        Parameters
-        ----------
-        gaps
-            The gaps.
-        t_ns
-            Time at which they were found, ns UTC.
-        """
+        """Record gaps that were found at ``t_ns``, ns UTC."""
         self._chunk.gaps.append((gaps, t_ns))
 
     def add_marks(self, marks: Sequence[Mark]) -> None:
@@ -250,13 +214,7 @@ class QueuedSeries:
         self._wait()
 
     def close(self, counters: Mapping[str, int]) -> None:
-        """Finish the last file, with the counters of the whole capture.
-
-        Raises
-        ------
-        ConfigError
-            If the end of the file cannot be written. The file remains readable as a truncated one.
-        """
+        """Finish the last file, as :meth:`RecordingWriter.close`, with the counters of the whole capture."""
         self.flush()
         self._end()
         self._series.close(counters)

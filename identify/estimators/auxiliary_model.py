@@ -43,12 +43,7 @@ class _Diverged(Exception):
 class Response:
     """Response of the simulated loop, filtered and decimated like the equations.
 
-    Parameters
-    ----------
-    torque
-        Joint torques at the samples, one (M, n) array per experiment, N m or N.
-    position
-        Joint positions, one (M, n) array per experiment, rad or m.
+    ``torque``, ``position``: one (M, n) array per experiment, N m or N, rad or m.
     """
 
     torque: tuple[NDArray[np.float64], ...]
@@ -64,39 +59,15 @@ class AuxiliaryModel:
     Each such step adds a line to ``warnings``. Only the simulation uses the changed estimate; the estimator keeps its
     own.
 
-    Parameters
-    ----------
-    model
-        The arm.
-    controller
-        Discrete controller, on the motor side.
-    references
-        One (N, n) array of joint references per experiment, rad or m.
-    initial
-        Position and velocity (n,) each at the start of every experiment.
-    dt
-        Sampling period, s.
-    decimation
-        Parallel filter of the equations.
-    max_velocity
-        Joint speeds (n,) beyond which a simulation counts as diverged.
-    anchor
-        Base parameters (b,) that can be simulated, to move towards while there is no earlier estimate.
-    band_hz
-        Highest frequency of the instruments, whatever the decimation passes. The measured regressor is smoothed. Beyond
-        the band of the motion it lacks content that reference and simulated loop still hold, such as steps of the set
-        points. A prefilter that amplifies high frequencies would take this content for information.
-    starts
-        Time of the first sample of every experiment since the recordings began, s; ``None``: zero.
-    measured
-        ``measured(positions, k)``: derivatives of simulated positions (N, n) of experiment k by the filter of the
-        measured ones. ``None``: simulated velocities and accelerations.
-    feedback
-        True if the controller is that of the drives, through which the noise of their encoders passes.
-    rounds, tolerated
-        Most simulations of a loop with terms, and the difference of torques that ends them; see `simulate_with_terms`.
-    first_motions
-        Motion of every experiment at which the torque of the terms is computed first; ``None``: begin without it.
+    ``controller``: on the motor side. ``references``: (N, n) per experiment, rad or m. ``initial``: position and
+    velocity (n,) at its start, ``starts``: time of its first sample since the recordings began, s. ``max_velocity``
+    (n,): diverged beyond it. ``anchor`` (b,): can be simulated; the target while there is no earlier estimate.
+    ``measured``: derivatives of simulated positions of experiment k by the filter of the measured ones. ``feedback``:
+    True for the controller of the drives, through which the noise of their encoders passes. ``rounds``, ``tolerated``:
+    see `simulate_with_terms`. ``first_motions``: where the torque of the terms is computed first.
+
+    ``band_hz``: highest frequency of the instruments. The measured regressor is smoothed and lacks content that the
+    reference still holds, such as steps of the set points; a prefilter would amplify it and take it for information.
     """
 
     model: ArmModel
@@ -132,23 +103,11 @@ class AuxiliaryModel:
         return tuple(dict.fromkeys(self._warnings))
 
     def warn(self, text: str) -> None:
-        """Add a warning for the result.
-
-        Parameters
-        ----------
-        text
-            One sentence.
-        """
+        """Add a warning, one sentence, for the result."""
         self._warnings.append(text)
 
     def of_experiments(self, numbers: Sequence[int]) -> Self:
-        """The loop of some of the experiments.
-
-        Parameters
-        ----------
-        numbers
-            Numbers of the experiments, from 0.
-        """
+        """The loop of the experiments with these numbers, from 0."""
         return replace(
             self,
             references=chosen(self.references, numbers),
@@ -160,14 +119,9 @@ class AuxiliaryModel:
     def simulate(
         self, theta: NDArray[np.float64], disturbances: Sequence[NDArray[np.float64]] | None = None
     ) -> Sequence[Simulation] | None:
-        """All experiments with these base parameters, or ``None`` if one diverges or theta is not finite.
+        """All experiments with base parameters (b,), or ``None`` if one diverges or theta is not finite.
 
-        Parameters
-        ----------
-        theta
-            Base parameters (b,), SI.
-        disturbances
-            Additional motor torques, N m or N, one (N, n) array per experiment.
+        ``disturbances``: additional motor torques (N, n) per experiment, N m or N.
         """
         if not np.isfinite(theta).all():
             return None
@@ -212,21 +166,12 @@ class AuxiliaryModel:
     def instruments(self, theta: NDArray[np.float64]) -> Sequence[NDArray[np.float64]]:
         """Filtered regressor at simulated signals, one (M, n, b) per experiment.
 
-        Raises
-        ------
-        DataError
-            If neither theta nor any point between it and the last good estimate can be simulated.
+        Raises DataError if no point between theta and the last good estimate can be simulated.
         """
         return self.regressors(self.motions(theta))
 
     def motions(self, theta: NDArray[np.float64]) -> Sequence[Derivatives]:
-        """Simulated signals of every experiment.
-
-        Raises
-        ------
-        DataError
-            As `instruments`.
-        """
+        """Simulated signals of every experiment; raises DataError like `instruments`."""
         return self.motions_of(self._nearest(theta)[1])
 
     def motions_of(self, runs: Sequence[Simulation]) -> Sequence[Derivatives]:
@@ -242,30 +187,11 @@ class AuxiliaryModel:
     def equations(
         self, blocks: Sequence[ExperimentEquations], theta: NDArray[np.float64]
     ) -> Sequence[ExperimentEquations]:
-        """Equations with the simulated regressor in place of the measured one (2.32).
-
-        Parameters
-        ----------
-        blocks
-            Equations at measured signals, one per experiment.
-        theta
-            Base parameters of the simulation, shape (b,).
-
-        Raises
-        ------
-        DataError
-            As `instruments`.
-        """
+        """Equations with the regressor simulated at theta (b,) (2.32); DataError like `instruments`."""
         return mapped(lambda block, zeta: replace(block, x=zeta), blocks, self.instruments(theta))
 
     def reachable(self, theta: NDArray[np.float64]) -> tuple[NDArray[np.float64], Response]:
-        """Theta and its response, or the nearest point towards the last good estimate that has one.
-
-        Raises
-        ------
-        DataError
-            As `instruments`.
-        """
+        """Theta and its response, or of the nearest point towards the last good estimate; DataError if none."""
         near, runs = self._nearest(theta)
         return near, self._filtered(runs)
 

@@ -35,15 +35,8 @@ Array = NDArray[np.float64]
 class NestedFit:
     """F test of a set of parameters against the full set: all others are zero.
 
-    Parameters
-    ----------
-    kept, left_out
-        Number of parameters in the set, and of those tested to be zero.
-    f, degrees, p_value
-        Statistic, its two degrees of freedom, probability of more if they are zero. The set was chosen on the same
-        data, which makes the test lenient.
-    sufficient
-        True if the set suffices at ``SIGNIFICANCE``.
+    ``kept``, ``left_out``: numbers of parameters. ``sufficient``: the set suffices at `SIGNIFICANCE`. It was chosen on
+    the same data, which makes the test lenient.
     """
 
     kept: int
@@ -56,25 +49,11 @@ class NestedFit:
 
 @dataclass(frozen=True)
 class Diagnostics:
-    """Results of the tests of an estimate.
+    """Results of the tests of an estimate; ``None`` where there are no instruments, or no essential set.
 
-    Parameters
-    ----------
-    condition_regressor
-        Condition number of the whitened, column-normalised regressor.
-    condition_instruments
-        The same of ``Z' W X``; ``None`` without instruments.
-    relevance, endogeneity
-        First stage of every parameter, and test of exogeneity; ``None`` without instruments.
-    weak_instruments
-        Parameters whose instruments are weak.
-    joints
-        Residual tests, one per joint.
-    essential
-        F test of the essential set; ``None`` where no set was given.
-    serial_std_ratio
-        Largest ratio of the standard deviation of a parameter that allows for serially correlated residuals to that of
-        the estimate; 1 where the estimator already models the correlation.
+    ``condition_regressor``: of the whitened, column-normalised regressor; ``condition_instruments``: of ``Z' W X``.
+    ``relevance``: first stage of every parameter. ``serial_std_ratio``: largest ratio of the standard deviation of a
+    parameter that allows for serially correlated residuals to that of the estimate; 1 where it models them.
     """
 
     condition_regressor: float
@@ -103,30 +82,12 @@ def diagnose_estimate(
     essential: NDArray[np.bool_] | None = None,
     max_order: int = MAX_AR_ORDER,
 ) -> Diagnostics:
-    """Test an estimate.
+    """Test an estimate with its equations; ValueError if shapes do not belong together.
 
-    Parameters
-    ----------
-    names, joints
-        Base parameters (b,) and joints (n,).
-    blocks
-        The equations of the estimate.
-    estimate
-        Of any estimator.
-    instruments
-        Regressor at simulated signals, one (M, n, b) per experiment, at the final theta; ``None``: least squares.
-    weights
-        Noise models by which the estimator weighed its rows; ``None``: those of the estimate. They differ where a noise
-        model entered the covariance alone.
-    essential
-        Mask (b,) of the parameters kept; ``None``: no F test.
-    max_order
-        Highest order of the noise models fitted to the residuals where the weights have none.
-
-    Raises
-    ------
-    ValueError
-        If shapes do not belong together.
+    ``instruments``: regressor (M, n, b) at simulated signals at the final theta; ``None``: least squares. ``weights``:
+    noise models of the rows, those of the estimate by default; they differ where a model entered the covariance alone.
+    ``essential``: mask (b,) for the F test. ``max_order``: of noise models of the residuals where the weights have
+    none.
     """
     _check(names, joints, blocks, instruments)
     weights = list(weights or estimate.noise)
@@ -159,18 +120,9 @@ def diagnose_estimate(
 
 
 def nested_f_test(theta: Array, covariance: Array, kept: NDArray[np.bool_], equations: int) -> NestedFit:
-    """F test that all parameters but the kept ones are zero together.
+    """F test that all parameters but the kept ones, mask (b,), are zero together; ``equations``: number of rows.
 
     For least squares it is the ratio of the sums of squares of the two fits; for instruments the Wald form of it.
-
-    Parameters
-    ----------
-    theta, covariance
-        The full fit, (b,) and (b, b).
-    kept
-        Mask (b,).
-    equations
-        Number of rows of the regression.
     """
     out = np.flatnonzero(~kept)
     degrees = (out.size, max(equations - theta.size, 1))

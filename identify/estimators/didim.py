@@ -71,30 +71,9 @@ def didim(
 def solve_didim(
     blocks: Sequence[ExperimentEquations], auxiliary: AuxiliaryModel, start: NDArray[np.float64], iterations: int
 ) -> tuple[Iterations, Sequence[ExperimentEquations]]:
-    """Iterations of DIDIM (2.36), and the simulated equations at their end.
+    """Iterations of DIDIM (2.36), and the equations of every experiment simulated at their last theta.
 
-    Parameters
-    ----------
-    blocks
-        Filtered and decimated equations; only torques and kept equations are used.
-    auxiliary
-        The simulated closed loop.
-    start
-        First theta of the auxiliary model, shape (b,).
-    iterations
-        Most iterations.
-
-    Returns
-    -------
-    end
-        Last theta, number of iterations, convergence and its reason.
-    simulated
-        Equations of every experiment with the regressor simulated at the last theta.
-
-    Raises
-    ------
-    DataError
-        If no auxiliary model runs, not even the first.
+    Raises DataError if no auxiliary model runs, not even the first.
     """
     scale = noise = joint_variances(blocks, np.zeros_like(start))
 

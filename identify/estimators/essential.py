@@ -11,26 +11,13 @@ CONFIDENCE = 0.99
 def essential_parameters(
     theta: NDArray[np.float64], covariance: NDArray[np.float64], equations: int, confidence: float = CONFIDENCE
 ) -> NDArray[np.bool_]:
-    """Mask of the essential parameters, by backward elimination with an F statistic (thesis B.2).
+    """Mask (b,) of the essential parameters, by backward elimination with an F statistic (thesis B.2).
 
-    The least significant parameter is dropped and the rest refitted until all that are left are significant. The refit
-    is exact for Gaussian estimates with this covariance: fixing parameter i at zero moves the others by
-    ``-C[:, i] theta_i / C_ii``, and ``theta_i^2 / C_ii`` is the F statistic (1 and ``equations - b`` degrees).
-
-    Parameters
-    ----------
-    theta, covariance
-        Full model, (b,) and (b, b). They are not changed: reported values stay those of the full base model, since
-        a fit after selection has standard deviations that are too small.
-    equations
-        Number of rows of the regression.
-    confidence
-        Quantile of F below which a parameter is dropped.
-
-    Returns
-    -------
-    ndarray
-        Mask (b,), true where essential.
+    The least significant parameter is dropped and the rest refitted until all that are left are significant, at the
+    quantile ``confidence`` of F. The refit is exact for Gaussian estimates with this covariance: fixing parameter i at
+    zero moves the others by ``-C[:, i] theta_i / C_ii``, and ``theta_i^2 / C_ii`` is the F statistic (1 and ``equations
+    - b`` degrees). Reported values stay those of the full model: a fit after selection has too small standard
+    deviations.
     """
     theta, covariance = theta.copy(), covariance.copy()
     essential = np.ones(theta.size, dtype=np.bool_)

@@ -25,14 +25,8 @@ class InverseController:
     """Turns joint torque equations into equations of motor positions, ``C_j^-1`` applied to every term (6.28).
 
     Noise models describe spectra only. So ``C_j^-1`` is the stable, causal filter with the controller's inverse gain at
-    every frequency that the decimated equations hold: ``1 / D_j(z^-1)``, scaled.
-
-    Parameters
-    ----------
-    to_motor
-        (n, n), joint torques (row vector) to motor torques: the inverse of the transmission.
-    shapes
-        One ``D_j`` and its scale for each motor.
+    every frequency that the decimated equations hold: ``1 / D_j(z^-1)``, scaled. ``to_motor`` (n, n): inverse of the
+    transmission. ``shapes``: one ``D_j`` and its scale for each motor.
     """
 
     to_motor: NDArray[np.float64]
@@ -40,15 +34,7 @@ class InverseController:
 
     @classmethod
     def of(cls, auxiliary: AuxiliaryModel, order: int) -> Self:
-        """Inverse of the controller of the auxiliary model at its decimated rate.
-
-        Parameters
-        ----------
-        auxiliary
-            The simulated closed loop.
-        order
-            Highest order of ``D_j``.
-        """
+        """Inverse of the controller of a loop at its decimated rate; ``order``: highest of ``D_j``."""
         gain = controller_gain(auxiliary.controller, auxiliary.decimation.factor)
         inverse = np.asarray(np.linalg.inv(auxiliary.model.robot.transmission_matrix), dtype=np.float64)
         return cls(inverse, tuple(fit_spectrum(1.0 / row**2, order) for row in gain))
@@ -77,16 +63,9 @@ class InverseController:
 
 
 def controller_gain(controller: DiscreteController, factor: int) -> NDArray[np.float64]:
-    """Gain of each motor's controller from position noise to torque, (n, K), up to the decimated Nyquist frequency.
+    """Gain (n, K) of each motor's controller from position noise to torque, up to the decimated Nyquist frequency.
 
     Position noise enters with the tracking error and, in a velocity loop, with the position itself.
-
-    Parameters
-    ----------
-    controller
-        Discrete controller of n motors.
-    factor
-        Decimation factor.
     """
     z = np.exp(-1j * np.pi * np.linspace(0.0, 1.0, FREQUENCIES) / factor)
 

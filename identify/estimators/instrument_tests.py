@@ -38,17 +38,9 @@ SAME = 1e-8
 class Relevance:
     """First stage of one parameter.
 
-    Parameters
-    ----------
-    parameter
-        Base parameter.
-    partial_r2
-        Shea's partial R^2: variance of least squares over that of the instruments, 0 to 1.
-    first_stage_f
-        F statistic of the instruments given all other regressors (Sanderson and Windmeijer 2016), robust against
-        serial and cross-joint correlation; ``inf`` where the instruments are the regressors.
-    weak
-        True if ``first_stage_f`` is below ``WEAK_F``.
+    ``partial_r2``: Shea's, variance of least squares over that of the instruments, 0 to 1. ``first_stage_f``: F of the
+    instruments given all other regressors (Sanderson and Windmeijer 2016), robust against serial and cross-joint
+    correlation; ``inf`` where the instruments are the regressors. ``weak``: F is below `WEAK_F`.
     """
 
     parameter: str
@@ -61,16 +53,9 @@ class Relevance:
 class Endogeneity:
     """Durbin-Wu-Hausman test of exogeneity: least squares and instruments differ by chance alone.
 
-    Parameters
-    ----------
-    statistic, degrees, p_value
-        Chi-square statistic of the difference, its degrees of freedom, and the probability of a larger statistic under
-        exogeneity. The degrees of freedom are the directions in which the two estimators differ at all.
-    largest_shift, parameter
-        Greatest difference of the two, in standard deviations of the IV estimate, and its parameter. It measures the
-        size of the bias of least squares; the statistic only measures its significance.
-    rejected, verdict
-        True if exogeneity is rejected, and the result as a sentence.
+    ``statistic``: chi-square with the ``degrees`` in which the two differ at all. ``largest_shift``: greatest
+    difference, in standard deviations of the IV estimate, and its ``parameter``: the size of the bias of least squares,
+    while the statistic measures its significance. ``verdict``: the result as a sentence.
     """
 
     statistic: float
@@ -90,23 +75,10 @@ def instrument_relevance(
 ) -> tuple[Relevance, ...]:
     """Shea's partial R^2 and the conditional first-stage F of every parameter.
 
-    Parameters
-    ----------
-    names
-        Base parameters, shape (b,).
-    blocks
-        Equations with the regressor at measured signals.
-    instruments
-        Regressor at simulated signals, one (M, n, b) array per experiment.
-    weights
-        Noise model of each joint by which the rows are weighted.
-
-    Notes
-    -----
-    With ``Xp = Z (Z'Z)^-1 Z' X`` and ``A = (Xp'Xp)^-1`` the part of ``Xp`` that is new in column k is
-    ``w_k = Xp A[:, k] / A_kk`` and the first-stage error left beside it ``v_k = (X - Xp) A[:, k] / A_kk``: the second
-    stage of Sanderson and Windmeijer without a second regression. ``F_k = |w_k|^4 / S_k`` with ``S_k`` the long-run
-    variance of ``w_k v_k`` summed over the joints at each instant (Newey and West 1987).
+    With ``Xp = Z (Z'Z)^-1 Z' X`` and ``A = (Xp'Xp)^-1`` the part of ``Xp`` that is new in column k is ``w_k = Xp A[:,
+    k] / A_kk`` and the first-stage error left beside it ``v_k = (X - Xp) A[:, k] / A_kk``: the second stage of
+    Sanderson and Windmeijer without a second regression. ``F_k = |w_k|^4 / S_k`` with ``S_k`` the long-run variance of
+    ``w_k v_k`` summed over the joints at each instant (Newey and West 1987).
     """
     keep = [b.keep for b in blocks]
     x = whitened([b.x for b in blocks], weights, keep)
@@ -137,24 +109,10 @@ def durbin_wu_hausman(
 ) -> Endogeneity:
     """Durbin-Wu-Hausman test of least squares against instruments, on the same weighted equations.
 
-    Parameters
-    ----------
-    names
-        Base parameters, shape (b,).
-    blocks
-        Equations with the regressor at measured signals.
-    instruments
-        Regressor at simulated signals, one (M, n, b) array per experiment.
-    weights
-        Noise models by which both estimates weight their rows, one per joint.
-    noise
-        Noise models of the residuals, the same or richer.
-
-    Notes
-    -----
-    Both estimates are linear in the noise, so their difference is ``D e`` with ``D = (Z'WX)^-1 Z'W - (X'WX)^-1 X'W``
-    and its covariance ``D Omega D'``: never indefinite, also with serially correlated residuals. Directions in which
-    the two are the same carry no information; they are left out, and the degrees of freedom with them.
+    ``noise``: models of the residuals, the same as the ``weights`` or richer. Both estimates are linear in the noise,
+    so their difference is ``D e`` with ``D = (Z'WX)^-1 Z'W - (X'WX)^-1 X'W`` and its covariance ``D Omega D'``: never
+    indefinite, also with serially correlated residuals. Directions in which the two are the same carry no information;
+    they are left out, and the degrees of freedom with them.
     """
     keep = [b.keep for b in blocks]
     x = whitened([b.x for b in blocks], weights, keep)
@@ -190,13 +148,7 @@ def durbin_wu_hausman(
 
 
 def normalised(x: Array) -> Array:
-    """Return a matrix (rows, b) with columns of norm 1.
-
-    Parameters
-    ----------
-    x
-        The matrix; no column is zero.
-    """
+    """Return a matrix (rows, b), no column of which is zero, with columns of norm 1."""
     return np.asarray(x / np.linalg.norm(x, axis=0))
 
 

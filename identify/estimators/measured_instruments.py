@@ -29,19 +29,7 @@ class MotionInstruments(AuxiliaryModel):
 
     @classmethod
     def of(cls, model: ArmModel, motion: Sequence[NDArray[np.float64]], dt: float, decimation: Decimation) -> Self:
-        """Instruments from a smoothed motion.
-
-        Parameters
-        ----------
-        model
-            The arm.
-        motion
-            Smoothed joint positions, one (N, n) array per experiment, rad or m.
-        dt
-            Sampling period, s.
-        decimation
-            Parallel filter of the equations.
-        """
+        """Instruments from smoothed joint positions, one (N, n) array per experiment, rad or m."""
         # Neither controller nor initial state has a part in it.
         controller = DiscreteController.fir(np.zeros((model.n, 1)), dt)
         at_rest = [(q[0].copy(), np.zeros(model.n)) for q in motion]
@@ -50,14 +38,9 @@ class MotionInstruments(AuxiliaryModel):
     def simulate(
         self, theta: NDArray[np.float64], disturbances: Sequence[NDArray[np.float64]] | None = None
     ) -> Sequence[Simulation] | None:
-        """The motion of every experiment, with the torques that these base parameters need for it.
+        """The motion of every experiment, with the torques that base parameters (b,) need for it.
 
-        Parameters
-        ----------
-        theta
-            Base parameters (b,), SI.
-        disturbances
-            Not used: the motion is given.
+        ``disturbances`` have no effect: the motion is given.
         """
         if not np.isfinite(theta).all():
             return None

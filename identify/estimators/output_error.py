@@ -40,32 +40,13 @@ def output_error(
     start: Array,
     iterations: int,
 ) -> Estimate:
-    """Minimise the weighted difference between measured and simulated signals (4.1 to 4.4).
+    """Minimise the weighted difference between a measured and a simulated ``signal`` of a response (4.1 to 4.4).
 
     A start as poor as CAD values is first brought near by pseudo-linear regression (4.22), one simulation per
     iteration. Then Gauss-Newton steps with finite-difference sensitivities; Levenberg-Marquardt damping where one does
-    not lower the error or leads where the loop cannot be simulated. Weights 2.24 to 2.26 are those of the
-    last residuals.
-
-    Parameters
-    ----------
-    signal
-        Returns the compared signal of a response.
-    measured
-        The same signal measured, one (M, n) array per experiment.
-    blocks
-        Equations of the same samples: which of them to keep, and the torques.
-    auxiliary
-        The simulated closed loop, not yet used by another estimator.
-    start
-        First theta, shape (b,).
-    iterations
-        Most steps.
-
-    Raises
-    ------
-    DataError
-        If the closed loop cannot be simulated anywhere near ``start``.
+    not lower the error or leads where the loop cannot be simulated. Weights 2.24 to 2.26 are those of the last
+    residuals. ``auxiliary``: not yet used by another estimator. Raises DataError if no loop near ``start`` (b,) can be
+    simulated.
     """
     search = _approach(signal, measured, blocks, auxiliary, start, iterations)
     scale = search.variances()

@@ -15,20 +15,9 @@ DIAGNOSE = "armident diagnose RECORDING"
 
 @dataclass(frozen=True)
 class Reason:
-    """One defect of a result.
+    """One defect of a result: level of its verdict, a sentence with figures, and the action that removes it.
 
-    Parameters
-    ----------
-    level
-        Level of the verdict that the defect causes.
-    message
-        The defect in one sentence, with figures.
-    next_step
-        Action that removes it.
-    joint
-        Joint concerned; ``None``: several, or none in particular.
-    kind
-        Property that was judged.
+    ``joint``: ``None`` for several, or none in particular. ``kind``: property that was judged.
     """
 
     level: Level

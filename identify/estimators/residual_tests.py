@@ -24,26 +24,11 @@ LAGS = 20
 
 @dataclass(frozen=True)
 class JointResiduals:
-    """Tests of the residuals of one joint, whitened by a noise model.
+    """Tests of the residuals of one joint, whitened by a noise model of ``order``.
 
-    Parameters
-    ----------
-    joint
-        Name of the joint.
-    order
-        Order of the noise model.
-    lags
-        Number of lags of the whiteness test.
-    ljung_box, ljung_box_degrees, ljung_box_p
-        Statistic of Ljung and Box, degrees of freedom (lags less order), probability of more if white.
-    white
-        True if whiteness is not rejected: p is at least ``FALSE_ALARM_RATE`` over the number of joints.
-    breusch_pagan, breusch_pagan_degrees, breusch_pagan_p
-        Koenker's form of the Breusch-Pagan statistic against the magnitudes in ``against``.
-    homoskedastic
-        True if a constant variance is not rejected, at the same level.
-    against
-        Magnitudes on which the variance may depend: ``speed``, ``torque``.
+    ``ljung_box``: statistic over ``lags``, its degrees of freedom (lags less order), and p-value; ``white``: not
+    rejected at `FALSE_ALARM_RATE` over the number of joints. ``breusch_pagan``: Koenker's form against the magnitudes
+    ``against`` (``speed``, ``torque``); ``homoskedastic``: not rejected at the same level.
     """
 
     joint: str
@@ -70,21 +55,8 @@ def residual_tests(
 ) -> tuple[JointResiduals, ...]:
     """Whiteness and homoskedasticity of the residuals of every joint, whitened by ``noise``.
 
-    Speed and torque magnitudes are the simulated ones where there are instruments: the measured ones share their
-    errors with the residuals.
-
-    Parameters
-    ----------
-    names, joints
-        Base parameters (b,) and joints (n,).
-    blocks
-        Equations with the regressor at measured signals.
-    estimate
-        The estimate to test.
-    noise
-        Noise model of each joint.
-    instruments
-        Regressor at simulated signals, one (M, n, b) array per experiment; ``None``: least squares.
+    Speed and torque magnitudes are those at the ``instruments``, (M, n, b) per experiment, where there are any: the
+    measured ones share their errors with the residuals.
     """
     motion = [b.x for b in blocks] if instruments is None else list(instruments)
     tests = []
@@ -119,22 +91,11 @@ def residual_tests(
 def ljung_box(
     series: Sequence[Array], lags: int = LAGS, fitted: int = 0, absorbed: Array | None = None
 ) -> tuple[float, int, float]:
-    """Test of Ljung and Box (1978) that residuals, pooled over experiments, are white.
+    """Statistic, degrees of freedom and p-value of Ljung and Box (1978): residuals (M,) by experiment are white.
 
-    Parameters
-    ----------
-    series
-        One array (M,) per experiment; the mean is not removed.
-    lags
-        Number of lags; fewer where the series are short.
-    fitted
-        Coefficients of the noise model, taken off the degrees of freedom.
-    absorbed
-        Sums of the autocovariances (lags + 1,) that fitted parameters took out of the residuals; they are given back.
-
-    Returns
-    -------
-    statistic, degrees, p_value
+    The mean is not removed; short series have fewer lags. ``fitted``: coefficients of the noise model, taken off the
+    degrees of freedom. ``absorbed``: sums of the autocovariances (lags + 1,) that fitted parameters took out, to be
+    given back.
     """
     total = sum(s.size for s in series)
     lags = max(min([lags, *(s.size - 1 for s in series)]), 0)
@@ -152,16 +113,7 @@ def ljung_box(
 def breusch_pagan(residuals: Array, magnitudes: Array) -> tuple[float, int, float]:
     """Test of Breusch and Pagan in Koenker's (1981) form, valid without normality: ``M R^2`` of the squares.
 
-    Parameters
-    ----------
-    residuals
-        White residuals (M,).
-    magnitudes
-        Variables on which their variance may depend (M, k).
-
-    Returns
-    -------
-    statistic, degrees, p_value
+    White residuals (M,) against magnitudes (M, k) to statistic, degrees of freedom and p-value.
     """
     squares = residuals**2
     centred = magnitudes - magnitudes.mean(axis=0)

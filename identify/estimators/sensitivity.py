@@ -31,14 +31,8 @@ LEAST_TORQUE = 1e-3
 class Sensitivity:
     """Singular values of the unweighted Jacobians, in descending order (tables 4.2 and 4.5).
 
-    Parameters
-    ----------
-    clie
-        Of the simulated torque with respect to the parameters, ``Psi_CLIE`` (4.4).
-    cloe
-        Of the simulated position, ``Psi_CLOE`` (4.2).
-    didim
-        Of the simulated regressor, the pseudo-linear approximation of ``Psi_CLIE`` (4.22).
+    ``clie``: of the simulated torque (4.4); ``cloe``: of the simulated position (4.2); ``didim``: of the simulated
+    regressor, the pseudo-linear approximation of ``clie`` (4.22).
     """
 
     clie: Array
@@ -47,21 +41,10 @@ class Sensitivity:
 
 
 def sensitivity(auxiliary: AuxiliaryModel, theta: Array, parameters: Sequence[int] | None = None) -> Sensitivity:
-    """Singular values of the Jacobians of CLIE, CLOE and DIDIM at ``theta``.
+    """Singular values of the Jacobians of CLIE, CLOE and DIDIM at ``theta`` (b,); DataError if it cannot be simulated.
 
-    Parameters
-    ----------
-    auxiliary
-        The simulated closed loop and its parallel filter; a decimation factor of 1 is no filter (table 4.2).
-    theta
-        Base parameters, shape (b,).
-    parameters
-        Columns to consider, such as the essential parameters of the thesis; ``None``: all.
-
-    Raises
-    ------
-    DataError
-        If the loop cannot be simulated with ``theta``.
+    ``parameters``: columns to consider, such as the essential parameters of the thesis; ``None``: all. A decimation
+    factor of 1 is no filter (table 4.2).
     """
     auxiliary = auxiliary.fresh()
     response = auxiliary.respond(theta)
@@ -89,17 +72,8 @@ def sensitivity(auxiliary: AuxiliaryModel, theta: Array, parameters: Sequence[in
 def sensitivities(auxiliary: AuxiliaryModel, theta: Array, response: Response, steps: Array) -> list[Response]:
     """Derivatives of the response with respect to each parameter, by forward differences: b simulations at once.
 
-    If the loop diverges at a perturbation, the opposite one is tried, then smaller ones. If it diverges at all of them,
-    the derivative is zero and a warning is added.
-
-    Parameters
-    ----------
-    auxiliary
-        The simulated closed loop; it receives the warning.
-    theta, response
-        Base parameters (b,), and the response of the loop with them.
-    steps
-        Perturbation of each parameter, shape (b,).
+    ``response``: of the loop at ``theta`` (b,); ``steps`` (b,): perturbations. If the loop diverges at one, the
+    opposite one is tried, then smaller ones. If it diverges at all, the derivative is zero and the loop gets a warning.
     """
     columns: list[Response | None] = [None] * theta.size
     for factor in (1.0, -1.0, 0.1, -0.1):
@@ -117,14 +91,8 @@ def sensitivities(auxiliary: AuxiliaryModel, theta: Array, response: Response, s
 def difference_steps(zeta: Arrays, torques: Arrays, errors: Arrays, keep: Sequence[NDArray[np.bool_]]) -> Array:
     """Finite-difference steps (b,) on the scale of each parameter's standard deviation.
 
-    Parameters
-    ----------
-    zeta
-        Filtered regressor at simulated signals, one (M, n, b) array per experiment.
-    torques, errors
-        Torques, and their unexplained part, (M, n) each, N m or N.
-    keep
-        Equations to use, (M, n).
+    Per experiment, ``zeta``: filtered regressor at simulated signals (M, n, b); torques and their unexplained part (M,
+    n), N m or N; equations to keep (M, n).
     """
     noise = [
         ArModel(np.empty(0), max(e.variance, LEAST_TORQUE**2 * y.variance), 0.0)
@@ -136,14 +104,7 @@ def difference_steps(zeta: Arrays, torques: Arrays, errors: Arrays, keep: Sequen
 def weighted_columns(columns: Sequence[Arrays], keep: Sequence[NDArray[np.bool_]], noise: Sequence[ArModel]) -> Array:
     """Jacobian of 4.2 and 4.4 (rows, b): each column stacked joint by joint and weighted.
 
-    Parameters
-    ----------
-    columns
-        Derivative with respect to each parameter, b sequences of one (M, n) array per experiment.
-    keep
-        Equations to use, (M, n) per experiment.
-    noise
-        Noise model of each joint.
+    ``columns``: by parameter, its derivatives (M, n) by experiment; ``noise``: models of the joints.
     """
     return np.stack([whitened(column, noise, keep) for column in columns], axis=1)
 
@@ -158,24 +119,7 @@ def _quotient(moved: Response, response: Response, step: float) -> Response:
 def torque_sensitivities(
     auxiliary: AuxiliaryModel, theta: Array, blocks: Sequence[ExperimentEquations], noise: Sequence[ArModel]
 ) -> Array:
-    """Jacobian of the simulated torque (4.4), weighted, shape (rows, b).
-
-    Parameters
-    ----------
-    auxiliary
-        The simulated closed loop.
-    theta
-        Base parameters, shape (b,).
-    blocks
-        Filtered and decimated equations; only torques and kept equations are used.
-    noise
-        Noise model of each joint.
-
-    Raises
-    ------
-    DataError
-        If the loop cannot be simulated near ``theta``.
-    """
+    """Weighted Jacobian (rows, b) of the simulated torque (4.4); DataError if no simulation near theta runs."""
     theta, response = auxiliary.reachable(theta)
     torques, keep = [b.y for b in blocks], [b.keep for b in blocks]
     errors = [y - t for y, t in zip(torques, response.torque, strict=True)]
