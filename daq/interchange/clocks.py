@@ -41,7 +41,7 @@ EQUAL = 0.01
 _WINDOWS = 200
 """Velocities are differences over this part of the recording."""
 AMBIGUOUS = 0.25
-"""Distance, periods, of a step between stamps from a whole number above which missing samples cannot be counted."""
+"""Distance, periods, of a jittering step from a whole number above which missing samples cannot be counted."""
 
 PERIOD_TOLERANCE = 0.02
 """Largest relative difference of log's and session's SYNC periods: clocks agree to 0.1 %, periods differ by more."""
@@ -168,7 +168,7 @@ def clock_of(times: Floats, rate_hz: float | None, repeated: float = 0.0) -> Clo
         raise DataError(f"{missing} of {int(advance.sum()) + 1} samples are missing at {measured:.6g} Hz")
     if rate_hz is not None and abs(rate_hz / measured - 1.0) > RATE_TOLERANCE:
         raise DataError(
-            f"--rate {rate_hz:g} contradicts the time column: steps of {median:.6g} s, {measured:.6g} Hz; "
+            f"--rate {rate_hz:g} contradicts the times: steps of {median:.6g} s, {measured:.6g} Hz; "
             f"omit --rate, or give the rate of a conversion with --resample {rate_hz:g}"
         )
     return Clock(rate_hz or measured, np.append(0, np.cumsum(advance)).astype(np.int64))
@@ -196,52 +196,26 @@ def _jittering(times: Floats, rate_hz: float | None, repeated: float, how: str) 
     if rate_hz is None:
         raise JitterError(f"the times jitter: {spread}; --resample {typical:g} puts the samples on an even clock")
     on_clock = f"--resample {rate_hz:g} puts the samples on an even clock, with"
+    periods = steps * rate_hz
+    advance = np.rint(periods)
+    clear = (advance >= 1) & (np.abs(periods - advance) <= AMBIGUOUS)
+    counted = bool(clear.all()) and np.median(advance) == 1
+    if counted:
+        mean *= float(advance.mean())
     if abs(rate_hz / mean - 1.0) > RATE_TOLERANCE:
-        raise JitterError(
-            f"--rate {rate_hz:g} contradicts the time column: {spread}; {on_clock} gaps where some are missing"
-        )
+        raise JitterError(f"--rate {rate_hz:g} contradicts the times: {spread}; {on_clock} gaps where some are missing")
     longest = float(steps.max())
-    if longest > _JITTER * max(1.0 / mean, float(np.quantile(steps[steps > 0], 0.99))):
+    if not counted and longest > _JITTER * max(1.0 / mean, float(np.quantile(steps[steps > 0], 0.99))):
         raise JitterError(f"no sample for {longest:.6g} s, and the times jitter: {spread}; {on_clock} a gap there")
-    late = times - times[0] - np.arange(times.size) / mean
+    numbers = np.append(0, np.cumsum(advance if counted else np.ones(steps.size))).astype(np.int64)
+    late = times - times[0] - numbers / mean
     note = f"times jitter by {1e3 * float(np.ptp(late)):.4g} ms; rows are taken as even samples at {rate_hz:g} Hz"
-    return Clock(rate_hz, np.arange(times.size, dtype=np.int64), (note,))
+    return Clock(rate_hz, numbers, (note,))
 
 
 def two_digits(rate: float) -> float:
     """Return a rate with two digits, for advice."""
     return float(f"{rate:.2g}")
-
-
-def stamped_clock(t_ns: Ints, rate_hz: float | None = None) -> Clock:
-    """Return the clock of stamped messages, ns, (N,): a stamp may jitter by a quarter period at a stated rate."""
-    steps_ns = np.diff(t_ns)
-    steps = steps_ns / 1e9
-    if steps.size == 0:
-        raise DataError("a single sample is not a recording")
-    if steps.min() <= 0:
-        raise DataError(f"the time of sample {int(np.argmin(steps)) + 2} is not after that of the one before")
-    median = float(np.median(steps))
-    single = steps_ns[np.abs(steps - median) <= AMBIGUOUS * median]
-    measured = single.size * 1e9 / float(single.sum())
-    period = 1.0 / measured
-    if rate_hz is not None and abs(rate_hz / measured - 1.0) > RATE_TOLERANCE:
-        raise DataError(
-            f"--rate {rate_hz:g} contradicts the times of the samples, whose usual step of {period:.6g} s "
-            f"is a rate of {measured:.6g} Hz"
-        )
-    advance = np.round(steps / period)
-    error = np.abs(steps / period - advance)
-    tolerance = EVEN if rate_hz is None else AMBIGUOUS
-    uneven = np.flatnonzero((error > np.where(advance == 1, tolerance, AMBIGUOUS)) | (advance < 1))
-    if uneven.size:
-        k = int(uneven[0])
-        raise DataError(
-            f"the step of {steps[k]:.6g} s before sample {k + 2} is not a whole number of periods of {period:.6g} s "
-            f"({uneven.size} of {steps.size} steps): the times jitter; "
-            f"--resample {two_digits(measured):g} puts the samples on an even clock"
-        )
-    return Clock(measured if rate_hz is None else rate_hz, np.append(0, np.cumsum(advance)).astype(np.int64))
 
 
 def gaps_and_counters(streams: Mapping[str, Stream]) -> tuple[tuple[Gap, ...], dict[str, int]]:

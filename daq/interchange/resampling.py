@@ -16,7 +16,6 @@ from armident.daq.interchange.clocks import (
     gaps_and_counters,
     in_seconds,
     repeated_share,
-    stamped_clock,
 )
 from armident.daq.interchange.table_files import Source
 from armident.daq.interchange.table_rows import TableRows
@@ -92,9 +91,6 @@ def sampled(
         "--resample RATE, with the rate of the controller, puts them on its clock"
     )
     polled_note = [note] if repeated > POLLED_SHARE else []
-    if source.t_ns is not None and not polled and resample_hz is None:
-        stamped = stamped_clock(source.t_ns[rows.row], rate_hz)
-        return Sampled(stamped.rate_hz, stamped.numbers, rows.values, notes=tuple(polled_note))
     times, notes = _times(source, rows, robot, time_unit)
     if polled or (resample_hz is not None and (times is None or repeated > POLLED_SHARE)):
         return _from_polled(rows, times, resample_hz or rate_hz or 0.0, polled, notes)

@@ -97,7 +97,7 @@ def test_slow_motion_and_low_rates_are_seconds(tmp_path: Path) -> None:
 def test_a_rate_that_contradicts_the_times_is_refused_with_both(tmp_path: Path) -> None:
     path = written(tmp_path / "a.csv", motion())
     for rate in (500.0, 998.0 * 1.02, 5000.0):
-        with pytest.raises(DataError, match=rf"--rate {rate:g} contradicts the time column: .* 1000 Hz"):
+        with pytest.raises(DataError, match=rf"--rate {rate:g} contradicts the times: .* 1000 Hz"):
             import_recording(path, TX40, rate_hz=rate)
     assert import_recording(path, TX40, rate_hz=1000.0).sample_rate_hz == 1000.0
 
