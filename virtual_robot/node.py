@@ -45,7 +45,7 @@ from armident.drivers.canopen.objects import (
 from armident.virtual_robot.arm import DriveBackend
 from armident.virtual_robot.cia402 import MOVING, next_state, statusword
 from armident.virtual_robot.node_services import Nmt, Sdo
-from armident.virtual_robot.oddities import Oddity
+from armident.virtual_robot.oddity import Oddity
 
 ABORT_UNSUPPORTED = 0x06010000
 ABORT_NOT_MAPPABLE = 0x06040041

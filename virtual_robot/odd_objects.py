@@ -9,7 +9,7 @@ from armident.configs.schema.session import SessionConfig
 from armident.drivers.canopen import objects as od
 from armident.drivers.canopen.objects import DriveState, TpdoLayout
 from armident.virtual_robot.node import Drive
-from armident.virtual_robot.oddities import Oddity
+from armident.virtual_robot.oddity import Oddity
 
 ABORT_READ_ONLY = 0x06010002
 ABORT_NO_OBJECT = 0x06020000

@@ -12,7 +12,7 @@ from armident.drivers.can.udp import open_python_can
 from armident.drivers.canopen import objects as od
 from armident.drivers.canopen.objects import NmtCommand, NmtState
 from armident.virtual_robot.node import ABORT_DEVICE_STATE, Drive
-from armident.virtual_robot.oddities import Oddity
+from armident.virtual_robot.oddity import Oddity
 
 BURST = (0x8611, 0xFF05)
 """Error codes of the emergency messages of a burst, in turn."""

@@ -17,7 +17,7 @@ from armident.drivers.canopen.objects import DriveState
 from armident.virtual_robot.arm import DriveBackend
 from armident.virtual_robot.bus_server import BATCH, DriveBus
 from armident.virtual_robot.node import Drive
-from armident.virtual_robot.odd_behaviours import make_oddities
+from armident.virtual_robot.oddities import make_oddities
 
 TOGETHER_S = 0.05
 """Longest wait of a SYNC of one bus for that of another bus, s."""

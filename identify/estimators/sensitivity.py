@@ -1,17 +1,14 @@
-"""Sensitivity of torque and position to the parameters: singular values of the Jacobians (thesis section 4.1.2)."""
+"""Sensitivity of torque and position to the parameters, by finite differences (thesis section 4.1.2)."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from armident.configs import DataError
 from armident.identify.estimators.auxiliary_model import AuxiliaryModel, Response
-from armident.identify.regression.ar_noise import WHITE, ArModel, ar_models
+from armident.identify.regression.ar_noise import ArModel, ar_models
 from armident.identify.regression.equations import ExperimentEquations
 from armident.identify.regression.least_squares import column_norms
-from armident.identify.regression.qr import triangularize
 from armident.identify.regression.whitening import whitened
 
 Array = NDArray[np.float64]
@@ -25,48 +22,6 @@ Forward differences are then accurate to 1e-4 of the norm of a column (TX40), fa
 
 LEAST_TORQUE = 1e-3
 """Least torque error of the standard deviations, as a share of a joint's torque, for noise-free data."""
-
-
-@dataclass(frozen=True)
-class Sensitivity:
-    """Singular values of the unweighted Jacobians, in descending order (tables 4.2 and 4.5).
-
-    ``clie``: of the simulated torque (4.4); ``cloe``: of the simulated position (4.2); ``didim``: of the simulated
-    regressor, the pseudo-linear approximation of ``clie`` (4.22).
-    """
-
-    clie: Array
-    cloe: Array
-    didim: Array
-
-
-def sensitivity(auxiliary: AuxiliaryModel, theta: Array, parameters: Sequence[int] | None = None) -> Sensitivity:
-    """Singular values of the Jacobians of CLIE, CLOE and DIDIM at ``theta`` (b,); DataError if it cannot be simulated.
-
-    ``parameters``: columns to consider, such as the essential parameters of the thesis; ``None``: all. A decimation
-    factor of 1 is no filter (table 4.2).
-    """
-    auxiliary = auxiliary.fresh()
-    response = auxiliary.respond(theta)
-    if response is None:
-        raise DataError("sensitivity: the auxiliary closed loop diverges with these parameters")
-    chosen = np.arange(theta.size) if parameters is None else np.asarray(parameters)
-    zeta = auxiliary.instruments(theta)
-    keep = [np.ones(torque.shape, dtype=np.bool_) for torque in response.torque]
-    none = [np.zeros_like(torque) for torque in response.torque]
-    steps = difference_steps(zeta, response.torque, none, keep)
-    columns = sensitivities(auxiliary, theta, response, steps)
-    plain = [WHITE] * auxiliary.model.n
-
-    def singular_values(jacobian: Array) -> Array:
-        factor = triangularize(jacobian[:, chosen], columns=chosen.size)
-        return np.asarray(np.linalg.svd(factor, compute_uv=False), dtype=np.float64)
-
-    return Sensitivity(
-        clie=singular_values(weighted_columns([column.torque for column in columns], keep, plain)),
-        cloe=singular_values(weighted_columns([column.position for column in columns], keep, plain)),
-        didim=singular_values(whitened(zeta, plain, keep)),
-    )
 
 
 def sensitivities(auxiliary: AuxiliaryModel, theta: Array, response: Response, steps: Array) -> list[Response]:

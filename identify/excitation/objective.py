@@ -45,13 +45,6 @@ class EffectObjective:
 
     pairs: tuple[tuple[EffectLocation, EffectLocation | None], ...]
 
-    @property
-    def predicts(self) -> bool:
-        """True if an effect depends on the predicted torques."""
-        return any(
-            location is not None and location.effect.depends_on_torque for pair in self.pairs for location in pair
-        )
-
     def cost(self, motion: Motion, x: Array, decimation: Decimation, sigma: Array) -> float:
         """Return the mean log standard deviation of all linear parameters (D-optimality); lower is better.
 

@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from armident.identify.estimators.sensitivity import Sensitivity, sensitivity
 from tests.reproduction.aircraft import DURATION, SAMPLING_HZ, aircraft_sensitivity
 from tests.reproduction.cached_estimates import Case, Laboratory, Run
 from tests.reproduction.context import Bench, TableFunction, estimates, figures, iterations
+from tests.reproduction.singular_values import Sensitivity, sensitivity
 from tests.reproduction.tables import Table
 
 Array = NDArray[np.float64]

@@ -19,8 +19,7 @@ class JumpCriteria:
     exceed where a jump comes back. ``accelerations``: acceleration that the jump needs over the
     usual ones (95 % quantile of the joint), and over its limit. ``start_s``: a joint without a limit of acceleration
     takes at least this time to its velocity limit. ``counts``: least jump in steps of the encoder. ``longest``: rows
-    that a value may be wrong before it counts as a lasting step. ``smallest``: least jump over the range of the motion;
-    ``smallest_step``: of a lasting step, which moves gravity by that share of a radian, rad, or share of the range.
+    that a value may be wrong before it counts as a lasting step. ``smallest``: least jump over the range of the motion.
     ``turn_share``: largest usual step in turns where steps of a turn are no motion.
     """
 
@@ -34,7 +33,6 @@ class JumpCriteria:
     counts: float = 8.0
     longest: int = 10
     smallest: float = 1e-3
-    smallest_step: float = 3e-3
     turn_share: float = 0.1
 
 

@@ -14,11 +14,11 @@ from armident.identify.estimators.didim import didim
 from armident.identify.estimators.idim_iv import idim_iv
 from armident.identify.estimators.idim_ls import idim_ls
 from armident.identify.estimators.idim_piv import idim_piv
-from armident.identify.estimators.sensitivity import sensitivity
 from armident.identify.estimators.sep_pem import sep_pem
 from armident.identify.regression.ar_noise import whiteness
 from armident.identify.regression.equations import Estimate
 from tests.reproduction.gear_ratios import with_gear_ratios
+from tests.reproduction.singular_values import sensitivity
 from tests.unit.two_joint_arm import Recorded, masked, model, recorded, start
 
 Start = NDArray[np.float64]

@@ -18,7 +18,6 @@ from armident.identify.estimators.cloe import cloe
 from armident.identify.estimators.didim import didim
 from armident.identify.estimators.idim_iv import idim_iv
 from armident.identify.estimators.idim_ls import idim_ls
-from armident.identify.estimators.sensitivity import sensitivity
 from armident.identify.identification.auxiliary_loop import initial_parameters
 from armident.identify.identification.equations import equations
 from armident.identify.identification.from_recording import experiments_from_recording
@@ -33,6 +32,7 @@ from armident.virtual_robot.offline import simulate_recording
 from armident.virtual_robot.plant import Plant
 from tests.fixtures.arms import recording, trajectory
 from tests.reproduction.gear_ratios import with_gear_ratios
+from tests.reproduction.singular_values import sensitivity
 
 pytestmark = pytest.mark.slow
 
