@@ -21,6 +21,7 @@ from armident.identify.diagnosis.criteria import Criteria
 from armident.identify.documents.diagnosis import DiagnosisDocument
 from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.effects.registry import own_effects
+from armident.identify.estimators.methods import METHODS, estimator
 from armident.identify.report import glossary
 
 Schema = dict[str, Any]
@@ -124,7 +125,10 @@ def glossary_page() -> str:
     for effect in own_effects():
         text = f"{effect.description[0].upper()}{effect.description[1:]}."
         parts += [f"### {effect.key}", text, parameter_table(glossary.effect_entries(effect))]
-    parts += ["## Methods, tests and verdicts", listed([*glossary.TERMS, *glossary.verdict_entries()])]
+    rows = [f"| {m.upper()} | {estimator(m).source} | {estimator(m).meaning} |" for m in METHODS]
+    rows = ["| method | section of Brunot 2017 (equations) | meaning |", "| --- | --- | --- |", *rows]
+    parts += ["## Methods", "\n".join(rows)]
+    parts += ["## Tests and verdicts", listed([*glossary.TERMS, *glossary.verdict_entries()])]
     parts += ["## Variables of an unexplained residual", listed(glossary.variable_entries())]
     return "\n\n".join(parts) + "\n"
 

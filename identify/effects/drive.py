@@ -249,6 +249,3 @@ class EncoderEccentricity(Periodic, TorqueDependent):
             return ([resolution * k for k in (*np.arange(2.0, 16.0, 0.5), *range(16, 81))],)
         ratio = float(np.max(np.abs(motion.model.robot.transmission_matrix[place.joint])))
         return (sorted({1.0, 2.0, ratio, 2 * ratio}),)
-
-
-EFFECTS = (DriveGainError, DriveGainSaturation, TimeDelay, ActuatorBandwidth, EncoderEccentricity)

@@ -442,21 +442,3 @@ class CouplingFriction(Effect):
         pair = {robot.joints[j].name for j in (place.joint, place.second)}
         coupled = any(set(coupling.joints) == pair for coupling in robot.couplings)
         return not coupled and super().may_be_added(motion, place, present)
-
-
-EFFECTS = (
-    CoulombTransition,
-    AsymmetricViscousFriction,
-    AsymmetricCoulombFriction,
-    StribeckFriction,
-    StribeckFrictionExponential,
-    StribeckFrictionTable,
-    NonlinearViscousFriction,
-    LoadDependentFriction,
-    PreslidingFriction,
-    PositionDependentFriction,
-    PositionDependentFrictionTable,
-    FrictionDrift,
-    FrictionDriftWithWork,
-    CouplingFriction,
-)

@@ -222,6 +222,3 @@ class TorqueOffset(ParameterChange):
     def parameters(self, place: Place, n: int) -> list[str]:
         """Return that of the joint."""
         return [f"off{place.joint + 1}"]
-
-
-EFFECTS = (JointSpring, JointSpringCubic, JointSpringTable, Payload, RotorInertia, GravityDirection, TorqueOffset)

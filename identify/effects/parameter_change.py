@@ -69,6 +69,3 @@ class FrictionChange(ParameterChange):
     def sizes(self, place: Place, standard: Mapping[str, float]) -> Array:
         """Return the friction that the joint has."""
         return np.array([max(abs(standard[name]), 1e-3) for name in self.parameters(place, 0)])
-
-
-EFFECTS = (FrictionChange,)

@@ -2,6 +2,9 @@
 
 from functools import cache
 from importlib.metadata import entry_points
+from inspect import isabstract
+from types import ModuleType
+from typing import TypeGuard
 
 from armident.configs import ConfigError
 from armident.configs.schema.robot import Effect as Entry
@@ -16,9 +19,20 @@ REQUIRED = ("name", "title", "description", "reference", "required_motion", "lin
 
 
 def own_effects() -> list[Effect]:
-    """Return the effects of this package."""
+    """Return the effects of this package: the classes with a title, of one key the last."""
     modules = (friction, link, transmission, drive, parameter_change, wiring, unnamed)
-    return [effect() for module in modules for effect in module.EFFECTS]
+    classes = [each for module in modules for each in vars(module).values() if _of_module(each, module)]
+    return list({effect.key: effect for effect in (each() for each in classes)}.values())
+
+
+def _of_module(each: object, module: ModuleType) -> TypeGuard[type[Effect]]:
+    return (
+        isinstance(each, type)
+        and issubclass(each, Effect)
+        and each.__module__ == module.__name__
+        and hasattr(each, "title")
+        and not isabstract(each)
+    )
 
 
 @cache

@@ -205,6 +205,3 @@ def inertias(motion: Motion, joint: int, rotor: float) -> Array:
     inertia = motion.slopes(joint, links=True)[2][:, joint] - rotor
     believed: Array = np.maximum(inertia, LEAST_INERTIA * inertia.max())
     return believed
-
-
-EFFECTS = (CoggingTorque, JointElasticity, Backlash)

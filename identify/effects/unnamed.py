@@ -151,15 +151,3 @@ class OfOtherPosition(OverSignal):
     scope = "other"
     shapes = ends(POSITION)
     signal = "q"
-
-
-EFFECTS = (
-    OfVelocity,
-    OfTime,
-    OfTimeAndDirection,
-    OfTorque,
-    OfAcceleration,
-    OfOtherVelocity,
-    OfOtherTorque,
-    OfOtherPosition,
-)

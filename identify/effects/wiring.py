@@ -136,9 +136,7 @@ class PositionOffset(SignalMistake):
     settings = (Shape("offset", POSITION, "True less recorded position of the joint, on the joint side."),)
 
 
-EXCHANGES = (SignError, JointOrder, SignalScale)
-EFFECTS = (*EXCHANGES, PositionOffset)
-BY_NAME = {effect.name: effect() for effect in EXCHANGES}
+BY_NAME = {wiring.name: wiring() for wiring in Wiring.__subclasses__()}
 
 
 def with_zeros(experiments: Sequence[Experiment], robot: RobotConfig) -> Sequence[Experiment]:

@@ -57,4 +57,9 @@ def _solve(problem: Problem) -> Solved:
     return Solved(estimate, noise_of="joint position")
 
 
-ESTIMATOR = Estimator("cloe", _solve)
+ESTIMATOR = Estimator(
+    "cloe",
+    _solve,
+    "Least error between measured and simulated positions of the closed loop (closed-loop output error).",
+    "4.1 (4.1 to 4.4)",
+)

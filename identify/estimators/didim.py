@@ -89,5 +89,9 @@ def solve_didim(
 
 
 ESTIMATOR = Estimator(
-    "didim", lambda problem: Solved(didim(problem.blocks, problem.auxiliary, problem.start)), white_covariance=True
+    "didim",
+    lambda problem: Solved(didim(problem.blocks, problem.auxiliary, problem.start)),
+    "Least error of the torque that simulated motion needs; no measured position is in the equations.",
+    "2.3.4 (2.36, 2.37)",
+    white_covariance=True,
 )

@@ -82,4 +82,12 @@ def _solve(problem: Problem) -> Solved:
     return Solved(idim_iv(problem.blocks, problem.auxiliary, problem.start, serial_order=problem.max_ar_order))
 
 
-ESTIMATOR = Estimator("idim-iv", _solve, measured=True, white_covariance=True)
+ESTIMATOR = Estimator(
+    "idim-iv",
+    _solve,
+    "Instrumental variables: the regressor of a simulation serves as instrument, so that noise in the "
+    "measured positions causes no bias.",
+    "2.3.3 (2.33, 2.34), 4.34",
+    measured=True,
+    white_covariance=True,
+)

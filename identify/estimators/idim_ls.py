@@ -62,4 +62,11 @@ def idim_ls(
     return Estimate(theta, covariance, tuple(noise), whitened_residuals(blocks, theta, noise))
 
 
-ESTIMATOR = Estimator("idim-ls", None, measured=True, white_covariance=True)
+ESTIMATOR = Estimator(
+    "idim-ls",
+    None,
+    "Least squares on the inverse dynamic model, the reference method.",
+    "2.3.2 (2.22 to 2.27)",
+    measured=True,
+    white_covariance=True,
+)

@@ -147,4 +147,11 @@ def _difference_without_model_error(problem: Problem, estimate: Estimate, withou
     return np.zeros_like(without.theta) if refined is None or plain is None else refined - plain
 
 
-ESTIMATOR = Estimator("idim-piv", _solve, measured=True, prefiltered=True)
+ESTIMATOR = Estimator(
+    "idim-piv",
+    _solve,
+    "IDIM-IV with a prefilter by the noise model, black box or grey box; the default method.",
+    "6.2.2 (6.28, 6.30, 6.31), 7.2",
+    measured=True,
+    prefiltered=True,
+)

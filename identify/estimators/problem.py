@@ -96,6 +96,8 @@ class Estimator:
     solve
         Solves a problem with a simulated closed loop. ``None``: the estimate is that of least squares, with which
         every identification starts.
+    meaning, source
+        The method in a sentence, for the glossary, and its section of the thesis with the equations.
     measured
         True if the regressor is the measured one. Otherwise it is simulated: without a loop that runs, the estimate
         has no meaning.
@@ -107,6 +109,8 @@ class Estimator:
 
     name: Method
     solve: Callable[[Problem], Solved] | None
+    meaning: str
+    source: str
     measured: bool = False
     prefiltered: bool = False
     white_covariance: bool = False

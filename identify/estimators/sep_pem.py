@@ -69,4 +69,10 @@ def _solve(problem: Problem) -> Solved:
     return Solved(sep_pem(problem.blocks, problem.auxiliary, problem.start, max_order=problem.max_ar_order))
 
 
-ESTIMATOR = Estimator("sep-pem", _solve, prefiltered=True)
+ESTIMATOR = Estimator(
+    "sep-pem",
+    _solve,
+    "Least prediction error of the torque, with a noise model that is estimated separately.",
+    "6.2.1 (6.26, 6.27, 6.29)",
+    prefiltered=True,
+)

@@ -11,6 +11,7 @@ from armident.identify.documents.diagnosis import VERDICTS, DiagnosisDocument, F
 from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.effects.effect import Effect
 from armident.identify.effects.registry import catalogue
+from armident.identify.estimators.methods import METHODS, estimator
 
 
 @dataclass(frozen=True)
@@ -82,12 +83,6 @@ TERMS = _entries({
     "NVR": "Noise-variance ratio of the position smoother: small values smooth more (thesis section 5.1.2).",
     "IRWSM": "Integrated-random-walk smoother: derivatives of measured positions by fixed-interval smoothing "
         "(thesis section 5.1.2).",
-    "IDIM-LS": "Least squares on the inverse dynamic model, the reference method.",
-    "IDIM-IV": "Instrumental variables: the regressor of a simulation serves as instrument, so that noise in the "
-        "measured positions causes no bias.",
-    "IDIM-PIV": "IDIM-IV with a prefilter by the noise model; the default method (thesis chapter 6).",
-    "DIDIM, CLIE, CLOE, SEP-PEM": "Methods that minimise an error of the closed loop: of simulated torques, of "
-        "inputs, of outputs, or of predictions.",
     "instruments": "Signals that follow the motion but not the measurement noise. Weak instruments follow a "
         "parameter's column of the regressor too little to determine it.",
     "Durbin, Wu, Hausman": "Test that compares least squares and instrumental variables: a difference beyond "
@@ -106,7 +101,7 @@ TERMS = _entries({
         "`--false-alarms`, shared between all tests.",
     "baseline": "Earlier identification of the same arm whose parameters are tested for change.",
 })  # fmt: skip
-"""Methods, tests and words of the reports that are no keys of a document."""
+"""Tests and words of the reports that are no keys of a document."""
 
 EVERYDAY = {
     "after", "all", "before", "by_joint", "configuration", "converged", "effect", "evidence", "findings", "formula",
@@ -202,6 +197,11 @@ def document_entries(kind: type[Document]) -> list[GlossaryEntry]:
     return list(found.values())
 
 
+def method_entries() -> list[GlossaryEntry]:
+    """Return the methods of identification."""
+    return [GlossaryEntry(method.upper(), estimator(method).meaning) for method in METHODS]
+
+
 def verdict_entries() -> list[GlossaryEntry]:
     """Return the verdicts of a diagnosis."""
     return [GlossaryEntry(name.replace("_", " "), f"Verdict of a diagnosis: {text}") for name, text in VERDICTS.items()]
@@ -216,7 +216,7 @@ def variable_entries() -> list[GlossaryEntry]:
 def all_terms() -> tuple[GlossaryEntry, ...]:
     """Return all terms of reports: methods and tests, keys of documents, verdicts."""
     keys = (document_entries(kind) for kind in (IdentificationDocument, DiagnosisDocument))
-    every = (entry for part in (TERMS, verdict_entries(), *keys) for entry in part)
+    every = (entry for part in (TERMS, method_entries(), verdict_entries(), *keys) for entry in part)
     return tuple({entry.name: entry for entry in every}.values())
 
 
@@ -225,7 +225,7 @@ def mentioned(page: str) -> list[GlossaryEntry]:
     text = re.sub(r'src="data:[^"]*"|<script.*?</script>', "", page, flags=re.DOTALL)
 
     def stands(entry: GlossaryEntry) -> bool:
-        # The name of several methods has commas, and that of a test the names of its authors.
+        # The name of a test may be the names of its authors.
         return any(re.search(rf"\b{re.escape(word)}", text, re.IGNORECASE) for word in entry.name.split(", "))
 
     return [entry for entry in all_terms() if stands(entry)]

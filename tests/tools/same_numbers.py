@@ -27,6 +27,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from armident.identify.estimators.methods import METHODS
+
 KEYS = {
     "gap_foretold": "gap_without_derivative_noise",
     "could_hide": "detection_limits",
@@ -129,7 +131,6 @@ def recording_file(name: str) -> str:
     return f"{RECORDINGS}/{name}.mcap"
 
 
-METHODS = ("idim-ls", "idim-iv", "idim-piv", "didim", "clie", "cloe", "sep-pem")
 BASELINE = "virtual-idim-piv"
 
 CASES: tuple[Case, ...] = (

@@ -67,6 +67,18 @@ def test_effects_of_other_packages_come_last(monkeypatch: pytest.MonkeyPatch, lo
     assert registry.known("end_stop") == EndStop()
 
 
+def test_of_effects_with_one_key_the_one_in_the_catalogue_refines_the_others() -> None:
+    classes, k = [Effect], 0
+    while k < len(classes):
+        classes += [each for each in classes[k].__subclasses__() if each not in classes]
+        k += 1
+    own = [each for each in classes if each.__module__.startswith("armident.") and hasattr(each, "title")]
+    catalogue = list(registry.catalogue().values())
+    for each in own:
+        assert any(isinstance(effect, each) for effect in catalogue), each
+    assert len({type(effect) for effect in catalogue}) == len(catalogue)
+
+
 class Unfinished(Effect):
     """An effect without columns and texts."""
 
