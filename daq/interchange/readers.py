@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from armident.daq.interchange.import_options import FLAGS, ImportOptions, given
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 _OF_TABLES = frozenset(FLAGS) - {"topic", "effort"}
 
 
-class Reader(Protocol):
+class Reader:
     """Reader of a format, and writer if ``writer`` names one.
 
     Both are ``module:function`` in this package: (path, config, options) and (recording, path).
@@ -167,10 +167,8 @@ class BusLog(Reader):
         return recording_from_log(path, config, load_robot(config.robot, LOG))
 
 
-READERS: tuple[Reader, ...] = (
-    Csv(), Npz(), Mat(), Parquet(), LeRobot(), OwnRecording(), RosBag(), BusLog()
-)  # fmt: skip
-"""All formats; the first one that matches a file reads it."""
+READERS = tuple(reader() for reader in Reader.__subclasses__())
+"""All formats in the order of their classes; the first one that matches a file reads it."""
 
 
 def reader_of(path: Path) -> Reader:
