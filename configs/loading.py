@@ -110,18 +110,7 @@ def load_robot(name: str | Path, command: str = "") -> RobotConfig:
 
 
 def is_session(path: Path) -> bool:
-    """Return True if a configuration file is that of a session by its schema.
-
-    Parameters
-    ----------
-    path
-        Path of the file.
-
-    Raises
-    ------
-    ConfigError
-        If the file cannot be read.
-    """
+    """Return True if a configuration file is that of a session by its schema; ConfigError if it cannot be read."""
     return str(_read_mapping(_read_text(path), str(path)).get("schema", "")).startswith("armident/session/")
 
 
@@ -160,40 +149,14 @@ def _limit_places(robot: RobotConfig, given: UrdfGeometry, path: Path) -> tuple[
 
 
 def checked_robot(data: dict[str, Any], where: str) -> RobotConfig:
-    """Robot of the content of a configuration file.
-
-    Parameters
-    ----------
-    data
-        Keys and values.
-    where
-        Name of the source in messages.
-
-    Raises
-    ------
-    ConfigError
-        If the content is wrong; names ``where``, key and expected value.
-    """
+    """Robot of the keys and values of a configuration file; ConfigError with ``where``, key and expected value."""
     return _checked(data, RobotConfig, where)
 
 
 def load_inertials(name: str | Path) -> UrdfInertials | None:
-    """Load the masses of a robot from the URDF of its configuration.
+    """Load the masses of a robot from the URDF of its configuration; ``None`` if it names no URDF.
 
-    Parameters
-    ----------
-    name
-        A path, or the name of a shipped file (see `config_path`).
-
-    Returns
-    -------
-    UrdfInertials or None
-        ``None`` if the configuration names no URDF.
-
-    Raises
-    ------
-    ConfigError
-        If a file is missing or wrong; names file and element.
+    ``name``: as of `config_path`. ConfigError, with file and element, if a file is missing or wrong.
     """
     path = config_path(name)
     given = _urdf_geometry(_marked(path), path)
@@ -201,22 +164,9 @@ def load_inertials(name: str | Path) -> UrdfInertials | None:
 
 
 def load_shapes(name: str | Path) -> UrdfShapes | None:
-    """Load the shapes of the links of a robot from the URDF of its configuration.
+    """Load the shapes of the links of a robot from the URDF of its configuration; ``None`` if it names no URDF.
 
-    Parameters
-    ----------
-    name
-        A path, or the name of a shipped file (see `config_path`).
-
-    Returns
-    -------
-    UrdfShapes or None
-        ``None`` if the configuration names no URDF.
-
-    Raises
-    ------
-    ConfigError
-        If a file is missing or wrong; names file and element.
+    ``name``: as of `config_path`. ConfigError, with file and element, if a file is missing or wrong.
     """
     path = config_path(name)
     given = _urdf_geometry(_marked(path), path)
@@ -350,22 +300,7 @@ def _load(path: Path, kind: type[T]) -> T:
 
 
 def parse(text: str, kind: type[T], where: str) -> T:
-    """Parse YAML text into a configuration object.
-
-    Parameters
-    ----------
-    text
-        YAML text.
-    kind
-        Class of the configuration object.
-    where
-        Name of the text in messages.
-
-    Raises
-    ------
-    ConfigError
-        If the text is wrong; names ``where``, key and expected value.
-    """
+    """Parse YAML text into a configuration object; ConfigError with ``where``, key and expected value."""
     return _checked(_read_mapping(text, where), kind, where)
 
 

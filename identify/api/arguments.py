@@ -12,18 +12,7 @@ Recorded = Recording | str | Path
 
 
 def recordings_of(recordings: Recorded | Sequence[Recorded]) -> tuple[Recording, ...]:
-    """Return the recordings; those given by their path are read.
-
-    Parameters
-    ----------
-    recordings
-        A recording, the path of one, or a sequence of them.
-
-    Raises
-    ------
-    ConfigError
-        If none is given or a file does not exist.
-    """
+    """Return the recordings; those given by their path are read. ConfigError if none is given or a file is missing."""
     given = [recordings] if isinstance(recordings, Recording | str | Path) else list(recordings)
     if not given:
         raise ConfigError("no recording was given")
@@ -33,14 +22,7 @@ def recordings_of(recordings: Recorded | Sequence[Recorded]) -> tuple[Recording,
 def robot_of(robot: Robot | None, recordings: Sequence[Recording], command: str = "identify") -> RobotConfig:
     """Return the configuration to use, with all values that a command needs.
 
-    Parameters
-    ----------
-    robot
-        Configuration, or the path or shipped name of one; ``None``: the one inside the first recording.
-    recordings
-        Recordings, at least one if ``robot`` is ``None``.
-    command
-        Command whose values may not be blank.
+    ``robot``: configuration, or its path or shipped name; ``None``: the one inside the first recording.
     """
     if isinstance(robot, str | Path):
         return load_robot(robot, command)

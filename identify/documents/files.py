@@ -19,22 +19,7 @@ def to_json(document: BaseModel) -> str:
 
 
 def from_json(text: str, kind: type[T], where: str) -> T:
-    """Return the document of a JSON text; older versions are converted.
-
-    Parameters
-    ----------
-    text
-        JSON.
-    kind
-        Class of the document.
-    where
-        Source of the text, for messages.
-
-    Raises
-    ------
-    DataError
-        If the text is no such document; the message names ``where``, the key and the expected value.
-    """
+    """Return the document of a JSON text; DataError names ``where``, the key and the expected value."""
     try:
         return kind.model_validate(json.loads(text))
     except json.JSONDecodeError as error:
@@ -46,40 +31,12 @@ def from_json(text: str, kind: type[T], where: str) -> T:
 
 
 def load_document(path: Path, kind: type[T]) -> T:
-    """Read a document from a file; older versions are converted.
-
-    Parameters
-    ----------
-    path
-        JSON file.
-    kind
-        Class of the document.
-
-    Raises
-    ------
-    ConfigError
-        If there is no such file.
-    DataError
-        If the file cannot be read or is not such a document.
-    """
+    """Read a document from a file; ConfigError if there is none, DataError if it is no such document."""
     return from_json(_text(path), kind, str(path))
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """Return the JSON object of a file, for instance to find out the schema of a document.
-
-    Parameters
-    ----------
-    path
-        JSON file.
-
-    Raises
-    ------
-    ConfigError
-        If there is no such file.
-    DataError
-        If the file cannot be read or is no JSON object.
-    """
+    """Return the JSON object of a file; ConfigError if there is none, DataError if it is no JSON object."""
     try:
         found = json.loads(_text(path))
     except json.JSONDecodeError as error:
@@ -101,20 +58,7 @@ def _text(path: Path) -> str:
 
 
 def write_atomically(path: Path, text: str) -> None:
-    """Write a file so that a reader sees all of it or none of it; missing folders are created.
-
-    Parameters
-    ----------
-    path
-        File to write.
-    text
-        Its content, written as UTF-8.
-
-    Raises
-    ------
-    OSError
-        If it cannot be written; its file name is ``path``.
-    """
+    """Write a file so that a reader sees all of it or none of it; missing folders are created."""
     path.parent.mkdir(parents=True, exist_ok=True)
     handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
     try:

@@ -27,13 +27,7 @@ _numbers = itertools.count()
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """Add the option that chooses the kernel of the virtual buses.
-
-    Parameters
-    ----------
-    parser
-        Parser of pytest.
-    """
+    """Add the option that chooses the kernel of the virtual buses."""
     parser.getgroup("armident").addoption(
         "--virtual-bus",
         choices=("auto", "native", "guest"),
@@ -44,13 +38,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_configure(config: pytest.Config) -> None:
-    """In a guest, hand the reports to the run that started it.
-
-    Parameters
-    ----------
-    config
-        Configuration of the run.
-    """
+    """In a guest, hand the reports to the run that started it."""
     file = os.environ.get(REPORTS_VARIABLE)
     if file:
         from armident.testing.guest import ReportWriter
@@ -61,13 +49,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> bool | None:
-    """Run a test that needs a bus in the guest, if there is one, and report it here.
-
-    Parameters
-    ----------
-    item, nextitem
-        The test, and the next one.
-    """
+    """Run a test that needs a bus in the guest, if there is one, and report it here."""
     if not needs_bus(item):
         return None
     if _run not in item.config.stash:
@@ -80,13 +62,7 @@ def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> 
 
 
 def needs_bus(item: pytest.Item) -> bool:
-    """Return True if a test uses a virtual bus.
-
-    Parameters
-    ----------
-    item
-        The test.
-    """
+    """Return True if a test uses a virtual bus."""
     return virtual_bus.__name__ in getattr(item, "fixturenames", ())
 
 

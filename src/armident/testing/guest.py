@@ -31,27 +31,13 @@ def can_make_buses() -> bool:
 
 
 class ReportWriter:
-    """Plug-in of the pytest in the guest: writes each report as a line of JSON.
-
-    Parameters
-    ----------
-    config
-        Configuration of the run.
-    file
-        File to append to.
-    """
+    """Plug-in of the pytest in the guest: appends each report as a line of JSON to a file."""
 
     def __init__(self, config: pytest.Config, file: Path) -> None:
         self._config, self._file = config, file
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
-        """Append a report.
-
-        Parameters
-        ----------
-        report
-            Report of a phase of a test.
-        """
+        """Append the report of a phase of a test."""
         data = self._config.hook.pytest_report_to_serializable(config=self._config, report=report)
         with self._file.open("a", encoding="utf-8") as file:
             file.write(json.dumps(data, default=str) + "\n")
@@ -66,13 +52,7 @@ class GuestRun:
         self._output = ""
 
     def report(self, item: pytest.Item, nextitem: pytest.Item | None) -> None:
-        """Report a test as if it had run here.
-
-        Parameters
-        ----------
-        item, nextitem
-            The test, and the next one.
-        """
+        """Report a test as if it had run here."""
         if item.nodeid not in self._done:
             # A worker of pytest-xdist knows all tests, but runs only a part of them.
             alone = hasattr(item.config, "workerinput")
