@@ -1,7 +1,6 @@
 """Metrics of a capture for Prometheus; off by default, and on the loopback interface."""
 
 from collections.abc import Iterator
-from types import TracebackType
 from typing import Self
 
 from prometheus_client import CollectorRegistry, start_http_server
@@ -61,7 +60,7 @@ class Metrics:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
 

@@ -117,10 +117,7 @@ def nearest_consistent(
     face, the squared distance is at most chi-square with the face's codimension (Wollan and Dykstra 1986). That is the
     trace of ``I`` minus the derivative of the projection, also for curved faces.
     """
-    theta, p = _checked(model, theta_base, covariance)
-    std = np.sqrt(np.diag(p))
-    factor = std[:, None] * linalg.cholesky(p / np.outer(std, std), lower=True)
-    whitened = linalg.solve_triangular(factor, theta, lower=True)
+    theta, std, factor, whitened = _whitened(model, theta_base, covariance)
     projection = _Projection(model, factor, max(float(np.sqrt(np.mean(whitened**2))), 1.0), smallest_link)
     standard, residual = projection.nearest(whitened)
     distance = float(np.linalg.norm(residual))
@@ -142,7 +139,7 @@ def nearest_consistent(
         theta_base=base,
         identifiable=identifiable,
         groups=tuple(tuple(model.base.names[i] for i in np.flatnonzero(column)) for column in model.base.regroup.T),
-        std=_standard_deviations(model, p, identifiable),
+        std=_standard_deviations(model, np.asarray(covariance, dtype=np.float64), identifiable),
         shifts=shifts,
         distance_std=distance,
         degrees=degrees,
@@ -164,10 +161,7 @@ class NearestBase:
 
 def nearest_base(model: ArmModel, theta_base: ArrayLike, covariance: ArrayLike) -> NearestBase:
     """Find the base parameters of the nearest physically consistent arm: one semidefinite programme."""
-    theta, p = _checked(model, theta_base, covariance)
-    std = np.sqrt(np.diag(p))
-    factor = std[:, None] * linalg.cholesky(p / np.outer(std, std), lower=True)
-    whitened = linalg.solve_triangular(factor, theta, lower=True)
+    theta, std, factor, whitened = _whitened(model, theta_base, covariance)
     projection = _Projection(model, factor, max(float(np.sqrt(np.mean(whitened**2))), 1.0))
     standard, residual = projection.nearest(whitened)
     base = model.base.regroup @ _inside(model, standard)
@@ -283,7 +277,8 @@ def minimise_in_cones(quadratic: Floats, linear: Floats, rows: Floats, right: Fl
     return np.asarray(solution.x, dtype=np.float64)
 
 
-def _checked(model: ArmModel, theta_base: ArrayLike, covariance: ArrayLike) -> tuple[Floats, Floats]:
+def _whitened(model: ArmModel, theta_base: ArrayLike, covariance: ArrayLike) -> tuple[Floats, Floats, Floats, Floats]:
+    """Theta and its standard deviations (b,), factor L (b, b) of the covariance, and ``L^-1 theta``."""
     theta, p = np.asarray(theta_base, dtype=np.float64), np.asarray(covariance, dtype=np.float64)
     b = model.base.b
     if theta.shape != (b,) or p.shape != (b, b):
@@ -296,7 +291,8 @@ def _checked(model: ArmModel, theta_base: ArrayLike, covariance: ArrayLike) -> t
     std = np.sqrt(np.maximum(np.diag(p), 0.0))
     if not std.all() or np.linalg.eigvalsh(p / np.outer(std, std))[0] <= b * np.finfo(np.float64).eps:
         raise DataError("the covariance of the base estimate is not positive definite")
-    return theta, p
+    factor = std[:, None] * linalg.cholesky(p / np.outer(std, std), lower=True)
+    return theta, std, factor, linalg.solve_triangular(factor, theta, lower=True)
 
 
 def _inside(model: ArmModel, theta: Floats, smallest_link: Floats | None = None) -> Floats:

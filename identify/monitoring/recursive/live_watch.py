@@ -7,7 +7,6 @@ import queue
 import threading
 import time
 from collections.abc import Callable
-from types import TracebackType
 from typing import Self
 
 import zenoh
@@ -83,9 +82,7 @@ class LiveWatch:
         self._token = self._session.liveliness().declare_token(self._keys.alive("watch"))
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Close the session."""
         self._token.undeclare()
         self._session.close()

@@ -8,7 +8,6 @@ import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import FrameType, TracebackType
 from typing import Self
 
 from rich.console import Console
@@ -55,9 +54,7 @@ class Screen:
             self._live.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """End the renewed table."""
         if self._live is not None and not self._as_json:
             self._live.stop()
@@ -139,12 +136,8 @@ def watch_cell(config: Path | None, options: WatchOptions) -> int:
     estimator = live_estimator(session, robot, load_document(options.reference, IdentificationDocument))
     _load_state(estimator, options.state)
     stopped = threading.Event()
-
-    def stop(_signal: int, _frame: FrameType | None) -> None:
-        stopped.set()
-
     for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, stop)
+        signal.signal(number, lambda *_: stopped.set())
 
     def save() -> None:
         if options.state is None:

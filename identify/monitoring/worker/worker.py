@@ -8,7 +8,6 @@ import time
 from collections.abc import Callable
 from contextlib import closing, suppress
 from pathlib import Path
-from types import FrameType
 from typing import TypeVar
 
 from armident.configs import ArmidentError, DataError, RobotConfig, SessionConfig, load_robot, load_session
@@ -306,12 +305,8 @@ def run_worker(config: Path, *, once: bool, out: Path | None) -> int:
     session = load_session(config, "identify")
     robot = load_robot(session.robot, "identify")
     stopped = threading.Event()
-
-    def stop(_signal: int, _frame: FrameType | None) -> None:
-        stopped.set()
-
     for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, stop)
+        signal.signal(number, lambda *_: stopped.set())
     folder = out or session.recording.directory
     with closing(Notifier()) as notifier, Worker(session, robot, folder, notifier.progress) as worker:
         print("worker: ready", flush=True)
