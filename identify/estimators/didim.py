@@ -91,7 +91,7 @@ def solve_didim(
 ESTIMATOR = Estimator(
     "didim",
     lambda problem: Solved(didim(problem.blocks, problem.auxiliary, problem.start)),
-    "Least error of the torque that simulated motion needs; no measured position is in the equations.",
+    "Least error between measured and simulated torques, by a regression on the simulated motion.",
     "2.3.4 (2.36, 2.37)",
     white_covariance=True,
 )
