@@ -331,7 +331,15 @@ class RobotConfig(WithBlanks):
         return self._first_moments
 
     def with_urdf_facts(self, limit_places: tuple[str, ...], first_moments: dict[str, float] | None = None) -> Self:
-        """Return the robot with facts of its URDF that no document of it contains."""
+        """Return the robot with facts of its URDF that no document of it contains.
+
+        Parameters
+        ----------
+        limit_places
+            File and line of the limits of each joint, (n,).
+        first_moments
+            Masses, kg, and first moments, kg m, in the frames of the model; ``None``: not every link has a mass.
+        """
         made = self.model_copy()
         made._limit_places, made._first_moments = limit_places, first_moments or {}
         return made

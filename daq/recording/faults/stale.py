@@ -38,8 +38,11 @@ APART = 0.01
 """Distance of the positions, in shares of their range, from which equal torques are no repeated motion."""
 
 
-def repeated_rows(position: Array, effort: Array) -> Mask:
-    """Mask (N,) of rows with the positions and efforts (N, n) of the row before, although the arm moves."""
+def frozen_rows(position: Array, effort: Array) -> Mask:
+    """Mask (N,) of rows in which all positions and efforts (N, n) stay the same between rows in which the arm moves.
+
+    Single repeated rows are those of polled samples, of which an import speaks.
+    """
     found = np.zeros(len(position), dtype=np.bool_)
     equal, chance = np.ones(len(position) - 1, dtype=np.bool_), 0.0
     for x in (*position.T, *effort.T):  # an hour has gigabytes: one signal at a time
@@ -51,7 +54,7 @@ def repeated_rows(position: Array, effort: Array) -> Mask:
     moves = _moves(position)
     for begin, end in runs(equal):
         likely = (end - begin) * chance > np.log(MOST_CHANCE) - np.log(len(equal))
-        if not likely and np.any(moves(begin - NEAR, begin) & moves(end, end + NEAR)):
+        if not likely and end - begin >= LEAST_RUN and np.any(moves(begin - NEAR, begin) & moves(end, end + NEAR)):
             found[begin + 1 : end + 1] = True
     return found
 
