@@ -18,12 +18,13 @@ from armident.configs.schema.session import Bus
 from armident.drivers.can.udp import open_python_can
 from armident.drivers.vcan import ensure_vcan, have_socketcan, remove_vcan
 from tests.fixtures.store import use_folder
+from tests.fixtures.undeclared import UNDECLARED
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 NO_SOCKETCAN = "no SocketCAN in this kernel; run through `make test`"
 
 # Examples of each property: a few in `make test`, many in `make nightly` and by hand.
-hypothesis.settings.register_profile("armident", deadline=None, print_blob=True, max_examples=60)
+hypothesis.settings.register_profile("armident", deadline=None, print_blob=True, max_examples=30)
 hypothesis.settings.register_profile("nightly", deadline=None, print_blob=True, max_examples=200)
 hypothesis.settings.load_profile(os.environ.get("ARMIDENT_HYPOTHESIS_PROFILE", "armident"))
 
@@ -47,6 +48,15 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
         if os.environ.get("ARMIDENT_REQUIRE_VCAN") == "1":
             pytest.fail(NO_SOCKETCAN, pytrace=False)
         pytest.skip(NO_SOCKETCAN)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_call() -> Generator[None, object, object]:
+    """Fail if a kernel compiled at run time, for types that its module does not declare."""
+    result = yield
+    if found := UNDECLARED.taken():
+        pytest.fail(f"compiled at run time; declare the signature: {', '.join(found)}", pytrace=False)
+    return result
 
 
 @pytest.fixture(scope="session", autouse=True)

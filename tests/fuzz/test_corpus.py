@@ -10,7 +10,7 @@ from tests.fuzz.targets import TARGETS
 
 pytestmark = pytest.mark.slow
 
-NEW = 8
+NEW = 4
 """Inputs besides the corpus; `python -m tests.fuzz` tries as many as there is time for."""
 
 

@@ -37,8 +37,8 @@ def test_a_process_that_fails_is_named_with_the_end_of_what_it_printed(tmp_path:
 def test_a_process_that_ends_before_it_is_ready_is_an_error_at_once(tmp_path: Path) -> None:
     begin = time.monotonic()
     with (
-        pytest.raises(ArmidentError, match="robot ended with exit code 2 before it printed 'ready'"),
-        _running("robot", ["robot", "--config", "no_such_cell.yaml"], tmp_path, "ready"),
+        pytest.raises(ArmidentError, match="capture ended with exit code 2 before it printed 'ready'"),
+        _running("capture", ["capture", "--config", "no_such_cell.yaml"], tmp_path, "ready"),
     ):
         pytest.fail("it was never ready")
     assert time.monotonic() - begin < 60.0

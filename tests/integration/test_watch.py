@@ -32,18 +32,20 @@ pytestmark = pytest.mark.slow
 
 
 def reference() -> IdentificationDocument:
-    return arms.identified("tx40", "tx40_excitation", 1).document
+    return arms.tx40_baseline()
 
 
 def recorded() -> Recording:
-    return arms.recording("tx40", "tx40_excitation", 1)
+    return arms.recording("tx40", "tx40_excitation", 1, period=arms.FAST)
 
 
 @pytest.fixture
 def session(request: pytest.FixtureRequest) -> SessionConfig:
-    """A cell of its own."""
+    """A cell of its own, with the rate of the recording."""
     name = f"watch_{os.getpid()}_{abs(hash(request.node.name)) % 10**6}"
-    return load_session("tx40_cell.yaml").model_copy(update={"cell": name})
+    shipped = load_session("tx40_cell.yaml")
+    sync = shipped.sync.model_copy(update={"period_us": round(1e6 * arms.FAST)})
+    return shipped.model_copy(update={"cell": name, "sync": sync})
 
 
 @contextmanager
@@ -203,13 +205,10 @@ def test_a_replay_prints_lines_for_machines_and_keeps_its_state(
 def test_an_alarm_is_the_exit_code_4_and_too_little_motion_a_data_error(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    worn = arms.hide("friction_scale", "joint_3", factor=1.15)
-    paths, document = in_files(
-        tmp_path,
-        arms.recording("tx40", "tx40_1", 8, worn, repeats=4, period=arms.FAST),
-        arms.recording("tx40", "tx40_1", 7, repeats=2, period=arms.FAST),
-    )
-    assert watch_recordings(paths[:1], None, WatchOptions(document, None, as_json=False)) == 4
+    """An alarm within 30 s of motion with a tenth more friction."""
+    worn = arms.hide("friction_scale", "joint_3", factor=1.1)
+    paths, document = in_files(tmp_path, arms.recording("tx40", "tx40_1", 8, worn, repeats=4, period=arms.FAST))
+    assert watch_recordings(paths, None, WatchOptions(document, None, as_json=False)) == 4
     assert "joint_3: alarm" in capsys.readouterr().out
     streams = {
         name: replace(s, raw={f: np.repeat(v[:1], len(v), axis=0) for f, v in s.raw.items()})

@@ -36,6 +36,7 @@ def test_the_table_lists_modules_of_the_distributions_of_each_extra() -> None:
         assert not of_extra[extra] & base
 
 
+@pytest.mark.slow
 def test_a_command_or_a_name_without_its_extra_names_the_installation(tmp_path: Path) -> None:
     commands = {
         ("identify", "run.mcap"): "identify",

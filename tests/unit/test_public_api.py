@@ -13,8 +13,10 @@ from typing import assert_type
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from typer.testing import CliRunner
 
 import armident
+from armident.daq.cli import application
 from armident.daq.recording import write_recording
 from tests.fixtures import arms
 
@@ -177,8 +179,8 @@ def test_the_command_line_writes_what_the_api_returns(axis: armident.Identificat
     (recording,) = axis.recordings
     path = tmp_path / "run.mcap"
     write_recording(recording, path)
-    command = [sys.executable, "-m", "armident.daq.cli", "identify", str(path), "--method", "idim-ls"]
-    subprocess.run([*command, "--out", str(tmp_path / "out")], check=True, capture_output=True, timeout=240)
+    words = ["identify", str(path), "--method", "idim-ls", "--out", str(tmp_path / "out")]
+    assert CliRunner().invoke(application(words), words).exit_code == 0
     document = json.loads((tmp_path / "out" / "identification.json").read_text())
     assert [p["value"] for p in document["parameters"]] == list(axis.theta)
 

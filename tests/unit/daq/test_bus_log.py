@@ -39,6 +39,7 @@ def captured(rows: int = 3000, lost: slice = slice(0)) -> Recording:
     return Recording(None, ROBOT, SESSION, 1e9 / PERIOD_NS, streams)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suffix", BusLog.suffixes)
 def test_a_recording_survives_the_round_trip_through_every_log_format(tmp_path: Path, suffix: str) -> None:
     recording = captured()
@@ -140,6 +141,7 @@ def test_the_import_and_export_commands_accept_logs(tmp_path: Path) -> None:
     assert run(application(["import"]), [*back, "--rate", "5"]).exit_code == 2
 
 
+@pytest.mark.slow
 def test_a_recording_of_several_buses_survives_the_round_trip_through_one_log(tmp_path: Path) -> None:
     session = load_session("tx40_six_buses.yaml")
     one = captured()

@@ -110,6 +110,7 @@ def test_slow_streams_of_another_master_without_sync_counter_are_a_warning(tmp_p
     assert "sync" not in checks_of(cell(tmp_path, sync={"counter": 0}))
 
 
+@pytest.mark.slow
 def test_an_overloaded_bus_fails(tmp_path: Path) -> None:
     checks = checks_of(cell(tmp_path, bus={"bitrate": 1_000_000}))
     assert checks["bus load"].verdict == "failed"

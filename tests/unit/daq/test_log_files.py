@@ -22,7 +22,7 @@ from armident.daq.matching.streams import captured_streams
 from armident.daq.recording import Recording
 from tests.unit.daq.test_bus_log import PERIOD_NS, ROBOT, SESSION, captured
 
-ROWS = 300
+ROWS = 120
 
 
 def lines_of(folder: Path, suffix: str) -> tuple[Path, list[str]]:

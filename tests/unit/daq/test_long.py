@@ -8,7 +8,7 @@ import pytest
 pytestmark = pytest.mark.slow
 
 
-@pytest.mark.parametrize(("hours", "rows"), [(0.004, 72_000), pytest.param(0.02, 360_000, marks=pytest.mark.nightly)])
+@pytest.mark.parametrize(("hours", "rows"), [(0.001, 18_000), pytest.param(0.02, 360_000, marks=pytest.mark.nightly)])
 def test_many_seconds_of_six_drives_are_recorded_without_loss(hours: float, rows: int) -> None:
     command = [sys.executable, "-m", "tests.faults.hour", "--hours", str(hours)]
     done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=270)

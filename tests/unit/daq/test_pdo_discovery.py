@@ -56,6 +56,7 @@ def test_a_stream_that_no_drive_sends_is_left_out() -> None:
     assert list(found.streams) == ["samples"]
 
 
+@pytest.mark.slow
 def test_packed_samples_are_discovered_by_length_and_interval(caplog: pytest.LogCaptureFixture) -> None:
     session = load_session("tx40_one_fd.yaml")
     caplog.set_level(logging.INFO, "armident")

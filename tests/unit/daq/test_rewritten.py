@@ -186,7 +186,7 @@ def test_a_copy_is_exported_and_identified_as_the_recording_itself(tmp_path: Pat
         recording, out = tmp_path / f"{name}.mcap", tmp_path / f"{name}.identification"
         for command in (
             ["export", recording, "--out", tmp_path / f"{name}.csv"],
-            ["identify", recording, "--out", out],
+            ["identify", recording, "--method", "idim-ls", "--out", out],
         ):
             words = [str(word) for word in command]
             done = CliRunner().invoke(application(words), words)

@@ -87,6 +87,7 @@ def test_every_row_is_in_exactly_one_file(tmp_path: Path) -> None:
             assert np.array_equal(whole.streams[name].raw[field], values)
 
 
+@pytest.mark.slow
 def test_a_killed_capture_loses_no_more_than_a_chunk(tmp_path: Path) -> None:
     recording = make_recording(1500)
     series = QueuedSeries(RecordingSeries(beginner(recording, 2 * CHUNK_NS), tmp_path, NAME), EVERY, CHUNK_NS)

@@ -42,15 +42,16 @@ def test_strengths_rise_from_level_to_level() -> None:
 
 
 @pytest.mark.slow
-def test_every_hidden_effect_is_one_that_the_virtual_arm_takes() -> None:
+@pytest.mark.parametrize("quick", [True, pytest.param(False, marks=pytest.mark.nightly)])
+def test_every_hidden_effect_is_one_that_the_virtual_arm_takes(quick: bool) -> None:
     robots = {name: load_robot(arm.config) for name, arm in SUITE.robots.items()}
     once = {path: load_trajectory(path) for arm in SUITE.robots.values() for path in arm.trajectories}
     for name, arm in SUITE.robots.items():
         for path in arm.trajectories:
             once[path].check(robots[name], str(path))
-    for case in CASES:
-        # Runs of one effect differ in trajectory and noise alone.
-        for part in case.parts if case.seed == 1 else ():
+    # Runs of one effect differ in trajectory and noise alone.
+    for case in select_cases(CASES, quick=True) if quick else (c for c in CASES if c.seed == 1):
+        for part in case.parts:
             entry = {
                 "effect": part.effect, "joint": part.joint, "other": part.other, "parameters": part.parameters,
                 "truth": part.truth, "strength": part.strength,

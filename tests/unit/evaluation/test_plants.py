@@ -184,6 +184,7 @@ def impulse_of(speed: float, weight: float, level: float, smoothing: float) -> f
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("drive", "moves"), [(0.9, False), (1.1, True), (-1.1, True)])
 def test_dry_friction_holds_a_joint_up_to_its_bound(drive: float, moves: bool) -> None:
     mass, step, level = 2.0, 1e-3, 3.0

@@ -124,6 +124,7 @@ def test_failures_count_as_wrong_and_invisible_cases_count_nowhere() -> None:
     assert (counted.effects[1].level, counted.effects[1].n) == (UNSEEN, 1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("half", ["development", "reserve"])
 def test_the_reserve_names_no_case(
     half: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

@@ -18,7 +18,9 @@ def scara(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("arm", sorted(PLACES))
+@pytest.mark.parametrize(
+    "arm", ["scara", *(pytest.param(arm, marks=pytest.mark.nightly) for arm in ("kuka_lwr4", "panda"))]
+)
 @pytest.mark.parametrize("effect", sorted(EFFECTS))
 def test_an_effect_changes_the_signals_of_any_arm(effect: str, arm: str, scara: Path) -> None:
     size, peak = change(scara if arm == "scara" else Path(arm), effect, *PLACES[arm])

@@ -2,6 +2,7 @@
 
 import json
 from functools import cache
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -146,8 +147,16 @@ def test_every_virtual_arm_has_a_noise_and_a_name() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("method", ["idim-piv", "idim-iv", "didim"])
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize(
+    ("method", "seed"),
+    [
+        ("idim-piv", 1),
+        *(
+            pytest.param(method, seed, marks=pytest.mark.nightly)
+            for method, seed in (("idim-piv", 2), *product(("idim-iv", "didim"), (1, 2)))
+        ),
+    ],
+)
 def test_identification_recovers_the_published_parameters(method: Method, seed: int) -> None:
     result = identify_experiment([experiment(recorded(seed, 1.0))], emps(), Options(method=method))
     assert result.converged
@@ -156,6 +165,7 @@ def test_identification_recovers_the_published_parameters(method: Method, seed: 
     assert (result.std < 0.01 * np.abs(PUBLISHED)).all()
 
 
+@pytest.mark.slow
 def test_session_of_the_axis_records_and_tells_the_truth(tmp_path: Path) -> None:
     record_robot(Path("emps_cell.yaml"), tmp_path / "a.mcap", seed=5, truth=tmp_path / "truth.json")
     read = read_recording(tmp_path / "a.mcap")

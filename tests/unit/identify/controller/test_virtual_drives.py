@@ -43,8 +43,11 @@ def robot() -> RobotConfig:
 
 @cache
 def recorded(noise: float) -> Experiment:
-    experiments, _ = experiments_from_recording(recording("tx40", "tx40_excitation", 1, noise=noise), robot())
-    return experiments[0]
+    """The excitation, of which half is enough without noise."""
+    ((whole,), _) = experiments_from_recording(recording("tx40", "tx40_excitation", 1, noise=noise), robot())
+    assert whole.q_ref is not None
+    taken = slice(whole.q.shape[0] // (2 if noise == 0.0 else 1))
+    return Experiment(whole.q[taken], whole.tau[taken], whole.q_ref[taken], whole.dt)
 
 
 def motor_side(experiment: Experiment) -> tuple[list[Floats], list[Floats], list[Floats]]:

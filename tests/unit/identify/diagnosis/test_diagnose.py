@@ -19,7 +19,7 @@ from tests.fixtures.diagnoses import diagnosis
 MOTION = "tx40_excitation"
 WORN = HiddenEffect(effect="asymmetric_viscous_friction", joint="joint_2", parameters={"fva": 0.2 * 5.5})
 
-RATES = [pytest.param(FAST, 1, id="1 kHz"), pytest.param(None, 3, id="5 kHz", marks=pytest.mark.nightly)]
+RATES = [pytest.param(FAST, 1, id="1 kHz"), pytest.param(None, 3, id="5 kHz")]
 """One repetition at 1 kHz, and three at the rate of the drives."""
 
 
@@ -29,6 +29,7 @@ def robot() -> RobotConfig:
 
 
 @pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize(("period", "repeats"), RATES)
 def test_a_plant_without_hidden_effects_has_no_gap(period: float | None, repeats: int) -> None:
     document = diagnosis("tx40", MOTION, 1, period=period, repeats=repeats).document
@@ -36,14 +37,24 @@ def test_a_plant_without_hidden_effects_has_no_gap(period: float | None, repeats
     assert document.gap.validation.before == document.gap.validation.after
 
 
-def worn(period: float | None = FAST, repeats: int = 1) -> DiagnosisResult:
-    return diagnosis("tx40", MOTION, 4, WORN, period=period, repeats=repeats)
+def worn() -> DiagnosisResult:
+    """A worn joint beside the baseline; ``monitoring/test_agreement.py`` has it too."""
+    return diagnosis("tx40", MOTION, 63, WORN, against_baseline=True)
 
 
 @pytest.mark.slow
+def test_a_worn_joint_is_named_and_its_size_is_right() -> None:
+    check_worn(worn())
+
+
+@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize(("period", "repeats"), RATES)
-def test_a_worn_joint_is_named_and_its_size_is_right(period: float | None, repeats: int) -> None:
-    found = worn(period, repeats)
+def test_a_worn_joint_is_named_without_a_baseline(period: float | None, repeats: int) -> None:
+    check_worn(diagnosis("tx40", MOTION, 4, WORN, period=period, repeats=repeats))
+
+
+def check_worn(found: DiagnosisResult) -> None:
     (finding,) = found.document.findings
     assert (finding.effect, finding.joint) == ("asymmetric_viscous_friction", "joint_2")
     assert finding.gap_after < finding.gap_before
@@ -115,7 +126,7 @@ def test_an_entry_with_a_parameter_of_another_effect_is_refused(robot: RobotConf
 
 @pytest.mark.slow
 def test_identifying_with_the_effect_inside_brings_the_torque_error_down(robot: RobotConfig) -> None:
-    data = recording("tx40", MOTION, 4, WORN, repeats=1, period=FAST)
+    data = recording("tx40", MOTION, 63, WORN, period=FAST)
     model = worn().robot
     plain = identify_recording(data, robot, Options(method="idim-ls"), check=None).document
     better = identify_recording(data, model, Options(method="idim-ls"), check=None).document

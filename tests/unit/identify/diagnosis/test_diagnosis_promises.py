@@ -1,19 +1,20 @@
 """What a diagnosis promises: a model that is right, numbers told from structure, effects of other packages."""
 
-import json
 import os
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner
 
+from armident.configs import load_robot
 from armident.configs.schema.scenario import HiddenEffect
 from armident.daq.cli import application
-from armident.daq.recording import write_recording
 from armident.identify.diagnosis.diagnose import run_diagnosis
 from armident.identify.documents.diagnosis import Finding
+from armident.identify.effects.registry import catalogue
 from armident.identify.identification.from_recording import experiments_from_recording
 from tests.fixtures.arms import recording
 from tests.fixtures.diagnoses import WORN_AND_SPRUNG, diagnosis
@@ -24,7 +25,6 @@ MISSED = pytest.mark.xfail(strict=True, reason="the stepwise selection misses it
 
 TX40_2, TX40_3 = (pytest.param("tx40", joint, marks=pytest.mark.nightly) for joint in ("joint_2", "joint_3"))
 
-ARMIDENT = [sys.executable, "-m", "armident.daq.cli"]
 PLUGIN = '''
 import numpy as np
 from armident.identify.effects.effect import Effect, Linear, Shape
@@ -51,6 +51,7 @@ class TightSpot(Effect):
 def test_the_resulting_model_has_no_gap_on_a_new_recording() -> None:
     first = diagnosis("emps", "emps_1", 1, *WORN_AND_SPRUNG)
     assert {f.effect for f in first.document.findings} == {hidden.effect for hidden in WORN_AND_SPRUNG}
+    assert all(f.gap_after < f.gap_before and f.evidence["p_value"] < 0.05 for f in first.document.findings)
     experiments, _ = experiments_from_recording(recording("emps", "emps_1", 2, *WORN_AND_SPRUNG), first.robot)
     assert run_diagnosis(experiments, [], first.robot).document.verdict == "no_gap"
 
@@ -125,47 +126,46 @@ def test_a_base_that_was_tilted_is_named() -> None:
 
 
 @pytest.fixture
-def elsewhere(tmp_path: Path) -> dict[str, str]:
-    """Environment in which a distribution of somebody else's is installed, which brings one effect along."""
+def site(tmp_path: Path) -> Path:
+    """Folder with an installed distribution of somebody else's, which brings one effect along."""
     site = tmp_path / "site"
     info = site / "tight_spots-1.0.dist-info"
     info.mkdir(parents=True)
     (site / "tight_spots.py").write_text(PLUGIN)
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: tight-spots\nVersion: 1.0\n")
     (info / "entry_points.txt").write_text("[armident.effects]\ntight_spot = tight_spots:TightSpot\n")
-    paths = [str(site), *filter(None, [os.environ.get("PYTHONPATH")])]
-    return {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
+    return site
 
 
-def test_an_effect_of_somebody_else_is_listed(elsewhere: dict[str, str]) -> None:
+def test_an_effect_of_somebody_else_is_listed(site: Path) -> None:
+    paths = os.pathsep.join([str(site), *filter(None, [os.environ.get("PYTHONPATH")])])
+    command = [sys.executable, "-m", "armident.daq.cli", "effects", "tight_spot"]
     listed = subprocess.run(
-        [*ARMIDENT, "effects", "tight_spot"], env=elsewhere, capture_output=True, text=True, check=True
+        command, env={**os.environ, "PYTHONPATH": paths}, capture_output=True, text=True, check=True
     )
     assert "something pushes back near one position" in listed.stdout
     words = ["effects", "tight_spot"]
     assert CliRunner().invoke(application(words), words).exit_code == 2
 
 
-def test_an_effect_of_somebody_else_is_found_by_name(elsewhere: dict[str, str], tmp_path: Path) -> None:
+@pytest.fixture
+def installed(site: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """The distribution is installed in this process."""
+    monkeypatch.syspath_prepend(str(site))
+    catalogue.cache_clear()
+    yield
+    catalogue.cache_clear()
+    sys.modules.pop("tight_spots", None)
+
+
+@pytest.mark.usefixtures("installed")
+def test_an_effect_of_somebody_else_is_found_by_name() -> None:
     bump = HiddenEffect(
         effect="torque_bump", joint="joint_1", parameters={"torque": 3.0, "position": 0.06, "width": 0.01}
     )
-    file = tmp_path / "bump.mcap"
-    write_recording(recording("emps", "emps_1", 7, bump), file)
-
-    def run(environment: dict[str, str]) -> dict[str, object]:
-        done = subprocess.run(
-            [*ARMIDENT, "diagnose", str(file), "--out", str(tmp_path / "out"), "--json"],
-            env=environment, capture_output=True, text=True, check=False,
-        )  # fmt: skip
-        assert done.returncode == 4, done.stderr
-        document: dict[str, object] = json.loads(done.stdout)
-        return document
-
-    findings = run(elsewhere)["findings"]
-    assert isinstance(findings, list)
-    assert [(f["effect"], f["joint"]) for f in findings] == [("tight_spot", "joint_1")]
-    parameters, std = findings[0]["parameters"], findings[0]["evidence"]["std"]
+    experiments, _ = experiments_from_recording(recording("emps", "emps_1", 7, bump), load_robot("emps"))
+    (finding,) = run_diagnosis(experiments, [], load_robot("emps")).document.findings
+    assert (finding.effect, finding.joint) == ("tight_spot", "joint_1")
     # The torque works against the joint.
-    assert abs(parameters["height"]) == pytest.approx(3.0, abs=4 * std["height"])
-    assert parameters["position"] == pytest.approx(0.06, abs=0.003)
+    assert abs(finding.parameters["height"]) == pytest.approx(3.0, abs=4 * finding.evidence["std"]["height"])
+    assert finding.parameters["position"] == pytest.approx(0.06, abs=0.003)

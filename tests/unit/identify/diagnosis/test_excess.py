@@ -24,6 +24,7 @@ def noise(seed: int, constant_s: float = 0.0) -> Array:
     return np.asarray(signal.lfilter([np.sqrt(1 - pole**2)], [1.0, -pole], white)[200:])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("constant_s", [0.0, 0.01, 0.03])
 def test_noise_of_drives_has_no_excess(constant_s: float) -> None:
     lowest = []

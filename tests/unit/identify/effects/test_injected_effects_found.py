@@ -136,7 +136,8 @@ def test_an_injected_effect_is_admitted_first(case: Case) -> None:
         assert abs(value - truth) < 4 * std, (name, value, std, truth)
 
 
-@pytest.mark.parametrize("robot", [pytest.param("tx40", marks=pytest.mark.nightly), "emps"])
+@pytest.mark.nightly
+@pytest.mark.parametrize("robot", ["tx40", "emps"])
 def test_nothing_is_admitted_beside_the_model_of_a_healthy_arm(robot: str) -> None:
     config = load_robot(robot)
     selection, step = first_step(recorded(robot, 7, repeats=3 if robot == "tx40" else 1), config, config)

@@ -26,7 +26,7 @@ def at_500_hz() -> list[Experiment]:
     return list(experiments_from_recording(slow, load_robot("tx40.yaml"))[0])
 
 
-@pytest.mark.parametrize("method", ["idim-iv", "idim-piv"])
+@pytest.mark.parametrize("method", [pytest.param("idim-iv", marks=pytest.mark.nightly), "idim-piv"])
 def test_a_loop_at_the_edge_of_stability_is_replaced(at_500_hz: list[Experiment], method: Method) -> None:
     """The iterates do not settle with the identified controller; with a stiff one they converge near least squares."""
     found = identify_experiment(at_500_hz, load_robot("tx40.yaml"), Options(method=method))

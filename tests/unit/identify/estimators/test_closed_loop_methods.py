@@ -67,7 +67,7 @@ def test_two_experiments_without_noise_give_the_truth(method: str) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("method", ["idim-ls", "idim-iv", "clie"])
+@pytest.mark.parametrize("method", ["idim-ls", "idim-iv", pytest.param("clie", marks=pytest.mark.nightly)])
 def test_standard_deviations_are_those_of_the_scatter(method: str) -> None:
     deviations = []
     # White up to the Nyquist frequency of the equations: the samples stay uncorrelated.
@@ -81,6 +81,7 @@ def test_standard_deviations_are_those_of_the_scatter(method: str) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.nightly
 def test_scatter_of_didim_is_that_of_the_true_sensitivities() -> None:
     estimates = []
     for seed in range(24):

@@ -41,6 +41,7 @@ def test_a_decimation_that_leaves_enough_stays_as_it_is() -> None:
     assert sufficient(wanted, DT, SAMPLES, decimated_rows(wanted, SAMPLES)) is wanted
 
 
+@pytest.mark.slow
 @given(
     dt=st.sampled_from([2e-4, 1e-3, 5e-3]),
     cutoff=st.floats(0.05, 20.0),

@@ -129,7 +129,7 @@ def test_without_noise_the_truth_comes_back_from_a_good_and_from_a_poor_start(me
     np.testing.assert_allclose(found.theta, truth(), atol=1e-3)
 
 
-@pytest.mark.parametrize("method", [idim_iv, didim])
+@pytest.mark.parametrize("method", [idim_iv, pytest.param(didim, marks=pytest.mark.nightly)])
 def test_a_poor_start_costs_iterations_only(method: Iterative) -> None:
     data = recorded(1.0)
     poor = method(data.blocks, data.loop, cad())
@@ -155,7 +155,7 @@ def test_gear_ratios_at_80_percent_in_the_simulator_move_didim_by_20_percent_and
     np.testing.assert_allclose((moved.theta / noisy(didim).theta)[chosen], 0.8, atol=0.08)
 
 
-@pytest.mark.parametrize("method", [idim_iv, didim])
+@pytest.mark.parametrize("method", [idim_iv, pytest.param(didim, marks=pytest.mark.nightly)])
 def test_encoders_a_hundred_times_as_coarse_still_give_the_parameters(method: Iterative) -> None:
     data = recorded(1.0, COARSE)
     found = method(data.blocks, data.loop, data.ls)

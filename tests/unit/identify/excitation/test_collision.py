@@ -196,7 +196,7 @@ def test_geometry_of_a_urdf_counts_and_a_mesh_that_is_not_there_is_said(
         tmp_path, 100.0, "collision:\n  boxes: [{name: shelf, center: [0.6, 0, 1.2], size: [0.2, 1, 0.4]}]\n"
     )
     out = tmp_path / "motion.yaml"
-    trajectory_command(config, out, 6.0, 0, None, 60)
+    trajectory_command(config, out, 6.0, 0, None, 20)
     printed = " ".join(capsys.readouterr().out.split())
     assert "pairs of bodies, clearance 0.02 m: closest" in printed
     assert "not checked: shapes of meshes that cannot be read: tool.stl of link fore" in printed
@@ -230,9 +230,8 @@ def test_boxes_of_a_urdf_stand_in_its_base_link(tmp_path: Path) -> None:
 def test_masses_of_a_urdf_limit_the_torque(tmp_path: Path) -> None:
     # Gravity alone needs 9.81 * (4 * 0.25 + 2 * 0.7) = 23.5 N m at the shoulder of the stretched arm.
     config = write_urdf(tmp_path, 18.0)
-    out = tmp_path / "motion.yaml"
-    trajectory_command(config, out, 6.0, 0, None, 200)
-    trajectory_command(config, None, look_at=out)
+    design = armident.design_trajectory(config, 6.0, evaluations=40)
+    assert any("torque by the masses of the URDF" in line for line in design.checks.checked)
     still = tmp_path / "stretched.yaml"
     still.write_text(
         "schema: armident/trajectory/1\nstart: [0, 0]\nmoves:\n"
@@ -240,17 +239,6 @@ def test_masses_of_a_urdf_limit_the_torque(tmp_path: Path) -> None:
     )
     with pytest.raises(ConfigError, match=r"needs a torque of 2\d\.\d N m at shoulder \(allowed 18\.0\)"):
         trajectory_command(config, None, look_at=still)
-
-
-@pytest.mark.slow
-def test_a_trajectory_into_a_box_is_refused(tmp_path: Path) -> None:
-    config = write_urdf(
-        tmp_path, 100.0, "collision: {boxes: [{name: shelf, center: [0.5, 0, 1], size: [0.4, 1, 0.2]}]}\n"
-    )
-    into = tmp_path / "into.yaml"
-    into.write_text("schema: armident/trajectory/1\nstart: [0, 0]\nmoves:\n- {to: [1.5, 0.1], duration: 3}\n")
-    with pytest.raises(ConfigError, match=r"needs a distance of -0\.\d+ m between link of .* and box 'shelf'"):
-        trajectory_command(config, None, look_at=into)
 
 
 def masses_file(path: Path, **values: object) -> Path:

@@ -164,7 +164,7 @@ def test_too_low_a_bandwidth_leaves_the_kuka_ten_equations_per_parameter_all_the
     assert relative_torque_errors(blocks, idim_ls(blocks, model.base.names).theta)[0] < 1.7
 
 
-@pytest.mark.parametrize("left_out", [0, 1])
+@pytest.mark.parametrize("left_out", [pytest.param(0, marks=pytest.mark.nightly), 1])
 def test_a_recording_of_the_kuka_is_predicted_up_to_2_4_percent_from_the_others(
     kuka: list[Experiment], left_out: int
 ) -> None:
@@ -181,6 +181,7 @@ def with_entries(*names: str) -> RobotConfig:
     return KUKA.model_copy(update={"effects": tuple(e for e in KUKA.effects if e.effect in names)})
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("number", [0, 1, 2])
 def test_the_last_third_of_each_recording_of_the_kuka_is_predicted_up_to_1_7_percent(
     settled: list[Experiment], number: int
@@ -211,6 +212,7 @@ def test_the_second_recording_of_the_kuka_is_predicted_from_the_others_up_to_1_6
     assert held_out_error(KUKA, [settled[0], settled[2]], [settled[1]]) < 1.6
 
 
+@pytest.mark.nightly
 def test_the_first_recording_of_the_kuka_is_predicted_from_the_others_up_to_1_7_percent(
     settled: list[Experiment],
 ) -> None:

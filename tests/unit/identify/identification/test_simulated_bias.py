@@ -66,7 +66,7 @@ def test_instrumental_variables_allow_for_coloured_noise() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("position", [0.0, 1e-6, ENCODER])
+@pytest.mark.parametrize("position", [0.0, pytest.param(1e-6, marks=pytest.mark.nightly), ENCODER])
 def test_no_decimation_does_not_step_back_on_data_of_exactly_the_model(position: float) -> None:
     experiment = axis.recorded(1, torque=0.5, position=position)
     found = identify_experiment(experiment, axis.robot(), Options(decimation=1))

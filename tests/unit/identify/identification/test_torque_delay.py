@@ -60,6 +60,7 @@ def test_a_held_torque_is_half_a_sample_early_and_what_comes_on_top_is_seen(axis
     np.testing.assert_allclose(found.seconds, found.samples * DT)
 
 
+@pytest.mark.slow
 def test_standard_deviation_is_that_of_the_estimates_over_20_noises(axis: ArmModel) -> None:
     simulated, reference = run(axis)
     rng = np.random.default_rng(1)

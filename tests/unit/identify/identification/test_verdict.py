@@ -92,7 +92,7 @@ def set_up(*findings: SetupFinding, not_understood: tuple[str, ...] = ()) -> Set
 @pytest.mark.slow
 def test_a_healthy_arm_is_trustworthy_by_every_line() -> None:
     for robot, seed in (("tx40", 1), ("emps", 1)):
-        outcome = identified(robot, f"{robot}_excitation", seed)
+        outcome = identified(robot, f"{robot}_excitation", seed, period=FAST)
         assert outcome.result.verdict.level == "trustworthy", outcome.result.verdict
         assert outcome.document.verdict == "trustworthy"
         assert outcome.document.reasons == []
@@ -115,7 +115,9 @@ def test_documents_without_a_verdict_are_still_read() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("method", ["idim-ls", "idim-iv", "idim-piv"])
+@pytest.mark.parametrize(
+    "method", ["idim-ls", *(pytest.param(m, marks=pytest.mark.nightly) for m in ("idim-iv", "idim-piv"))]
+)
 def test_all_signs_turned_are_physically_impossible(
     healthy: list[Experiment], arm: RobotConfig, method: Method
 ) -> None:
@@ -171,7 +173,7 @@ def test_an_arm_at_rest_is_refused_in_one_line(arm: RobotConfig) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "method", [pytest.param(m, marks=[pytest.mark.nightly] * (m in ("cloe", "clie"))) for m in METHODS]
+    "method", [pytest.param(m, marks=[pytest.mark.nightly] * (m not in ("idim-ls", "didim"))) for m in METHODS]
 )
 def test_one_moving_joint_gives_its_few_parameters(arm: RobotConfig, method: Method) -> None:
     single = recorded(arm, motion(*([0.0, angle, 0.0, 0.0, 0.0, 0.0] for angle in (0.8, -0.8, 0.4, 0.0))))
@@ -310,7 +312,7 @@ def test_a_diverging_loop_is_unusable_where_the_estimate_comes_from_it(method: M
 
 
 def diagnostics() -> Diagnostics:
-    return identified("tx40", "tx40_excitation", 1).result.diagnostics
+    return identified("tx40", "tx40_excitation", 1, period=FAST).result.diagnostics
 
 
 def residuals_of(tests: Diagnostics, monkeypatch: pytest.MonkeyPatch, method: Method, *moving: str) -> list[Reason]:

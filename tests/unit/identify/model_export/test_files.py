@@ -245,6 +245,7 @@ def test_every_link_of_the_lightest_arm_has_mass_and_extent() -> None:
     assert np.linalg.eigvalsh(model.links[0].central_inertia).min() > 0.0
 
 
+@pytest.mark.slow
 def test_an_impossible_arm_is_refused_unless_the_nearest_one_is_wanted(tmp_path: Path) -> None:
     robot = load_robot("tx40")
     arm = arm_model(robot)

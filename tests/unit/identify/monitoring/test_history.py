@@ -138,6 +138,7 @@ def of(number: int, document: IdentificationDocument) -> IdentificationDocument:
     return document.model_copy(update={"recording": source})
 
 
+@pytest.mark.slow
 def test_arms_of_one_name_in_two_cells_are_kept_apart(url: str, tmp_path: Path) -> None:
     history = History(url)
     left, right = of(1, result(0, TRUTH)), of(2, result(1, 2 * TRUTH))

@@ -3,6 +3,7 @@
 import datetime
 import json
 import os
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,18 +16,16 @@ from typer.testing import CliRunner, Result
 from armident.configs import ConfigError, DataError, config_path, load_robot, load_session
 from armident.configs.schema.scenario import Scenario
 from armident.daq.cli import application
-from armident.daq.recording import Recording, write_recording
+from armident.daq.recording import write_recording
 from armident.identify.diagnosis.change_test import compare
 from armident.identify.documents.files import load_document, to_json
 from armident.identify.documents.identification import IdentificationDocument
-from armident.identify.identification.identify_recording import identify_recording
 from armident.identify.monitoring.change.history import History
 from armident.identify.monitoring.reidentify.baseline import baseline_of
 from armident.identify.monitoring.reidentify.fleet import cluster
 from armident.identify.monitoring.reidentify.run import prepare
 from armident.identify.monitoring.reidentify.summary import change_lines, meaning_of, place_of
-from tests.fixtures.arms import FAST, hide, recording
-from tests.fixtures.store import shared
+from tests.fixtures.arms import document, hide, recording
 from tests.statistics.weeks import WORN
 
 NOW = datetime.datetime(2026, 3, 1, tzinfo=datetime.UTC)
@@ -34,20 +33,10 @@ WEEKS = {"a_monday": (1, ()), "b_tuesday": (2, ()), "d_worn": (3, Scenario.model
 """Seed of the noise, and hidden effects."""
 
 
-def week(name: str) -> Recording:
-    """Two weeks of an arm, and one with a tenth more friction in joint 2."""
-    seed, effects = WEEKS[name]
-    return recording("tx40", "tx40_excitation", seed, *effects, period=FAST, setpoint_every=1)
-
-
-@shared
-def document(name: str) -> IdentificationDocument:
-    return identify_recording(week(name), check=None).document
-
-
 @pytest.fixture(scope="module")
 def documents() -> dict[str, IdentificationDocument]:
-    return {name: document(name) for name in WEEKS}
+    """Two weeks of an arm, and one with a tenth more friction in joint 2."""
+    return {name: document("tx40", seed, *effects) for name, (seed, effects) in WEEKS.items()}
 
 
 def cell(folder: Path, **changes: Any) -> Path:
@@ -175,8 +164,10 @@ def test_a_fleet_is_compared_in_order_and_survives_a_failed_recording(tmp_path: 
     from distributed import LocalCluster
 
     friction = hide("friction_drift", "joint_1", change=0.1, time_constant=1e-6)
+    session = load_session("emps_cell.yaml").model_copy(update={"identification": {"method": "idim-ls"}})
     for name, seed, effects in (("a_monday", 1, ()), ("b_tuesday", 2, ()), ("d_worn", 3, (friction,))):
-        write_recording(recording("emps", "emps_excitation", seed, *effects), tmp_path / f"{name}.mcap")
+        made = replace(recording("emps", "emps_excitation", seed, *effects), session=session)
+        write_recording(made, tmp_path / f"{name}.mcap")
     (tmp_path / "c_broken.mcap").write_bytes(b"not a recording")
     # The worker is two threads of this process, which has imported everything.
     with LocalCluster(

@@ -19,6 +19,11 @@ def diagnosis() -> DiagnosisResult:
     return found
 
 
+@pytest.fixture(scope="module")
+def page(diagnosis: DiagnosisResult) -> str:
+    return diagnosis_report(diagnosis, diagnosis.document)
+
+
 @pytest.mark.slow
 def test_the_curves_without_and_with_a_finding_are_those_of_its_errors(diagnosis: DiagnosisResult) -> None:
     def error(torque: np.ndarray) -> float:
@@ -33,8 +38,9 @@ def test_the_curves_without_and_with_a_finding_are_those_of_its_errors(diagnosis
 
 
 @pytest.mark.slow
-def test_every_finding_has_a_picture_of_its_own_in_a_page_that_needs_no_other_file(diagnosis: DiagnosisResult) -> None:
-    page = diagnosis_report(diagnosis, diagnosis.document)
+def test_every_finding_has_a_picture_of_its_own_in_a_page_that_needs_no_other_file(
+    diagnosis: DiagnosisResult, page: str
+) -> None:
     sources = re.findall(r'(?:src|href)="([^"]*)"', page)
     assert all(source.startswith("data:image/svg+xml;base64,") for source in sources)
     pictures = re.findall(r'<img alt="residual of joint_1" src="([^"]*)"', page)
@@ -45,13 +51,12 @@ def test_every_finding_has_a_picture_of_its_own_in_a_page_that_needs_no_other_fi
 
 
 @pytest.mark.slow
-def test_a_loop_that_diverges_leaves_out_its_table_and_nothing_else(diagnosis: DiagnosisResult) -> None:
+def test_a_loop_that_diverges_leaves_out_its_table_and_nothing_else(diagnosis: DiagnosisResult, page: str) -> None:
     assert diagnosis.document.simulated is not None
-    assert "Simulated closed loop" in diagnosis_report(diagnosis, diagnosis.document)
-    partly = diagnosis.document.model_copy(update={"simulated": None})
-    page = diagnosis_report(diagnosis, partly)
-    assert "Simulated closed loop" not in page
-    assert "Dependence of the residual" in page
+    assert "Simulated closed loop" in page
+    partly = diagnosis_report(diagnosis, diagnosis.document.model_copy(update={"simulated": None}))
+    assert "Simulated closed loop" not in partly
+    assert "Dependence of the residual" in partly
 
 
 @pytest.mark.slow
@@ -80,16 +85,14 @@ def test_a_long_recording_is_drawn_where_the_finding_changes_most() -> None:
 
 
 @pytest.mark.slow
-def test_the_verdict_and_the_next_step_stand_before_the_findings(diagnosis: DiagnosisResult) -> None:
-    page = diagnosis_report(diagnosis, diagnosis.document)
+def test_the_verdict_and_the_next_step_stand_before_the_findings(page: str) -> None:
     card = page.index('<div class="verdict doubtful"><b>explained</b>')
     assert card < page.index("<p>Next: identify with the findings") < page.index('class="finding"')
     assert "Half the difference of the viscous friction" in page
 
 
 @pytest.mark.slow
-def test_held_out_torques_are_drawn_of_both_models(diagnosis: DiagnosisResult) -> None:
-    page = diagnosis_report(diagnosis, diagnosis.document)
+def test_held_out_torques_are_drawn_of_both_models(page: str) -> None:
     found = re.search(r'<script type="application/json">(.*?)</script>', page)
     assert found is not None
     (plot,) = json.loads(found[1])

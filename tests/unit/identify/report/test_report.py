@@ -8,17 +8,15 @@ from markupsafe import escape
 
 from armident.identify.documents.files import load_document
 from armident.identify.documents.identification import IdentificationDocument, VerdictReason
-from armident.identify.identification.identify_recording import IdentificationOutcome, identify_recording
-from armident.identify.identification.options import Options
+from armident.identify.identification.identify_recording import IdentificationOutcome
 from armident.identify.report.identification_report import identification_report
 from armident.identify.report.robot_file import write_identification
-from tests.fixtures.arms import FAST, recording
+from tests.fixtures.arms import FAST, identified
 
 
 @pytest.fixture(scope="module")
 def outcome() -> IdentificationOutcome:
-    data = recording("tx40", "tx40_excitation", 1, repeats=1, period=FAST)
-    return identify_recording(data, options=Options(method="idim-ls"))
+    return identified("tx40", "tx40_excitation", 1, "idim-ls", period=FAST, checked=False)
 
 
 @pytest.fixture(scope="module")

@@ -66,7 +66,7 @@ def test_every_quantity_of_every_joint_is_drawn_with_its_limits(designed: str) -
 def test_a_refused_trajectory_has_its_reasons_in_the_report(tmp_path: Path) -> None:
     config, into = write_urdf(tmp_path, 100.0, SHELF), tmp_path / "into.yaml"
     into.write_text("schema: armident/trajectory/1\nstart: [0, 0]\nmoves:\n- {to: [1.5, 0.1], duration: 3}\n")
-    with pytest.raises(ConfigError):
+    with pytest.raises(ConfigError, match=r"needs a distance of -0\.\d+ m between link of .* and box 'shelf'"):
         trajectory_command(config, None, look_at=into, report=tmp_path / "page.html")
     page = text_of(tmp_path / "page.html")
     assert "<b>exceeds limits</b>" in page

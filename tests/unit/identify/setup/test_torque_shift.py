@@ -1,7 +1,8 @@
 """Common shift of all torques: it is estimated and aligned, and the delay of one joint is none."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -18,11 +19,12 @@ from armident.identify.identification.pipeline import identify_experiment
 from armident.identify.setup.bench import make_bench
 from armident.identify.setup.check import check_setup
 from armident.identify.setup.fit import Hypothesis
-from armident.identify.setup.result import TorqueShift, with_torque_shift
+from armident.identify.setup.result import SetupCheck, TorqueShift, with_torque_shift
 from armident.identify.setup.torque_shift import long_torque_shift
 from armident.identify.signals.experiments import Experiment
 from tests.fixtures import setups
 from tests.fixtures.arms import FAST, recording
+from tests.fixtures.arms import checked as healthy_check
 from tests.statistics.late_torques import moved
 
 LATE = 0.5
@@ -48,6 +50,12 @@ def healthy(arm: RobotConfig) -> list[Experiment]:
     return setups.record(arm, 0, noise=0.003, dt=4e-3)
 
 
+@pytest.fixture(scope="module")
+def checked(healthy: list[Experiment], arm: RobotConfig) -> Callable[[float], SetupCheck]:
+    """Checks of torques that are all late by a number of samples, each made once."""
+    return cache(lambda samples: check_setup(late(healthy, np.full(arm.n, samples)), arm))
+
+
 def estimate(experiments: Sequence[Experiment], robot: RobotConfig) -> TorqueShift:
     found = check_setup(experiments, robot).torque_shift
     assert found is not None
@@ -55,8 +63,9 @@ def estimate(experiments: Sequence[Experiment], robot: RobotConfig) -> TorqueShi
 
 
 @pytest.mark.slow
-def test_torques_held_until_the_next_sample_are_not_shifted(healthy: list[Experiment], arm: RobotConfig) -> None:
-    found = estimate(healthy, arm)
+def test_torques_held_until_the_next_sample_are_not_shifted(checked: Callable[[float], SetupCheck]) -> None:
+    found = checked(0.0).torque_shift
+    assert found is not None
     assert abs(found.samples) < 3 * found.std
     assert not found.applied
     assert found.remark == ""
@@ -65,9 +74,9 @@ def test_torques_held_until_the_next_sample_are_not_shifted(healthy: list[Experi
 @pytest.mark.slow
 @pytest.mark.parametrize("samples", [LATE, -LATE])
 def test_a_common_shift_of_half_a_sample_is_a_remark_and_no_mistake(
-    healthy: list[Experiment], arm: RobotConfig, samples: float
+    checked: Callable[[float], SetupCheck], samples: float
 ) -> None:
-    check = check_setup(late(healthy, np.full(arm.n, samples)), arm)
+    check = checked(samples)
     found = check.torque_shift
     assert check.findings == ()
     assert found is not None
@@ -106,9 +115,12 @@ def test_a_shift_is_known_where_it_tells_the_conventions_apart() -> None:
 
 
 @pytest.mark.slow
-def test_a_shift_that_was_applied_is_not_found_again(healthy: list[Experiment], arm: RobotConfig) -> None:
-    moved = late(healthy, np.full(arm.n, LATE))
-    again = estimate(with_torque_shift(moved, estimate(moved, arm)), arm)
+def test_a_shift_that_was_applied_is_not_found_again(
+    healthy: list[Experiment], arm: RobotConfig, checked: Callable[[float], SetupCheck]
+) -> None:
+    moved, found = late(healthy, np.full(arm.n, LATE)), checked(LATE).torque_shift
+    assert found is not None
+    again = estimate(with_torque_shift(moved, found), arm)
     assert abs(again.samples) < 0.05
     assert not again.applied
 
@@ -122,10 +134,12 @@ def test_the_diagnosis_begins_with_aligned_experiments(healthy: list[Experiment]
 
 
 @pytest.mark.slow
-def test_identify_aligns_its_equations_and_says_so(healthy: list[Experiment], arm: RobotConfig) -> None:
+def test_identify_aligns_its_equations_and_says_so(
+    healthy: list[Experiment], arm: RobotConfig, checked: Callable[[float], SetupCheck]
+) -> None:
     moved = late(healthy, np.full(arm.n, LATE))
     options = Options(method="idim-ls")
-    before, with_shift = (identify_experiment(moved, arm, options, setup=s) for s in (None, check_setup(moved, arm)))
+    before, with_shift = (identify_experiment(moved, arm, options, setup=s) for s in (None, checked(LATE)))
     original = identify_experiment(healthy, arm, options)
     assert with_shift.relative_error_pct < before.relative_error_pct
     assert with_shift.relative_error_pct == pytest.approx(original.relative_error_pct, rel=0.1)
@@ -134,24 +148,25 @@ def test_identify_aligns_its_equations_and_says_so(healthy: list[Experiment], ar
 
 
 @pytest.mark.slow
-def test_parameters_do_not_move_where_no_shift_is_significant(healthy: list[Experiment], arm: RobotConfig) -> None:
+def test_parameters_do_not_move_where_no_shift_is_significant(
+    healthy: list[Experiment], arm: RobotConfig, checked: Callable[[float], SetupCheck]
+) -> None:
     options = Options(method="idim-ls")
-    one, other = (identify_experiment(healthy, arm, options, setup=s) for s in (None, check_setup(healthy, arm)))
+    one, other = (identify_experiment(healthy, arm, options, setup=s) for s in (None, checked(0.0)))
     np.testing.assert_array_equal(one.theta, other.theta)
 
 
 @pytest.mark.slow
 def test_the_virtual_arm_with_references_is_not_shifted() -> None:
-    robot = load_robot("tx40")
-    experiments = experiments_from_recording(recording("tx40", "tx40_excitation", 3, period=FAST), robot)[0]
-    found = estimate(experiments, robot)
+    found = healthy_check("tx40", 3).torque_shift
+    assert found is not None
     assert found.instrumented
     assert abs(found.samples) < 3 * found.std
     assert not found.applied
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("samples", "decisive"), [(4, True), (-4, False)])
+@pytest.mark.parametrize(("samples", "decisive"), [(4, True), pytest.param(-4, False, marks=pytest.mark.nightly)])
 def test_torques_late_by_milliseconds_are_found_by_the_references(samples: int, decisive: bool) -> None:
     """Prediction gains too little by early torques: noise in the closed loop looks like them."""
     robot = load_robot("tx40")
