@@ -191,7 +191,10 @@ def test_kernels_of_a_bus_are_declared() -> None:
         MotionMonitor(session, robot, motion_limits_of(robot)).check(frames(count), 0)
 
 
-def test_a_kernel_that_compiles_at_run_time_is_noticed() -> None:
+def test_a_kernel_that_compiles_at_run_time_is_noticed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(armident.compiled, "_folders", lambda: (tmp_path,))
+    monkeypatch.setattr(armident.compiled, "_KERNELS", [])
+
     def kernel(x: float) -> float:
         return 2.0 * x
 

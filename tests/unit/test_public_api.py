@@ -265,12 +265,12 @@ def test_a_mistake_is_one_clear_line(call: object, expected: str) -> None:
 @pytest.mark.parametrize(
     "module",
     [
-        "armident",
+        pytest.param("armident", marks=pytest.mark.nightly),
         "armident.configs.loading",
         "armident.daq.recording.model",
-        "armident.identify.api.comparison_api",
+        pytest.param("armident.identify.api.comparison_api", marks=pytest.mark.nightly),
         "armident.identify.api.diagnosis_api",
-        "armident.identify.api.identification_api",
+        pytest.param("armident.identify.api.identification_api", marks=pytest.mark.nightly),
         "armident.identify.api.prediction_api",
         "armident.identify.api.setup_api",
         "armident.identify.api.trajectory_api",

@@ -322,6 +322,7 @@ def test_response_from_the_velocity_makes_up_for_its_feedback(bench: Bench) -> N
     assert all(a.fit_pct > b.fit_pct for a, b in zip(own, thesis, strict=True))
 
 
+@pytest.mark.nightly
 def test_didim_that_cannot_be_simulated_does_not_work(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     lab = Laboratory(lambda: bench.virtual.recording(Case()))
     for method in ("idim-iv", "didim"):

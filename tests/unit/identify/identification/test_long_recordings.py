@@ -61,7 +61,7 @@ def test_stretches_hold_the_samples_and_references_of_the_whole(robot: str) -> N
     ("method", "check"),
     [
         ("idim-ls", None),
-        pytest.param("idim-iv", None, marks=pytest.mark.slow),
+        pytest.param("idim-iv", None, marks=[pytest.mark.slow, pytest.mark.nightly]),
         pytest.param("idim-piv", check_setup, marks=pytest.mark.slow),
     ],
 )

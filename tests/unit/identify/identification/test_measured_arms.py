@@ -219,7 +219,8 @@ def test_the_first_recording_of_the_kuka_is_predicted_from_the_others_up_to_1_7_
     assert held_out_error(KUKA, [settled[1], settled[2]], [settled[0]]) < 1.7
 
 
-@pytest.mark.parametrize("number", [0, *(pytest.param(k, marks=pytest.mark.nightly) for k in (1, 2))])
+@pytest.mark.nightly
+@pytest.mark.parametrize("number", [0, 1, 2])
 def test_every_training_part_by_itself_shows_four_ripples_per_turn_of_joint_6(
     settled: list[Experiment], number: int
 ) -> None:
@@ -310,6 +311,7 @@ def test_idim_iv_agrees_with_idim_ls_on_the_panda_and_predicts_as_well(panda: Ex
     assert prediction_error(theta, PANDA, [last]) < 1.8
 
 
+@pytest.mark.nightly
 def test_idim_iv_agrees_with_idim_ls_on_the_kuka(kuka: list[Experiment]) -> None:
     _, shift, converged = followed(RIGID, kuka)
     assert converged

@@ -20,9 +20,14 @@ def outcome() -> IdentificationOutcome:
 
 
 @pytest.fixture(scope="module")
-def page(outcome: IdentificationOutcome, tmp_path_factory: pytest.TempPathFactory) -> str:
-    _, report = write_identification(outcome, tmp_path_factory.mktemp("out"))
-    return report.read_text(encoding="utf-8")
+def written(outcome: IdentificationOutcome, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """Document and report."""
+    return write_identification(outcome, tmp_path_factory.mktemp("results") / "deep" / "out")
+
+
+@pytest.fixture(scope="module")
+def page(written: tuple[Path, Path]) -> str:
+    return written[1].read_text(encoding="utf-8")
 
 
 @pytest.mark.slow
@@ -68,7 +73,7 @@ def test_an_unusable_result_is_neither_converged_nor_white(outcome: Identificati
     assert "They were not tested" in text
 
 
-def test_the_document_is_written_beside_the_report(outcome: IdentificationOutcome, tmp_path: Path) -> None:
-    document, report = write_identification(outcome, tmp_path / "deep" / "out")
+def test_the_document_is_written_beside_the_report(outcome: IdentificationOutcome, written: tuple[Path, Path]) -> None:
+    document, report = written
     assert load_document(document, IdentificationDocument) == outcome.document
     assert sorted(p.name for p in report.parent.iterdir()) == ["identification.json", "report.html"]
