@@ -64,6 +64,7 @@ def test_mass_matrix_and_bias_torques_are_those_of_pinocchio(seed: int) -> None:
     np.testing.assert_allclose(bias, expected, rtol=1e-9, atol=1e-9 * np.abs(expected).max())
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("half", HALVES)
 @pytest.mark.parametrize("seed", SEEDS)
 def test_every_body_exists_and_every_joint_resists(seed: int, half: Half) -> None:

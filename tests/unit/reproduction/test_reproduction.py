@@ -240,12 +240,14 @@ def test_every_table_of_estimates_speaks_of_the_28_essential_parameters() -> Non
     assert len(essential_names()) == 28
 
 
+@pytest.mark.nightly
 def test_thesis_columns_are_as_printed(reproduced: tuple[list[Table], list[claims.Claim]]) -> None:
     table = reproduced[0][0]
     assert column(table, "thesis", "DIDIM, 80 %").cells["zz1r"] == Cell(0.96, 1.22)
     assert column(table, "thesis", "IDIM-IV").cells["fvm6"] == Cell(0.60, 2.26)
 
 
+@pytest.mark.nightly
 def test_estimates_and_deviations_are_of_the_size_of_the_thesis(
     reproduced: tuple[list[Table], list[claims.Claim]],
 ) -> None:
@@ -265,6 +267,7 @@ def test_estimates_and_deviations_are_of_the_size_of_the_thesis(
     assert 0.4 < np.median(ratios) < 1.5
 
 
+@pytest.mark.nightly
 def test_relative_errors_with_right_and_wrong_gear_ratios(reproduced: tuple[list[Table], list[claims.Claim]]) -> None:
     table = reproduced[0][1]
     right, wrong = (figure(table, "virtual", name, "error, %") for name in ("IDIM-IV", "IDIM-IV, 80 %"))
@@ -274,6 +277,7 @@ def test_relative_errors_with_right_and_wrong_gear_ratios(reproduced: tuple[list
     assert figure(table, "virtual", "DIDIM, 80 %", "error, %") > 1.5 * right
 
 
+@pytest.mark.nightly
 def test_didim_moves_with_the_gear_ratios_and_idim_iv_does_not(
     reproduced: tuple[list[Table], list[claims.Claim]],
 ) -> None:
@@ -282,6 +286,7 @@ def test_didim_moves_with_the_gear_ratios_and_idim_iv_does_not(
     assert claim.holds, claim.findings
 
 
+@pytest.mark.nightly
 def test_claims_are_computed_from_the_estimates(bench: Bench) -> None:
     """A claim of a change fails on equal estimates, and a claim of no change on different ones."""
     lab = bench.virtual
@@ -375,6 +380,7 @@ def test_claims_are_judged_only_on_tables_that_were_made(bench: Bench) -> None:
     assert [j.number for j in claims.JUDGEMENTS] == [1, 2, 3, 4, 5, 6]
 
 
+@pytest.mark.nightly
 def test_documents_say_the_same(reproduced: tuple[list[Table], list[claims.Claim]]) -> None:
     tables, found = reproduced
     content = json.loads(document(tables, found, quick=True))
