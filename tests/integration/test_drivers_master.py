@@ -203,6 +203,7 @@ def test_a_drive_in_fault_is_reset_and_enabled(udp_bus: Bus) -> None:
         assert master.states() == [DriveState.ENABLED]
 
 
+@pytest.mark.slow
 def test_a_drive_that_stays_in_fault_is_named_with_state_and_error(udp_bus: Bus) -> None:
     with cell(udp_bus, nodes=(1,)) as (session, robot, servos), DriveMaster(session, robot) as master:
         servos[1].state, servos[1].obeys = DriveState.FAULT, False

@@ -306,6 +306,7 @@ def test_a_capture_that_dies_during_the_motion_is_detected(udp_bus: Bus, guarded
     assert len(dump.orders()) == 2 * N
 
 
+@pytest.mark.slow
 def test_the_regular_end_of_a_motion_is_no_alarm(udp_bus: Bus, guarded: Guarded) -> None:
     """SYNC continues after the last set point, NMT ends the state operational, then no frames follow."""
     cell = Cell()

@@ -115,6 +115,7 @@ def test_a_process_uses_more_memory_than_the_usual_number_of_mappings_allows() -
     assert launch([sys.executable, "-c", fill]).stdout == "76800\n"
 
 
+@pytest.mark.slow
 @needs_launcher
 def test_a_memory_that_is_no_size_is_refused() -> None:
     line = [sys.executable, "-m", "armident.drivers.vcan", "--guest", "-m", "many", "--", "true"]
@@ -132,6 +133,7 @@ def test_missing_packages_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert "lacks user-mode-linux, libc6, busybox-static, can-utils" in reason
 
 
+@pytest.mark.slow
 def test_a_truncated_package_is_one_error_line_and_leaves_no_files(tmp_path: Path) -> None:
     debs = tmp_path / "debs"
     debs.mkdir()

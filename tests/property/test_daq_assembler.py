@@ -119,6 +119,7 @@ def test_every_sync_is_received_or_in_a_gap_and_the_counters_add_up(faults: Faul
     assert counters["sync_missing"] == len(faults.sync)
 
 
+@pytest.mark.slow
 @given(mixed, splits)
 def test_the_result_does_not_depend_on_how_frames_are_split(faults: Faults, cuts: list[int]) -> None:
     frames = bus(COUNT, faults)

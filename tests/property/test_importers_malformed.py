@@ -84,6 +84,7 @@ def check(suffix: str, data: bytes) -> None:
         write_recording(found, Path(folder, "out.mcap"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suffix", list(FORMATS))
 @settings(max_examples=FEWER, suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large], deadline=None)
 @given(changes=edits, cut=st.sampled_from([1.0, 1.0, 0.97, 0.6, 0.1]))

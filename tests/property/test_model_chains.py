@@ -22,6 +22,7 @@ from tests.urdf_chains import configuration, link_frames, random_urdf
 chains = st.tuples(st.integers(0, 2**31), st.integers(1, 7), st.booleans())
 
 
+@pytest.mark.slow
 @given(chains)
 def test_dynamics_agree_with_pinocchio_on_random_chains(chain: tuple[int, int, bool]) -> None:
     seed, n, right_angles = chain
@@ -53,6 +54,7 @@ def test_dynamics_agree_with_pinocchio_on_random_chains(chain: tuple[int, int, b
         )
 
 
+@pytest.mark.slow
 @given(chains)
 def test_regressor_times_parameters_is_inverse_dynamics(chain: tuple[int, int, bool]) -> None:
     seed, n, right_angles = chain

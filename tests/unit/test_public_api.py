@@ -84,6 +84,7 @@ def test_an_identification_read_back_stands_for_a_fresh_one(axis: armident.Ident
     assert errors[0] < 2 * axis.relative_error_pct
 
 
+@pytest.mark.slow
 def test_every_result_prints_and_writes_its_document_and_its_report(
     axis: armident.Identification, tmp_path: Path
 ) -> None:

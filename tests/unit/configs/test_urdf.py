@@ -498,6 +498,7 @@ def test_joint_names_keep_their_letters_or_get_a_place(
     assert (joints[1].limits.velocity, joints[0].rotor_inertia) == (1.0, False)
 
 
+@pytest.mark.slow
 def test_an_arm_without_limits_is_identified_from_a_recording(tmp_path: Path) -> None:
     urdf(
         tmp_path,

@@ -86,6 +86,7 @@ def frames_of_lagging_drives(syncs: int, lagging: str, always: bool) -> Iterator
         yield frames
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("lagging", "always"), [("samples", True), ("samples", False), ("demand", False)])
 def test_streams_of_a_file_have_the_same_times_though_one_of_them_lags(
     tmp_path: Path, lagging: str, always: bool

@@ -69,6 +69,7 @@ def test_without_a_counter_the_unknown_phase_of_slow_streams_is_said(tmp_path: P
     assert ("demand: SYNC has no counter, so it is unknown which SYNCs are answered" in remarks) == (counter == 0)
 
 
+@pytest.mark.slow
 def test_a_sync_missing_from_the_log_is_a_gap(tmp_path: Path) -> None:
     write_log(captured(lost=slice(1000, 1030)), tmp_path / "bus.log")
     read = recording_from_log(tmp_path / "bus.log", SESSION, ROBOT)

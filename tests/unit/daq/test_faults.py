@@ -35,6 +35,7 @@ def found(t: Array, q: Array, tau: Array, robot: RobotConfig) -> Repair:
     return repair(q, tau, None, t, robot, "joint")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rate", [200.0, 1000.0, 5000.0])
 def test_nothing_is_said_about_smooth_motions_between_pauses(tx40: RobotConfig, rate: float) -> None:
     for seed in SEEDS:

@@ -319,6 +319,7 @@ def test_of_two_arms_the_recorded_one_is_taken(tmp_path: Path) -> None:
     ]
 
 
+@pytest.mark.slow
 def test_a_recording_keeps_the_blanks_of_its_robot(tmp_path: Path) -> None:
     recorded = arms.recording("emps", "emps_1", 0)
     robot = recorded.robot.model_copy(update={"blanks": ("joints[joint_1].drive.rated",)})
@@ -482,6 +483,7 @@ def test_a_unit_that_is_none_is_one_line(tmp_path: Path, units: str) -> None:
     assert "--units" in refused.stderr.splitlines()[-1]
 
 
+@pytest.mark.slow
 def test_joints_that_were_not_recorded_are_left_out(tmp_path: Path, arm: Path) -> None:
     path = table(tmp_path / "d.csv")
     rows = [line.split(",") for line in path.read_text().splitlines()[1:]]

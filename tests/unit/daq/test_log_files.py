@@ -67,6 +67,7 @@ def test_a_last_line_without_an_end_is_read_if_it_is_whole(tmp_path: Path) -> No
     assert "source_remarks" not in found.metadata
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("share", [0.3, 0.6, 0.95])
 def test_a_blf_that_is_cut_off_is_read_up_to_there_and_said(
     tmp_path: Path, share: float, caplog: pytest.LogCaptureFixture
@@ -174,6 +175,7 @@ def test_a_log_with_another_sync_period_than_the_session_is_refused(tmp_path: Pa
         assert CliRunner().invoke(application(["import"]), command).exit_code == 0
 
 
+@pytest.mark.slow
 def test_missing_syncs_and_jitter_are_no_other_period(tmp_path: Path) -> None:
     path = tmp_path / "bus.log"
     write_log(captured(3000, lost=slice(500, 1200)), path)

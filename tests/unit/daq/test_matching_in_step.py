@@ -127,6 +127,7 @@ def test_answers_to_discarded_rows_are_not_matched_to_other_rows(rate: int) -> N
     assert set(range(100, 175)) <= missing <= set(range(100, 350))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stale", [0, 3, 42])
 def test_after_an_outage_late_answers_are_matched_and_stale_ones_dropped(stale: int) -> None:
     """Bus 2 is off for 200 SYNCs; its drives send ``stale`` earlier answers afterwards and are late by 300 SYNCs."""

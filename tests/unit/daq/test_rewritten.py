@@ -146,6 +146,7 @@ def test_a_recording_that_was_torn_before_it_was_rewritten_is_not_taken_as_whole
     assert "was not finished when another tool rewrote it" in str(read_recording(copy).missing)
 
 
+@pytest.mark.slow
 def test_damage_in_a_rewritten_file_is_found_by_its_contents(recording: Recording, tmp_path: Path) -> None:
     for compression in (CompressionType.LZ4, CompressionType.ZSTD, CompressionType.NONE):
         copy = rewritten(source_of(recording), tmp_path / "copy.mcap", compression=compression, chunk_size=20_000)

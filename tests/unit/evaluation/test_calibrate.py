@@ -52,6 +52,7 @@ def test_a_wrong_name_has_the_right_one_beside_it_or_none() -> None:
     assert truths(family="healthy", accepted=[], joints=[]) == [("clear", "nothing")] * 2
 
 
+@pytest.mark.slow
 def test_fitted_probabilities_and_sets_hold_for_other_cases() -> None:
     rng = np.random.default_rng(1)
     entries = []

@@ -51,6 +51,7 @@ def test_a_plant_simulates_recordings_and_evaluates_strengths_relative_to_its_jo
     assert not (tmp_path / "b.mcap").exists()
 
 
+@pytest.mark.slow
 def test_a_function_that_only_the_process_imports_is_called_by_its_name(tmp_path: Path) -> None:
     plant = WorkerProcess("plant", tmp_path / "plant.log")
     try:
@@ -109,6 +110,7 @@ def test_a_diagnosis_worker_that_exceeds_its_memory_limit_is_replaced_after_its_
             diagnosis.close()
 
 
+@pytest.mark.slow
 def test_an_unexpected_error_of_a_task_is_its_result_and_its_trace_is_in_the_log(tmp_path: Path) -> None:
     diagnosis = WorkerProcess("diagnosis", tmp_path / "diagnosis.log")
     try:
@@ -133,6 +135,7 @@ def test_a_stopped_worker_fails_its_task_and_starts_no_other(tmp_path: Path) -> 
         killer.join()
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("refusing")
 def test_the_failure_of_a_case_is_its_result_and_the_run_continues(tmp_path: Path) -> None:
     cases = [Case("clean", None, "emps", f"no_{k}.yaml", str(EMPS["trajectory"]), 1, 1e-3, 1) for k in range(2)]

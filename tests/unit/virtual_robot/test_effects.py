@@ -120,6 +120,7 @@ def torque_and_slope(code: int, row: NDArray[np.float64], qd: float) -> tuple[fl
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("effect", CODES)
 def test_the_slope_of_a_hidden_torque_is_its_derivative(tx40: RobotConfig, effect: str) -> None:
     other = "joint_2" if effect == "quadratic_coupling" else None

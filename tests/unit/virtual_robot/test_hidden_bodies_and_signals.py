@@ -209,6 +209,7 @@ def record(robot: RobotConfig, scenario: Scenario | None, noise: float = 1.0) ->
     }
 
 
+@pytest.mark.slow
 def test_wrong_signs_and_names_change_the_recording_and_nothing_else(tx40: RobotConfig) -> None:
     healthy = record(tx40, None)
     sign = record(tx40, hide("sign_error", "joint_2"))
@@ -242,6 +243,7 @@ def quiet(tx40: RobotConfig, emps: RobotConfig) -> dict[str, dict[str, NDArray[n
     return {robot.name: record(robot, None, noise=0.0) for robot in (tx40, emps)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "effect"), CASES)
 def test_every_effect_shows_in_a_recording_and_leaves_the_arm_under_control(
     tx40: RobotConfig,

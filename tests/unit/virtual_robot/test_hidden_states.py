@@ -123,6 +123,7 @@ def test_backlash_leaves_the_link_at_rest_while_the_motor_crosses_the_gap(emps: 
     assert 0.5 * gap < twist.max() < 0.6 * gap
 
 
+@pytest.mark.slow
 def test_backlash_agrees_with_a_contact_that_has_a_sharp_corner(emps: RobotConfig) -> None:
     gap, motor, stiffness, ratio = 1e-3, 30.0, 2e6, 0.2
     link = MASS - motor
@@ -226,6 +227,7 @@ def test_steady_sliding_has_the_stribeck_curve(emps: RobotConfig) -> None:
     assert plant.qd[0] == pytest.approx(0.05, rel=1e-4)
 
 
+@pytest.mark.slow
 def test_stribeck_and_presliding_of_one_joint_share_a_bristle(emps: RobotConfig) -> None:
     both = hide(entry("stribeck_friction", extra=10.0, velocity=0.02), entry("presliding_friction", deflection=2e-4))
     forces = sweep(0.3, 60.0)

@@ -83,6 +83,7 @@ def odd_drive(robot: RobotConfig, session: SessionConfig, *names: str) -> Iterat
         there.disconnect()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("oddity", CONFIGURED)
 def test_an_odd_drive_is_configured_and_enabled(robot: RobotConfig, session: SessionConfig, oddity: str) -> None:
     with odd_drive(robot, session, oddity) as (drive, sdo, remarks):

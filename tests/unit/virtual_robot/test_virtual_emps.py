@@ -56,6 +56,7 @@ def experiment(recording: Recording) -> Experiment:
     return found
 
 
+@pytest.mark.slow
 def test_recording_is_in_volts_and_metres_at_1_khz() -> None:
     recording = recorded(0, 1.0)
     fields = recording.samples.fields
@@ -80,6 +81,7 @@ def test_parameters_of_the_plant_are_the_published_ones() -> None:
     assert tuple(plant_parameters(emps())[name] for name in NAMES) == PUBLISHED
 
 
+@pytest.mark.slow
 def test_voltage_is_the_published_law_of_the_recorded_positions() -> None:
     found = experiment(recorded(0, 0.0))
     assert found.q_ref is not None

@@ -84,6 +84,7 @@ def value(law: ControlLaw, name: str) -> float:
     return law.gains[name].value
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("drive", "structure"),
     [
@@ -161,6 +162,7 @@ def test_a_noise_model_that_hides_a_missing_filter_is_not_used() -> None:
     np.testing.assert_allclose([value(law, "kp") * value(law, "kv"), value(law, "kv")], simple, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_saturated_samples_are_left_out() -> None:
     drive = Drive(limit=100.0)
     stretch = run(drive)

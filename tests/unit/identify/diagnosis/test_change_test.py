@@ -54,6 +54,7 @@ def identified(
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("pairs", "least"),
     [

@@ -41,6 +41,7 @@ def column(
     return report
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pairs", [6, pytest.param(40, marks=[pytest.mark.slow, pytest.mark.nightly])])
 def test_healthy_pairs_have_not_changed(pairs: int) -> None:
     """Of 40 at a rate of 1e-4, one alarm has a probability of 0.4 %; half of them repeat the motion."""

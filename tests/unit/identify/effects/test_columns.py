@@ -138,6 +138,7 @@ def test_a_rotor_is_looked_for_where_only_the_load_can_tell_it(axis: Motion, arm
     assert rotors(arm, 3) == rotors(axis, 0) == (0.0,)
 
 
+@pytest.mark.slow
 def test_presliding_is_what_dahl_lacks_of_coulomb(axis: Motion) -> None:
     width = 0.002
 

@@ -16,6 +16,7 @@ def short() -> Trajectory:
     return once.model_copy(update={"moves": once.moves[:2]})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "signals", [{"position": 1.0, "torque": 1.0}, {"position": 1.0}, {"torque": 1.0}], ids=" ".join
 )

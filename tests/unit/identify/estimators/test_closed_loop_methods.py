@@ -56,6 +56,7 @@ def test_equations_that_are_left_out_do_not_count(method: str) -> None:
     np.testing.assert_allclose(METHODS[method](data, start()).theta, data.truth, atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
 def test_two_experiments_without_noise_give_the_truth(method: str) -> None:
     a, b = recorded(), recorded(seconds=4.0)
@@ -220,6 +221,7 @@ def test_positions_of_another_recording_are_refused() -> None:
         cloe(data.blocks, [data.positions[0][1:]], data.loop, data.truth)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ITERATIVE)
 def test_hopeless_noise_ends_with_numbers_and_without_an_exception(method: str) -> None:
     data = recorded(seconds=3.0)

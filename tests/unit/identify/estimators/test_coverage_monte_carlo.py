@@ -64,6 +64,7 @@ def test_overstated_standard_deviations_are_called_high() -> None:
     assert all(row.verdict == "high" for row in coverage(drawn(2.0)))
 
 
+@pytest.mark.slow
 def test_a_campaign_goes_on_where_it_stopped_and_main_tells_by_its_exit_status(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

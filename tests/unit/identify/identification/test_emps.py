@@ -69,6 +69,7 @@ def test_simulation_with_the_controller_follows_the_measurement(emps: Experiment
     assert found.controller["velocity_error_pct"] < 0.229
 
 
+@pytest.mark.slow
 def test_instruments_from_identified_and_from_known_controller_give_the_same_parameters(emps: Experiment) -> None:
     robot = load_robot("emps")
     crc = identify_experiment(emps, robot, Options(method="idim-iv"))
@@ -96,6 +97,7 @@ def test_prefilter_that_contradicts_the_instruments_is_not_believed(emps: Experi
     assert found.whiteness[0].fraction_outside_2sigma <= 0.1
 
 
+@pytest.mark.slow
 def test_two_runs_agree_to_the_last_bit(emps: Experiment) -> None:
     first, second = (identify_experiment(emps, load_robot("emps"), Options(method="idim-iv")) for _ in range(2))
     np.testing.assert_array_equal(first.theta, second.theta)

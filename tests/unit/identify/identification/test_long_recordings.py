@@ -57,6 +57,7 @@ def test_stretches_hold_the_samples_and_references_of_the_whole(robot: str) -> N
     assert np.allclose(np.diff(starts), lengths[:-1], rtol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("method", "check"),
     [

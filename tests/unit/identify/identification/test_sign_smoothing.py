@@ -96,6 +96,7 @@ def smoothed_sign(width: float, speed: NDArray[np.float64]) -> NDArray[np.float6
     return np.asarray(2 / np.pi * np.arctan(speed / width))
 
 
+@pytest.mark.slow
 def test_intervals_hold_the_width_of_the_transition() -> None:
     inside = []
     for seed in range(6):

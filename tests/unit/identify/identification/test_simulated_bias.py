@@ -57,6 +57,7 @@ def test_methods_without_noise_model_say_that_coloured_noise_makes_their_interva
     assert any("serially correlated" in warning for warning in found.interval_warnings)
 
 
+@pytest.mark.slow
 def test_instrumental_variables_allow_for_coloured_noise() -> None:
     white, coloured = (
         identify_experiment(axis.recorded(0, torque=2.0, pole=pole), axis.robot(), Options(method="idim-iv"))

@@ -232,6 +232,7 @@ def test_late_torques_are_doubtful_in_one_line(arm: RobotConfig) -> None:
     assert delay(judged(robot=arm, statistics=SimpleNamespace(delay=None)), CRITERIA) == []
 
 
+@pytest.mark.slow
 def test_the_parameters_do_not_depend_on_the_verdict(healthy: list[Experiment], arm: RobotConfig) -> None:
     one = identify_experiment(healthy, arm, LEAST_SQUARES)
     other = identify_experiment(healthy, arm, LEAST_SQUARES, setup=set_up(WRONG_UNIT))

@@ -154,6 +154,7 @@ def test_mujoco_computes_our_torques_from_the_urdf(model: ExportedModel, motion:
     assert relative_error(found, rigid_torque(model, motion, *viscous)) < TOLERANCE
 
 
+@pytest.mark.slow
 def test_drake_computes_our_torques_from_the_sdf(model: ExportedModel, motion: Motion, tmp_path: Path) -> None:
     file = written(model, "sdf", tmp_path)
     viscous = [name for name in model.arm.names if name.startswith("fv") and name[2:].isdigit()]

@@ -323,6 +323,7 @@ def test_a_wrong_request_is_one_line(
     assert err.count("\n") == 1
 
 
+@pytest.mark.slow
 def test_an_identification_in_memory_is_exported(tmp_path: Path) -> None:
     recording = arms.recording("emps", "emps_excitation", 1)
     result = armident.identify(recording, method="idim-ls")

@@ -137,6 +137,7 @@ def test_the_sources_of_an_fmu_compile_without_a_warning(fmu: Path, tmp_path: Pa
     subprocess.run(["gcc", *strict, "-c", *files], cwd=tmp_path, check=True)
 
 
+@pytest.mark.slow
 def test_equal_models_give_equal_units(model: ExportedModel, fmu: Path, tmp_path: Path) -> None:
     again = export_model(model, "fmu", tmp_path / "arm.fmu")[0][0]
     with zipfile.ZipFile(again) as one, zipfile.ZipFile(fmu) as other:

@@ -99,6 +99,7 @@ def test_a_result_is_kept_once_and_comes_back_as_it_was(url: str, tmp_path: Path
     assert again.arms() == [("arm", None)]
 
 
+@pytest.mark.slow
 def test_weeks_of_the_same_arm_are_no_change_and_a_change_is_exit_code_4(url: str, tmp_path: Path) -> None:
     rng = np.random.default_rng(7)
     weeks = [result(k, d) for k, d in enumerate(rng.multivariate_normal(TRUTH, C, 8))]

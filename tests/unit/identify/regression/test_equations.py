@@ -104,6 +104,7 @@ def test_a_joint_that_is_noisier_counts_less() -> None:
     assert abs(estimate.theta[0] - 1) < 0.05
 
 
+@pytest.mark.slow
 def test_ordinary_least_squares_knows_its_scatter_where_joints_differ() -> None:
     found, promised = [], np.zeros(2)
     keep, t = np.ones((200, 2), dtype=np.bool_), np.arange(200.0)

@@ -33,6 +33,7 @@ def autocovariances(x: Array, lags: int) -> Array:
     return np.array([x[k:] @ x[: x.size - k] for k in range(lags + 1)]) / x.size
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("order", [1, 2, 7, 30, 60])
 def test_levinson_durbin_solves_the_yule_walker_equations(order: int) -> None:
     from statsmodels.tsa.stattools import levinson_durbin as reference_levinson_durbin
@@ -52,6 +53,7 @@ def test_levinson_durbin_stops_at_an_exact_model() -> None:
     assert variances.size == coefficients.shape[0] == 2
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:yule_walker currently returns:FutureWarning")
 @pytest.mark.parametrize("seed", range(4))
 def test_ar_model_is_the_yule_walker_estimate_of_lowest_aic(seed: int) -> None:

@@ -59,6 +59,7 @@ def test_the_verdict_stands_in_a_card_before_everything_else(outcome: Identifica
         assert page.count(str(escape(reason.message))) == 1 + (reason.kind in ("residual", "uncertainty"))
 
 
+@pytest.mark.slow
 def test_an_unusable_result_is_neither_converged_nor_white(outcome: IdentificationOutcome) -> None:
     reason = VerdictReason(
         level="unusable", kind="error", joint=None, message="The model explains nothing", next_step="x"

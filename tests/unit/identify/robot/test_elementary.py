@@ -1,6 +1,7 @@
 """Vector sine, cosine and arctangent against the C library's."""
 
 import numpy as np
+import pytest
 
 from armident.compiled import ARITHMETIC, compiled
 from armident.identify.robot.chain import Floats
@@ -25,6 +26,7 @@ def lanes(n: int) -> int:
     return padded(n)
 
 
+@pytest.mark.slow
 def test_sine_and_cosine_are_exact_to_the_last_places_up_to_1e5() -> None:
     rng = np.random.default_rng(1)
     quarters = np.arange(-400, 401) * (np.pi / 4)
@@ -35,6 +37,7 @@ def test_sine_and_cosine_are_exact_to_the_last_places_up_to_1e5() -> None:
     assert np.abs(cosine - np.cos(angle)).max() < 4e-16
 
 
+@pytest.mark.slow
 def test_the_arctangent_is_exact_to_the_last_places_everywhere() -> None:
     rng = np.random.default_rng(2)
     x = np.concatenate(
