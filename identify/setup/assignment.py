@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 from scipy import optimize
 
 from armident.identify.setup.bench import Bench
-from armident.identify.setup.fit import FLOOR, Hypothesis, physical_least_squares, regressors
+from armident.identify.setup.fit import Hypothesis, regressors
+from armident.identify.setup.least_squares import every_column
 
 Array = NDArray[np.float64]
 OrderCriterion = Callable[[Array], float]
@@ -28,13 +29,10 @@ def by_rows(bench: Bench, h: Hypothesis) -> Hypothesis:
     for m in range(n):
         used = np.flatnonzero(np.abs(x[m]).max(axis=0) > 0)
         own = x[m][:, used]
-        gram, physical = own.T @ own, physical_rows[m::n][:, used]
+        normal = every_column((own.T @ own)[None], physical_rows[m::n][:, used], np.ones(1, np.bool_))
         for k in range(n):
-            right = own.T @ y[:, k]
-            shares = []
-            for s in (1.0, -1.0):
-                theta = physical_least_squares(gram, s * right, physical)
-                shares.append(max((power[k] - 2 * s * right @ theta + theta @ gram @ theta) / power[k], FLOOR))
+            right = (own.T @ y[:, k])[None]
+            shares = [float(normal.solve(sign * right, power[k : k + 1], 1).shares[0]) for sign in (1.0, -1.0)]
             cost[m, k] = np.log(min(shares))
             sign[m, k] = 1.0 if shares[0] <= shares[1] else -1.0
     chosen = np.flatnonzero(bench.moving)
@@ -51,9 +49,8 @@ def by_friction(bench: Bench, h: Hypothesis) -> Array:
     Dry friction changes only the torque of its own joint where that joint turns round. Needs no model of the arm.
     """
     n = bench.n
-    x = bench.rows(np.eye(n)).wide
-    dry = np.stack([x[j, :, bench.column(f"fc{j + 1}")] for j in range(n)], axis=1)
-    slow = np.stack([x[j, :, bench.column(f"fv{j + 1}")] for j in range(n)], axis=1)
+    rows = bench.rows(np.eye(n))
+    dry, slow = rows.friction[:, :, 0], rows.qd
     fast = bench.kept([s.qdd for s in bench.segments])
     q = bench.kept([s.q for s in bench.segments])
     smooth = np.concatenate([np.ones((q.shape[0], 1)), q, np.sin(q), np.cos(q), fast, slow], axis=1)

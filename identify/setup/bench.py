@@ -3,14 +3,13 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from armident.configs import DataError, RobotConfig
-from armident.identify.regression.whitening import nonzero_columns
 from armident.identify.robot.arm import ArmModel
+from armident.identify.setup.rows import ODD, Columns, Rows, columns_of, friction_terms, make_room
 from armident.identify.signals.bandwidth import motion_bandwidth
 from armident.identify.signals.decimate import Decimation, design
 from armident.identify.signals.experiments import Experiment
@@ -32,9 +31,6 @@ LEAST_ROWS = 40
 LEAST_SAMPLES = 200
 """Least number of samples: ten per period of twenty periods of a motion."""
 
-SLOW = 0.02
-"""Share of a joint's largest velocity below which the sign of its velocity is smoothed."""
-
 AT_REST = 0.05
 """Share of a joint's largest velocity below which it counts as at rest: the motion does not determine its dry friction
 there, nor the torque that holds it."""
@@ -42,30 +38,9 @@ there, nor the torque that holds it."""
 LEAST_MOVING = 0.1
 """Least share of the instants at which all joints move, for only those to be used."""
 
-BREAKAWAY = 0.1
-"""Share of a joint's largest velocity over which the free friction term of low velocities decays."""
-
-SPRING_TERMS = 2
-"""Springs of every joint beside the rigid model: linear and cubic. Without the cubic one a spring that stiffens looks
-like another direction of gravity."""
-
-ROTOR_TERMS = 1
-"""Rotor inertia of every joint beside the rigid model: where the configuration lacks it, its torque looks like another
-unit of the positions."""
-
-FREE_TERMS = SPRING_TERMS + ROTOR_TERMS + 3
-"""Free terms of every joint beside the rigid model: springs, rotor inertia, asymmetric, quadratic and low-velocity
-friction."""
-
 MOST_KEPT = 32
 """Largest number of assignments of positions whose equations are kept, 5 MB each for six joints: the gear ratio and the
 position of one joint are scaled alike."""
-
-GRAMS_KEPT = 4
-"""Largest number of gravities whose normal equations are kept for each assignment: torques are changed one by one."""
-
-POSTURES = 40
-"""Postures over which moments of inertia are averaged."""
 
 GENERIC = np.array([3.1, -5.3, -7.6])
 """Direction of gravity, m/s^2, without any symmetry: its base parameters serve for every direction."""
@@ -83,37 +58,6 @@ class Segment:
     q_ref: Array | None = None
     begin: float = 0.0
     experiment: int = 0
-
-
-@dataclass(frozen=True, eq=False)
-class Rows:
-    """Equations of all joints for one assignment of positions, and their normal equations for any gravity.
-
-    ``wide`` (n, M, c + 3 h): base parameters without gravity and free terms, then what gravity along each base axis,
-    per m/s^2, adds to the columns ``heavy`` (h,). ``square``: ``wide' wide``. ``physical`` (3 n, c): rows with
-    non-negative products: mean inertia, friction power, rotor inertia. ``products``: ``wide' y``, by shifts of torques.
-    """
-
-    wide: Array
-    square: Array
-    heavy: NDArray[np.int64]
-    physical: Array
-    products: dict[bytes, Array] = field(default_factory=dict)
-    grams: dict[bytes, Array] = field(default_factory=dict)
-
-    def under(self, gravity: Array, wide: Array) -> Array:
-        """Regressors, or products with them, (..., c) under a gravity (3,), m/s^2, from those with all columns."""
-        h = self.heavy.size
-        c = wide.shape[-1] - 3 * h
-        found = wide[..., :c].copy()
-        found[..., self.heavy] += sum(g * wide[..., c + a * h : c + (a + 1) * h] for a, g in enumerate(gravity))
-        return found
-
-    def of_gravity(self, values: Array) -> Array:
-        """Torques (n, M, 3) of gravity along each base axis, per m/s^2, with values of the columns (c,)."""
-        h = self.heavy.size
-        columns = self.wide[..., self.wide.shape[-1] - 3 * h :]
-        return np.asarray(columns.reshape(*columns.shape[:2], 3, h) @ values[self.heavy])
 
 
 @dataclass(eq=False)
@@ -135,6 +79,7 @@ class Bench:
     at_rest: bool = False
     _rows: dict[bytes, Rows] = field(default_factory=dict, repr=False)
     _torques: dict[bytes, Array] = field(default_factory=dict, repr=False)
+    _models: dict[bytes, ArmModel] = field(default_factory=dict, repr=False)
 
     @property
     def n(self) -> int:
@@ -192,16 +137,23 @@ class Bench:
         return position, velocity, torque
 
     @cached_property
-    def _weightless(self) -> tuple[ArmModel, ...]:
-        """The model without gravity, and with 1 m/s^2 along each base axis."""
-        return tuple(self.model.with_gravity(g) for g in (np.zeros(3), *np.eye(3)))
+    def peaks(self) -> tuple[Array, Array, Array]:
+        """Largest magnitudes of the recorded positions, velocities and torques after filtering, (n,) each."""
+        position, velocity, torque = (np.abs(x).max(axis=0) for x in self.recorded)
+        return position, velocity, torque
+
+    def under(self, gravity: Array) -> ArmModel:
+        """Return the model under a gravity (3,), m/s^2."""
+        key = gravity.tobytes()
+        if key not in self._models:
+            make_room(self._models, MOST_KEPT)
+            self._models[key] = self.model.with_gravity(gravity)
+        return self._models[key]
 
     @cached_property
-    def _heavy(self) -> NDArray[np.int64]:
-        """Columns that gravity changes, (h,): at postures without any symmetry."""
-        q = np.random.default_rng(0).uniform(-np.pi, np.pi, (POSTURES, self.n))
-        found = np.stack([model.rigid_regressor(q, 0.0 * q, 0.0 * q) for model in self._weightless])
-        return np.flatnonzero(np.any(found[1:] != found[0], axis=(0, 1, 2)))
+    def columns(self) -> Columns:
+        """Structure of the equations."""
+        return columns_of(self.model)
 
     def coarse(self, rows: int) -> "Bench":
         """Return the same signals with fewer instants. ``rows``: largest number of instants."""
@@ -217,7 +169,7 @@ class Bench:
         segments = tuple(
             replace(s, q=s.q + offsets, q_ref=None if s.q_ref is None else s.q_ref + offsets) for s in self.segments
         )
-        return replace(self, segments=segments, _rows={}, _torques={})
+        return replace(self, segments=segments, _rows={}, _torques={}, _models={})
 
     def slopes(self, position: Array, gravity: Array, values: Array, step: float) -> Array:
         """Torques (n, n, M) by each joint's position, per rad or m, under ``gravity`` (3,): joint moved, joint, row.
@@ -225,7 +177,7 @@ class Bench:
         ``values`` (c,): parameters. ``step``: half the difference of positions, rad or m.
         """
         q, qd, qdd = (x @ position.T for x in self._motion)
-        model, base = self.model.with_gravity(gravity), values[: self.rigid]
+        model, base = self.under(gravity), values[: self.rigid]
         ends = [
             [(model.rigid_regressor(q + sign * offset, qd, qdd) @ base).T for sign in (1.0, -1.0)]
             for offset in step * np.eye(self.n)
@@ -237,11 +189,7 @@ class Bench:
 
     def column(self, name: str) -> int:
         """Column of a standard parameter that is a base parameter, possibly with others regrouped into it."""
-        return self._columns[name]
-
-    @cached_property
-    def _columns(self) -> dict[str, int]:
-        return {self.model.names[k]: column for column, k in enumerate(self.model.base.independent)}
+        return self.columns.named[name]
 
     @cached_property
     def _motion(self) -> tuple[Array, Array, Array]:
@@ -261,7 +209,8 @@ class Bench:
         key = np.round(position, 9).tobytes()
         if key not in self._rows:
             make_room(self._rows, MOST_KEPT)
-            self._rows[key] = self._make(position)
+            q, qd, qdd = (x @ position.T for x in self._motion)
+            self._rows[key] = Rows(self.columns, self.under, self.moving, q, qd, qdd, self._friction_of(position))
         return self._rows[key]
 
     def kept(self, signals: Sequence[Array]) -> Array:
@@ -269,54 +218,19 @@ class Bench:
         pairs = zip(signals, self.instants_used, strict=True)
         return np.concatenate([self.decimation(x)[instants] for x, instants in pairs])
 
-    def _make(self, position: Array) -> Rows:
-        n, b, heavy = self.n, self.rigid, self._heavy
-        q, qd, qdd = (x @ position.T for x in self._motion)
+    def _friction_of(self, position: Array) -> Array:
+        """Friction terms (M, n, 4) of positions ``position @ q_recorded``; a sign turns the odd ones."""
+        taken = np.abs(position).argmax(axis=1)
+        if np.count_nonzero(position) == self.n and np.unique(taken).size == self.n:
+            signs = np.sign(position[np.arange(self.n), taken])
+            return np.asarray(self._recorded_friction[:, taken] * np.where(ODD, signs[:, None], 1.0))
         top = np.maximum(np.max([np.abs(s.qd @ position.T).max(axis=0) for s in self.segments], axis=0), 1e-12)
-        free = self.kept([_friction(s.qd @ position.T, top) for s in self.segments])
-        weightless, *along = self._weightless
-        still = np.zeros_like(q)
-        c = b + FREE_TERMS * n
-        wide = np.zeros((n, q.shape[0], c + 3 * heavy.size))
-        wide[:, :, :b] = weightless.rigid_regressor(q, qd, qdd).transpose(1, 0, 2)
-        at_rest = weightless.rigid_regressor(q, still, still)[:, :, heavy]
-        gravity = [model.rigid_regressor(q, still, still)[:, :, heavy] - at_rest for model in along]
-        wide[:, :, c:] = np.concatenate(gravity, axis=2).transpose(1, 0, 2)
-        inertia = self._mean_inertia(q)
-        physical = np.zeros((3, n, c))
-        stroke = q - q.mean(axis=0)
-        springs = np.stack([stroke, stroke**3 / np.maximum(np.abs(stroke).max(axis=0), 1e-12) ** 2], axis=2)
-        for j, x in enumerate(wide):
-            dry = self.column(f"fc{j + 1}")
-            wide[:, :, dry] = 0.0
-            x[:, dry] = free[:, j, 0]
-            own = b + FREE_TERMS * j + np.arange(FREE_TERMS)
-            rotor, friction = own[SPRING_TERMS], own[SPRING_TERMS + ROTOR_TERMS :]
-            x[:, own[:SPRING_TERMS]] = springs[:, j]
-            x[:, rotor] = qdd[:, j]
-            x[:, friction] = free[:, j, 1:]
-            physical[0, j, :b] = inertia[j]
-            physical[0, j, rotor] = 1.0
-            columns = [self.column(f"fv{j + 1}"), dry, *friction]
-            physical[1, j, columns] = (x[:, columns] * qd[:, j, None]).mean(axis=0)
-            physical[2, j, rotor] = 1.0
-        square = np.zeros((n, wide.shape[2], wide.shape[2]))
-        for gram, x in zip(square, wide, strict=True):
-            # A joint feels the links beyond it only, and its own friction.
-            used = nonzero_columns(x)
-            felt = x[:, used]
-            gram[np.ix_(used, used)] = felt.T @ felt
-        return Rows(wide, square, heavy, physical.reshape(3 * n, -1))
+        return self.kept([friction_terms(s.qd @ position.T, top) for s in self.segments])
 
-    def _mean_inertia(self, q: Array) -> Array:
-        """Torque of each joint per unit of its own acceleration, mean over postures of positions (M, n), (n, b)."""
-        n, model = self.n, self._weightless[0]
-        q = q[:: max(1, q.shape[0] // POSTURES, MOST_ROWS // POSTURES)]
-        postures, still = np.tile(q, (n, 1)), np.zeros((n * q.shape[0], n))
-        push = np.repeat(np.eye(n), q.shape[0], axis=0)
-        unit = model.rigid_regressor(postures, still, push) - model.rigid_regressor(postures, still, still)
-        own = unit.reshape(n, -1, n, unit.shape[2])[np.arange(n), :, np.arange(n)]
-        return np.asarray(own.mean(axis=1))
+    @cached_property
+    def _recorded_friction(self) -> Array:
+        top = np.maximum(self._fastest, 1e-12)
+        return self.kept([friction_terms(s.qd, top) for s in self.segments])
 
 
 def make_bench(
@@ -368,22 +282,9 @@ def make_bench(
     return Bench(model, robot, tuple(segments), second, moving, dt)
 
 
-def make_room(kept: dict[bytes, Any], most: int) -> None:
-    """Remove the oldest entries of a cache, so that with one more it has ``most`` entries."""
-    while len(kept) >= most:
-        del kept[next(iter(kept))]
-
-
 def _shifted(x: Array, samples: Array) -> Array:
     """Signals (N, n) moved to earlier times by numbers of samples (n,), linearly interpolated."""
     if not samples.any():
         return x
     t = np.arange(x.shape[0], dtype=np.float64)
     return np.stack([np.interp(t + s, t, column) for s, column in zip(samples, x.T, strict=True)], axis=1)
-
-
-def _friction(qd: Array, top: Array) -> Array:
-    """Free friction terms (W, n, 4): dry, asymmetric viscous, quadratic, and dry at low velocity only."""
-    u = qd / top
-    sign = 2 / np.pi * np.arctan(u / SLOW)
-    return np.stack([sign, np.abs(u), u * np.abs(u), sign * np.exp(-np.abs(u) / BREAKAWAY)], axis=2)

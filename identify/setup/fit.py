@@ -4,36 +4,15 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import optimize
-from scipy.linalg import lapack
 
-from armident.identify.setup.bench import GRAMS_KEPT, Bench, make_room
+from armident.identify.setup.bench import Bench
+from armident.identify.setup.least_squares import FLOOR, PASSES, Normal, Solution, every_column
+from armident.identify.setup.rows import PARTS
 
 Array = NDArray[np.float64]
 
-PASSES = 3
-"""Iterations between parameters and the weights of the joints."""
-
 CONVERGED = 6
 """The same where the slope of the fit is used, which assumes that they have converged."""
-
-SETTLED = 1e-4
-"""Relative change of the shares that ends these iterations: a two-hundredth of what is worth a refinement."""
-
-FLOOR = 1e-6
-"""Least share of a joint's torque power that counts as residual."""
-
-RIDGE = 1e-6
-"""Ridge of the column-normalised normal equations: parameters that a motion does not determine stay small."""
-
-PARTS = 4
-"""Parts of the cross-validation; each consists of several blocks of time."""
-
-KEPT = 64
-"""Largest number of shifts of the torques whose products with the regressors are kept for repeated use."""
-
-BLOCKS = 24
-"""Contiguous blocks of time per experiment set: long against the memory of the residual."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,40 +43,15 @@ def _gravity(h: Hypothesis) -> Array:
     return h.gravity * h.clock**2
 
 
-def grams_of(bench: Bench, h: Hypothesis) -> Array:
-    """``X_m' X_m`` of all rows of the model, (n, c, c)."""
-    rows, gravity = bench.rows(h.position), _gravity(h)
-    key = gravity.tobytes()
-    if key not in rows.grams:
-        make_room(rows.grams, GRAMS_KEPT)
-        rows.grams[key] = rows.under(gravity, rows.under(gravity, rows.square).transpose(0, 2, 1))
-    return rows.grams[key]
-
-
-def products_of(bench: Bench, h: Hypothesis) -> Array:
-    """``X_m' y_k`` of all rows of the model with all recorded torques, (n, n, c)."""
-    return bench.rows(h.position).under(_gravity(h), _wide_products(bench, h))
-
-
-def _wide_products(bench: Bench, h: Hypothesis) -> Array:
-    """The same with all columns of `Rows.wide`."""
-    rows, key = bench.rows(h.position), np.round(h.shift, 9).tobytes()
-    if key not in rows.products:
-        make_room(rows.products, KEPT)
-        rows.products[key] = (rows.wide.transpose(0, 2, 1) @ bench.torque(h.shift)).transpose(0, 2, 1)
-    return rows.products[key]
-
-
 def regressors(bench: Bench, h: Hypothesis) -> Array:
     """Regressors (n, M, c) of the corrected torques."""
-    rows = bench.rows(h.position)
-    return rows.under(_gravity(h), rows.wide)
+    return bench.rows(h.position).regressors(_gravity(h))
 
 
 def fit_shares(bench: Bench, h: Hypothesis) -> Array:
     """Residual share of the power of every recorded torque, in sample, (n,); see `fit`."""
-    known = _of_one_joint_each(bench, h)
-    return fit(bench, h).shares if known is None else _solve(*known)[1]
+    given = _of_one_joint_each(bench, h)
+    return fit(bench, h).shares if given is None else given.solve(PASSES).shares[given.owner]
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,7 +59,7 @@ class Misfit:
     """Sum of the logarithms of the residual shares of the moving joints, nats per row, and its slopes.
 
     ``by_scale`` (n,): by the logarithm of the factor of each torque. ``by_gravity`` (3,): per m/s^2. ``None`` where a
-    recorded torque belongs to several joints.
+    recorded torque belongs to several joints, or which was not asked for.
     """
 
     value: float
@@ -113,39 +67,67 @@ class Misfit:
     by_gravity: Array | None = None
 
 
-def misfit(bench: Bench, h: Hypothesis) -> Misfit:
-    """Return the misfit of a hypothesis with slopes: the fitted parameters, which minimise it, do not change them."""
-    known = _of_one_joint_each(bench, h)
-    if known is None:
+def misfit(bench: Bench, h: Hypothesis, *, turned: bool = False) -> Misfit:
+    """Return the misfit of a hypothesis with slopes: the fitted parameters, which minimise it, do not change them.
+
+    ``turned``: with the slope by gravity.
+    """
+    given = _of_one_joint_each(bench, h)
+    if given is None:
         return Misfit(float(np.log(fit_shares(bench, h)[bench.moving]).sum()))
-    theta, shares = _solve(*known, passes=CONVERGED)
-    grams, products, power = known[:3]
-    weights = np.where(bench.moving & (shares > FLOOR), 1.0 / (shares * power), 0.0)
-    owner, own = np.abs(h.torque).argmax(axis=0), np.arange(bench.n)
-    by_scale = np.zeros(bench.n)
-    by_scale[owner] = 2 * weights * (products @ theta - grams @ theta @ theta)
+    found = given.solve(CONVERGED)
+    shares, theta = found.shares, found.theta
+    value = float(np.log(shares[given.normal.used]).sum())
+    weights = np.where(given.normal.used & (shares > FLOOR), 1.0 / (shares * given.power), 0.0)
+    # The power of the model is the residual power less that of the torque, plus twice their product.
+    by_scale = 2.0 * weights * (given.power - shares * given.power - found.explained)
+    if not turned:
+        return Misfit(value, by_scale)
     # What gravity adds per m/s^2, times the residual.
-    rows, gravity = bench.rows(h.position), _gravity(h)
-    light, heavy = theta.size, theta[rows.heavy]
+    rows, gravity, n = bench.rows(h.position), _gravity(h), bench.n
+    c, heavy = theta.size, theta[rows.columns.heavy]
     columns = np.concatenate([theta, *(g * heavy for g in gravity)])
-    recorded = h.torque[owner, own, None] * _wide_products(bench, h)[owner, own, light:]
-    left = rows.square[owner, light:] @ columns - recorded
+    wide = rows.wide_products(bench.torque(h.shift), _key(h.shift))[np.arange(n), given.recorded, c:]
+    left = rows.square[:, c:] @ columns - given.scale[:, None] * wide
     by_gravity = 2 * h.clock**2 * (weights @ left).reshape(3, -1) @ heavy
-    return Misfit(float(np.log(shares[bench.moving]).sum()), by_scale, by_gravity)
+    return Misfit(value, by_scale, by_gravity)
 
 
-def _of_one_joint_each(bench: Bench, h: Hypothesis) -> tuple[Array, Array, Array, Array, NDArray[np.bool_]] | None:
-    """Normal equations of recorded torques that belong to one joint each, in its units; else ``None``."""
-    owner, own = np.abs(h.torque).argmax(axis=0), np.arange(bench.n)
-    scale = h.torque[owner, own]
-    if np.count_nonzero(h.torque) != np.count_nonzero(scale):
+@dataclass(frozen=True, eq=False)
+class _Given:
+    """Normal equations of recorded torques that belong to one joint each, in the joints' order and units.
+
+    ``owner``: joint of each recorded torque; ``recorded``: recorded torque of each joint, with its ``scale``, (n,).
+    """
+
+    normal: Normal
+    products: Array
+    power: Array
+    owner: NDArray[np.int64]
+    recorded: NDArray[np.int64]
+    scale: Array
+
+    def solve(self, passes: int) -> Solution:
+        return self.normal.solve(self.products, self.power, passes)
+
+
+def _of_one_joint_each(bench: Bench, h: Hypothesis, *, free: bool = True) -> _Given | None:
+    """Normal equations of a hypothesis in which every recorded torque belongs to one joint; else ``None``."""
+    own, recorded = np.arange(bench.n), np.abs(h.torque).argmax(axis=1)
+    owner, scale = np.argsort(recorded), h.torque[own, recorded]
+    if np.count_nonzero(h.torque) != bench.n or np.any(recorded[owner] != own) or not scale.all():
         return None
-    grams = grams_of(bench, h)
-    if not np.array_equal(owner, own):
-        grams = grams[owner]
-    products = products_of(bench, h)[owner, own] * scale[:, None]
-    power = np.maximum((bench.torque(h.shift) ** 2).sum(axis=0), 1e-300) * scale**2
-    return grams, products, power, bench.rows(h.position).physical, bench.moving
+    if not np.array_equal(bench.moving[recorded], bench.moving):
+        return None
+    rows, gravity, torque = bench.rows(h.position), _gravity(h), bench.torque(h.shift)
+    normal = rows.normal(gravity, free=free)
+    products = rows.products(gravity, torque, _key(h.shift))[own, recorded, : normal.limits.shape[1]]
+    power = np.maximum((torque**2).sum(axis=0), 1e-300)[recorded] * scale**2
+    return _Given(normal, products * scale[:, None], power, owner, recorded, scale)
+
+
+def _key(shift: Array) -> bytes:
+    return np.round(shift, 9).tobytes()
 
 
 def equations(bench: Bench, h: Hypothesis, *, free: bool = True) -> tuple[Array, Array, Array]:
@@ -160,16 +142,21 @@ def equations(bench: Bench, h: Hypothesis, *, free: bool = True) -> tuple[Array,
 
 def fit(bench: Bench, h: Hypothesis, *, free: bool = True) -> Fit:
     """Fit with non-negative mean inertias and dissipative friction; ``free``: with free friction and springs."""
-    x, y, physical = equations(bench, h, free=free)
-    grams, products, power = _normal(x, y)
-    theta, shares = _solve(grams, products, power, physical, bench.moving)
-    return Fit(shares, y - x @ theta, theta)
+    given = _of_one_joint_each(bench, h, free=free)
+    if given is None:
+        x, y, physical = equations(bench, h, free=free)
+        grams, products, power = _normal(x, y)
+        found = every_column(grams, physical, bench.moving).solve(products, power)
+        return Fit(found.shares, y - x @ found.theta, found.theta)
+    found = given.solve(PASSES)
+    made = regressors(bench, h)[:, :, : found.theta.size] @ found.theta / given.scale[:, None]
+    return Fit(found.shares[given.owner], bench.torque(h.shift) - made[given.owner].T, found.theta)
 
 
 def fit_rows(x: Array, y: Array, used: NDArray[np.bool_], physical: Array, moving: NDArray[np.bool_]) -> Array:
     """Parameters (c,) of a fit to equations ``used`` (M, n), with ``x`` (M, n, c) and ``y`` (M, n)."""
-    theta, _ = _solve(*_normal(x * used[:, :, None], y * used), physical, moving)
-    return theta
+    grams, products, power = _normal(x * used[:, :, None], y * used)
+    return every_column(grams, physical, moving).solve(products, power).theta
 
 
 def joint_errors(bench: Bench, h: Hypothesis, *, free: bool = False) -> tuple[Array, Array]:
@@ -183,15 +170,24 @@ def joint_errors(bench: Bench, h: Hypothesis, *, free: bool = False) -> tuple[Ar
 
 def held_out(bench: Bench, h: Hypothesis) -> Array:
     """Residual share of the power of every recorded torque (n,) on blocks of time that were not fitted."""
-    x, y, physical = equations(bench, h)
-    block = (np.arange(y.shape[0]) * BLOCKS // y.shape[0]) % PARTS
-    parts = [_normal(x[block == k], y[block == k]) for k in range(PARTS)]
-    total = [sum(part[i] for part in parts) for i in range(3)]
+    rows, given = bench.rows(h.position), _of_one_joint_each(bench, h)
     left = np.zeros(bench.n)
-    for grams, products, power in parts:
-        theta, _ = _solve(total[0] - grams, total[1] - products, total[2] - power, physical, bench.moving)
-        left += power - 2 * products @ theta + grams @ theta @ theta
-    return np.maximum(left / total[2], FLOOR)
+    if given is None:
+        x, y, physical = equations(bench, h)
+        parts = [_normal(x[rows.part == k], y[rows.part == k]) for k in range(PARTS)]
+        grams, products, power = (sum(part[i] for part in parts) for i in range(3))
+        for gram, product, own_power in parts:
+            normal = every_column(grams - gram, physical, bench.moving)
+            theta = normal.solve(products - product, power - own_power).theta
+            left += own_power - 2 * product @ theta + gram @ theta @ theta
+        return np.maximum(left / power, FLOOR)
+    x, y = regressors(bench, h), bench.torque(h.shift)[:, given.recorded] * given.scale
+    for k, normal in enumerate(rows.parts(_gravity(h))):
+        x_k, y_k = x[:, rows.part == k], y[rows.part == k]
+        product = np.einsum("kmc,mk->kc", x_k, y_k)
+        theta = normal.solve(given.products - product, given.power - (y_k**2).sum(axis=0)).theta
+        left += ((y_k.T - x_k @ theta) ** 2).sum(axis=1)
+    return np.maximum(left / given.power, FLOOR)[given.owner]
 
 
 def _normal(x: Array, y: Array) -> tuple[Array, Array, Array]:
@@ -200,37 +196,3 @@ def _normal(x: Array, y: Array) -> tuple[Array, Array, Array]:
     grams = each.transpose(0, 2, 1) @ each
     products = np.einsum("kmc,mk->kc", each, y)
     return grams, products, np.maximum((y**2).sum(axis=0), 1e-300)
-
-
-def _solve(
-    grams: Array, products: Array, power: Array, physical: Array, used: NDArray[np.bool_], passes: int = PASSES
-) -> tuple[Array, Array]:
-    weights, flat = used / power, grams.reshape(power.size, -1)
-    theta, shares = np.zeros(products.shape[1]), np.ones(power.size)
-    for _ in range(passes):
-        theta = physical_least_squares((weights @ flat).reshape(grams.shape[1:]), weights @ products, physical)
-        before, shares = shares, np.maximum((power - 2 * products @ theta + grams @ theta @ theta) / power, FLOOR)
-        weights = used / (shares * power)
-        if np.all(np.abs(shares - before) < SETTLED * shares):
-            break
-    return theta, shares
-
-
-def physical_least_squares(gram: Array, right: Array, physical: Array) -> Array:
-    """``min theta' gram theta / 2 - right' theta`` subject to ``physical theta >= 0``, through the dual problem.
-
-    Lawson, Hanson, Solving Least Squares Problems, 1974, chapter 23.
-    """
-    scale = np.sqrt(np.diag(gram))
-    scale[scale <= 1e-12 * scale.max(initial=0.0)] = np.inf
-    # LAPACK itself: scipy's checks of the arguments take as long, thousands of times in a search.
-    lower, failed = lapack.dpotrf(gram / np.outer(scale, scale) + RIDGE * np.eye(scale.size), lower=1)
-    if failed:
-        raise np.linalg.LinAlgError("the normal equations are not positive definite")
-    free = lapack.dtrtrs(lower, right / scale, lower=1)[0]
-    limits = lapack.dtrtrs(lower, (physical / scale).T, lower=1)[0]
-    limits /= np.maximum(np.linalg.norm(limits, axis=0), 1e-300)
-    if np.any(limits.T @ free < 0):
-        free = free + limits @ optimize.nnls(limits, -free)[0]
-    theta: Array = lapack.dtrtrs(lower, free, lower=1, trans=1)[0] / scale
-    return theta

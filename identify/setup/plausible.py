@@ -48,24 +48,26 @@ def torque_ratio(bench: Bench, h: Hypothesis) -> float:
 def _positions(bench: Bench, h: Hypothesis) -> tuple[Array, Array]:
     """Largest position of each joint over its limit, and the limits."""
     limits = bench.limits[0]
-    return _largest(bench.recorded[0], h.position) / limits, limits
+    return _largest(bench, 0, h.position) / limits, limits
 
 
 def _velocities(bench: Bench, h: Hypothesis) -> tuple[Array, Array]:
     """Largest velocity of each joint over its limit, and the limits."""
     limits = bench.limits[1]
-    return _largest(bench.recorded[1], h.position) / h.clock / limits, limits
+    return _largest(bench, 1, h.position) / h.clock / limits, limits
 
 
 def _torques(bench: Bench, h: Hypothesis) -> tuple[Array, Array]:
     """Largest torque of each joint over its limit, and the limits."""
     limits = bench.limits[2]
-    return _largest(bench.recorded[2], h.torque) / limits, limits
+    return _largest(bench, 2, h.torque) / limits, limits
 
 
-def _largest(recorded: Array, correction: Array) -> Array:
-    """Largest magnitude (n,) of each corrected signal. ``recorded``: (W, n)."""
-    return np.asarray(np.abs(recorded @ correction.T).max(axis=0))
+def _largest(bench: Bench, signal: int, correction: Array) -> Array:
+    """Largest magnitude (n,) of each corrected signal: positions, velocities or torques, by number."""
+    if np.count_nonzero(correction) == bench.n and np.all(np.any(correction, axis=1)):
+        return np.asarray(np.abs(correction) @ bench.peaks[signal])
+    return np.asarray(np.abs(bench.recorded[signal] @ correction.T).max(axis=0))
 
 
 def plausible_factor(bench: Bench, h: Hypothesis) -> float:

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from armident.identify.setup import assignment, gravity, moves, scales
 from armident.identify.setup.bench import Bench
-from armident.identify.setup.fit import FLOOR, Hypothesis, fit, fit_shares, held_out, joint_errors, misfit
+from armident.identify.setup.fit import Hypothesis, fit, fit_shares, held_out, joint_errors, misfit
+from armident.identify.setup.least_squares import FLOOR
 from armident.identify.setup.plausible import LEAST_ODDS, log_plausibility, plausible_factor, worst_change
 from armident.identify.setup.prior import Mistake, between, composed, cost, wiring_cost
 
@@ -322,7 +323,7 @@ class Search:
             ratios = np.abs(np.diag(robot.transmission_matrix))
             unequal = np.all(ratios > 0) and np.ptp(ratios) > 0
             yield from self._torque_scales(step, (np.ones(bench.n), ratios) if unequal else (np.ones(bench.n),))
-        turned = gravity.best_direction(h, partial(misfit, bench))
+        turned = gravity.best_direction(h, partial(misfit, bench, turned=True))
         yield self._made(step, "gravity_direction", "another direction of gravity", turned)
         for clock in CLOCKS:
             yield self._made(step, "time_unit", f"time in units of {clock:g} s", scales.with_clock(h, clock))
