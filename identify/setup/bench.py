@@ -38,9 +38,9 @@ there, nor the torque that holds it."""
 LEAST_MOVING = 0.1
 """Least share of the instants at which all joints move, for only those to be used."""
 
-MOST_KEPT = 32
-"""Largest number of assignments of positions whose equations are kept, 5 MB each for six joints: the gear ratio and the
-position of one joint are scaled alike."""
+MOST_KEPT = 256
+"""Largest number of assignments of positions whose normal equations are kept, 0.4 MB each for seven joints: a step of
+the search that changes torques alone needs those of the step before."""
 
 GENERIC = np.array([3.1, -5.3, -7.6])
 """Direction of gravity, m/s^2, without any symmetry: its base parameters serve for every direction."""
@@ -78,8 +78,9 @@ class Bench:
     rows_kept: int = MOST_ROWS
     at_rest: bool = False
     _rows: dict[bytes, Rows] = field(default_factory=dict, repr=False)
-    _torques: dict[bytes, Array] = field(default_factory=dict, repr=False)
+    _torques: dict[bytes, tuple[Array, Array]] = field(default_factory=dict, repr=False)
     _models: dict[bytes, ArmModel] = field(default_factory=dict, repr=False)
+    _regressors: dict[bytes, Array] = field(default_factory=dict, repr=False)
 
     @property
     def n(self) -> int:
@@ -129,18 +130,15 @@ class Bench:
         return q, qd, tau
 
     @cached_property
-    def limits(self) -> tuple[Array, Array, Array]:
-        """Largest configured positions, velocities and torques, (n,) each."""
+    def limits(self) -> Array:
+        """Largest configured positions, velocities and torques, (3, n)."""
         limits = [joint.limits for joint in self.robot.joints]
-        most = ([max(map(abs, one.position)), one.velocity, one.torque] for one in limits)
-        position, velocity, torque = np.array(list(most), np.float64).T
-        return position, velocity, torque
+        return np.array([[max(map(abs, one.position)), one.velocity, one.torque] for one in limits], np.float64).T
 
     @cached_property
-    def peaks(self) -> tuple[Array, Array, Array]:
-        """Largest magnitudes of the recorded positions, velocities and torques after filtering, (n,) each."""
-        position, velocity, torque = (np.abs(x).max(axis=0) for x in self.recorded)
-        return position, velocity, torque
+    def peaks(self) -> Array:
+        """Largest magnitudes of the recorded positions, velocities and torques after filtering, (3, n)."""
+        return np.array([np.abs(x).max(axis=0) for x in self.recorded])
 
     def under(self, gravity: Array) -> ArmModel:
         """Return the model under a gravity (3,), m/s^2."""
@@ -169,7 +167,7 @@ class Bench:
         segments = tuple(
             replace(s, q=s.q + offsets, q_ref=None if s.q_ref is None else s.q_ref + offsets) for s in self.segments
         )
-        return replace(self, segments=segments, _rows={}, _torques={}, _models={})
+        return replace(self, segments=segments, _rows={}, _torques={}, _models={}, _regressors={})
 
     def slopes(self, position: Array, gravity: Array, values: Array, step: float) -> Array:
         """Torques (n, n, M) by each joint's position, per rad or m, under ``gravity`` (3,): joint moved, joint, row.
@@ -199,9 +197,18 @@ class Bench:
 
     def torque(self, shift: Array) -> Array:
         """Recorded torques (M, n) at the instants of the rows, moved earlier by ``shift`` (n,), s."""
+        return self._torque(shift)[0]
+
+    def power(self, shift: Array) -> Array:
+        """Power (n,) of these torques."""
+        return self._torque(shift)[1]
+
+    def _torque(self, shift: Array) -> tuple[Array, Array]:
         key = np.round(shift, 9).tobytes()
         if key not in self._torques:
-            self._torques[key] = self.kept([_shifted(s.tau, shift / s.dt) for s in self.segments])
+            make_room(self._torques, MOST_KEPT)
+            torque = self.kept([_shifted(s.tau, shift / s.dt) for s in self.segments])
+            self._torques[key] = torque, np.maximum((torque**2).sum(axis=0), 1e-300)
         return self._torques[key]
 
     def rows(self, position: Array) -> Rows:
@@ -210,7 +217,9 @@ class Bench:
         if key not in self._rows:
             make_room(self._rows, MOST_KEPT)
             q, qd, qdd = (x @ position.T for x in self._motion)
-            self._rows[key] = Rows(self.columns, self.under, self.moving, q, qd, qdd, self._friction_of(position))
+            self._rows[key] = Rows(
+                self.columns, self.under, self.moving, q, qd, qdd, self._friction_of(position), key, self._regressors
+            )
         return self._rows[key]
 
     def kept(self, signals: Sequence[Array]) -> Array:

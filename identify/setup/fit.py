@@ -113,16 +113,16 @@ class _Given:
 
 def _of_one_joint_each(bench: Bench, h: Hypothesis, *, free: bool = True) -> _Given | None:
     """Normal equations of a hypothesis in which every recorded torque belongs to one joint; else ``None``."""
-    own, recorded = np.arange(bench.n), np.abs(h.torque).argmax(axis=1)
-    owner, scale = np.argsort(recorded), h.torque[own, recorded]
-    if np.count_nonzero(h.torque) != bench.n or np.any(recorded[owner] != own) or not scale.all():
+    at = np.nonzero(h.torque)
+    if at[0].size != bench.n or np.any(at[0] != np.arange(bench.n)):
         return None
-    if not np.array_equal(bench.moving[recorded], bench.moving):
+    (own, recorded), owner = at, np.argsort(at[1])
+    if np.any(recorded[owner] != own) or np.any(bench.moving[recorded] != bench.moving):
         return None
-    rows, gravity, torque = bench.rows(h.position), _gravity(h), bench.torque(h.shift)
+    rows, gravity, scale = bench.rows(h.position), _gravity(h), h.torque[at]
     normal = rows.normal(gravity, free=free)
-    products = rows.products(gravity, torque, _key(h.shift))[own, recorded, : normal.limits.shape[1]]
-    power = np.maximum((torque**2).sum(axis=0), 1e-300)[recorded] * scale**2
+    products = rows.products(gravity, bench.torque(h.shift), _key(h.shift))[own, recorded, : normal.c]
+    power = bench.power(h.shift)[recorded] * scale**2
     return _Given(normal, products * scale[:, None], power, owner, recorded, scale)
 
 

@@ -5,7 +5,6 @@ What is left serves for any weights, units and signs of the torques.
 """
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +13,7 @@ from armident.compiled import ARITHMETIC, UNCOUNTED, compiled
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
+Places = NDArray[np.int64]
 
 PASSES = 3
 """Iterations between parameters and the weights of the joints."""
@@ -38,26 +38,21 @@ SUMS = {**ARITHMETIC, "fastmath": {*ARITHMETIC["fastmath"], "reassoc"}}
 
 @dataclass(frozen=True, eq=False)
 class Normal:
-    """Normal equations of n torques with c parameters under limits ``limits theta >= 0``.
+    """Normal equations of n torques with c parameters under limits, after the elimination of those of one torque each.
 
-    ``grams`` (n, c, c); ``own`` (n, o): columns of each torque alone, -1 for none; ``shared`` (s,): the others;
-    ``limits`` (k, c): limit p holds parameters of torque p modulo n; ``used`` (n,): torques that count.
+    ``own`` (n, o): columns of each torque alone, -1 for none; ``shared`` (s,): the others; ``used`` (n,): torques that
+    count. ``parts``: see `_eliminate`.
     """
 
-    grams: Array
-    own: NDArray[np.int64]
-    shared: NDArray[np.int64]
-    limits: Array
+    parts: tuple[Array, Array, Array, Array, Array, Array, Array]
+    own: Places
+    shared: Places
     used: Mask
 
-    @cached_property
-    def _eliminated(self) -> tuple[Array, Array, Array, Array, Array, Array, Array]:
-        grams, limits = (np.ascontiguousarray(x) for x in (self.grams, self.limits))
-        *parts, solvable = _eliminate(grams, self.own, self.shared, limits, self.used)
-        if not solvable:
-            raise np.linalg.LinAlgError(SINGULAR)
-        factor, across, left, own_power, shared_power, inner, outer = parts
-        return factor, across, left, own_power, shared_power, inner, outer
+    @property
+    def c(self) -> int:
+        """Number of parameters."""
+        return self.shared.size + int((self.own >= 0).sum())
 
     def solve(self, products: Array, power: Array, passes: int = PASSES) -> "Solution":
         """Weight every torque by its own residual power. ``products`` (n, c): ``X' y``; ``power`` (n,): ``y' y``.
@@ -65,10 +60,28 @@ class Normal:
         Raises numpy.linalg.LinAlgError if the equations are not positive definite.
         """
         given = np.ascontiguousarray(products), np.ascontiguousarray(power)
-        theta, shares, explained, solvable = _solve(*self._eliminated, self.own, self.shared, self.used, *given, passes)
+        theta, shares, explained, solvable = _solve(*self.parts, self.own, self.shared, self.used, *given, passes)
         if not solvable:
             raise np.linalg.LinAlgError(SINGULAR)
         return Solution(theta, shares, explained)
+
+
+def normal_equations(grams: Array, limits: Array, used: Mask, own: Places, shared: Places) -> Normal:
+    """Eliminate from ``X_m' X_m`` (n, c, c) the parameters of one torque each, with ``limits theta >= 0``.
+
+    ``limits`` (k, c): limit p holds parameters of torque p modulo n. Raises numpy.linalg.LinAlgError, see `Normal`.
+    """
+    *parts, solvable = _eliminate(np.ascontiguousarray(grams), own, shared, np.ascontiguousarray(limits), used)
+    if not solvable:
+        raise np.linalg.LinAlgError(SINGULAR)
+    factor, across, left, own_power, shared_power, inner, outer = parts
+    return Normal((factor, across, left, own_power, shared_power, inner, outer), own, shared, used)
+
+
+def every_column(grams: Array, limits: Array, used: Mask) -> Normal:
+    """Return equations of which no parameter acts on one torque alone."""
+    n, c = grams.shape[:2]
+    return normal_equations(grams, limits, used, np.zeros((n, 0), np.int64), np.arange(c))
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,12 +91,6 @@ class Solution:
     theta: Array
     shares: Array
     explained: Array
-
-
-def every_column(grams: Array, limits: Array, used: Mask) -> Normal:
-    """Return equations of which no parameter acts on one torque alone."""
-    n, c = grams.shape[:2]
-    return Normal(grams, np.zeros((n, 0), np.int64), np.arange(c), limits, used)
 
 
 @compiled(nogil=False, forceinline=True, **SUMS, **UNCOUNTED)
@@ -124,7 +131,7 @@ def _backward(lower: Array, x: Array, size: int) -> None:
 
 @compiled("f8[:, :, ::1], i8[:, ::1], i8[::1], f8[:, ::1], b1[::1]", **SUMS)
 def _eliminate(
-    grams: Array, own: NDArray[np.int64], shared: NDArray[np.int64], limits: Array, used: Mask
+    grams: Array, own: Places, shared: Places, limits: Array, used: Mask
 ) -> tuple[Array, Array, Array, Array, Array, Array, Array, bool]:
     """Factors (n, o, o), what they make of the shared columns (n, o, s), what is left of these (n, s, s) and of limits.
 
@@ -194,7 +201,7 @@ def _eliminate(
 )
 def _solve(
     factor: Array, across: Array, left: Array, own_power: Array, shared_power: Array, inner: Array, outer: Array,
-    own: NDArray[np.int64], shared: NDArray[np.int64], used: Mask, products: Array, power: Array, passes: int,
+    own: Places, shared: Places, used: Mask, products: Array, power: Array, passes: int,
 ) -> tuple[Array, Array, Array, bool]:  # fmt: skip
     """Parameters (c,), shares (n,), explained powers (n,), and False if the equations are not positive definite."""
     n, o, s = across.shape

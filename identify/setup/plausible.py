@@ -1,5 +1,7 @@
 """Plausibility of units: recorded signals against the limits of the configuration."""
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,6 +19,9 @@ VELOCITY = (0.01, 2.0)
 TORQUE = (0.02, 1.5)
 """Plausible range of the largest torque over the limit: 2 % is less than friction and gravity of usual robots take."""
 
+USUAL = ((0.0, POSITION_MOST), VELOCITY, TORQUE)
+"""Plausible ranges of positions, velocities and torques over their limits."""
+
 RATE_LEAST_HZ = 20.0
 """Sampling rate below which a recording of a robot is implausible, Hz: ten samples per period of a 2 Hz motion."""
 
@@ -31,60 +36,31 @@ NO_LIMIT = 1e6
 
 
 def position_ratio(bench: Bench, h: Hypothesis) -> float:
-    """Geometric mean over the moving joints of the largest position over its limit."""
-    return _mean(*_positions(bench, h), bench.moving)
+    """Geometric mean over the moving joints of the largest position over its limit; 1 if no limit is usable."""
+    return float(np.exp(_means(bench, h)[0]))
 
 
 def velocity_ratio(bench: Bench, h: Hypothesis) -> float:
-    """Geometric mean over the moving joints of the largest velocity over its limit."""
-    return _mean(*_velocities(bench, h), bench.moving)
+    """The same of the velocities."""
+    return float(np.exp(_means(bench, h)[1]))
 
 
 def torque_ratio(bench: Bench, h: Hypothesis) -> float:
-    """Geometric mean over the moving joints of the largest torque over its limit."""
-    return _mean(*_torques(bench, h), bench.moving)
-
-
-def _positions(bench: Bench, h: Hypothesis) -> tuple[Array, Array]:
-    """Largest position of each joint over its limit, and the limits."""
-    limits = bench.limits[0]
-    return _largest(bench, 0, h.position) / limits, limits
-
-
-def _velocities(bench: Bench, h: Hypothesis) -> tuple[Array, Array]:
-    """Largest velocity of each joint over its limit, and the limits."""
-    limits = bench.limits[1]
-    return _largest(bench, 1, h.position) / h.clock / limits, limits
-
-
-def _torques(bench: Bench, h: Hypothesis) -> tuple[Array, Array]:
-    """Largest torque of each joint over its limit, and the limits."""
-    limits = bench.limits[2]
-    return _largest(bench, 2, h.torque) / limits, limits
-
-
-def _largest(bench: Bench, signal: int, correction: Array) -> Array:
-    """Largest magnitude (n,) of each corrected signal: positions, velocities or torques, by number."""
-    if np.count_nonzero(correction) == bench.n and np.all(np.any(correction, axis=1)):
-        return np.asarray(np.abs(correction) @ bench.peaks[signal])
-    return np.asarray(np.abs(bench.recorded[signal] @ correction.T).max(axis=0))
+    """The same of the torques."""
+    return float(np.exp(_means(bench, h)[2]))
 
 
 def plausible_factor(bench: Bench, h: Hypothesis) -> float:
     """Common factor that brings the torques to the middle of their plausible range, 1 unless they are far from it."""
     ratio = torque_ratio(bench, h)
-    return 1.0 if _beyond(ratio, *TORQUE) >= -LEAST_ODDS else float(np.sqrt(TORQUE[0] * TORQUE[1])) / ratio
+    return 1.0 if _beyond(np.log(ratio), *TORQUE) >= -LEAST_ODDS else float(np.sqrt(TORQUE[0] * TORQUE[1])) / ratio
 
 
 def log_plausibility(bench: Bench, h: Hypothesis) -> float:
     """Logarithm of the plausibility of the corrected signals against the limits, 0 or less."""
-    rate = 1.0 / (bench.period * h.clock)
-    return (
-        _beyond(position_ratio(bench, h), 0.0, POSITION_MOST)
-        + _beyond(velocity_ratio(bench, h), *VELOCITY)
-        + _beyond(torque_ratio(bench, h), *TORQUE)
-        + _beyond(rate, RATE_LEAST_HZ, np.inf)
-    )
+    rate = -math.log(bench.period * h.clock)
+    signals = sum(_beyond(mean, *usual) for mean, usual in zip(_means(bench, h), USUAL, strict=True))
+    return signals + _beyond(rate, RATE_LEAST_HZ, math.inf)
 
 
 def worst_change(bench: Bench, old: Hypothesis, new: Hypothesis) -> float:
@@ -94,26 +70,37 @@ def worst_change(bench: Bench, old: Hypothesis, new: Hypothesis) -> float:
     """
 
     def each(h: Hypothesis) -> Array:
-        sums = np.zeros(bench.n)
-        for (ratios, limits), (least, most) in (
-            (_positions(bench, h), (0.0, POSITION_MOST)),
-            (_velocities(bench, h), VELOCITY),
-            (_torques(bench, h), TORQUE),
-        ):
-            usable = (limits < NO_LIMIT) & (ratios > 0)
-            sums += [_beyond(r, least, most) if u else 0.0 for r, u in zip(ratios, usable, strict=True)]
-        return sums[bench.moving]
+        logs, usable = _logs(bench, h)
+        beyond = [[_beyond(one, *usual) for one in own] for own, usual in zip(logs, USUAL, strict=True)]
+        return np.asarray(np.where(usable, beyond, 0.0).sum(axis=0))
 
     return float((each(new) - each(old)).min(initial=0.0))
 
 
-def _mean(ratios: Array, limits: Array, moving: NDArray[np.bool_]) -> float:
-    """Geometric mean; 1 if no limit is usable."""
-    used = moving & (limits < NO_LIMIT) & (ratios > 0)
-    return float(np.exp(np.mean(np.log(ratios[used])))) if used.any() else 1.0
+def _means(bench: Bench, h: Hypothesis) -> list[float]:
+    """Mean logarithms of the largest position, velocity and torque over their limits; 0 if no limit is usable."""
+    logs, usable = _logs(bench, h)
+    means: list[float] = (logs.sum(axis=1) / np.maximum(usable.sum(axis=1), 1)).tolist()
+    return means
+
+
+def _logs(bench: Bench, h: Hypothesis) -> tuple[Array, NDArray[np.bool_]]:
+    """Logarithms (3, n) of the largest positions, velocities and torques over their limits, and usable ones; else 0."""
+    limits = bench.limits
+    sizes = np.stack([_largest(bench, 0, h.position), _largest(bench, 1, h.position), _largest(bench, 2, h.torque)])
+    sizes[1] /= h.clock
+    usable = bench.moving & (limits < NO_LIMIT) & (sizes > 0.0)
+    return np.log(np.where(usable, sizes / limits, 1.0)), usable
+
+
+def _largest(bench: Bench, signal: int, correction: Array) -> Array:
+    """Largest magnitude (n,) of each corrected signal: positions, velocities or torques, by number."""
+    if np.count_nonzero(correction) == bench.n and correction.any(axis=1).all():
+        return np.asarray(np.abs(correction) @ bench.peaks[signal])
+    return np.asarray(np.abs(bench.recorded[signal] @ correction.T).max(axis=0))
 
 
 def _beyond(ratio: float, least: float, most: float) -> float:
-    """Logarithm of a normal density of the logarithm beyond a range, 0 inside it."""
-    excess = max(np.log(ratio / most) if np.isfinite(most) else 0.0, np.log(least / ratio) if least > 0 else 0.0, 0.0)
-    return -0.5 * float(excess / SPREAD) ** 2
+    """Logarithm of a normal density of the logarithm of a ratio beyond a range, 0 inside it."""
+    excess = max(ratio - math.log(most), (math.log(least) if least > 0.0 else -math.inf) - ratio, 0.0)
+    return -0.5 * (excess / SPREAD) ** 2

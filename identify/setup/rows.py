@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armident.identify.robot.arm import ArmModel
-from armident.identify.setup.least_squares import Normal
+from armident.identify.setup.least_squares import Normal, normal_equations
 
 Array = NDArray[np.float64]
 Places = NDArray[np.int64]
@@ -50,6 +50,9 @@ POSTURE_EVERY = 15
 BLOCKS = 24
 """Contiguous blocks of time per experiment set: long against the memory of the residual."""
 
+REGRESSORS_KEPT = 4
+"""Largest number of regressors that are kept of all hypotheses, 4 MB each for seven joints."""
+
 PRODUCTS_KEPT = 64
 """Largest number of shifts of the torques whose products with the regressors are kept for repeated use."""
 
@@ -71,13 +74,15 @@ def friction_terms(qd: Array, top: Array) -> Array:
 class Columns:
     """Structure of the equations of n joints: b base parameters, then the free terms of each joint.
 
-    ``named``: columns of the base parameters. ``heavy`` (h,): columns that gravity changes. ``acting``: columns of each
-    joint's torque. ``own`` (n, o): those of them that act on no other one, -1 for none; ``shared`` (s,): the others.
+    ``named``: columns of the base parameters. ``heavy`` (h,): columns that gravity changes; ``constant``: those that an
+    arm at rest without gravity has. ``acting``: columns of each joint's torque. ``own`` (n, o): those of them that act
+    on no other one, -1 for none; ``shared`` (s,): the others.
     """
 
     named: dict[str, int]
     rigid: int
     heavy: Places
+    constant: Places
     acting: tuple[Places, ...]
     own: Places
     shared: Places
@@ -87,9 +92,26 @@ class Columns:
         """Number of joints."""
         return len(self.acting)
 
-    def free(self, joint: int) -> Places:
-        """Columns of the free terms of a joint: springs, rotor, friction."""
-        return self.rigid + FREE_TERMS * joint + np.arange(FREE_TERMS)
+    @property
+    def c(self) -> int:
+        """Number of columns."""
+        return self.rigid + FREE_TERMS * self.n
+
+    @cached_property
+    def friction(self) -> Places:
+        """Columns of the friction of each joint, (n, 5): viscous, then the `friction_terms`."""
+        named = [[self.named[f"{kind}{j + 1}"] for kind in ("fv", "fc")] for j in range(self.n)]
+        return np.concatenate([np.array(named), self.free[:, SPRING_TERMS + ROTOR_TERMS :]], axis=1)
+
+    @cached_property
+    def free(self) -> Places:
+        """Columns of the free terms of each joint, (n, .): springs, rotor, friction."""
+        return self.rigid + np.arange(FREE_TERMS * self.n).reshape(self.n, -1)
+
+    @cached_property
+    def squares(self) -> list[Any]:
+        """Indices of the products of the columns of each joint's torque."""
+        return [np.ix_(used, used) for used in self.acting]
 
 
 def columns_of(model: ArmModel) -> Columns:
@@ -97,10 +119,9 @@ def columns_of(model: ArmModel) -> Columns:
     n, rigid = model.n, model.base.b
     q, qd, qdd = np.random.default_rng(0).uniform(-np.pi, np.pi, (3, POSTURES, n))
     still = 0.0 * q
-    heavy = np.any(
-        model.rigid_regressor(q, still, still) != model.with_gravity(np.zeros(3)).rigid_regressor(q, still, still),
-        axis=(0, 1),
-    )
+    weightless = model.with_gravity(np.zeros(3)).rigid_regressor(q, still, still)
+    heavy = np.any(model.rigid_regressor(q, still, still) != weightless, axis=(0, 1))
+    constant = np.any(weightless != 0.0, axis=(0, 1))
     acts = np.zeros((n, rigid + FREE_TERMS * n), np.bool_)
     acts[:, :rigid] = np.any(model.rigid_regressor(q, qd, qdd) != 0.0, axis=0)
     for j in range(n):
@@ -112,15 +133,16 @@ def columns_of(model: ArmModel) -> Columns:
         line[: p.size] = p
     named = {model.names[k]: column for column, k in enumerate(model.base.independent)}
     acting = tuple(np.flatnonzero(row) for row in acts)
-    return Columns(named, rigid, np.flatnonzero(heavy), acting, own, np.flatnonzero(~alone))
+    return Columns(named, rigid, np.flatnonzero(heavy), np.flatnonzero(constant), acting, own, np.flatnonzero(~alone))
 
 
 @dataclass(eq=False)
 class Rows:
     """Equations of all joints along a motion ``q``, ``qd``, ``qdd`` (M, n) with ``friction`` terms (M, n, 4).
 
-    ``under``: model under a gravity (3,), m/s^2. ``moving`` (n,): joints that move. All equations under the gravity of
-    the first call are direct; those of others are made from products with what gravity adds.
+    ``under``: model under a gravity (3,), m/s^2; ``moving`` (n,): joints that move. ``kept``: regressors of some
+    assignments, of which this one has a ``key``. Equations under the gravity of the first call are direct; others are
+    made from products with what gravity adds.
     """
 
     columns: Columns
@@ -130,34 +152,31 @@ class Rows:
     qd: Array
     qdd: Array
     friction: Array
+    key: bytes
+    kept: dict[bytes, Array] = field(repr=False)
     _first: Array | None = field(default=None, repr=False)
-    _made: dict[bytes, Array] = field(default_factory=dict, repr=False)
     _normal: dict[tuple[bytes, bool], Normal] = field(default_factory=dict, repr=False)
-    _parts: dict[bytes, tuple[Normal, ...]] = field(default_factory=dict, repr=False)
     _products: dict[bytes, Array] = field(default_factory=dict, repr=False)
 
     def regressors(self, gravity: Array) -> Array:
         """Regressors (n, M, c) of the torques: base parameters and free terms."""
-        key = gravity.tobytes()
-        if key not in self._made:
-            make_room(self._made, 1)
-            self._made[key] = self._regressors(self.under(gravity))
-        return self._made[key]
+        key = self.key + gravity.tobytes()
+        if key not in self.kept:
+            make_room(self.kept, REGRESSORS_KEPT)
+            self.kept[key] = self._regressors(self.under(gravity))
+        return self.kept[key]
 
     def _regressors(self, model: ArmModel) -> Array:
-        columns, n = self.columns, self.columns.n
-        x = np.zeros((n, self.q.shape[0], columns.rigid + FREE_TERMS * n))
+        columns, joints = self.columns, np.arange(self.columns.n)[:, None]
+        x = np.zeros((columns.n, self.q.shape[0], columns.c))
         x[:, :, : columns.rigid] = model.rigid_regressor(self.q, self.qd, self.qdd).transpose(1, 0, 2)
-        stroke = self.q - self.q.mean(axis=0)
-        most = np.maximum(np.abs(stroke).max(axis=0), 1e-12)
-        for j, own in enumerate(x):
-            dry, free = columns.named[f"fc{j + 1}"], columns.free(j)[0]
-            x[:, :, dry] = 0.0
-            own[:, dry] = self.friction[:, j, 0]
-            own[:, free] = stroke[:, j]
-            own[:, free + 1] = stroke[:, j] ** 3 / most[j] ** 2
-            own[:, free + SPRING_TERMS] = self.qdd[:, j]
-            own[:, free + SPRING_TERMS + ROTOR_TERMS : free + FREE_TERMS] = self.friction[:, j, 1:]
+        x[:, :, columns.friction[:, 1]] = 0.0
+        stroke = (self.q - self.q.mean(axis=0)).T
+        most = np.maximum(np.abs(stroke).max(axis=1, keepdims=True), 1e-12)
+        x[joints, :, columns.friction[:, 1:]] = self.friction.transpose(1, 2, 0)
+        x[joints, :, columns.free[:, : SPRING_TERMS + ROTOR_TERMS]] = np.stack(
+            [stroke, stroke**3 / most**2, self.qdd.T], axis=1
+        )
         return x
 
     @cached_property
@@ -178,53 +197,43 @@ class Rows:
     @cached_property
     def physical(self) -> Array:
         """Rows (3 n, c) with products that are not negative: mean inertia, friction power, rotor inertia."""
-        columns, n = self.columns, self.columns.n
-        physical = np.zeros((3, n, columns.rigid + FREE_TERMS * n))
-        inertia = self._mean_inertia()
-        for j in range(n):
-            springs_end = columns.free(j)[0] + SPRING_TERMS
-            friction = springs_end + ROTOR_TERMS + np.arange(FREE_TERMS - SPRING_TERMS - ROTOR_TERMS)
-            physical[0, j, : columns.rigid] = inertia[j]
-            physical[0, j, springs_end] = physical[2, j, springs_end] = 1.0
-            acting = [columns.named[f"fv{j + 1}"], columns.named[f"fc{j + 1}"], *friction]
-            terms = np.column_stack([self.qd[:, j], self.friction[:, j]])
-            physical[1, j, acting] = (terms * self.qd[:, j, None]).mean(axis=0)
-        return physical.reshape(3 * n, -1)
+        columns, joints = self.columns, np.arange(self.columns.n)
+        physical = np.zeros((3, columns.n, columns.c))
+        physical[0, :, : columns.rigid] = self._mean_inertia()
+        physical[[[0], [2]], joints, columns.free[:, SPRING_TERMS]] = 1.0
+        terms = np.concatenate([self.qd[:, :, None], self.friction], axis=2)
+        physical[1, joints[:, None], columns.friction] = np.einsum("mj,mjk->jk", self.qd, terms) / self.q.shape[0]
+        return physical.reshape(3 * columns.n, -1)
 
     def _mean_inertia(self) -> Array:
         """Torque of each joint per unit of its own acceleration, mean over postures, (n, b)."""
-        n, model = self.columns.n, self.under(np.zeros(3))
+        n, rigid = self.columns.n, self.columns.rigid
         q = self.q[:: max(1, self.q.shape[0] // POSTURES, POSTURE_EVERY)]
         postures, still = np.tile(q, (n, 1)), np.zeros((n * q.shape[0], n))
         push = np.repeat(np.eye(n), q.shape[0], axis=0)
-        moved = model.rigid_regressor(postures, still, push).reshape(n, -1, n, self.columns.rigid)
-        held = model.rigid_regressor(q, still[: q.shape[0]], still[: q.shape[0]])
-        own = moved[np.arange(n), :, np.arange(n)] - held.transpose(1, 0, 2)
-        return np.asarray(own.mean(axis=1))
+        moved = self.under(np.zeros(3)).rigid_regressor(postures, still, push).reshape(n, -1, n, rigid)
+        own = moved[np.arange(n), :, np.arange(n)].mean(axis=1)
+        own[:, self.columns.constant] = 0.0
+        return np.asarray(own)
 
     def normal(self, gravity: Array, *, free: bool = True) -> Normal:
         """Normal equations under a gravity; ``free``: with the free terms."""
         key = gravity.tobytes(), free
         if key not in self._normal:
             make_room(self._normal, NORMAL_KEPT)
-            if not free:
-                self._normal[key] = self._reduced(self.normal(gravity))
-            elif self._is_first(gravity):
-                self._normal[key] = self._of(self._gram(self.regressors(gravity), self.columns.acting))
+            if self._is_first(gravity) or not free:
+                grams = self._grams(self.regressors(gravity))
             else:
                 grams = self._turned(gravity, self._turned(gravity, self.square).transpose(0, 2, 1))
-                self._normal[key] = self._of(grams)
+            self._normal[key] = self._of(grams, free)
         return self._normal[key]
 
-    def parts(self, gravity: Array) -> tuple[Normal, ...]:
+    def parts(self, gravity: Array) -> list[Normal]:
         """Normal equations of all rows but those of each part of the cross-validation."""
-        key = gravity.tobytes()
-        if key not in self._parts:
-            make_room(self._parts, 1)
-            x, grams = self.regressors(gravity), self.normal(gravity).grams
-            held = (self._gram(x[:, self.part == k], self.columns.acting) for k in range(PARTS))
-            self._parts[key] = tuple(self._of(grams - own) for own in held)
-        return self._parts[key]
+        x = self.regressors(gravity)
+        own = [self._grams(x[:, self.part == k]) for k in range(PARTS)]
+        whole = sum(own)
+        return [self._of(whole - grams) for grams in own]
 
     @property
     def part(self) -> Places:
@@ -253,10 +262,13 @@ class Rows:
     def square(self) -> Array:
         """Products of all columns without gravity and of what gravity adds, (n, c + 3 h, c + 3 h)."""
         columns, wide = self.columns, self._wide
-        h, c = columns.heavy.size, wide.shape[2] - 3 * columns.heavy.size
-        added = [c + a * h + np.flatnonzero(np.isin(columns.heavy, own)) for own in columns.acting for a in range(3)]
-        acting = [np.concatenate([own, *added[3 * j : 3 * j + 3]]) for j, own in enumerate(columns.acting)]
-        return self._gram(wide, acting)
+        h, c = columns.heavy.size, columns.c
+        felt = [np.flatnonzero(np.isin(columns.heavy, own)) for own in columns.acting]
+        acting = [
+            np.concatenate([own, *(c + a * h + f for a in range(3))])
+            for own, f in zip(columns.acting, felt, strict=True)
+        ]
+        return _grams(wide, acting, [np.ix_(used, used) for used in acting])
 
     @cached_property
     def _wide(self) -> Array:
@@ -276,20 +288,20 @@ class Rows:
             self._first = gravity.copy()
         return np.array_equal(self._first, gravity)
 
-    @staticmethod
-    def _gram(x: Array, acting: Sequence[Places]) -> Array:
-        square = np.zeros((x.shape[0], x.shape[2], x.shape[2]))
-        for gram, rows, used in zip(square, x, acting, strict=True):
-            # A joint feels the links beyond it only, and its own friction.
-            felt = rows[:, used]
-            gram[np.ix_(used, used)] = felt.T @ felt
-        return square
+    def _grams(self, x: Array) -> Array:
+        return _grams(x, self.columns.acting, self.columns.squares)
 
-    def _of(self, grams: Array) -> Normal:
-        return Normal(grams, self.columns.own, self.columns.shared, self.physical, self.moving)
+    def _of(self, grams: Array, free: bool = True) -> Normal:
+        own, c = self.columns.own, self.columns.c if free else self.columns.rigid
+        own = np.where(own < c, own, -1)
+        return normal_equations(grams[:, :c, :c], self.physical[:, :c], self.moving, own, self.columns.shared)
 
-    def _reduced(self, whole: Normal) -> Normal:
-        """Normal equations without the free terms."""
-        rigid = self.columns.rigid
-        own = np.where(whole.own < rigid, whole.own, -1)
-        return Normal(whole.grams[:, :rigid, :rigid], own, whole.shared, whole.limits[:, :rigid], whole.used)
+
+def _grams(x: Array, acting: Sequence[Places], squares: Sequence[Any]) -> Array:
+    """Products of the columns (n, M, c) that act on each torque, (n, c, c)."""
+    made = np.zeros((x.shape[0], x.shape[2], x.shape[2]))
+    for gram, rows, used, square in zip(made, x, acting, squares, strict=True):
+        # A joint feels the links beyond it only, and its own friction.
+        felt = rows[:, used]
+        gram[square] = felt.T @ felt
+    return made
