@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armident.configs import DataError
-from armident.identify.regression.equations import ExperimentEquations, filtered_regressor
+from armident.identify.regression.equations import ExperimentEquations, filtered_regressor, thinned_regressor
 from armident.identify.robot.arm import ArmModel
 from armident.identify.robot.controller import DiscreteController
 from armident.identify.robot.physical import damp_to_physical
@@ -164,11 +164,11 @@ class AuxiliaryModel:
             return list(pool.map(self.respond, thetas))
 
     def instruments(self, theta: NDArray[np.float64]) -> Sequence[NDArray[np.float64]]:
-        """Filtered regressor at simulated signals, one (M, n, b) per experiment.
+        """Filtered regressor at few samples of simulated signals, one (M, n, b) per experiment.
 
         Raises DataError if no point between theta and the last good estimate can be simulated.
         """
-        return self.regressors(self.motions(theta))
+        return self.regressors(self.motions(theta), thinned=True)
 
     def motions(self, theta: NDArray[np.float64]) -> Sequence[Derivatives]:
         """Simulated signals of every experiment; raises DataError like `instruments`."""
@@ -179,16 +179,17 @@ class AuxiliaryModel:
         starts = [self._start(k) for k in range(len(runs))]
         return mapped(lambda run, start: Derivatives(run.q, run.qd, run.qdd, None, self.dt, start), runs, starts)
 
-    def regressors(self, motions: Sequence[Derivatives]) -> Sequence[NDArray[np.float64]]:
-        """Filtered regressor at noise-free motions, one (M, n, b) per experiment."""
+    def regressors(self, motions: Sequence[Derivatives], *, thinned: bool = False) -> Sequence[NDArray[np.float64]]:
+        """Filtered regressor at noise-free motions, one (M, n, b) per experiment; ``thinned``: for instruments."""
+        regressor = thinned_regressor if thinned else filtered_regressor
         seen = (self._in_band(motion, k) for k, motion in enumerate(motions))
-        return kept((filtered_regressor(self.model, motion, self.decimation) for motion in seen), like=motions)
+        return kept((regressor(self.model, motion, self.decimation) for motion in seen), like=motions)
 
     def equations(
         self, blocks: Sequence[ExperimentEquations], theta: NDArray[np.float64]
     ) -> Sequence[ExperimentEquations]:
         """Equations with the regressor simulated at theta (b,) (2.32); DataError like `instruments`."""
-        return mapped(lambda block, zeta: replace(block, x=zeta), blocks, self.instruments(theta))
+        return mapped(lambda block, zeta: replace(block, x=zeta), blocks, self.regressors(self.motions(theta)))
 
     def reachable(self, theta: NDArray[np.float64]) -> tuple[NDArray[np.float64], Response]:
         """Theta and its response, or of the nearest point towards the last good estimate; DataError if none."""

@@ -54,23 +54,22 @@ def idim_iv(
     auxiliary = auxiliary.fresh()
     scale = noise = joint_variances(blocks, start)
 
-    def products(simulated: Sequence[ExperimentEquations]) -> IvProducts:
-        rows = instrumented(blocks, mapped(lambda b: b.x, simulated))
-        return factored_parts(instrumented_parts(rows, noise), start.size)
+    def products(zeta: Sequence[NDArray[np.float64]]) -> IvProducts:
+        return factored_parts(instrumented_parts(instrumented(blocks, zeta), noise), start.size)
 
     def step(previous: NDArray[np.float64], _: int) -> tuple[NDArray[np.float64], float]:
         nonlocal noise
-        estimate = products(auxiliary.equations(blocks, previous)).theta  # 2.33
+        estimate = products(auxiliary.instruments(previous)).theta  # 2.33
         noise = joint_variances(blocks, estimate)
         return estimate, residual_norm(blocks, estimate, scale)
 
     theta, done, converged, reason = iterate(step, start, iterations)
     noise = joint_variances(blocks, theta)
-    simulated = auxiliary.equations(blocks, theta)
-    covariance = products(simulated).covariance
+    zeta = auxiliary.instruments(theta)
+    covariance = products(zeta).covariance
     if serial_order:
         weights, keep = noise, [b.keep for b in blocks]
-        zeta, x = mapped(lambda b: b.x, simulated), mapped(lambda b: b.x, blocks)
+        x = mapped(lambda b: b.x, blocks)
         for _ in range(COVARIANCE_PASSES):
             noise = noise_models(blocks, theta, covariance, serial_order)
             covariance = serial_covariance(zeta, x, keep, weights, noise)

@@ -1,6 +1,7 @@
 """IDIM-PIV: prefiltered instrumental variables (thesis section 6.2.2), after a rough decimation (section 7.2)."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -87,8 +88,8 @@ def idim_piv(
     noise: list[ArModel] = scale  # step 1: H = 1, lambda from the start
 
     def solved(at: NDArray[np.float64]) -> IvProducts:
-        instruments = mapped(lambda block: block.x, seen(auxiliary.equations(blocks, at)))
-        return iv_products(instrumented(measured, instruments), noise)  # 6.30
+        simulated = mapped(lambda block, zeta: replace(block, x=zeta), blocks, auxiliary.instruments(at))
+        return iv_products(instrumented(measured, mapped(lambda block: block.x, seen(simulated))), noise)  # 6.30
 
     def step(previous: NDArray[np.float64], k: int) -> tuple[NDArray[np.float64], float]:
         nonlocal noise

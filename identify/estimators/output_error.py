@@ -137,7 +137,8 @@ class _LevenbergMarquardt:
     def _differentiate(self) -> None:
         torques = [b.y for b in self.blocks]
         errors = [y - t for y, t in zip(torques, self.response.torque, strict=True)]
-        steps = difference_steps(self.auxiliary.instruments(self.theta), torques, errors, self.keep)
+        zeta = self.auxiliary.regressors(self.auxiliary.motions(self.theta))
+        steps = difference_steps(zeta, torques, errors, self.keep)
         responses = sensitivities(self.auxiliary, self.theta, self.response, steps)
         self._columns = [self.signal(column) for column in responses]
         self._differentiated_at = self.theta

@@ -78,6 +78,6 @@ def torque_sensitivities(
     theta, response = auxiliary.reachable(theta)
     torques, keep = [b.y for b in blocks], [b.keep for b in blocks]
     errors = [y - t for y, t in zip(torques, response.torque, strict=True)]
-    steps = difference_steps(auxiliary.instruments(theta), torques, errors, keep)
+    steps = difference_steps(auxiliary.regressors(auxiliary.motions(theta)), torques, errors, keep)
     columns = sensitivities(auxiliary, theta, response, steps)
     return weighted_columns([column.torque for column in columns], keep, noise)

@@ -96,7 +96,7 @@ def simulated_bias(
         return None
     starts = [e.start for e in prepared.experiments]
     motions = mapped(lambda run, at: Derivatives(run.q, run.qd, run.qdd, None, auxiliary.dt, at), clean, starts)
-    instruments = auxiliary.regressors(motions)
+    instruments = auxiliary.regressors(motions, thinned=True)
     rng = np.random.default_rng(0)
     errors: list[Array] = []
     while len(errors) < (runs or MANY):

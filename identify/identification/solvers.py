@@ -179,8 +179,9 @@ class Solution:
     def instruments(self) -> Sequence[Array]:
         """Regressors at these motions, decimated to the band of the instruments, (M, n, b) per `tested` experiment."""
         problem = self.problem.in_band
-        numbers = tested(problem.blocks)
-        return list(problem.auxiliary.of_experiments(numbers).regressors(chosen(self.motions, numbers)))
+        numbers, measured = tested(problem.blocks), estimator(problem.options.method).measured
+        loop = problem.auxiliary.of_experiments(numbers)
+        return list(loop.regressors(chosen(self.motions, numbers), thinned=measured))
 
     def diagnostics(self, essential: NDArray[np.bool_]) -> Diagnostics:
         """Tests of the estimate on its equations, decimated to the band of its instruments; see `tested`."""
@@ -211,7 +212,7 @@ class Solution:
         motions = chosen(self.motions, numbers)
         thinned = problem.in_band.auxiliary.decimation == problem.plain
         loop = problem.plain_problem.auxiliary.of_experiments(numbers)
-        z = self.instruments if thinned else loop.regressors(motions)
+        z = self.instruments if thinned else loop.regressors(motions, thinned=True)
         part = prepared.part(numbers)
         try:
             found = torque_delay(part.model, part.experiments, part.signals, problem.plain, motions, (x, z))

@@ -65,7 +65,7 @@ EXHAUSTIVE = 4
 """Largest number of joints of which all orders are tried; with more, a search by exchanges starts from several."""
 
 CLIMBS = 4
-"""Number of the best usual orders from which it starts: it found all of 55 random orders of five to seven joints, with a
+"""Number of the best usual orders from which it starts: it found all of 55 random orders of five to seven joints, at a
 tenth of the orders tried."""
 
 EACH_OWN = "every torque is in a unit of its own drive"

@@ -15,6 +15,9 @@ STOPBAND_DB = 70.0
 TRANSITION = 0.5
 """Width of the transition band as a fraction of the decimated Nyquist frequency."""
 
+WORKING_RATE = 8
+"""Rate at which signals without noise are computed, in cut-offs: central differences and filters need no more."""
+
 _ROWS = 8
 """Output rows per matrix product: fewer rows mean more calls, more rows more products with zeros off the band."""
 
@@ -56,6 +59,16 @@ class Decimation:
     def instants(self, samples: int) -> NDArray[np.int64]:
         """Index of the input sample at the centre of each window, shape (M,), for a record of ``samples``."""
         return self.margin + self.factor * np.arange(self.count(samples), dtype=np.int64)
+
+    def thinned(self) -> tuple[slice, "Decimation"]:
+        """Samples that are enough for signals without noise, and the filter of them: the same instants, and response.
+
+        The rate of these samples is `WORKING_RATE` times the cut-off, or more. Content beyond is not filtered out.
+        """
+        every = max(k for k in range(1, max(self.factor // (WORKING_RATE // 2), 1) + 1) if self.factor % k == 0)
+        first = self.margin % every
+        taps = self.taps[first::every]
+        return slice(first, None, every), Decimation(self.factor // every, taps / taps.sum() * self.taps.sum())
 
     def rows_of(self, begin: int, end: int) -> slice:
         """Output rows that depend on the input samples ``begin .. end - 1``, for a record without end."""

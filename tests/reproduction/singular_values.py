@@ -40,7 +40,7 @@ def sensitivity(auxiliary: AuxiliaryModel, theta: Array, parameters: Sequence[in
     if response is None:
         raise DataError("sensitivity: the auxiliary closed loop diverges with these parameters")
     chosen = np.arange(theta.size) if parameters is None else np.asarray(parameters)
-    zeta = auxiliary.instruments(theta)
+    zeta = auxiliary.regressors(auxiliary.motions(theta))
     keep = [np.ones(torque.shape, dtype=np.bool_) for torque in response.torque]
     none = [np.zeros_like(torque) for torque in response.torque]
     steps = difference_steps(zeta, response.torque, none, keep)
