@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,8 +66,8 @@ class Bench:
     """Signals of a set of recordings, and a cache of their equations.
 
     ``model``: with base parameters for gravity in any direction. ``moving`` (n,): joints that move. ``period``: of the
-    recordings, s. ``rows_kept``: largest number of instants. ``at_rest``: equations at all instants instead of those at
-    which all joints move.
+    recordings, s; ``bandwidth``: of the motion, Hz. ``rows_kept``: largest number of instants. ``at_rest``: equations
+    at all instants instead of those at which all joints move. ``shifts``: those of the torques that were estimated.
     """
 
     model: ArmModel
@@ -75,8 +76,10 @@ class Bench:
     decimation: Decimation
     moving: NDArray[np.bool_]
     period: float
+    bandwidth: float
     rows_kept: int = MOST_ROWS
     at_rest: bool = False
+    shifts: dict[bytes, Any] = field(default_factory=dict, repr=False)
     _rows: dict[bytes, Rows] = field(default_factory=dict, repr=False)
     _torques: dict[bytes, tuple[Array, Array]] = field(default_factory=dict, repr=False)
     _models: dict[bytes, ArmModel] = field(default_factory=dict, repr=False)
@@ -183,7 +186,8 @@ class Bench:
         return np.stack([(plus - minus) / (2.0 * step) for plus, minus in ends])
 
     def _with(self, rows: int, at_rest: bool) -> "Bench":
-        return Bench(self.model, self.robot, self.segments, self.decimation, self.moving, self.period, rows, at_rest)
+        signals = (self.model, self.robot, self.segments, self.decimation, self.moving, self.period, self.bandwidth)
+        return Bench(*signals, rows, at_rest)
 
     def column(self, name: str) -> int:
         """Column of a standard parameter that is a base parameter, possibly with others regrouped into it."""
@@ -247,14 +251,16 @@ def make_bench(
     robot: RobotConfig,
     moving: NDArray[np.bool_],
     working_rate: float = WORKING_RATE,
-    model: ArmModel | None = None,
+    known: Bench | None = None,
 ) -> Bench:
     """Filter and differentiate recordings (SI, joint side, one rate); DataError if they are too short.
 
-    ``working_rate``: rate of the derivatives over the cut-off of the equations; ``model``: of another bench, if made.
+    ``working_rate``: rate of the derivatives over the cut-off of the equations. ``known``: another bench of this
+    arm and motion, if there is one.
     """
     dt = experiments[0].dt
-    cutoff = min(CUTOFF * motion_bandwidth([e.q for e in experiments], dt), 0.45 / dt)
+    bandwidth = motion_bandwidth([e.q for e in experiments], dt) if known is None else known.bandwidth
+    cutoff = min(CUTOFF * bandwidth, 0.45 / dt)
     first_factor = max(1, int(1.0 / (dt * working_rate * cutoff)))
     working = dt * first_factor
     first = design(dt, 0.4 / working, first_factor) if first_factor > 1 else design(dt, 0.5 / dt, 1)
@@ -286,9 +292,11 @@ def make_bench(
             f"the recordings are too short for a check of the set-up: {samples} samples, {count} after filtering; "
             f"at least {LEAST_SAMPLES} and {LEAST_ROWS} are needed: record longer"
         )
-    if model is None:
+    if known is None:
         model = ArmModel.from_config(robot.model_copy(update={"gravity": tuple(GENERIC), "effects": ()}))
-    return Bench(model, robot, tuple(segments), second, moving, dt)
+    else:
+        model = known.model
+    return Bench(model, robot, tuple(segments), second, moving, dt, bandwidth)
 
 
 def _shifted(x: Array, samples: Array) -> Array:

@@ -20,7 +20,7 @@ from armident.identify.setup.prior import Mistake
 from armident.identify.setup.result import SetupCheck, SetupFinding, TorqueShift
 from armident.identify.setup.search import NOT_UNDERSTOOD, STRUCTURED, Search, Step
 from armident.identify.setup.stationarity import ChangedStretch, change_finding, spans, stretch
-from armident.identify.setup.torque_shift import SHIFT_RATE, long_torque_shift, torque_shift
+from armident.identify.setup.torque_shift import common_shift, long_torque_shift
 from armident.identify.setup.weight import weight_findings
 from armident.identify.setup.zero_offset import zero_offset
 from armident.identify.signals.experiments import Experiment, check_one_rate
@@ -162,8 +162,7 @@ def _torque_shift(experiments: Sequence[Experiment], bench: Bench, best: Step) -
     if "time_shift" in best.families:
         return None
     try:
-        finer = make_bench(experiments, bench.robot, bench.moving, SHIFT_RATE, bench.model)
-        return torque_shift(finer, best.h)
+        return common_shift(experiments, bench, best.h)
     except (DataError, np.linalg.LinAlgError):
         return None
 

@@ -77,16 +77,15 @@ def long_torque_shift(
 ) -> TorqueShift | None:
     """Estimate a common shift of many samples; ``None`` where none is determined within ``reach_s`` of ``first_s``.
 
-    `torque_shift` is linear: it is repeated with torques moved by the last value until that changes no more.
+    The estimate is linear: it is repeated with torques moved by the last value until that changes no more.
     """
     first, reach = first_s / bench.period, reach_s / bench.period
     shift = first
     for _ in range(ROUNDS):
-        moved = [replace(e, torque_shift=e.torque_shift + shift) for e in experiments]
         try:
-            finer = make_bench(moved, bench.robot, bench.moving, SHIFT_RATE, bench.model)
-            rest = torque_shift(finer, h, max(RANGE, reach))
-            experiments = _first_part(experiments, round(MOST_SAMPLES * finer.segments[0].dt / bench.period))
+            found = _estimated(experiments, bench, h, shift)
+            rest = _common(found, max(RANGE, reach))
+            experiments = _first_part(experiments, round(MOST_SAMPLES * found.bench.segments[0].dt / bench.period))
         except (DataError, np.linalg.LinAlgError):
             return None
         shift += rest.samples
@@ -99,11 +98,37 @@ def long_torque_shift(
     return replace(rest, samples=shift, by_joint=by_joint)
 
 
-def torque_shift(bench: Bench, h: Hypothesis, reach: float = RANGE) -> TorqueShift:
-    """Estimate the common shift of the torques, up to ``reach`` samples, and that of every joint.
+def common_shift(experiments: Sequence[Experiment], bench: Bench, h: Hypothesis) -> TorqueShift:
+    """Estimate the common shift of the torques, up to `RANGE` samples, and that of every joint.
 
-    ``bench`` has the working rate `SHIFT_RATE`. Raises numpy.linalg.LinAlgError if the motion determines no shift.
+    Raises DataError or numpy.linalg.LinAlgError if the motion determines no shift.
     """
+    return _common(_estimated(experiments, bench, h, 0.0), RANGE)
+
+
+@dataclass(frozen=True, eq=False)
+class _Shifts:
+    """Shift of each moving joint, samples, with covariance, and the bench of the equations."""
+
+    samples: Array
+    covariance: Array
+    bench: Bench
+    instrumented: bool
+
+
+def _estimated(experiments: Sequence[Experiment], bench: Bench, h: Hypothesis, shift: float) -> _Shifts:
+    """Shifts that torques have that are moved by ``shift`` samples; those of a bench are estimated once."""
+    parts = (h.position, h.torque, h.gravity, h.shift, h.clock, shift, [e.q.shape[0] for e in experiments])
+    key = b"".join(np.asarray(part).tobytes() for part in parts)
+    if key not in bench.shifts:
+        moved = [replace(e, torque_shift=e.torque_shift + shift) for e in experiments]
+        bench.shifts[key] = _shifts(make_bench(moved, bench.robot, bench.moving, SHIFT_RATE, bench), h)
+    found: _Shifts = bench.shifts[key]
+    return found
+
+
+def _shifts(bench: Bench, h: Hypothesis) -> _Shifts:
+    """Shifts of a bench with the working rate `SHIFT_RATE`."""
     segments = _shortened(bench)
     joints = [int(j) for j in np.flatnonzero(bench.moving)]
     instrumented = all(s.q_ref is not None for s in segments.segments)
@@ -130,7 +155,7 @@ def torque_shift(bench: Bench, h: Hypothesis, reach: float = RANGE) -> TorqueShi
             for k, j in enumerate(joints)
         ]
     c, samples = basis.shape[1], segments.period
-    return _common(theta[c:] / samples, covariance[c:, c:] / samples**2, segments, instrumented, reach)
+    return _Shifts(theta[c:] / samples, covariance[c:, c:] / samples**2, segments, instrumented)
 
 
 def _first_part(experiments: Sequence[Experiment], samples: int) -> Sequence[Experiment]:
@@ -256,9 +281,9 @@ def _solved(
     return inverse @ right, covariance
 
 
-def _common(samples: Array, covariance: Array, bench: Bench, instrumented: bool, reach: float) -> TorqueShift:
+def _common(found: _Shifts, reach: float) -> TorqueShift:
     """Common shift of the joints; some have effects of their own that look like a shift, such as a slow actuator."""
-    std = np.sqrt(np.diag(covariance))
+    samples, std, bench = found.samples, np.sqrt(np.diag(found.covariance)), found.bench
     if not (np.isfinite(samples).all() and np.isfinite(std).all()):
         raise np.linalg.LinAlgError("the motion determines no shift of the torques")
 
@@ -275,4 +300,4 @@ def _common(samples: Array, covariance: Array, bench: Bench, instrumented: bool,
     names = [bench.robot.joints[j].name for j in np.flatnonzero(bench.moving)]
     each = {name: (float(s), float(d)) for name, s, d in zip(names, samples, std, strict=True)}
     spread = float(np.sqrt(density @ (grid - mean) ** 2))
-    return TorqueShift(mean, spread, bench.period, each, float(np.exp(min(instant - held, LARGE))), instrumented)
+    return TorqueShift(mean, spread, bench.period, each, float(np.exp(min(instant - held, LARGE))), found.instrumented)

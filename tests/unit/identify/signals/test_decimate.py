@@ -47,3 +47,16 @@ def test_chebyshev_of_order_8_is_sound_at_a_decimation_where_its_transfer_functi
     constant = np.ones(60000)
     # Ripple of 0.05 dB, twice: an even order has its minimum at zero frequency.
     np.testing.assert_allclose(chebyshev_decimate(constant, 50, 8, 0.05, 24), 10 ** (-2 * 0.05 / 20), rtol=1e-6)
+
+
+@pytest.mark.parametrize("cutoff_hz", [12.0, 20.0, 37.0, 50.0, 700.0])
+def test_few_samples_give_the_same_filtered_signal_where_there_is_nothing_fast(cutoff_hz: float) -> None:
+    t = np.arange(30011) * DT
+    slow = np.sin(2 * np.pi * 5 * t) + 0.3 * np.sin(2 * np.pi * 0.9 * cutoff_hz * t)
+    low_pass = design(DT, cutoff_hz)
+    chosen, few = low_pass.thinned()
+    of_few = few(slow[chosen])[: low_pass.count(t.size)]
+    # The images of the pass band lie where the filter stops.
+    np.testing.assert_allclose(of_few, low_pass(slow), atol=10 ** (-STOPBAND_DB / 20))
+    rate = 1 / (DT * (chosen.step or 1))
+    assert rate >= min(8 * cutoff_hz, 1 / DT)
