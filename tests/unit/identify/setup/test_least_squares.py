@@ -38,7 +38,7 @@ def test_the_fit_is_that_of_a_general_solver(seed: int) -> None:
     def loss(theta: Array) -> float:
         return float((((y - x @ theta) ** 2).sum(axis=1) / power).sum())
 
-    constraints = {"type": "ineq", "fun": lambda theta: limits @ theta}
+    constraints = optimize.LinearConstraint(limits, 0.0, np.inf)
     best = optimize.minimize(loss, np.zeros(C), method="SLSQP", constraints=constraints, options={"ftol": 1e-14})
     assert np.any(limits @ np.linalg.lstsq(np.concatenate(x), np.concatenate(y), rcond=None)[0] < 0.0)
     # The ridge is a millionth of the columns' powers.
