@@ -130,11 +130,10 @@ def thinned_regressor(model: ArmModel, signals: Derivatives, decimation: Decimat
     Dry friction has content beyond: it changes an instrument by percents where a joint turns round. Terms need all
     samples.
     """
-    if model.terms:
+    if model.terms or decimation.every == 1:
         return filtered_regressor(model, signals, decimation)
-    chosen, filtered = decimation.thinned()
-    few = replace(signals, q=signals.q[chosen], qd=signals.qd[chosen], qdd=signals.qdd[chosen])
-    return filtered_regressor(model, few, filtered)[: decimation.count(signals.q.shape[0])]
+    few = replace(signals, **{name: decimation.thin(getattr(signals, name)) for name in ("q", "qd", "qdd")})
+    return filtered_regressor(model, few, decimation.of_thin)[: decimation.count(signals.q.shape[0])]
 
 
 def stacked(

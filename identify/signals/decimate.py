@@ -60,15 +60,29 @@ class Decimation:
         """Index of the input sample at the centre of each window, shape (M,), for a record of ``samples``."""
         return self.margin + self.factor * np.arange(self.count(samples), dtype=np.int64)
 
-    def thinned(self) -> tuple[slice, "Decimation"]:
-        """Samples that are enough for signals without noise, and the filter of them: the same instants, and response.
+    @property
+    def every(self) -> int:
+        """Samples from one to the next that are enough for signals without noise: a divisor of the factor."""
+        most = max(self.factor // (WORKING_RATE // 2), 1)
+        return max(k for k in range(1, most + 1) if self.factor % k == 0)
 
-        The rate of these samples is `WORKING_RATE` times the cut-off, or more. Content beyond is not filtered out.
+    def thin(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Means of ``every`` samples (N, n) around those that `of_thin` filters: without what would fold into its band.
+
+        A mean has its zeros at the multiples of the new rate. The first and the last sample stand for those beyond.
         """
-        every = max(k for k in range(1, max(self.factor // (WORKING_RATE // 2), 1) + 1) if self.factor % k == 0)
-        first = self.margin % every
-        taps = self.taps[first::every]
-        return slice(first, None, every), Decimation(self.factor // every, taps / taps.sum() * self.taps.sum())
+        taps = np.full(self.every + 1 - self.every % 2, 1.0 / self.every)
+        if self.every % 2 == 0:
+            taps[[0, -1]] /= 2.0
+        margin = taps.size // 2
+        padded = np.pad(x, ((margin, margin), (0, 0)), mode="edge")
+        return Decimation(self.every, taps)(padded[self.margin % self.every :])
+
+    @property
+    def of_thin(self) -> "Decimation":
+        """Filter of thinned signals with the same instants and response."""
+        taps = self.taps[self.margin % self.every :: self.every]
+        return Decimation(self.factor // self.every, taps / taps.sum() * self.taps.sum())
 
     def rows_of(self, begin: int, end: int) -> slice:
         """Output rows that depend on the input samples ``begin .. end - 1``, for a record without end."""
