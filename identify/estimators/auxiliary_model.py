@@ -192,7 +192,15 @@ class AuxiliaryModel:
         return mapped(lambda run, start: Derivatives(run.q, run.qd, run.qdd, None, self.dt, start), runs, starts)
 
     def regressors(self, motions: Sequence[Derivatives], *, thinned: bool = False) -> Sequence[NDArray[np.float64]]:
-        """Filtered regressor at noise-free motions, one (M, n, b) per experiment; ``thinned``: for instruments."""
+        """Filtered regressor at noise-free motions, one (M, n, b) per experiment.
+
+        Parameters
+        ----------
+        motions
+            Signals of every experiment.
+        thinned
+            Compute it at few samples, which is enough for instruments.
+        """
         regressor = thinned_regressor if thinned else filtered_regressor
         seen = (self._in_band(motion, k) for k, motion in enumerate(motions))
         return kept((regressor(self.model, motion, self.decimation) for motion in seen), like=motions)

@@ -181,7 +181,7 @@ class Rows:
 
     @cached_property
     def weights_of_gravity(self) -> Array:
-        """What gravity along each base axis, per m/s^2, adds to the heavy columns, (n, M, 3 h)."""
+        """Columns (n, M, 3 h) that gravity along each base axis adds to the heavy ones, per m/s^2."""
         still, heavy = np.zeros_like(self.q), self.columns.heavy
         at_rest, *along = (
             self.under(g).rigid_regressor(self.q, still, still)[:, :, heavy] for g in (np.zeros(3), *np.eye(3))
