@@ -132,7 +132,8 @@ def thinned_regressor(model: ArmModel, signals: Derivatives, decimation: Decimat
     """
     if model.terms or decimation.every == 1:
         return filtered_regressor(model, signals, decimation)
-    few = replace(signals, **{name: decimation.thin(getattr(signals, name)) for name in ("q", "qd", "qdd")})
+    q, qd, qdd = (decimation.thin(x) for x in (signals.q, signals.qd, signals.qdd))
+    few = replace(signals, q=q, qd=qd, qdd=qdd)
     return filtered_regressor(model, few, decimation.of_thin)[: decimation.count(signals.q.shape[0])]
 
 

@@ -39,7 +39,7 @@ there, nor the torque that holds it."""
 LEAST_MOVING = 0.1
 """Least share of the instants at which all joints move, for only those to be used."""
 
-MOST_KEPT = 256
+MOST_KEPT = 128
 """Largest number of assignments of positions whose normal equations are kept, 0.4 MB each for seven joints: a step of
 the search that changes torques alone needs those of the step before."""
 
