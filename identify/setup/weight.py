@@ -73,10 +73,11 @@ def weight_findings(bench: Bench, h: Hypothesis, robot: RobotConfig) -> list[Set
 
 def _of_gravity(bench: Bench, h: Hypothesis, base: Array) -> Array:
     """Torque of gravity at each joint, rms, (n,), N m or N, with values of the base parameters (b,)."""
-    rows = bench.rows(h.position)
-    columns = rows.square.shape[1] - 3 * rows.heavy.size
-    values = np.concatenate([base, np.zeros(columns - base.size)])
-    return np.asarray(np.sqrt(np.mean((rows.of_gravity(values) @ h.gravity) ** 2, axis=1)))
+    q = bench.rows(h.position).q
+    with_it, without = (
+        bench.model.with_gravity(g).rigid_regressor(q, 0.0 * q, 0.0 * q) @ base for g in (h.gravity, 0.0 * h.gravity)
+    )
+    return np.asarray(np.sqrt(np.mean((with_it - without) ** 2, axis=0)))
 
 
 def _base_values(bench: Bench, robot: RobotConfig) -> Array:
