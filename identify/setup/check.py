@@ -107,7 +107,8 @@ def _check(experiments: Sequence[Experiment], robot: RobotConfig) -> SetupCheck:
         tried = tried | search.tried
     best, corrected, likely = judged.step, judged.robot, judged.likely
     findings += rates
-    if not any(finding.kind in ("torque_unit", "side") and finding.decisive for finding in setup_findings):
+    of_scale = [finding for finding in setup_findings if finding.kind in ("torque_unit", "side")]
+    if not any(finding.decisive for finding in of_scale):
         findings += signals.small_torque_findings(experiments, robot)
     findings += _clipped(bench, best, robot, {name for finding in findings for name in finding.joints})
     doubtful = changed is not None or not all(finding.correction for finding in setup_findings)
@@ -122,7 +123,7 @@ def _check(experiments: Sequence[Experiment], robot: RobotConfig) -> SetupCheck:
             for one in (corrected, likely)
         )
     lost = _not_explained(bench, best)
-    if not lost and changed is None and not any(finding.decisive for finding in findings):
+    if not (lost or of_scale or changed is not None or any(finding.decisive for finding in findings)):
         findings += weight_findings(bench, best.h, robot)
     after = _errors(bench, best.h)
     if changed is not None:

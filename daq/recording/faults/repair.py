@@ -116,7 +116,7 @@ def repair(
     elsewhere = np.asarray(zeros & ~known[:, None], dtype=np.bool_)
     for chosen, rows in _alike(elsewhere, names):
         notes.append(f"the torque of {chosen} is 0 {_times(rows, at)}, between rows where it is not: left out as gaps")
-    kept = frozen_efforts(effort, position) & ~stale
+    kept = frozen_efforts(effort, position, criteria) & ~stale
     for chosen, rows in _alike(kept, names):
         notes.append(f"the torque of {chosen} is the same while the joint moves {_times(rows, at)}: left out as gaps")
     copied = repeated_efforts(effort, position)

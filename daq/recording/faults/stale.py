@@ -6,7 +6,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armident.daq.recording.faults.jumps import JumpCriteria
-from armident.daq.recording.faults.updates import LEAST_COUNTS
 from armident.daq.recording.faults.zeros import NOTHING, runs
 
 Array = NDArray[np.float64]
@@ -24,6 +23,9 @@ NEAR = 8
 
 SLOW = 0.2
 """Velocity over the usual one from which a joint moves."""
+
+OF_NOISE = -0.25
+"""Correlation of changes that follow each other below which an effort is noise from row to row: -0.5 if it is white."""
 
 REPEATED = 20
 """Rows in the same order as earlier that are a copy: noise repeats a value of twelve bits so often once in 10^70."""
@@ -70,27 +72,30 @@ def frozen_before(x: Array, row: int, criteria: JumpCriteria) -> Rows | None:
     return (begin + 1, row) if stops else None
 
 
-def frozen_efforts(effort: Array, position: Array) -> Mask:
+def frozen_efforts(effort: Array, position: Array, criteria: JumpCriteria) -> Mask:
     """Mask (N, n) of efforts (N, n) that stay the same too long for chance while their joints move.
 
-    At the largest or least effort of a joint they are clipped, and zeros are faults of their own.
+    A smooth effort in coarse steps is flat at its peaks: one that is frozen ends with a jump. At its extremes an effort
+    is clipped, and zeros are faults of their own.
     """
     found = np.zeros(effort.shape, dtype=np.bool_)
     moves = _moves(position)
     for j, x in enumerate(effort.T):
-        step = np.abs(np.diff(x))
+        change = np.diff(x)
+        step = np.abs(change)
         renewed = np.flatnonzero(step)
         if not renewed.size:
             continue
-        least = LEAST_COUNTS * float(step[renewed].min())
+        noisy = float(change[1:] @ change[:-1]) < OF_NOISE * float(change @ change)
+        jump = criteria.ratio * float(np.quantile(step, criteria.most))
         chance = np.log(max(1.0 - renewed.size / step.size, 1.0 / step.size))
         longest = max((np.log(MOST_CHANCE) - np.log(step.size)) / min(chance, -1e-12), LEAST_RUN)
         ends = np.concatenate([[-1], renewed, [step.size]])
         for k in np.flatnonzero(np.diff(ends) > longest):
             begin, end = int(ends[k]) + 1, int(ends[k + 1])
             outermost = x[begin] in (x.min(), x.max())
-            slight = end < step.size and step[end] < least
-            if not (outermost or slight or abs(x[begin]) < NOTHING):
+            jumps = end < step.size and step[end] > jump
+            if (noisy or jumps) and not outermost and abs(x[begin]) >= NOTHING:
                 found[begin + 1 : end + 1, j] = moves(begin, end)[j]
     return found
 
