@@ -27,6 +27,9 @@ SLOW = 0.2
 OF_NOISE = -0.25
 """Correlation of changes that follow each other below which an effort is noise from row to row: -0.5 if it is white."""
 
+RUN_RATIO = 3.0
+"""Time for which an effort stays the same at the end of a recording over the longest such time before."""
+
 REPEATED = 20
 """Rows in the same order as earlier that are a copy: noise repeats a value of twelve bits so often once in 10^70."""
 
@@ -75,8 +78,8 @@ def frozen_before(x: Array, row: int, criteria: JumpCriteria) -> Rows | None:
 def frozen_efforts(effort: Array, position: Array, criteria: JumpCriteria) -> Mask:
     """Mask (N, n) of efforts (N, n) that stay the same too long for chance while their joints move.
 
-    A smooth effort in coarse steps is flat at its peaks: one that is frozen ends with a jump. At its extremes an effort
-    is clipped, and zeros are faults of their own.
+    A smooth effort in coarse steps is flat at its peaks: one that is frozen ends with a jump, or lasts to the end and
+    much longer. At its extremes an effort is clipped, and zeros are faults of their own.
     """
     found = np.zeros(effort.shape, dtype=np.bool_)
     moves = _moves(position)
@@ -91,10 +94,11 @@ def frozen_efforts(effort: Array, position: Array, criteria: JumpCriteria) -> Ma
         chance = np.log(max(1.0 - renewed.size / step.size, 1.0 / step.size))
         longest = max((np.log(MOST_CHANCE) - np.log(step.size)) / min(chance, -1e-12), LEAST_RUN)
         ends = np.concatenate([[-1], renewed, [step.size]])
+        lengths = np.sort(np.diff(ends))
         for k in np.flatnonzero(np.diff(ends) > longest):
             begin, end = int(ends[k]) + 1, int(ends[k + 1])
             outermost = x[begin] in (x.min(), x.max())
-            jumps = end < step.size and step[end] > jump
+            jumps = step[end] > jump if end < step.size else end - begin > RUN_RATIO * lengths[-2]
             if (noisy or jumps) and not outermost and abs(x[begin]) >= NOTHING:
                 found[begin + 1 : end + 1, j] = moves(begin, end)[j]
     return found

@@ -130,6 +130,14 @@ def test_signals_that_are_not_renewed_are_left_out_while_they_are(tx40: RobotCon
 
 
 @pytest.mark.parametrize("seed", range(5))
+def test_a_torque_that_freezes_until_the_end_is_left_out_from_there(tx40: RobotConfig, seed: int) -> None:
+    t, q, tau = motion(np.random.default_rng(seed), 1000.0, 6.0)
+    tau[4000:, 3] = tau[3999, 3]
+    result = found(t, q, tau, tx40)
+    assert np.flatnonzero(result.wrong).tolist() == list(range(4000, t.size))
+
+
+@pytest.mark.parametrize("seed", range(5))
 def test_torques_that_repeat_earlier_ones_are_left_out(tx40: RobotConfig, seed: int) -> None:
     rng = np.random.default_rng(seed)
     t, q, tau = motion(rng, 1000.0)
