@@ -10,7 +10,7 @@ from scipy import optimize
 
 from armident.identify.setup.bench import Bench
 from armident.identify.setup.fit import Hypothesis, regressors
-from armident.identify.setup.least_squares import every_column
+from armident.identify.setup.limited_least_squares import every_column
 
 Array = NDArray[np.float64]
 OrderCriterion = Callable[[Array], float]

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from armident.configs import DataError, RobotConfig
 from armident.identify.robot.arm import ArmModel
-from armident.identify.setup.rows import ODD, Columns, Rows, columns_of, friction_terms, make_room
+from armident.identify.setup.torque_equations import ODD, Columns, Rows, columns_of, friction_terms, make_room
 from armident.identify.signals.bandwidth import motion_bandwidth
 from armident.identify.signals.decimate import Decimation, design
 from armident.identify.signals.experiments import Experiment

@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armident.identify.setup.bench import Bench
-from armident.identify.setup.least_squares import FLOOR, PASSES, Normal, Solution, every_column
-from armident.identify.setup.rows import PARTS
+from armident.identify.setup.limited_least_squares import FLOOR, PASSES, Normal, Solution, every_column
+from armident.identify.setup.torque_equations import PARTS
 
 Array = NDArray[np.float64]
 

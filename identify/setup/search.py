@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from armident.identify.setup import assignment, gravity, moves, scales
 from armident.identify.setup.bench import Bench
 from armident.identify.setup.fit import Hypothesis, fit, fit_shares, held_out, joint_errors, misfit
-from armident.identify.setup.least_squares import FLOOR
+from armident.identify.setup.limited_least_squares import FLOOR
 from armident.identify.setup.plausible import LEAST_ODDS, log_plausibility, plausible_factor, worst_change
 from armident.identify.setup.prior import Mistake, between, composed, cost, wiring_cost
 

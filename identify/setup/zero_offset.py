@@ -15,7 +15,7 @@ from armident.identify.effects.wiring import PositionOffset
 from armident.identify.setup.bench import Bench
 from armident.identify.setup.calibration import CORRECTED
 from armident.identify.setup.fit import Hypothesis, fit, held_out, regressors
-from armident.identify.setup.least_squares import RIDGE
+from armident.identify.setup.limited_least_squares import RIDGE
 from armident.identify.setup.plausible import LEAST_ODDS
 from armident.identify.setup.prior import MISTAKE
 from armident.identify.setup.result import SetupFinding

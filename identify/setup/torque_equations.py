@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armident.identify.robot.arm import ArmModel
-from armident.identify.setup.least_squares import Normal, normal_equations
+from armident.identify.setup.limited_least_squares import Normal, normal_equations
 
 Array = NDArray[np.float64]
 Places = NDArray[np.int64]

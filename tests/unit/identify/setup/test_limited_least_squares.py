@@ -5,7 +5,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy import optimize
 
-from armident.identify.setup.least_squares import every_column, normal_equations
+from armident.identify.setup.limited_least_squares import every_column, normal_equations
 
 Array = NDArray[np.float64]
 
