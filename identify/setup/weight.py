@@ -47,7 +47,8 @@ def weight_findings(bench: Bench, h: Hypothesis, robot: RobotConfig) -> list[Set
     shoulder = int(carrying[0])
     names = tuple(robot.joints[j].name for j in carrying)
     if robot.first_moments:
-        expected = _of_gravity(bench, h, _base_values(bench, robot))
+        standard = np.array([robot.first_moments.get(name, 0.0) for name in bench.model.names])
+        expected = _of_gravity(bench, h, bench.model.base.regroup @ standard)
         heavy = carrying[expected[carrying] > HEAVY * expected[carrying].max()]
         if heavy.size:
             ratio = float(np.exp(np.median(np.log(felt[heavy] / expected[heavy]))))
@@ -58,10 +59,9 @@ def weight_findings(bench: Bench, h: Hypothesis, robot: RobotConfig) -> list[Set
     if any(joint.type != "revolute" for joint in robot.joints[shoulder:]):
         return []
     reach = sum(float(np.hypot(joint.mdh.d, joint.mdh.r)) for joint in robot.joints[shoulder + 1 :])
-    moment = sum(
-        float(np.hypot(_value(bench, found.theta, f"mx{j}"), _value(bench, found.theta, f"my{j}")))
-        for j in carrying + 1
-    )
+    places = bench.columns.named
+    pairs = ([places[name] for name in (f"mx{j}", f"my{j}") if name in places] for j in carrying + 1)
+    moment = sum(float(np.linalg.norm(found.theta[pair])) for pair in pairs)
     if moment >= LIGHTEST * reach**3:
         return []
     message = (
@@ -78,14 +78,3 @@ def _of_gravity(bench: Bench, h: Hypothesis, base: Array) -> Array:
         bench.model.with_gravity(g).rigid_regressor(q, 0.0 * q, 0.0 * q) @ base for g in (h.gravity, 0.0 * h.gravity)
     )
     return np.asarray(np.sqrt(np.mean((with_it - without) ** 2, axis=0)))
-
-
-def _base_values(bench: Bench, robot: RobotConfig) -> Array:
-    standard = np.array([robot.first_moments.get(name, 0.0) for name in bench.model.names])
-    return np.asarray(bench.model.base.regroup @ standard)
-
-
-def _value(bench: Bench, theta: Array, name: str) -> float:
-    independent = bench.model.base.independent
-    found = [float(theta[k]) for k, column in enumerate(independent) if bench.model.names[column] == name]
-    return found[0] if found else 0.0

@@ -174,7 +174,7 @@ def test_every_process_gives_machine_code_the_same_name() -> None:
 
 
 def test_kernels_of_a_bus_are_declared() -> None:
-    """What a capture calls on every bus; `tests.fixtures.undeclared` listens in each test."""
+    """Compile nothing undeclared in the calls of a capture on every bus; the fixture fails the test otherwise."""
     for fd in (False, True):
         for buses in (1, 2):
             streams = [TpdoStream("samples", 1, (0x181, 0x182), 8), TpdoStream("demand", 5, (0x281, 0x282), 4)]

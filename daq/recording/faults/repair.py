@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from armident.configs import RobotConfig
 from armident.daq.recording.faults.jumps import JumpCriteria, jumps, unwrapped
-from armident.daq.recording.faults.stale import frozen_before, frozen_efforts, frozen_rows, repeated_efforts
+from armident.daq.recording.faults.stale import frozen_before, frozen_efforts, repeated_efforts
 from armident.daq.recording.faults.zeros import switched_off, zero_rows
 from armident.daq.recording.model import Gap, Quantity, Recording, Side
 
@@ -75,7 +75,7 @@ def repair(
     demand = None if demand is None else demand.copy()
     notes: list[str] = []
     lasting: list[tuple[int, int, float]] = []
-    stale: Mask = np.repeat(frozen_rows(position, effort)[:, None], robot.n, axis=1)
+    stale: Mask = np.zeros((times.size, robot.n), dtype=np.bool_)
     wrong = np.zeros((times.size, robot.n), dtype=np.bool_)
     for j, joint in enumerate(robot.joints):
         if joint.type == "revolute":
@@ -94,7 +94,7 @@ def repair(
         for row, size in found.steps:
             if frozen := frozen_before(position[:, j], row, criteria):
                 stale[slice(*frozen), j] = True
-            elif not stale[row - 1, j]:
+            else:
                 lasting.append((j, row, size))
     for chosen, rows in _alike(stale, names):
         notes.append(f"the position of {chosen} is not renewed {_times(rows, at)}: left out as gaps")

@@ -33,35 +33,11 @@ RUN_RATIO = 3.0
 REPEATED = 20
 """Rows in the same order as earlier that are a copy: noise repeats a value of twelve bits so often once in 10^70."""
 
-HELD = 0.2
-"""Share of rows equal to the one before above which all signals are held: half of the rows with a period of two."""
-
 MOST_ROWS = 10_000
 """Rows that tell the usual velocity."""
 
 APART = 0.01
 """Distance of the positions, in shares of their range, from which equal torques are no repeated motion."""
-
-
-def frozen_rows(position: Array, effort: Array) -> Mask:
-    """Mask (N,) of rows in which all positions and efforts (N, n) stay the same between rows in which the arm moves.
-
-    Single repeated rows are those of polled samples, of which an import speaks.
-    """
-    found = np.zeros(len(position), dtype=np.bool_)
-    equal, chance = np.ones(len(position) - 1, dtype=np.bool_), 0.0
-    for x in (*position.T, *effort.T):  # an hour has gigabytes: one signal at a time
-        same = np.diff(x) == 0
-        equal &= same
-        chance += float(np.log(max(same.mean(), 1.0 / same.size)))
-    if equal.mean() > HELD:
-        return found
-    moves = _moves(position)
-    for begin, end in runs(equal):
-        likely = (end - begin) * chance > np.log(MOST_CHANCE) - np.log(len(equal))
-        if not likely and end - begin >= LEAST_RUN and np.any(moves(begin - NEAR, begin) & moves(end, end + NEAR)):
-            found[begin + 1 : end + 1] = True
-    return found
 
 
 def frozen_before(x: Array, row: int, criteria: JumpCriteria) -> Rows | None:
