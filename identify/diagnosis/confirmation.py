@@ -9,6 +9,7 @@ from scipy import stats
 from armident.identify.diagnosis.criteria import Criteria
 from armident.identify.diagnosis.model_state import ModelState, acted_on
 from armident.identify.diagnosis.predictive_score import SUMS
+from armident.identify.effects.effect import SIGN_TOLERANCE
 from armident.identify.regression.equations import applied
 
 Array = NDArray[np.float64]
@@ -20,7 +21,7 @@ class Confirmation:
 
     ``noiseless``: errors with the torque of the effect at the simulated motion. Measured positions, differentiated
     twice, may add more noise than the effect has torque. ``acts``: joints on whose torques it acts. ``whole_before``,
-    ``whole_after``: errors of all joints together.
+    ``whole_after``: errors of all joints together. ``scale``: best factor of the effect's torque, 1 as in training.
     """
 
     p_value: float
@@ -30,6 +31,13 @@ class Confirmation:
     acts: NDArray[np.bool_]
     whole_before: float
     whole_after: float
+    scale: float
+    scale_std: float
+
+    @property
+    def absent(self) -> bool:
+        """True if the report part has less than half of the effect, by two standard deviations."""
+        return self.scale + SIGN_TOLERANCE * self.scale_std < 0.5
 
     @property
     def share(self) -> Array:
@@ -98,6 +106,8 @@ def confirmed(with_it: ModelState, without: ModelState) -> Confirmation:
         acted_on(with_it, without),
         _whole(before, torque),
         _whole(after, torque),
+        coefficient,
+        spread,
     )
 
 

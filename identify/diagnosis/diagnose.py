@@ -11,6 +11,7 @@ from threadpoolctl import threadpool_limits
 
 from armident.configs import RobotConfig
 from armident.identify.diagnosis.baseline_stage import BaselineStage, against_baseline
+from armident.identify.diagnosis.candidate_comparison import Addition
 from armident.identify.diagnosis.criteria import Criteria
 from armident.identify.diagnosis.detection_limits import detection_limits
 from armident.identify.diagnosis.findings import (
@@ -43,6 +44,7 @@ from armident.identify.documents.diagnosis import (
 from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.effects.friction import TRANSITION
 from armident.identify.effects.recording_corrections import of_recording
+from armident.identify.effects.registry import known
 from armident.identify.effects.unnamed import NAME as UNNAMED
 from armident.identify.regression.equations import applied
 from armident.identify.signals.experiments import Experiment
@@ -197,6 +199,11 @@ def _diagnose(
     first = selection.start()
     steps("comparison of effects")
     chosen, every = (first, ()) if change.complete else selection.run(first)
+    if validation and selection.absent:
+        own = _diagnose(training, (), robot, recordings, baseline, notes, steps, criteria, deadline)
+        lines = _changed_between(own.document, selection.absent)
+        if lines:
+            return replace(own, document=own.document.model_copy(update={"warnings": [*own.document.warnings, *lines]}))
     final = with_report_part(chosen)
     # Where the instant of all torques is unknown, a delay of one drive is known to the sample only.
     conventional = [one for one in every if one.conventional(final, 0.0 if stage.shift_known else final.study.sample)]
@@ -265,6 +272,19 @@ def _diagnose(
         simulated=simulated,
         first=None if change.complete else first,
     )
+
+
+def _changed_between(document: DiagnosisDocument, absent: Sequence[Addition]) -> list[str]:
+    """Warnings of effects that the training recordings have, by their own report part, and the validation does not."""
+    likely = {(f.effect, f.joint): f for f in document.findings if f.confidence >= LIKELY}
+    gone = {(one.candidate.effect.name, str(one.entry.joint)): one for one in absent}
+    return [
+        f"{joint}: {known(effect).title} explains {100 * one.share:.0f} % of its residual in the recordings to learn "
+        "from, and is absent from those of --validate: the arm changed between them; this diagnosis is of the former, "
+        "judged by their last part; diagnose the latter alone"
+        for (effect, joint), one in gone.items()
+        if (effect, joint) in likely
+    ]
 
 
 def _gaps(before: Gap, after: Gap, change: BaselineStage, part: int) -> BeforeAfter:

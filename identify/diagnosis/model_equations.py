@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from armident.identify.diagnosis.regressor_cache import Arrays
 from armident.identify.diagnosis.stretch import KINDS, MotionStretch
 from armident.identify.diagnosis.study import Study
+from armident.identify.effects.friction import TRANSITION
 from armident.identify.effects.terms import Term, effect_terms
 from armident.identify.regression.equations import InstrumentedEquations
 from armident.identify.regression.iv import JointEquations
@@ -43,6 +44,14 @@ class Equations:
         """Weight by which each parameter is held at zero, (b,): see `HELD_AT_ZERO`."""
         model = self.study.model
         return np.repeat([0.0, HELD_AT_ZERO], [model.base.b - model.e, model.e])
+
+    @property
+    def tied(self) -> tuple[tuple[int, int], ...]:
+        """Pairs of parameters of one value: the transition and the dry friction of the joints `Study.tied`."""
+        names, joints = self.study.model.base.names, self.study.joints
+        terms = [t for t in effect_terms(self.study.model) if t.effect.name == TRANSITION]
+        own = {joints[t.place.joint]: (names.index(t.names[0]), t.place.joint) for t in terms}
+        return tuple((own[j][0], names.index(f"fc{own[j][1] + 1}")) for j in joints if j in self.study.tied and j in own)
 
     @property
     def train(self) -> tuple[InstrumentedEquations, ...]:

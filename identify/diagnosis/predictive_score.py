@@ -20,6 +20,7 @@ from armident.identify.effects.free_shapes import FreeShape
 from armident.identify.effects.terms import effect_terms
 from armident.identify.regression.ar_noise import ArModel, ar_models
 from armident.identify.regression.iv import JointEquations
+from armident.identify.regression.iv_regression import ties
 
 Array = NDArray[np.float64]
 
@@ -60,6 +61,7 @@ class PredictiveScore:
                 zy[k][joint.z] += sums[:, -1]
         scale, weak = regression.solution.scale, np.diag(self._prior)
         left, right = (zx.sum(0) - zx + weak) / np.outer(scale, scale), (zy.sum(0) - zy) / scale
+        left += ties(self.fit.equations.tied, scale)
         return np.array([_solved(a, c) for a, c in zip(left, right, strict=True)]) / scale
 
     @cached_property

@@ -94,8 +94,8 @@ def refined(fit: IvFit, candidate: Candidate, column_cache: ColumnCache, best: t
     """Nonlinear parameters between those of the grid, one continuous one after the other, on a logarithmic scale."""
     found = best
     for k, free in enumerate(candidate.effect.refinable(fit.study.robot, candidate.place)):
-        values = sorted({grid[k][1] for grid in candidate.grid})
-        if not free or len(values) < 2:
+        values = sorted({grid[k][1] for grid in candidate.grid if grid[k][1] > 0.0})
+        if not free or len(values) < 2 or found[1][k][1] == 0.0:
             continue
         at = int(np.argmin(np.abs(np.array(values) - found[1][k][1])))
         low, high = values[max(at - 1, 0)], values[min(at + 1, len(values) - 1)]

@@ -68,6 +68,7 @@ class StepwiseSelection:
     stopped: bool = False
     hidden: frozenset[Key] = frozenset()
     immaterial: tuple[Addition, ...] = ()
+    absent: tuple[Addition, ...] = ()
     _states: dict[str, ModelState | None] = field(default_factory=dict)
     _steps: dict[str, SelectionStep] = field(default_factory=dict)
     _visited: set[str] = field(default_factory=set)
@@ -84,7 +85,9 @@ class StepwiseSelection:
         if not self.study.sign_given:
             state = with_own_noise(with_transitions(state, self._state))
         state = with_references(with_first_motions(state))
-        self.study = replace(self.study, robot=state.robot, model=state.study.model, references=state.study.references)
+        self.study = replace(
+            self.study, robot=state.robot, model=state.study.model, references=state.study.references, tied=state.study.tied
+        )
         self._states[_key(state.robot)] = state
         return state
 
@@ -315,6 +318,9 @@ class StepwiseSelection:
             assert gone.confirmation is not None
             if not gone.confirmation.is_material(self.criteria, named=gone.addition.named):
                 self.immaterial = (*self.immaterial, gone.addition)
+            strong = gone.addition.named and gone.addition.share >= self.criteria.named_share
+            if strong and gone.confirmation.absent:
+                self.absent = (*self.absent, gone.addition)
             found = tuple(one for one in found if one.entry is not gone.entry)
 
     def _holds(self, one: Selected) -> bool:

@@ -62,7 +62,8 @@ class Study:
     to the working rate. ``loop``: kind of controller; ``auxiliary``: that loop with the IDIM-LS estimate. ``sources``:
     training and validation recordings without corrections; ``signals``: derivatives of their positions. ``volume``
     (n,): see `log_volume`. ``references``: see `predictive_score.references_of`; empty before the fit.
-    ``sought``: joints at which effects are looked for; ``None``: all.
+    ``sought``: joints at which effects are looked for; ``None``: all. ``tied``: joints the transition of whose dry
+    friction has the size of that friction.
     """
 
     robot: RobotConfig
@@ -84,6 +85,7 @@ class Study:
     regressors: RegressorCache = field(default_factory=RegressorCache, repr=False, compare=False)
     references: tuple[Array | None, ...] = ()
     sought: tuple[int, ...] | None = None
+    tied: frozenset[str] = frozenset()
 
     @property
     def recorded(self) -> tuple[Entry, ...]:
@@ -113,7 +115,8 @@ class Study:
         return self._rebuilt(self.robot, self.signals)
 
     def _rebuilt(self, robot: RobotConfig, signals: Sequence[Derivatives] | None = None) -> "Study":
-        return replace(build_study(*self.sources, robot, signals, self.criteria), sought=self.sought)
+        rebuilt = build_study(*self.sources, robot, signals, self.criteria)
+        return replace(rebuilt, sought=self.sought, tied=self.tied)
 
     def _with_torques(self, sources: tuple[Sequence[Experiment], Sequence[Experiment]]) -> "Study":
         """The study with torques of the same motion that were recorded or corrected otherwise."""

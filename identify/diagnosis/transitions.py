@@ -1,5 +1,8 @@
 """Transitions of dry friction at the reversals of the joints: a part of the friction model, found before any effect."""
 
+from collections.abc import Sequence
+from dataclasses import replace
+
 import numpy as np
 
 from armident.configs.schema.robot import Effect as Entry
@@ -7,6 +10,7 @@ from armident.identify.diagnosis.candidates import ColumnCache, Shapes
 from armident.identify.diagnosis.model_state import (
     Fitter,
     ModelState,
+    fitted,
     fitted_in_loop_of,
     with_entries,
     without_entry,
@@ -31,20 +35,33 @@ def with_transitions(state: ModelState, model: Fitter) -> ModelState:
     Beside another law of the reversal, the smoothed sign looks like Stribeck friction or an early torque.
     """
     search = _Search(state)
-    for number in range(search.count):
-        search.tried({place: grid[number] for place, grid in search.grids.items()}, state)
-    made = search.converged(state)
-    if made is None:
-        return state
-    made = model(with_entries(state.robot, list(search.entries(search.chosen).values())), state)
-    if made is None:
-        return state
-    kept = [
-        entry
-        for place, entry in search.entries(search.chosen).items()
-        if _clear(made, model(without_entry(made.robot, entry), made), entry, place.joint)
-    ]
-    return model(with_entries(state.robot, _beside_curve(made, kept, model)), state) or state
+    made, clear = search.clear(model)
+    kept = _beside_curve(made, clear, model)
+    found = {entry.joint for entry in kept}
+    large = [place for place in search.large if state.study.joints[place.joint] not in found]
+    tied = _tied(state, large, model) if large else []
+    robot = with_entries(state.robot, [*kept, *tied])
+    if not tied:
+        return model(robot, state) or state
+    return fitted(replace(state.study, tied=frozenset(str(entry.joint) for entry in tied)), robot, state)
+
+
+def _tied(state: ModelState, places: Sequence[Place], model: Fitter) -> list[Entry]:
+    """Transitions of joints whose best transition is too large: those beside a free curve of friction over speed.
+
+    Friction that falls with the speed makes a transition too large, and is no part of it. Until an effect takes its
+    place, the transition has the size of the dry friction.
+    """
+    curved = model(with_entries(state.robot, _curves(state, places)), state)
+    if curved is None:
+        return []
+    return _Search(curved, places).clear(model)[1]
+
+
+def _curves(state: ModelState, places: Sequence[Place]) -> list[Entry]:
+    """Free curves of friction over speed."""
+    motion, curve = ColumnCache(state.study, state.fit.theta).motion(state.study.train[0], "measured"), known(CURVE)
+    return [entry_of(curve, place, state.robot, dict(curve.grid(motion, place)[0])) for place in places]
 
 
 def _beside_curve(state: ModelState, entries: list[Entry], model: Fitter) -> list[Entry]:
@@ -53,12 +70,8 @@ def _beside_curve(state: ModelState, entries: list[Entry], model: Fitter) -> lis
     Few reversals do not determine a transition: it may take the place of friction that falls with the speed. Beside the
     curve it is negative then, and the curve alone leaves less than half of the residual's power.
     """
-    motion = ColumnCache(state.study, state.fit.theta).motion(state.study.train[0], "measured")
-    curve = known(CURVE)
-
     def curves(some: list[Entry]) -> list[Entry]:
-        places = [Place(state.study.joints.index(str(entry.joint))) for entry in some]
-        return [entry_of(curve, place, state.robot, dict(curve.grid(motion, place)[0])) for place in places]
+        return _curves(state, [Place(state.study.joints.index(str(entry.joint))) for entry in some])
 
     both = model(with_entries(state.robot, curves(entries)), state)
     if both is None:
@@ -77,15 +90,38 @@ def _beside_curve(state: ModelState, entries: list[Entry], model: Fitter) -> lis
 class _Search:
     """Best transition of each joint so far, in the loop of the model without them. ``state``: model without them."""
 
-    def __init__(self, state: ModelState) -> None:
+    def __init__(self, state: ModelState, places: Sequence[Place] | None = None) -> None:
         self.state, self.effect = state, known(TRANSITION)
-        present = {entry.joint for entry in state.robot.effects if entry.effect == TRANSITION}
         motion = ColumnCache(state.study, state.fit.theta).motion(state.study.train[0], "measured")
-        places = [Place(j) for j, name in enumerate(state.study.joints) if name not in present]
+        if places is None:
+            present = {entry.joint for entry in state.robot.effects if entry.effect == TRANSITION}
+            places = [Place(j) for j, name in enumerate(state.study.joints) if name not in present]
         self.grids = {place: self.effect.grid(motion, place) for place in places}
         self.count = min(map(len, self.grids.values()), default=0)
         self.sample = motion.dt
         self.best: dict[Place, tuple[float, Shapes]] = {}
+        self._large: dict[Place, float] = {}
+
+    def clear(self, model: Fitter) -> tuple[ModelState, list[Entry]]:
+        """Model with the best transitions, and those that clearly predict better; the model without any if none is."""
+        for number in range(self.count):
+            self.tried({place: grid[number] for place, grid in self.grids.items()}, self.state)
+        made = self.converged(self.state)
+        if made is not None:
+            made = model(with_entries(self.state.robot, list(self.entries(self.chosen).values())), self.state)
+        if made is None:
+            return self.state, []
+        return made, [
+            entry
+            for place, entry in self.entries(self.chosen).items()
+            if _clear(made, model(without_entry(made.robot, entry), made), entry, place.joint)
+        ]
+
+    @property
+    def large(self) -> list[Place]:
+        """Joints at which a transition that is too large predicts clearly better than none."""
+        own, close = self.state.score.own_log_likelihoods, self.state.study.criteria.close
+        return [place for place, score in self._large.items() if score - own[place.joint] > close]
 
     @property
     def chosen(self) -> dict[Place, Shapes]:
@@ -105,7 +141,11 @@ class _Search:
         for place, entry in entries.items():
             score = float(made.score.own_log_likelihoods[place.joint])
             least = self.best[place][0] if place in self.best else -np.inf
-            if score > least and _possible(made, entry, place.joint):
+            value = float(made.values_of(made.term_of(entry))[0][0])
+            if not _possible(made, entry, place.joint):
+                if value > 0.0:
+                    self._large[place] = max(score, self._large.get(place, -np.inf))
+            elif score > least:
                 self.best[place] = score, shapes[place]
         return made
 

@@ -153,8 +153,8 @@ class StribeckBell(Effect):
         return dahl(motion.q[:, j], displacement) if displacement > 0.0 else motion.sign[:, j]
 
     def trial_values(self, motion: Motion, place: Place) -> Trials:
-        """Return `speeds`, and displacements from three millionths of the joint's range to a hundred times that."""
-        return speeds(motion, place), motion.span[place.joint] * np.geomspace(3e-6, 3e-4, 4)
+        """Return `speeds`, and displacements: none, and three millionths of the joint's range to 100 times that."""
+        return speeds(motion, place), [0.0, *motion.span[place.joint] * np.geomspace(3e-6, 3e-4, 4)]
 
 
 class StribeckFriction(StribeckBell):

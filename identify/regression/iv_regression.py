@@ -14,6 +14,9 @@ from armident.identify.regression.whitening import rows_of_joints
 
 Array = NDArray[np.float64]
 
+TIED = 1e4
+"""Weight of the difference of two parameters that have one value, over that of the data: a ten-thousandth is left."""
+
 
 class Jointwise(Protocol):
     """Equations of all joints, which may be computed again after they were freed."""
@@ -29,6 +32,10 @@ class Jointwise(Protocol):
     @property
     def held_at_zero(self) -> Array:
         """Weight by which each parameter is held at zero, over the norms of its columns, (b,)."""
+
+    @property
+    def tied(self) -> Sequence[tuple[int, int]]:
+        """Pairs of parameters that have one value."""
 
     def release(self) -> None:
         """Free the equations; they are computed again, with the same values, when they are next used."""
@@ -60,7 +67,7 @@ class IvRegression:
                 rows[j] = _whitened(joint, ar)
                 products.append(joint.products([rows[j]]))
         solution = together(zip(joints, products, strict=True), equations.parameters)
-        solution = replace(solution, cross=solution.cross + np.diag(equations.held_at_zero))
+        solution = replace(solution, cross=solution.cross + np.diag(equations.held_at_zero) + ties(equations.tied, solution.scale))
         made = cls(equations, tuple(noise), tuple(products), solution)
         if len(rows) == len(joints):
             made.__dict__["rows"] = tuple(rows[j] for j in range(len(joints)))
@@ -143,6 +150,16 @@ class IvRegression:
                 x[joint.x] += through[: joint.x.size]
                 q[joint.z] += through[joint.x.size :]
         return x, q / self.solution.scale[:, None]
+
+
+def ties(pairs: Sequence[tuple[int, int]], scale: Array) -> Array:
+    """Weights (b, b) that hold pairs of parameters together, in units of the norms ``scale`` (b,) of the columns."""
+    weights = np.zeros((scale.size, scale.size))
+    for pair in pairs:
+        apart = np.zeros(scale.size)
+        apart[list(pair)] = scale[pair[0]] / scale[list(pair)] * [1.0, -1.0]
+        weights += TIED * np.outer(apart, apart)
+    return weights
 
 
 def _whitened(joint: JointEquations, ar: ArModel) -> Array:

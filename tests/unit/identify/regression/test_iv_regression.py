@@ -27,6 +27,7 @@ class Given:
     blocks: Sequence[InstrumentedEquations]
     made: list[int] = field(default_factory=list)
     held_at_zero: Array = field(default_factory=lambda: np.zeros(5))
+    tied: Sequence[tuple[int, int]] = ()
 
     @cached_property
     def joints(self) -> tuple[JointEquations, ...]:
@@ -130,3 +131,17 @@ def test_a_parameter_that_two_columns_share_belongs_to_the_one_that_is_not_held_
     both = [replace(b, x=b.x[:, :, :4], z=b.z[:, :, :4]) for b in given.blocks]
     z, x, y = whitened([b.z for b in both], NOISE), *stacked(both, NOISE)
     np.testing.assert_allclose(theta[:4], factored(z, x, y).theta, rtol=1e-4)
+
+
+def test_tied_parameters_have_one_value_and_fit_as_one_column(given: Given) -> None:
+    given.tied = [(4, 2)]
+    theta = IvRegression.of(given, NOISE).solution.theta
+    assert theta[4] == pytest.approx(theta[2], rel=1e-3)
+    both = [replace(b, **{k: merged(getattr(b, k)) for k in ("x", "z")}) for b in given.blocks]
+    z, x, y = whitened([b.z for b in both], NOISE), *stacked(both, NOISE)
+    np.testing.assert_allclose(theta[:4], factored(z, x, y).theta, rtol=1e-3)
+
+
+def merged(columns: Array) -> Array:
+    """Columns (M, n, 5) with the last one added to the third."""
+    return np.concatenate([columns[:, :, :2], columns[:, :, 2:3] + columns[:, :, 4:], columns[:, :, 3:4]], axis=2)
