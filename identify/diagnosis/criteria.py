@@ -110,8 +110,8 @@ class Criteria:
         which an effect is looked for: half of the larger error is no error of the baseline then.
     larger_residuals
         Root mean square of the residuals of a joint over that in the baseline, with another motion, above which an
-        effect is looked for. Errors of one model differ with the motion; of 152 joints of healthy random arms, 5 differ
-        by more.
+        effect is looked for; the same of the report part over the training data. Errors of one model differ with the
+        motion; of 152 joints of healthy random arms, 5 differ by more.
     estimable
         Share of a parameter in the observed directions above which its change is reported by itself: the other
         directions hold 3 % of it at most.

@@ -6,7 +6,7 @@ that of other moments.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -61,11 +61,12 @@ LOG_2 = float(np.log(2.0))
 class Excess:
     """Part of one joint's residual beyond broadband noise; an event, which other data need not repeat.
 
-    ``share`` of the power of the residual, whose rms is ``error``, N m or N. ``where``: frequency, Hz, or the first
-    moments, s. ``x``, ``value``, ``noise`` (G,): amplitude over frequency or time, and that of the noise.
+    ``share`` of the power of the residual, whose rms is ``error``, N m or N. ``where``: frequency, Hz, the first
+    moments, s, or a factor. ``x``, ``value``, ``noise`` (G,): amplitude over frequency or time, and that of the noise.
+    ``narrow``: share of the power beyond noise at the strongest frequency, as wide as the window allows.
     """
 
-    kind: Literal["frequency", "unrecorded signal", "bursts"]
+    kind: Literal["frequency", "unrecorded signal", "bursts", "recording"]
     p_value: float
     share: float
     error: float
@@ -73,6 +74,7 @@ class Excess:
     x: Array
     value: Array
     noise: Array
+    narrow: float = 0.0
 
 
 def spectral_excess(
@@ -111,13 +113,27 @@ def spectral_excess(
     part = float(np.mean(away[away != 0.0] ** 2)) / rms**2
     peak, share = int(np.argmax(beyond)), float(np.clip(part * beyond.sum() / power.sum(), 0.0, 1.0))
     # A line is as narrow as the window allows; wider, it is a signal with a spectrum of its own.
-    line = peak > NARROW and beyond[peak - NARROW // 2 : peak + NARROW // 2 + 1].sum() > MOST * beyond.sum()
+    lobe = beyond[max(peak - NARROW // 2, 0) : peak + NARROW // 2 + 1].sum() if peak > NARROW else 0.0
+    narrow = float(lobe / max(beyond.sum(), 1e-300))
     around = slice(max(peak - SHOWN, 0), peak + SHOWN)
     value, noise = (np.sqrt(2.0 * dt * one[around]) for one in (power, level))
     return Excess(
-        "frequency" if line else "unrecorded signal", p_value, share, rms,
-        (float(f[peak]),), f[around], value, noise,
+        "frequency" if narrow > MOST else "unrecorded signal", p_value, share, rms,
+        (float(f[peak]),), f[around], value, noise, narrow,
     )  # fmt: skip
+
+
+def as_lines(one: Excess | None, other: Excess | None) -> tuple[Excess | None, Excess | None]:
+    """Signals of two parts of the data, as lines if both have most of their power at one frequency, the same one.
+
+    Errors of parameters that a vibration disturbs add frequencies of the motion; a slow signal has others in each part.
+    """
+    if one is None or other is None or min(one.narrow, other.narrow) <= 0.5:
+        return one, other
+    step = max(float(part.x[1] - part.x[0]) for part in (one, other))
+    if abs(one.where[0] - other.where[0]) > step:
+        return one, other
+    return replace(one, kind="frequency"), replace(other, kind="frequency")
 
 
 def _noise_level(f: Array, power: Array, used: NDArray[np.int64], dt: float) -> Array:
@@ -174,6 +190,34 @@ def bursts(
     level = np.full(power.size, np.sqrt(usual))
     when = tuple(np.sort(moment[first]).tolist())
     return Excess("bursts", float(min(1.0, p.min())), share, error, when, moment, np.sqrt(power), level)
+
+
+def larger_errors(
+    training: Sequence[Array], held: Sequence[Array], variance: float, times: Sequence[Array], factor: float
+) -> Excess | None:
+    """Errors of the report part that are ``factor`` times as large as the training data explain.
+
+    ``training``, ``held``: residuals (M,) of one joint, held-out ones at ``times`` (M,); ``variance``: mean one of the
+    prediction by the uncertainty of the parameters.
+    """
+    (one, count), (other, rest) = _power(training), _power(held)
+    expected = one + variance
+    if not other > factor**2 * expected > 0.0:
+        return None
+    e, t = np.concatenate(held), np.concatenate(times)
+    rms = np.sqrt(np.mean(e[: e.size // WINDOW * WINDOW].reshape(-1, WINDOW) ** 2, axis=1))
+    level = np.full(rms.size, np.sqrt(expected))
+    p_value = float(stats.f.sf(other / expected, rest, count))
+    times_as_large = float(np.sqrt(other / expected))
+    share, error = 1.0 - expected / other, float(np.sqrt(other))
+    return Excess("recording", p_value, share, error, (times_as_large,), t[::WINDOW][: rms.size], rms, level)
+
+
+def _power(series: Sequence[Array]) -> tuple[float, float]:
+    """Mean square of the residual of a moving joint, and its number of independent equations."""
+    e = np.concatenate(series)
+    moving = int(np.count_nonzero(e))
+    return float(e @ e) / max(moving, 1), max(moving / WINDOW * _independent(series), 1.0)
 
 
 def _independent(series: Sequence[Array]) -> float:

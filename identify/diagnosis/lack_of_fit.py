@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from armident.configs.schema.robot import Effect as Entry
 from armident.identify.diagnosis.criteria import Criteria
-from armident.identify.diagnosis.excess import Excess, bursts, spectral_excess
+from armident.identify.diagnosis.excess import Excess, as_lines, bursts, larger_errors, spectral_excess
 from armident.identify.diagnosis.free_functions import FINE, FreeFunction, free_functions, in_band
 from armident.identify.diagnosis.noise_beyond import noise_beyond
 from armident.identify.diagnosis.projection import JointResidual, Projection
@@ -89,7 +89,7 @@ class ResidualDependence:
     @property
     def of_noise(self) -> bool:
         """True if the band of the curve is the level of noise instead of the uncertainty of the curve."""
-        return self.kind in ("frequency", "motion", "unrecorded signal", "bursts")
+        return self.kind in ("frequency", "motion", "unrecorded signal", "bursts", "recording")
 
     @property
     def hint(self) -> str:
@@ -233,6 +233,7 @@ class LackOfFit:
         transitions = [e.parameters["velocity"] for e in study.robot.effects if self._reverses(e, joint)]
         slow = self.criteria.reversal * max(1.0 / float(study.robot.sign_smoothing[joint]), *transitions, 0.0)
         found: list[Excess] = []
+        signals: list[Excess | None] = []
         for held, stretches in ((False, study.train), (True, study.held)):
             errors = [e[:, joint] for e in self.fit.errors(self.fit.theta, held=held)]
             if held:
@@ -242,10 +243,19 @@ class LackOfFit:
             moments = bursts(errors, [s.t for s in stretches], velocities, slow)
             if moments is not None and moments.share >= self.criteria.burst_share:
                 found.append(moments)
-            signal = spectral_excess(errors, velocities, study.dt * study.decimation.factor, slow)
-            if signal is not None:
-                found.append(signal)
-        return sorted(found, key=lambda one: -one.share)
+            signals.append(spectral_excess(errors, velocities, study.dt * study.decimation.factor, slow))
+        found += [signal for signal in as_lines(*signals) if signal is not None]
+        larger = self._larger(joint)
+        return [*sorted(found, key=lambda one: -one.share), *([larger] if larger else [])]
+
+    def _larger(self, joint: int) -> Excess | None:
+        """Errors of a joint in the report part that are larger than those of the training data explain."""
+        fit, held = self.fit, self.fit.study.held
+        x = np.concatenate([e.x[:, joint] for e in fit.equations.held])
+        variance = float(np.mean(np.einsum("mb,mb->m", x @ fit.covariance, x)))
+        training, unseen = ([e[:, joint] for e in fit.errors(fit.theta, held=part)] for part in (False, True))
+        factor = self.criteria.larger_residuals
+        return larger_errors(training, unseen, variance, [s.t for s in held], factor)
 
     def _reverses(self, entry: Entry, joint: int) -> bool:
         """True for the entry with the transition of a joint's dry friction."""
@@ -334,8 +344,11 @@ class LackOfFit:
 
     @cached_property
     def tests(self) -> int:
-        """Number of all tests: sets of functions; of each joint all together, a line, two of spectra, two of bursts."""
-        return sum(len(own) + 6 for own in self.functions)
+        """Number of all tests: sets of functions, and seven of each joint.
+
+        These are all functions together, a line, two of spectra, two of bursts, and errors larger than before.
+        """
+        return sum(len(own) + 7 for own in self.functions)
 
     def _whitened(self, fit: IvFit) -> tuple[JointResidual, ...]:
         blocks, rows = fit.equations.held, fit.regression.rows_of

@@ -48,10 +48,9 @@ class Equations:
     @property
     def tied(self) -> tuple[tuple[int, int], ...]:
         """Pairs of parameters of one value: the transition and the dry friction of the joints `Study.tied`."""
-        names, joints = self.study.model.base.names, self.study.joints
-        terms = [t for t in effect_terms(self.study.model) if t.effect.name == TRANSITION]
-        own = {joints[t.place.joint]: (names.index(t.names[0]), t.place.joint) for t in terms}
-        return tuple((own[j][0], names.index(f"fc{own[j][1] + 1}")) for j in joints if j in self.study.tied and j in own)
+        names, tied = self.study.model.base.names, {self.study.joints.index(joint) for joint in self.study.tied}
+        every = [t for t in effect_terms(self.study.model) if t.effect.name == TRANSITION and t.place.joint in tied]
+        return tuple((names.index(t.names[0]), names.index(f"fc{t.place.joint + 1}")) for t in every)
 
     @property
     def train(self) -> tuple[InstrumentedEquations, ...]:

@@ -85,9 +85,8 @@ class StepwiseSelection:
         if not self.study.sign_given:
             state = with_own_noise(with_transitions(state, self._state))
         state = with_references(with_first_motions(state))
-        self.study = replace(
-            self.study, robot=state.robot, model=state.study.model, references=state.study.references, tied=state.study.tied
-        )
+        own = state.study
+        self.study = replace(self.study, robot=state.robot, model=own.model, references=own.references, tied=own.tied)
         self._states[_key(state.robot)] = state
         return state
 

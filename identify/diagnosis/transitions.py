@@ -70,6 +70,7 @@ def _beside_curve(state: ModelState, entries: list[Entry], model: Fitter) -> lis
     Few reversals do not determine a transition: it may take the place of friction that falls with the speed. Beside the
     curve it is negative then, and the curve alone leaves less than half of the residual's power.
     """
+
     def curves(some: list[Entry]) -> list[Entry]:
         return _curves(state, [Place(state.study.joints.index(str(entry.joint))) for entry in some])
 

@@ -8,9 +8,9 @@ from armident.identify.effects.effect import POSITION, TORQUE, VELOCITY
 Kind = Literal[
     "velocity", "position", "position and direction", "motor angle", "load", "load and direction", "torque",
     "acceleration", "time", "time and direction", "position of another joint", "velocity of another joint",
-    "torque of another joint", "frequency", "motion", "unrecorded signal", "bursts",
+    "torque of another joint", "frequency", "motion", "unrecorded signal", "bursts", "recording",
 ]  # fmt: skip
-"""Variables; those with a direction have the opposite sign in the negative direction. The last four have no free
+"""Variables; those with a direction have the opposite sign in the negative direction. The last five have no free
 functions of their own: all functions of the motion together, and what no recorded motion explains."""
 
 
@@ -143,6 +143,13 @@ VARIABLES: dict[Kind, ResidualVariable] = {
         SECONDS,
         "the torque of {joint} has bursts, the strongest at {at}, that the motion does not explain: look for contact "
         "with the surroundings, a collision, a slipping brake or a loose part",
+    ),
+    "recording": ResidualVariable(
+        "Data: the report part has far more torque error than the training data.",
+        ("times", "times"),
+        "the torque error of {joint} in the report part is {at} as large as in the training data: the arm or its load "
+        "changed between them, or the training motion does not show what the other needs; diagnose the recording of "
+        "the report part alone",
     ),
 }
 """All variables by their names in ``varies_with``."""

@@ -67,7 +67,8 @@ class IvRegression:
                 rows[j] = _whitened(joint, ar)
                 products.append(joint.products([rows[j]]))
         solution = together(zip(joints, products, strict=True), equations.parameters)
-        solution = replace(solution, cross=solution.cross + np.diag(equations.held_at_zero) + ties(equations.tied, solution.scale))
+        weights = np.diag(equations.held_at_zero) + ties(equations.tied, solution.scale)
+        solution = replace(solution, cross=solution.cross + weights)
         made = cls(equations, tuple(noise), tuple(products), solution)
         if len(rows) == len(joints):
             made.__dict__["rows"] = tuple(rows[j] for j in range(len(joints)))

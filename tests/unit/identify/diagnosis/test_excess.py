@@ -5,7 +5,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy import signal
 
-from armident.identify.diagnosis.excess import bursts, spectral_excess
+from armident.identify.diagnosis.excess import as_lines, bursts, larger_errors, spectral_excess
 from armident.identify.diagnosis.spectral_lines import has_line
 
 Array = NDArray[np.float64]
@@ -45,6 +45,26 @@ def test_a_vibration_has_its_frequency() -> None:
     assert found.p_value < 1e-6
     # It has twice the power of the noise.
     assert found.share == pytest.approx(2.0 / 3.0, abs=0.1)
+
+
+def test_a_vibration_beside_errors_of_the_motion_is_a_line_of_both_parts() -> None:
+    motion = sum(np.sin(2 * np.pi * f * T) for f in (0.5, 0.9, 1.3))
+    parts = [spectral_excess([noise(k) + 3.0 * np.sin(2 * np.pi * 3.7 * T + k) + motion], [SPEED], DT) for k in (0, 1)]
+    assert all(part is not None and part.kind == "unrecorded signal" for part in parts)
+    assert all(part is not None and part.kind == "frequency" for part in as_lines(*parts))
+    moved = spectral_excess([noise(2) + 3.0 * np.sin(2 * np.pi * 4.4 * T) + motion], [SPEED], DT)
+    assert as_lines(parts[0], moved) == (parts[0], moved)
+
+
+def test_errors_that_are_larger_in_the_report_part_count_beyond_twice_the_expected() -> None:
+    usual = [noise(0)]
+    assert larger_errors(usual, [1.8 * noise(1)], 0.0, [T], 2.0) is None
+    assert larger_errors(usual, [2.4 * noise(1)], 1.0, [T], 2.0) is None
+    found = larger_errors(usual, [4.0 * noise(1)], 0.0, [T], 2.0)
+    assert found is not None
+    assert found.where[0] == pytest.approx(4.0, rel=0.1)
+    assert found.share == pytest.approx(15 / 16, abs=0.02)
+    assert found.p_value < 1e-6
 
 
 def test_a_slow_signal_is_no_line() -> None:

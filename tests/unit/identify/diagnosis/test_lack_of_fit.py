@@ -151,7 +151,8 @@ def test_every_set_of_functions_has_its_own_key_and_a_hint() -> None:
     motions = [study.motion(s, "simulated", fit_model(study).theta) for s in study.train]
     every = list(free_functions(study, motions, 0))
     assert len({(f.kind, f.other, f.knots) for f in every}) == len(every)
-    assert {f.kind for f in every} | {"frequency", "motion", "unrecorded signal", "bursts"} == set(VARIABLES)
+    tests = {"frequency", "motion", "unrecorded signal", "bursts", "recording"}
+    assert {f.kind for f in every} | tests == set(VARIABLES)
     text = hint_of("torque of another joint", "joint_3", "joint_2", "1 N m")
     assert text.startswith("The torque of joint_3 follows that of joint_2: look for")
 

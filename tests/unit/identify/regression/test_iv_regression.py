@@ -137,7 +137,7 @@ def test_tied_parameters_have_one_value_and_fit_as_one_column(given: Given) -> N
     given.tied = [(4, 2)]
     theta = IvRegression.of(given, NOISE).solution.theta
     assert theta[4] == pytest.approx(theta[2], rel=1e-3)
-    both = [replace(b, **{k: merged(getattr(b, k)) for k in ("x", "z")}) for b in given.blocks]
+    both = [replace(b, x=merged(b.x), z=merged(b.z)) for b in given.blocks]
     z, x, y = whitened([b.z for b in both], NOISE), *stacked(both, NOISE)
     np.testing.assert_allclose(theta[:4], factored(z, x, y).theta, rtol=1e-3)
 
