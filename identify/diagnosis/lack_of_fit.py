@@ -244,9 +244,13 @@ class LackOfFit:
             if moments is not None and moments.share >= self.criteria.burst_share:
                 found.append(moments)
             signals.append(spectral_excess(errors, velocities, study.dt * study.decimation.factor, slow))
-        found += [signal for signal in as_lines(*signals) if signal is not None]
+        one, other = as_lines(*signals)
         larger = self._larger(joint)
-        return [*sorted(found, key=lambda one: -one.share), *([larger] if larger else [])]
+        if larger and other and other.kind == "unrecorded signal":
+            # What the model lacks in the report part alone is in the band of the motion, too.
+            other = None
+        found += [signal for signal in (one, other) if signal is not None]
+        return [*sorted(found, key=lambda event: -event.share), *([larger] if larger else [])]
 
     def _larger(self, joint: int) -> Excess | None:
         """Errors of a joint in the report part that are larger than those of the training data explain."""

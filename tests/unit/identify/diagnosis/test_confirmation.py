@@ -33,6 +33,8 @@ def test_a_true_effect_is_confirmed_and_the_error_is_smaller() -> None:
     found = compared(1, SPRING)
     assert found.p_value < 0.01
     assert found.smaller
+    assert not found.absent
+    assert found.scale == pytest.approx(1.0, abs=0.3)
     assert found.after[0] < 0.5 * found.before[0]
     assert found.share[0] > 0.75
     assert found.change[0] == pytest.approx(float(np.sqrt(found.before[0] ** 2 - found.best[0] ** 2)))

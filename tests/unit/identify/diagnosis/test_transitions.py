@@ -88,3 +88,28 @@ def test_a_transition_that_stands_for_friction_falling_with_the_speed_is_dropped
     study = build_study([replace(e, tau=tau)], [], robot)
     state = with_transitions(fitted(study, study.robot, None), lambda one, before: fitted(study, one, before))
     assert {entry.joint for entry in state.robot.effects} == set(study.joints[1:])
+
+
+def test_a_transition_that_stribeck_friction_makes_too_large_is_tied_to_the_dry_friction() -> None:
+    """The friction at low speed is left for an effect."""
+    robot = random_arm(4, 2)
+    model, dry = arm_model(robot), setups.physical_parameters(robot, 0)[list(arm_model(robot).names).index("fc1")]
+    made = []
+    for e in setups.record(robot, 0, noise=0.003):
+        v = np.gradient(e.q, e.dt, axis=0)[:, 0]
+        speed = v / np.abs(v).max()
+        friction = np.tanh(speed / 0.001) * (1.0 + 0.6 * np.exp(-((speed / 0.15) ** 2)))
+        change = dry * (friction - 2 / np.pi * np.arctan(model.smoothing[0] * v))
+        tau = e.tau.copy()
+        tau[:, 0] += signal.lfilter([0.5, 0.5], [1.0], np.append(change, change[-1]))[1:]
+        made.append(replace(e, tau=tau))
+    study = build_study(made, [], robot)
+    base = fitted(study, study.robot, None)
+    state = with_transitions(base, lambda one, before: fitted(study, one, before))
+    assert state.study.tied == {"axis_1"}
+    entry = next(e for e in state.robot.effects if e.joint == "axis_1")
+    names = state.study.model.base.names
+    own, usual = (float(state.fit.theta[names.index(name)]) for name in (state.term_of(entry).names[0], "fc1"))
+    assert own == pytest.approx(usual, rel=0.01)
+    assert entry.parameters["velocity"] < 0.004 * np.abs(v).max()
+    assert (state.score.own_log_likelihoods - base.score.own_log_likelihoods)[0] > 0.0
