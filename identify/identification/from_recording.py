@@ -275,7 +275,8 @@ def _check_missing(present: int, first: int, last: int, dt: float) -> None:
         raise DataError(
             f"{expected - present} of {expected} samples ({100 * (1 - present / expected):.1f} %) of the experiment "
             f"from SYNC {first} to {last} ({expected * dt:.2f} s) are missing; "
-            f"at most {100 * MAX_MISSING_SHARE:.0f} % may be"
+            f"at most {100 * MAX_MISSING_SHARE:.0f} % may be: mend the cause, which the import or the capture names, "
+            "and record again"
         )
 
 
