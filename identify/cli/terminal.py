@@ -184,10 +184,7 @@ def diagnosis_table(document: DiagnosisDocument) -> None:
         if e.doubtful:
             console.print(f"{e.joint}: 90 % set: {e.sentence}", highlight=False, soft_wrap=True)
     for u in document.unexplained:
-        console.print(
-            f"unexplained: {u.joint}, {100 * u.share_of_residual:.0f} % of its residual varies with {u.varies_with}",
-            highlight=False,
-        )
+        console.print(f"unexplained: {u.sentence}", highlight=False, soft_wrap=True)
     if document.transitions:
         found = ", ".join(f"{joint} {1e3 * velocity:.3g}" for joint, velocity in document.transitions.items())
         console.print(

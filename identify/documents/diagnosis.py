@@ -142,6 +142,12 @@ class Unexplained(Document):
     varies_with: str
     hint: str
 
+    @property
+    def sentence(self) -> str:
+        """The part in words, with its probable causes."""
+        share = 100 * self.share_of_residual
+        return f"{self.joint}: {self.varies_with}, {share:.0f} % of the residual. {self.hint}"
+
 
 class Negligible(Document):
     """Effect or dependence that is significant and smaller than what counts as a cause; it is not in the model.
