@@ -11,7 +11,7 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
+from scipy import special, stats
 
 from armident.identify.signals.periodogram import hann_window, periodogram
 
@@ -123,17 +123,22 @@ def spectral_excess(
     )  # fmt: skip
 
 
-def as_lines(one: Excess | None, other: Excess | None) -> tuple[Excess | None, Excess | None]:
-    """Signals of two parts of the data, as lines if both have most of their power at one frequency, the same one.
+def together(one: Excess | None, other: Excess | None) -> tuple[Excess | None, Excess | None]:
+    """Signals of two parts of the data; at one frequency both are evidence for either (Fisher's method).
 
-    Errors of parameters that a vibration disturbs add frequencies of the motion; a slow signal has others in each part.
+    It is a line if both have most of their power there. Errors of parameters that a vibration disturbs add frequencies
+    of the motion; a slow signal has others in each part.
     """
-    if one is None or other is None or min(one.narrow, other.narrow) <= 0.5:
+    if one is None or other is None:
         return one, other
     step = max(float(part.x[1] - part.x[0]) for part in (one, other))
-    if abs(one.where[0] - other.where[0]) > step:
+    if abs(one.where[0] - other.where[0]) > PER_FREQUENCY * step:
         return one, other
-    return replace(one, kind="frequency"), replace(other, kind="frequency")
+    product = sum(float(np.log(max(part.p_value, 1e-300))) for part in (one, other))
+    p_value = float(special.chdtrc(4, -2.0 * product))
+    line = min(one.narrow, other.narrow) > 0.5
+    first, second = (replace(p, p_value=p_value, kind="frequency" if line else p.kind) for p in (one, other))
+    return first, second
 
 
 def _noise_level(f: Array, power: Array, used: NDArray[np.int64], dt: float) -> Array:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from armident.configs.schema.robot import Effect as Entry
 from armident.identify.diagnosis.criteria import Criteria
-from armident.identify.diagnosis.excess import Excess, as_lines, bursts, larger_errors, spectral_excess
+from armident.identify.diagnosis.excess import Excess, bursts, larger_errors, spectral_excess, together
 from armident.identify.diagnosis.free_functions import FINE, FreeFunction, free_functions, in_band
 from armident.identify.diagnosis.noise_beyond import noise_beyond
 from armident.identify.diagnosis.projection import JointResidual, Projection
@@ -244,7 +244,7 @@ class LackOfFit:
             if moments is not None and moments.share >= self.criteria.burst_share:
                 found.append(moments)
             signals.append(spectral_excess(errors, velocities, study.dt * study.decimation.factor, slow))
-        one, other = as_lines(*signals)
+        one, other = together(*signals)
         larger = self._larger(joint)
         if larger and other and other.kind == "unrecorded signal":
             # What the model lacks in the report part alone is in the band of the motion, too.

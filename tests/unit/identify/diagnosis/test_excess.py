@@ -5,7 +5,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy import signal
 
-from armident.identify.diagnosis.excess import as_lines, bursts, larger_errors, spectral_excess
+from armident.identify.diagnosis.excess import bursts, larger_errors, spectral_excess, together
 from armident.identify.diagnosis.spectral_lines import has_line
 
 Array = NDArray[np.float64]
@@ -51,9 +51,17 @@ def test_a_vibration_beside_errors_of_the_motion_is_a_line_of_both_parts() -> No
     motion = sum(np.sin(2 * np.pi * f * T) for f in (0.5, 0.9, 1.3))
     parts = [spectral_excess([noise(k) + 3.0 * np.sin(2 * np.pi * 3.7 * T + k) + motion], [SPEED], DT) for k in (0, 1)]
     assert all(part is not None and part.kind == "unrecorded signal" for part in parts)
-    assert all(part is not None and part.kind == "frequency" for part in as_lines(*parts))
+    assert all(part is not None and part.kind == "frequency" for part in together(*parts))
     moved = spectral_excess([noise(2) + 3.0 * np.sin(2 * np.pi * 4.4 * T) + motion], [SPEED], DT)
-    assert as_lines(parts[0], moved) == (parts[0], moved)
+    assert together(parts[0], moved) == (parts[0], moved)
+
+
+def test_a_weak_signal_at_one_frequency_of_both_parts_is_more_evidence_than_either() -> None:
+    parts = [spectral_excess([noise(k) + 0.45 * np.sin(2 * np.pi * 3.7 * T + k)], [SPEED], DT) for k in (3, 4)]
+    both = together(*parts)
+    for part, joint in zip(parts, both, strict=True):
+        assert part is not None and joint is not None
+        assert joint.p_value < 0.1 * part.p_value
 
 
 def test_errors_that_are_larger_in_the_report_part_count_beyond_twice_the_expected() -> None:
