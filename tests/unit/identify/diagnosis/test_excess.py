@@ -60,7 +60,8 @@ def test_a_weak_signal_at_one_frequency_of_both_parts_is_more_evidence_than_eith
     parts = [spectral_excess([noise(k) + 0.45 * np.sin(2 * np.pi * 3.7 * T + k)], [SPEED], DT) for k in (3, 4)]
     both = together(*parts)
     for part, joint in zip(parts, both, strict=True):
-        assert part is not None and joint is not None
+        assert part is not None
+        assert joint is not None
         assert joint.p_value < 0.1 * part.p_value
 
 
