@@ -169,7 +169,7 @@ class GravityDirection(TorqueDependent):
     required_motion = "postures all over the workspace"
     excitation = ("range", "load")
     scope = "arm"
-    linear = (
+    linear: tuple[Linear, ...] = (
         Linear(
             "tilt_x",
             ("rad", "rad"),
@@ -198,6 +198,49 @@ class GravityDirection(TorqueDependent):
     def invisible(self, motion: Motion, place: Place) -> str | None:
         """Return a reason if there is no gravity."""
         return None if np.any(motion.model.chain.gravity) else "the configuration has no gravity"
+
+
+class GravityDirectionOfVerticalJoint(GravityDirection):
+    """Tilt of the base of an arm whose first axis is vertical as configured.
+
+    Gravity along the axis never shows where the weight that turns with it is; across the axis it acts on that.
+    """
+
+    law = "vertical_joint"
+    change_title = ""
+    compared = False
+    rigid_part = ""
+    linear = (
+        *GravityDirection.linear,
+        Linear("first_cos", TORQUE, "Torque of the tilt on the first joint, over the cosine of its position."),
+        Linear("first_sin", TORQUE, "Torque of the tilt on the first joint, over the sine of its position."),
+    )
+
+    def columns(self, motion: Motion, place: Place, shapes: Mapping[str, float]) -> Array:
+        """Return those of the tilt, and both functions of the first joint."""
+        first = np.zeros((motion.samples, motion.n, 2))
+        first[:, 0] = np.column_stack([np.cos(motion.q[:, 0]), np.sin(motion.q[:, 0])])
+        return np.concatenate([super().columns(motion, place, shapes), first], axis=2)
+
+    def invisible(self, motion: Motion, place: Place) -> str | None:
+        """Return a reason if there is no gravity, or the first axis is not along it."""
+        chain = motion.model.chain
+        axis = np.array([0.0, -chain.sin_alpha[0], chain.cos_alpha[0]])
+        apart = float(np.linalg.norm(np.cross(axis, chain.gravity)))
+        if chain.prismatic[0] or apart > PARALLEL * float(np.linalg.norm(chain.gravity)):
+            return "the first joint does not turn about a vertical axis"
+        return super().invisible(motion, place)
+
+    def allows(self, values: Array, std: Array, shapes: Mapping[str, float]) -> bool:
+        """Return True if joints beside the first show a tilt: that joint alone may as well have a spring."""
+        return bool(np.any(np.abs(values[:2]) > SHOWN * std[:2]))
+
+
+SHOWN = 3.0
+"""Standard deviations from which a tilt is shown: noise exceeds them once in 370 times."""
+
+PARALLEL = 1e-3
+"""Sine of the angle under which an axis counts as vertical, as right angles of a file are rounded."""
 
 
 def across(gravity: Array) -> Array:

@@ -231,7 +231,14 @@ def instant_model(arm: ArmModel, theta: Floats) -> InstantModel:
                 theta[arm.names.index(names[k])] += value
         elif isinstance(term.effect, GravityDirection):
             size = float(np.linalg.norm(arm.chain.gravity))
-            gravity += size * (values @ across(arm.chain.gravity)[list(term.kept)]) if size else 0.0
+            tilts = [k for k in term.kept if k < len(GravityDirection.linear)]
+            gravity += size * (values[: len(tilts)] @ across(arm.chain.gravity)[tilts]) if size else 0.0
+            if len(tilts) < len(term.kept):
+                turned = _symbols("q", 1)[0, 0]
+                functions = (turned.cos(), turned.sin())
+                rest = zip(term.kept[len(tilts) :], values[len(tilts) :], strict=True)
+                torque = sum(float(value) * functions[k - len(GravityDirection.linear)] for k, value in rest)
+                torques[number] = {0: _of(torque).text}
         else:
             found = _formulas(known, term, values)
             if found is None:

@@ -279,6 +279,34 @@ def test_a_tilted_base_feels_a_turned_gravity(arm: Motion) -> None:
     np.testing.assert_allclose(found, expected, atol=1e-4 * np.abs(expected).max())
 
 
+def test_a_tilt_acts_on_weight_beside_a_vertical_joint_that_gravity_along_it_never_shows(arm: Motion) -> None:
+    """The moments of the first link are in no base parameter of an upright arm."""
+    model, still, tilt = arm.model, np.zeros_like(arm.q), 1e-5
+    heavy = arm.standard.copy()
+    for name, value in (("mx1", 0.7), ("my1", -0.3)):
+        heavy[model.names.index(name)] += value
+    size = float(np.linalg.norm(model.chain.gravity))
+    turned = model.with_gravity(size * np.array([tilt, 0.5 * tilt, -1.0]))
+    torque = (
+        turned.inverse_dynamics(heavy, arm.q, still, still) - model.inverse_dynamics(heavy, arm.q, still, still)
+    ) / tilt
+    found = columns("gravity_direction/vertical_joint", arm)
+    values = np.linalg.lstsq(found.reshape(-1, 4), torque.ravel(), rcond=None)[0]
+    np.testing.assert_allclose(found @ values, torque, atol=1e-4 * np.abs(torque).max())
+    np.testing.assert_allclose(values[:2], [1.0, 0.5], rtol=1e-3)
+    assert np.abs(found[:, :, :2] @ [1.0, 0.5] - torque).max() > 0.1 * np.abs(torque).max()
+
+
+def test_a_spring_of_a_vertical_joint_is_no_tilt(arm: Motion) -> None:
+    effect = catalogue()["gravity_direction/vertical_joint"]
+    std = np.full(4, 0.01)
+    assert not effect.allows(np.array([0.02, -0.02, 3.0, 1.0]), std, {})
+    assert effect.allows(np.array([0.02, -0.05, 3.0, 1.0]), std, {})
+    assert effect.invisible(arm, Place(0)) is None
+    wall = replace(arm, model=arm.model.with_gravity(np.array([9.81, 0.0, 0.0])))
+    assert effect.invisible(wall, Place(0)) == "the first joint does not turn about a vertical axis"
+
+
 def test_a_wrong_gain_scales_the_motor_torque(arm: Motion) -> None:
     tau = arm.model.inverse_dynamics(arm.standard, arm.q, arm.qd, arm.qdd)
     # tau_joint = ratios' tau_motor: motor 6 turns with joints 5 and 6, motor 5 with joint 5 alone.

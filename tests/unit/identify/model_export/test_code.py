@@ -146,11 +146,12 @@ def test_an_effect_with_memory_has_none(key: str) -> None:
     "keys",
     [
         sorted(key for key in MEMORYLESS if not catalogue()[key].depends_on_torque and key != "payload"),
-        sorted(key for key in MEMORYLESS if catalogue()[key].depends_on_torque and key != "gravity_direction"),
+        sorted(key for key in MEMORYLESS if catalogue()[key].depends_on_torque and "gravity_direction" not in key),
         ["payload"],
         ["gravity_direction"],
+        ["gravity_direction/vertical_joint"],
     ],
-    ids=["of the motion", "of the torque", "payload", "gravity"],
+    ids=["of the motion", "of the torque", "payload", "gravity", "gravity on a vertical joint"],
 )
 def test_code_with_effects_has_the_torques_of_the_model(keys: list[str], tmp_path: Path) -> None:
     robot = with_effect(load_robot("tx40"), *keys)
