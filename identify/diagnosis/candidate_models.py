@@ -43,7 +43,8 @@ def _corrected(
 ) -> FittedCandidate | None:
     """Model in which the recordings are corrected for an effect on a recorded torque.
 
-    The first-order expansion refines the value to within its standard deviation; else the largest gain decides.
+    The first-order expansion refines the value to within its standard deviation; else the largest gain decides. A value
+    that the expansion takes back by more than half only makes noise smaller.
     """
     name = candidate.effect.linear[0].name
     found: list[FittedCandidate] = []
@@ -55,11 +56,13 @@ def _corrected(
             further = None if exact is None else fitter(with_entries(exact.robot, [entry]), exact)
             if exact is None:
                 break
-            allowed = candidate.effect.allows(np.array([value]), np.zeros(1), {})
-            found.append(FittedCandidate(candidate, (), right, exact, allowed))
             if further is None:
                 break
             rest, std = (float(x[0]) for x in further.values_of(further.term_of(entry)))
+            if 2.0 * rest * np.sign(value) < -abs(value):
+                break
+            allowed = candidate.effect.allows(np.array([value]), np.zeros(1), {})
+            found.append(FittedCandidate(candidate, (), right, exact, allowed))
             if abs(rest) < std and allowed:
                 return found[-1]
             value += rest

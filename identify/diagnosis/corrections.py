@@ -30,10 +30,14 @@ def screened_correction(fit: IvFit, candidate: Candidate, column_cache: ColumnCa
     return _largest(lambda values: _at_simulated(fit, effect, motor, limit, column_cache, values), grid)
 
 
-def likely_correction(fit: IvFit, candidate: Candidate) -> float:
-    """Value with the largest likelihood: for effects so large that the predicted torque is far from the true one."""
+def likely_correction(fit: IvFit, candidate: Candidate) -> tuple[float, float]:
+    """Twice the gain of log-likelihood by a correction, and the value of its parameter there.
+
+    For effects so large that predicted torque or simulated motion are far from the true ones.
+    """
     effect, motor, limit, grid = _tested(fit, candidate)
-    return _largest(lambda values: _likelihoods(fit, effect, motor, limit, values), grid)[1]
+    most, value = _largest(lambda values: _likelihoods(fit, effect, motor, limit, values), grid)
+    return most - float(_likelihoods(fit, effect, motor, limit, [0.0])[0]), value
 
 
 def _tested(fit: IvFit, candidate: Candidate) -> tuple[Correction, int, float, list[float]]:

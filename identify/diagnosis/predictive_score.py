@@ -109,11 +109,17 @@ class PredictiveScore:
 
     @property
     def _changes(self) -> Sequence[Array | None]:
-        """Rigid parameters of each fold less the reference of a joint, (`FOLDS`, b - e); ``None`` without one."""
+        """Parameters of each fold less the reference of a joint, (`FOLDS`, b); ``None`` without one.
+
+        The first model has no effects: the reference of theirs is zero.
+        """
         study = self.fit.study
         rigid = self.fit.theta.size - study.model.e
         references = study.references or (None,) * study.robot.n
-        return [None if r is None or r.size != rigid else self.folds[:, :rigid] - r for r in references]
+        return [
+            None if r is None or r.size != rigid else self.folds - np.append(r, np.zeros(study.model.e))
+            for r in references
+        ]
 
     def innovations(self, noise: Sequence[ArModel]) -> Array:
         """Mean squares of the innovations of each joint under noise models, (N m)^2 or N^2, (n,)."""

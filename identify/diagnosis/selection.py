@@ -48,6 +48,7 @@ from armident.identify.diagnosis.shortlist import Incumbent, shortlist
 from armident.identify.diagnosis.study import Study
 from armident.identify.diagnosis.transitions import with_transitions
 from armident.identify.effects.free_shapes import FreeShape
+from armident.identify.effects.recording_corrections import of_recording
 
 Array = NDArray[np.float64]
 
@@ -71,6 +72,7 @@ class StepwiseSelection:
     absent: tuple[Addition, ...] = ()
     _states: dict[str, ModelState | None] = field(default_factory=dict)
     _steps: dict[str, SelectionStep] = field(default_factory=dict)
+    _studies: dict[str, Study] = field(default_factory=dict)
     _visited: set[str] = field(default_factory=set)
 
     @property
@@ -115,16 +117,9 @@ class StepwiseSelection:
             state, found = self._exchanged(state, found, changed)
             less, kept = self._confirmed(state, found)
             if len(kept) == len(found):
-                return (self._final(less), kept) if kept else (first, ())
+                return (with_own_noise(less), kept) if kept else (first, ())
             changed = acted_on(state, less)
             state, found = less, kept
-
-    def _final(self, state: ModelState) -> ModelState:
-        """Model with noise models of its own residual, and with the controller that its corrected torques identify."""
-        if state.study.recorded != self.study.recorded:
-            with contextlib.suppress(DataError):
-                state = fitted(state.study.with_own_controller(), state.robot, state)
-        return with_own_noise(state)
 
     def step(self, state: ModelState, incumbent: Incumbent | None = None) -> SelectionStep:
         """Compare all candidates in a model; with an ``incumbent``, those on its joints that promise hardly less."""
@@ -179,8 +174,8 @@ class StepwiseSelection:
         """Addition that the step admits: the best law of the best effect; ``None`` if there is none.
 
         A named effect is admitted if no explanation of its joint, even one too small for a finding, is clearly better.
-        It comes first if it explains most of what the best unnamed term does. Of equal laws, the fewest parameters come
-        first.
+        It comes first if it explains most of what the best unnamed term does. Of laws that explain about as much, the
+        fewest parameters come first.
         """
         able = [a for a in step.passing if not (a.named and self._superseded(a, step))]
         if not able:
@@ -189,17 +184,32 @@ class StepwiseSelection:
         if not best.named:
             named = [a for a in able if a.named and a.share >= self.criteria.named_share * best.share]
             best = named[0] if named else best
-        close = best.log_likelihood - self.criteria.close
-        same = [a for a in able if a.family == best.family and a.log_likelihood > close]
+        same = [a for a in able if a.family == best.family and not self._explains_more(best, a)]
         return min(same, key=lambda a: (isinstance(a.candidate.effect, FreeShape), len(a.candidate.effect.linear)))
+
+    def _explains_more(self, one: Addition, other: Addition) -> bool:
+        """True if a law of an effect is clearly better than another one, and by as much as a finding has to be."""
+        share = (one.share - other.share) / max(1.0 - other.share, 1e-300)
+        changed = float(np.sqrt(max(one.material_pct**2 - other.material_pct**2, 0.0)))
+        return (
+            one.log_likelihood > other.log_likelihood + self.criteria.close
+            and share >= self.criteria.least_share
+            and changed >= self.criteria.material_pct
+        )
 
     def _superseded(self, addition: Addition, step: SelectionStep) -> bool:
         """True if an explanation of the same joint that does not pass is clearly better than an addition.
 
-        It has to reduce the errors of a joint. Corrections of recorded torques may only make them whiter.
+        It has to reduce the errors of a joint: corrections of recorded torques may only make them whiter. They may also
+        only make noise smaller: their parameters have to differ from zero.
         """
+        level = self.criteria.selection_level(step.tests)
         better = (a for a in step.rivals(addition) if a not in step.passing and a.share > 0.0)
-        return any(a.log_likelihood > addition.log_likelihood + self.criteria.close for a in better)
+        return any(
+            a.log_likelihood > addition.log_likelihood + self.criteria.close
+            and (not of_recording(a.entry) or a.p_value < level)
+            for a in better
+        )
 
     def _late(self) -> bool:
         self.stopped = self.stopped or time.monotonic() > self.deadline
@@ -231,10 +241,26 @@ class StepwiseSelection:
         key = _key(robot)
         if key not in self._states:
             try:
-                self._states[key] = fitted(self.study, robot, before)
+                self._states[key] = fitted(self._study_of(robot), robot, before)
             except (DataError, np.linalg.LinAlgError):
                 self._states[key] = None
         return self._states[key]
+
+    def _study_of(self, robot: RobotConfig) -> Study:
+        """The study with the torques that a model corrects, and with the controller that these identify.
+
+        The controller of a late torque may make a loop that swings, whose motion shows nothing.
+        """
+        recorded = tuple(entry for entry in robot.effects if of_recording(entry))
+        if recorded == self.study.recorded:
+            return self.study
+        key = _key(robot.model_copy(update={"effects": recorded}))
+        if key not in self._studies:
+            study = self.study.of_robot(robot)
+            with contextlib.suppress(DataError):
+                study = study.with_own_controller()
+            self._studies[key] = study
+        return self._studies[key]
 
     def _without(self, state: ModelState, entry: Entry) -> ModelState | None:
         """The model without one of its effects."""

@@ -5,13 +5,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from armident.configs import DataError
 from armident.identify.diagnosis.candidates import Candidate, ColumnCache, Key, Shapes, candidates
 from armident.identify.diagnosis.corrections import likely_correction, screened_correction
-from armident.identify.diagnosis.model_state import ModelState
+from armident.identify.diagnosis.model_state import ModelState, with_entries
 from armident.identify.diagnosis.order_analysis import motor_orders, nearby_orders
 from armident.identify.diagnosis.screening import contained, refined, screened
 from armident.identify.diagnosis.shaping import shapes_of_both_signals
+from armident.identify.diagnosis.stretch import distances
 from armident.identify.effects.drive import Correction
+from armident.identify.effects.terms import entry_of
 from armident.identify.effects.transmission import MotorOrder
 from armident.identify.effects.unnamed import NAME as UNNAMED
 
@@ -53,7 +56,11 @@ def shortlist(state: ModelState, incumbent: Incumbent | None) -> Shortlist:
         starts: Starts = ()
         if isinstance(candidate.effect, Correction):
             statistic, start = screened_correction(noise, candidate, column_cache)
-            found, starts = (statistic, ()), (start,)
+            gained, likely = likely_correction(noise, candidate)
+            starts = (start, likely)
+            if 0.5 * statistic < criteria.needed_gain(1) < 0.5 * gained and _loop_improves(state, candidate, likely):
+                statistic, starts = gained, (likely,)
+            found = (statistic, ())
         else:
             found = screened(noise, candidate, column_cache)
         if found is None:
@@ -72,7 +79,7 @@ def shortlist(state: ModelState, incumbent: Incumbent | None) -> Shortlist:
     for _, own, first, starts in (*named, *unnamed):
         candidate, found = own, first
         if starts:
-            chosen.append((candidate, (), (*starts, likely_correction(noise, candidate))))
+            chosen.append((candidate, (), starts))
             continue
         if isinstance(candidate.effect, MotorOrder):
             near = nearby_orders(state.study, candidate.place.joint, found[1][0][1])
@@ -83,3 +90,19 @@ def shortlist(state: ModelState, incumbent: Incumbent | None) -> Shortlist:
             without = contained(noise, candidate, column_cache, ends)
             chosen.append((replace(candidate, without=without), ends, ()))
     return Shortlist(chosen, tests, frozenset(hidden))
+
+
+def _loop_improves(state: ModelState, candidate: Candidate, value: float) -> bool:
+    """True if the controller that corrected torques identify follows the joint clearly better than that of the model.
+
+    Late torques, for example, give a controller whose loop swings: its motion shows no effect of the joint.
+    """
+    entry = entry_of(candidate.effect, candidate.place, state.robot, {})
+    parameters = {**entry.parameters, candidate.effect.linear[0].name: value}
+    corrected = with_entries(state.robot, [entry.model_copy(update={"parameters": parameters})])
+    try:
+        loop = state.study.of_robot(corrected).with_own_controller()
+    except DataError:
+        return False
+    before, after = (distances(study.train)[candidate.place.joint] for study in (state.study, loop))
+    return bool(before > state.study.criteria.stiff_loop * after)

@@ -103,7 +103,10 @@ class Study:
         wiring = [
             [s for s in study.recorded if isinstance(known(s.effect), SignalMistake)] for study in (self, changed)
         ]
-        return changed._with_torques(self.sources) if wiring[0] == wiring[1] else self._rebuilt(robot)
+        if wiring[0] == wiring[1]:
+            return changed._with_torques(self.sources)
+        rebuilt = build_study(*self.sources, robot, criteria=self.criteria)
+        return replace(rebuilt, sought=self.sought, tied=self.tied)
 
     def with_torque_shift(self, samples: float) -> "Study":
         """The study with all torques late by another time, samples."""
@@ -112,11 +115,12 @@ class Study:
 
     def with_own_controller(self) -> "Study":
         """The study with the controller that its corrected torques identify, and the loop that this makes."""
-        return self._rebuilt(self.robot, self.signals)
-
-    def _rebuilt(self, robot: RobotConfig, signals: Sequence[Derivatives] | None = None) -> "Study":
-        rebuilt = build_study(*self.sources, robot, signals, self.criteria)
-        return replace(rebuilt, sought=self.sought, tied=self.tied)
+        experiments = _continued(corrected_experiments([*self.sources[0], *self.sources[1]], self.robot))
+        bandwidth = self.robot.bandwidth_hz or motion_bandwidth([e.q for e in experiments], experiments[0].dt)
+        simulated, loop, auxiliary, _ = _simulated(self.model, experiments, self.signals, bandwidth)
+        changed = replace(self, loop=loop, auxiliary=auxiliary)
+        motions = dict(enumerate(simulated))
+        return replace(changed, train=changed._moved(self.train, motions), held=changed._moved(self.held, motions))
 
     def _with_torques(self, sources: tuple[Sequence[Experiment], Sequence[Experiment]]) -> "Study":
         """The study with torques of the same motion that were recorded or corrected otherwise."""
