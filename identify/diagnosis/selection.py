@@ -198,18 +198,22 @@ class StepwiseSelection:
         )
 
     def _superseded(self, addition: Addition, step: SelectionStep) -> bool:
-        """True if an explanation of the same joint that does not pass is clearly better than an addition.
+        """True if another explanation of the same joint is better than an addition.
 
-        It has to reduce the errors of a joint: corrections of recorded torques may only make them whiter. They may also
-        only make noise smaller: their parameters have to differ from zero.
+        One that does not pass has to be clearly more likely, and to reduce the errors of a joint. The likelihood of
+        corrected torques rewards smaller noise, too: for them, significance decides against effects that pass, and has
+        to agree with the likelihood otherwise.
         """
-        level = self.criteria.selection_level(step.tests)
-        better = (a for a in step.rivals(addition) if a not in step.passing and a.share > 0.0)
-        return any(
-            a.log_likelihood > addition.log_likelihood + self.criteria.close
-            and (not of_recording(a.entry) or a.p_value < level)
-            for a in better
-        )
+        for a in step.rivals(addition):
+            corrections = of_recording(a.entry), of_recording(addition.entry)
+            clearer = corrections[0] == corrections[1] or a.p_value < addition.p_value
+            better = a.log_likelihood > addition.log_likelihood + self.criteria.close
+            if a not in step.passing and a.share > 0.0 and better and clearer:
+                return True
+            alike = a.named and a.candidate.place.joint == addition.candidate.place.joint
+            if a in step.passing and alike and corrections == (False, True) and clearer:
+                return True
+        return False
 
     def _late(self) -> bool:
         self.stopped = self.stopped or time.monotonic() > self.deadline

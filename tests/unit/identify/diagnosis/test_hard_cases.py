@@ -207,7 +207,6 @@ def test_noise_of_the_measured_positions_does_not_speak_against_a_finding(case: 
     assert [found["effect"], found["joint"]] == case.split()[:2]
 
 
-@MISSED
 def test_a_rotor_that_is_missing_is_no_wrong_sign(tmp_path: Path) -> None:
     """Both signs of the wrist's roll exchanged leave a little less than the model with the rotor."""
     told, _ = diagnosed("effect rotor_inertia joint_6 obvious tx40 run 5", tmp_path)

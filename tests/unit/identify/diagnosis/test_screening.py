@@ -93,4 +93,4 @@ def test_a_delay_is_promised_with_about_its_value() -> None:
     statistic, start = screened_correction(fit, late, bench)
     assert statistic > 100.0
     # The model absorbs a part of the delay; what remains is found from the corrected torques.
-    assert all(0.3 * delay < value < 1.1 * delay for value in (start, likely_correction(fit, late)))
+    assert all(0.3 * delay < value < 1.1 * delay for value in (start, likely_correction(fit, late)[1]))

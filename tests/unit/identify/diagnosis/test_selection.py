@@ -171,6 +171,37 @@ def test_of_two_laws_that_predict_as_well_the_simpler_one_is_preferred() -> None
     assert admitted is linear
 
 
+def test_a_law_with_more_parameters_has_to_explain_materially_more() -> None:
+    steps, first = selection(1, SPRING)
+    step = steps.step(first)
+    linear, cubic = addition_of(step, "joint_spring"), addition_of(step, "joint_spring/cubic")
+    for factor, expected in ((0.9, linear), (1.1, cubic)):
+        share = linear.share + factor * steps.criteria.least_share * (1.0 - linear.share)
+        larger = 2.0 * linear.material_pct
+        better = replace(cubic, log_likelihood=linear.log_likelihood + 50.0, share=share, material_pct=larger)
+        admitted = steps.admitted(replace(step, ranked=(better, linear), passing=(better, linear)))
+        assert admitted is not None
+        assert admitted.candidate.effect.key == expected.candidate.effect.key
+
+
+@pytest.mark.parametrize("passing", [True, False])
+def test_smaller_noise_of_corrected_torques_is_no_evidence_against_an_effect(passing: bool) -> None:
+    steps, first = selection(1, SPRING)
+    step = steps.step(first)
+    named = addition_of(step, "joint_spring")
+    candidate = replace(named.candidate, effect=known("actuator_bandwidth"))
+    entry = Effect(effect="actuator_bandwidth", joint="joint_1", parameters={"lag": 0.003})
+    fitted = replace(named.fitted, candidate=candidate, entry=entry)
+    for p_value, expected in ((1e-6, "joint_spring"), (1e-30, "actuator_bandwidth")):
+        spring = replace(named)
+        lag = replace(named, fitted=fitted, log_likelihood=named.log_likelihood + 100.0)
+        spring.__dict__["p_value"], lag.__dict__["p_value"] = 1e-20, p_value
+        able = (lag, spring) if passing else (spring,)
+        admitted = steps.admitted(replace(step, ranked=(lag, spring), passing=able))
+        found = None if admitted is None else admitted.candidate.effect.name
+        assert found == (expected if passing or expected == "joint_spring" else None)
+
+
 def test_a_named_effect_that_explains_half_comes_before_a_better_term_without_a_name() -> None:
     steps, first = selection(1, SPRING)
     step = steps.step(first)

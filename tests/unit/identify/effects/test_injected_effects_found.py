@@ -40,7 +40,7 @@ class Case:
 
 TX40 = (
     Case("tx40", "asymmetric_viscous_friction", "joint_2", {"fva": 0.55}, {"fva": 0.55}),
-    Case("tx40", "asymmetric_coulomb_friction", "joint_2", {"fca": 2.472}),
+    Case("tx40", "asymmetric_coulomb_friction", "joint_2", {"fca": 4.944}),
     Case("tx40", "nonlinear_viscous_friction", "joint_1", {"thinning": 0.2}),
     Case("tx40", "load_dependent_friction", "joint_3", {"fcl": 0.2}, {"fcl": 0.2}),
     Case("tx40", "presliding_friction", "joint_1", {"deflection": 0.03}),
@@ -124,9 +124,10 @@ def test_an_injected_effect_is_admitted_first(case: Case) -> None:
     other = None if place.other is None else names[place.other]
     assert (first.candidate.effect.name, names[place.joint], other) == (case.effect, case.joint, case.other)
     if of_recording(first.entry):
-        # Corrections of the recording have their values in the entry, without standard deviations.
+        # Corrections of the recording have their values in the entry, without standard deviations. Nothing here tells
+        # the common shift of all torques, so that a delay or a lag is known to the sample only.
         for name, truth in case.truth.items():
-            assert first.entry.parameters[name] == pytest.approx(truth, rel=0.1)
+            assert first.entry.parameters[name] == pytest.approx(truth, rel=0.1, abs=FAST)
         return
     term = first.state.term_of(first.entry)
     values, deviations = first.state.values_of(term)
