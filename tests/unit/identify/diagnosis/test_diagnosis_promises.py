@@ -121,7 +121,7 @@ def test_like_joints_that_were_exchanged_are_found_though_nothing_else_is_amiss(
 
 @pytest.mark.nightly
 def test_a_base_that_was_tilted_is_named() -> None:
-    tilted = HiddenEffect(effect="gravity_direction", joint="joint_1", parameters={"tilt": 0.05, "azimuth": 0.7})
+    tilted = HiddenEffect(effect="gravity_direction", joint="joint_1", parameters={"tilt": 0.1, "azimuth": 0.7})
     assert [f.effect for f in against_baseline("tx40", 6, tilted)] == ["gravity_direction"]
 
 
