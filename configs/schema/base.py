@@ -15,6 +15,9 @@ _ENTRY = re.compile(r"^(\S[^\n]*)\n((?:[ ]{4}[^\n]*(?:\n|\Z)|\n)+)", re.MULTILIN
 class DescribedModel(BaseModel):
     """Model whose JSON Schema describes each field with the text of the Parameters section of its docstring."""
 
+    # A command uses few of the models: each builds its validator when it is first used.
+    model_config = ConfigDict(defer_build=True)
+
     @classmethod
     def __get_pydantic_json_schema__(cls, core_schema: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
         """Return the JSON Schema of the model with the descriptions of its fields."""

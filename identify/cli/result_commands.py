@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from armident.configs import ConfigError, DataError
 from armident.configs.errors import FOUND
+from armident.identify.cli.quick_scipy import omit_docstring_tables
 from armident.identify.diagnosis.diagnosis_options import DiagnosisOptions
 from armident.identify.documents.files import to_json, write_atomically
 from armident.identify.identification.options import Options
@@ -18,14 +19,17 @@ if TYPE_CHECKING:
     from armident.identify.documents.prediction import PredictionDocument
     from armident.identify.identification.robot_model import RobotModel
 
+omit_docstring_tables()
+
 UNUSABLE = DataError.exit_code
 """Exit code: the data cannot support the request as they are configured, and the result says why."""
 
 
 def identify_command(path: Path, config: Path | None, options: Options, out: Path | None, *, as_json: bool) -> int:
     """Carry out ``armident identify``; the exit code is `UNUSABLE` if the verdict says so, otherwise 0."""
-    from armident.identify.api import identify
-    from armident.identify.cli.terminal import identification_table, progress, verdict_lines, warn
+    from armident.identify.api.identification_api import identify
+    from armident.identify.cli.progress import progress, warn
+    from armident.identify.cli.terminal import identification_table, verdict_lines
 
     with progress(f"identify {path.name}") as report:
         result = identify(path, config, options=options, progress=report)
@@ -42,8 +46,8 @@ def identify_command(path: Path, config: Path | None, options: Options, out: Pat
 
 def check_command(paths: Sequence[Path], config: Path | None, *, as_json: bool) -> int:
     """Carry out ``armident check``; exit code `UNUSABLE` with a decisive finding or an unexplained joint, else 0."""
-    from armident.identify.api import check
-    from armident.identify.cli.terminal import progress
+    from armident.identify.api.setup_api import check
+    from armident.identify.cli.progress import progress
 
     with progress("check"):
         result = check(list(paths), config)
@@ -62,8 +66,9 @@ def diagnose_command(
     as_json: bool,
 ) -> int:
     """Carry out ``armident diagnose``; the exit code is 0 if the verdict is ``no_gap``, otherwise `FOUND`."""
-    from armident.identify.api import diagnose
-    from armident.identify.cli.terminal import diagnosis_table, progress, warn
+    from armident.identify.api.diagnosis_api import diagnose
+    from armident.identify.cli.progress import progress, warn
+    from armident.identify.cli.terminal import diagnosis_table
 
     with progress("diagnose") as report:
         found = diagnose(list(paths), config, validate=validate, baseline=baseline, progress=report, **asdict(options))
@@ -86,8 +91,9 @@ def predict_command(paths: Sequence[Path], model: Path, config: Path | None, out
     ``out``: folder of the results, of several recordings with a folder for each; ``None``: beside each recording.
     """
     from armident.daq.recording import read_recording
-    from armident.identify.api import predict
-    from armident.identify.cli.terminal import prediction_table, predictions_table, progress, warn
+    from armident.identify.api.prediction_api import predict
+    from armident.identify.cli.progress import progress, warn
+    from armident.identify.cli.terminal import prediction_table, predictions_table
     from armident.identify.documents.prediction import predictions_document
 
     folders = _prediction_folders(paths, out)
@@ -142,8 +148,8 @@ def compare_command(
     ``out``: folder; ``None``: ``comparison`` beside the later one. ``false_alarms``: probability of ``changed`` without
     a change. ``common``: compare only the parameters that both have.
     """
-    from armident.identify.api import compare
-    from armident.identify.cli.terminal import warn
+    from armident.identify.api.comparison_api import compare
+    from armident.identify.cli.progress import warn
     from armident.identify.monitoring.change.comparison import comparison_table
 
     test = compare(baseline, now, common=common, false_alarm_rate=false_alarms)

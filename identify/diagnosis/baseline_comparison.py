@@ -8,7 +8,7 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
+from scipy.special import chdtrc
 
 from armident.configs import DataError
 from armident.identify.documents.identification import IdentificationDocument
@@ -63,7 +63,8 @@ class Difference:
     @property
     def p_value(self) -> float:
         """Probability of so large a difference of all parameters together without a change."""
-        return float(stats.chi2.sf(*self.chi_square()))
+        statistic, degrees = self.chi_square()
+        return float(chdtrc(degrees, statistic))
 
 
 def whitening(covariance: Array) -> Array:

@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
+from scipy.special import chdtrc, ndtr
 
 from armident.configs import RobotConfig
 from armident.identify.diagnosis.baseline_comparison import Difference, difference_of
@@ -197,8 +197,8 @@ def _tested(
     names = difference.names
     places = _places(names)
     sums = [difference.chi_square(rows) for rows in places.values()]
-    single = 2 * stats.norm.sf(np.abs(difference.values) / difference.std)
-    p = holm(np.concatenate([single, [stats.chi2.sf(value, dof) for value, dof in sums]]))
+    single = 2 * ndtr(-np.abs(difference.values) / difference.std)
+    p = holm(np.concatenate([single, [chdtrc(dof, value) for value, dof in sums]]))
     groups = tuple(
         Group(kind, place, tuple(names[k] for k in rows), *found, float(chance))
         for ((kind, place), rows), found, chance in zip(places.items(), sums, p[len(names) :], strict=True)

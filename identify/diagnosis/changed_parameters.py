@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import special, stats
+from scipy import special
 
 from armident.identify.diagnosis.baseline_comparison import Difference
 from armident.identify.diagnosis.changes import Change
@@ -131,7 +131,7 @@ class Competition:
         p = [1.0]
         for one in self.candidates:
             left, degrees = _rest_of(self.target, [one])
-            p.append(float(stats.chi2.sf(whole - left @ left, self.target.size - degrees)))
+            p.append(float(special.chdtrc(max(self.target.size - degrees, 1), max(whole - left @ left, 0.0))))
         return min(1.0, min(p) * len(self.candidates))
 
     def explained(self, alpha: float) -> Attribution:
@@ -156,13 +156,13 @@ class Competition:
         rest = self.difference.values - moved
         count = self.difference.whitening.shape[0]
         own, free = _rest_of(self.target[:count], [w.of_parameters(count) for w in found])
-        p_rest = float(stats.chi2.sf(own @ own, free)) if free else 1.0
-        single = holm(2 * stats.norm.sf(np.abs(rest) / self.difference.std))
+        p_rest = float(special.chdtrc(free, own @ own)) if free else 1.0
+        single = holm(2 * special.ndtr(-np.abs(rest) / self.difference.std))
         unexplained = tuple(int(k) for k in np.argsort(single) if single[k] < alpha)
         changes = tuple(self._described(found, one, dispersion) for one in found)
         excess = float(self.target @ self.target) - self.target.size
         share = 1.0
-        if stats.chi2.sf(left @ left, degrees) < alpha:
+        if special.chdtrc(degrees, left @ left) < alpha:
             share = float(np.clip(1.0 - (left @ left - degrees) / max(excess, 1e-300), 0.0, 1.0))
         return Attribution(self.difference, changes, rest, p_rest, unexplained, share)
 
@@ -231,7 +231,7 @@ class Competition:
             values[-m:],
             np.sqrt(dispersion * np.diag(covariance)[-m:]),
             own[-m:] > self.criteria.estimable,
-            float(stats.chi2.sf((before @ before - after @ after) / dispersion, max(free - left, 1))),
+            float(special.chdtrc(max(free - left, 1), max(before @ before - after @ after, 0.0) / dispersion)),
             tuple(sorted(odds, key=lambda pair: -pair[1])),
         )
 

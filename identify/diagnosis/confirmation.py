@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
+from scipy.special import stdtr
 
 from armident.identify.diagnosis.criteria import Criteria
 from armident.identify.diagnosis.model_state import ModelState, acted_on
@@ -99,7 +99,7 @@ def confirmed(with_it: ModelState, without: ModelState) -> Confirmation:
     spread = float(sums.std(ddof=1)) * np.sqrt(SUMS) / max(float(np.sum(along**2)), 1e-300)
     torque = np.concatenate([s.y for s in with_it.study.held])
     return Confirmation(
-        float(stats.t.sf(coefficient / max(spread, 1e-300), SUMS - 1)),
+        float(stdtr(SUMS - 1, -coefficient / max(spread, 1e-300))),
         _relative(before, torque),
         _relative(after, torque),
         _relative(noiseless, torque),

@@ -2,7 +2,7 @@
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
+from scipy.special import ndtri
 
 from armident.identify.diagnosis.candidate_comparison import SelectionStep
 from armident.identify.diagnosis.candidates import Candidate, ColumnCache, Shapes, candidates
@@ -49,7 +49,7 @@ def _smallest(
     able = np.linalg.norm(right, axis=1) > criteria.beyond_model_limit
     # Coordinates of each column in orthonormal directions beside the model.
     along = u.T @ z
-    score = np.sqrt(2.0 * criteria.needed_gain(tests)) + float(stats.norm.ppf(criteria.detection_power))
+    score = np.sqrt(2.0 * criteria.needed_gain(tests)) + float(ndtri(criteria.detection_power))
     residual = fit.residual
     rows = fit.regression.rows_of
     sizes = np.full(scale.size, np.inf)

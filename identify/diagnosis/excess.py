@@ -11,7 +11,7 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import special, stats
+from scipy.special import chdtrc, chdtri, fdtrc
 
 from armident.identify.signals.periodogram import hann_window, periodogram
 
@@ -99,7 +99,7 @@ def spectral_excess(
     bands = np.array([(k, k + w) for w in widths for k in range(0, used.size - w + 1, max(1, w // 2))])
     wide = bands[:, 1] - bands[:, 0]
     mean = (sums[bands[:, 1]] - sums[bands[:, 0]]) / wide
-    p = stats.f.sf(mean, 2.0 * np.maximum(1.0, wide / PER_FREQUENCY), 2.0 * used.size / PER_FREQUENCY * LOG_2**2)
+    p = fdtrc(2.0 * np.maximum(1.0, wide / PER_FREQUENCY), 2.0 * used.size / PER_FREQUENCY * LOG_2**2, mean)
     p_value = min(1.0, bands.shape[0] * float(p.min()))
     # Of the bands that are no noise, either, the one with most power beyond it.
     power_of = excess[bands[:, 1]] - excess[bands[:, 0]]
@@ -135,7 +135,7 @@ def together(one: Excess | None, other: Excess | None) -> tuple[Excess | None, E
     if abs(one.where[0] - other.where[0]) > PER_FREQUENCY * step:
         return one, other
     product = sum(float(np.log(max(part.p_value, 1e-300))) for part in (one, other))
-    p_value = float(special.chdtrc(4, -2.0 * product))
+    p_value = float(chdtrc(4, -2.0 * product))
     line = min(one.narrow, other.narrow) > 0.5
     first, second = (replace(p, p_value=p_value, kind="frequency" if line else p.kind) for p in (one, other))
     return first, second
@@ -182,10 +182,10 @@ def bursts(
     if power.size < LEAST_FREQUENCIES:
         return None
     free = _independent(series)
-    usual = float(np.median(power) * free / stats.chi2.median(free))
+    usual = float(np.median(power) * free / chdtri(free, 0.5))
     if usual <= 0.0:
         return None
-    p = np.asarray(stats.chi2.sf(free * power / usual, free) * power.size)
+    p = np.asarray(chdtrc(free, free * power / usual) * power.size)
     strong = np.flatnonzero(p < 1.0)
     if strong.size == 0:
         return None
@@ -212,7 +212,7 @@ def larger_errors(
     e, t = np.concatenate(held), np.concatenate(times)
     rms = np.sqrt(np.mean(e[: e.size // WINDOW * WINDOW].reshape(-1, WINDOW) ** 2, axis=1))
     level = np.full(rms.size, np.sqrt(expected))
-    p_value = float(stats.f.sf(other / expected, rest, count))
+    p_value = float(fdtrc(rest, count, other / expected))
     times_as_large = float(np.sqrt(other / expected))
     share, error = 1.0 - expected / other, float(np.sqrt(other))
     return Excess("recording", p_value, share, error, (times_as_large,), t[::WINDOW][: rms.size], rms, level)

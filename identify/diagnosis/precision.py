@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
+from scipy.special import chdtrc
 
 from armident.configs.schema.robot import Effect as Entry
 from armident.identify.diagnosis.candidates import ColumnCache
@@ -68,7 +68,7 @@ def p_value_of_effect(state: ModelState, entry: Entry) -> float:
         scale = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
         unit = values / scale
         statistics.append(float(unit @ np.linalg.lstsq(covariance / np.outer(scale, scale), unit, rcond=RANK)[0]))
-    return float(stats.chi2.sf(min(statistics), len(tested)))
+    return float(chdtrc(len(tested), max(min(statistics), 0.0)))
 
 
 def _terms(state: ModelState) -> dict[int, Term]:

@@ -9,7 +9,7 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
+from scipy.special import chdtrc, fdtr, fdtrc
 
 from armident.identify.documents.identification import IdentificationDocument, ResidualStatistics
 from armident.identify.regression.multiple_testing import holm
@@ -150,7 +150,7 @@ def _tests(old: ResidualStatistics, new: ResidualStatistics, variance: float) ->
     )
     for kind, part in kinds:
         value, degrees = _functions(old, new, part, variance)
-        chance = float(stats.chi2.sf(value, degrees)) if degrees else 1.0
+        chance = float(chdtrc(degrees, value)) if degrees else 1.0
         found.append(ResidualChange(new.joint, kind, value, degrees, chance))
     if not np.allclose(old.band_edges_hz, new.band_edges_hz, rtol=1e-3):
         return found
@@ -166,8 +166,7 @@ def _tests(old: ResidualStatistics, new: ResidualStatistics, variance: float) ->
     for p0, d0, p1, d1, low, high in rows:
         if p0 <= 0.0 or p1 <= 0.0:
             continue
-        law = stats.f(d1, d0)
-        chance = min(1.0, 2.0 * min(float(law.sf(p1 / p0)), float(law.cdf(p1 / p0))))
+        chance = min(1.0, 2.0 * float(min(fdtrc(d1, d0, p1 / p0), fdtr(d1, d0, p1 / p0))))
         found.append(ResidualChange(new.joint, "power", p1 / p0, d1, chance, (low, high)))
     return found
 

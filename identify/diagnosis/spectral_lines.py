@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
+from scipy.special import chdtrc, fdtrc
 
 from armident.identify.diagnosis.stretch import MotionStretch
 from armident.identify.diagnosis.study import Study
@@ -48,7 +48,7 @@ class SpectralLine:
     @property
     def p_value(self) -> float:
         """Both combined (Fisher's method)."""
-        return float(stats.combine_pvalues([max(p, 1e-300) for p in (self.p_train, self.p_held)]).pvalue)
+        return float(chdtrc(4, -2.0 * sum(np.log(max(p, 1e-300)) for p in (self.p_train, self.p_held))))
 
 
 def working_rate_residuals(study: Study, stretches: Sequence[MotionStretch], theta: Array) -> list[Array]:
@@ -133,7 +133,7 @@ def has_line(reference: Array, sample: float, frequency: float, wide: float, lea
 
 def _chance(ratio: float, stretches: int) -> float:
     """Probability of so large a mean of power over background without a line."""
-    return float(stats.f.sf(ratio, 2 * stretches, 2 * EQUIVALENT * stretches))
+    return float(fdtrc(2 * stretches, 2 * EQUIVALENT * stretches, ratio))
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg, stats
+from scipy import linalg
+from scipy.special import fdtrc
 
 from armident.identify.estimators.instrument_tests import (
     SIGNIFICANCE,
@@ -131,7 +132,7 @@ def nested_f_test(theta: Array, covariance: Array, kept: NDArray[np.bool_], equa
     std = np.sqrt(np.diag(covariance)[out])
     scaled = theta[out] / std
     f = float(scaled @ linalg.solve(covariance[np.ix_(out, out)] / np.outer(std, std), scaled)) / out.size
-    p = float(stats.f.sf(f, *degrees))
+    p = float(fdtrc(*degrees, f))
     return NestedFit(int(kept.sum()), out.size, f, degrees, p, p >= SIGNIFICANCE)
 
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
+from scipy.special import fdtri
 
 CONFIDENCE = 0.99
 """A parameter is essential if leaving it out raises the weighted error beyond this quantile of F."""
@@ -21,7 +21,7 @@ def essential_parameters(
     """
     theta, covariance = theta.copy(), covariance.copy()
     essential = np.ones(theta.size, dtype=np.bool_)
-    limit = float(stats.f.ppf(confidence, 1, max(equations - theta.size, 1)))
+    limit = float(fdtri(1, max(equations - theta.size, 1), confidence))
     while essential.any():
         left = np.flatnonzero(essential)
         f = theta[left] ** 2 / np.diag(covariance)[left]

@@ -9,7 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg, signal, stats
+from scipy import linalg, signal
+from scipy.special import chdtrc
 
 from armident.identify.regression.ar_noise import ArModel
 from armident.identify.regression.equations import ExperimentEquations
@@ -133,7 +134,7 @@ def durbin_wu_hausman(
             0.0, 0, 1.0, 0.0, "", False, "instruments and regressors are the same: nothing can be said of endogeneity"
         )
     statistic = float(np.sum((directions[distinct] @ (shift / scale) / singular[distinct]) ** 2))
-    p = float(stats.chi2.sf(statistic, degrees))
+    p = float(chdtrc(degrees, statistic))
     shifts = np.abs(shift) / scale
     worst = int(np.argmax(shifts))
     rejected = p < SIGNIFICANCE

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
+from scipy.special import chdtrc
 
 from armident.identify.regression.ar_noise import ArModel, lagged_sums
 from armident.identify.regression.equations import Estimate, ExperimentEquations
@@ -107,7 +107,7 @@ def ljung_box(
         return 0.0, 0, 1.0
     pairs = np.sum([s.size - np.arange(1, lags + 1) for s in series], axis=0)
     statistic = float(total * (total + 2) * np.sum((r[1:] / r[0]) ** 2 / pairs))
-    return statistic, degrees, float(stats.chi2.sf(statistic, degrees))
+    return statistic, degrees, float(chdtrc(degrees, statistic))
 
 
 def breusch_pagan(residuals: Array, magnitudes: Array) -> tuple[float, int, float]:
@@ -126,7 +126,7 @@ def breusch_pagan(residuals: Array, magnitudes: Array) -> tuple[float, int, floa
     if u.shape[1] == 0 or total <= 0:
         return 0.0, 0, 1.0
     statistic = residuals.size * float(np.sum((u.T @ spread) ** 2)) / total
-    return statistic, u.shape[1], float(stats.chi2.sf(statistic, u.shape[1]))
+    return statistic, u.shape[1], float(chdtrc(u.shape[1], statistic))
 
 
 def _absorbed(sensitivities: Sequence[Array], covariance: Array, lags: int) -> Array:

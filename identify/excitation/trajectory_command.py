@@ -5,7 +5,8 @@ from pathlib import Path
 import yaml
 
 from armident.configs import ConfigError, RobotConfig, load_robot, load_trajectory
-from armident.identify.cli.terminal import design_table, progress, wanted_table
+from armident.identify.cli.progress import progress
+from armident.identify.cli.terminal import design_table, wanted_table
 from armident.identify.documents.files import load_document, write_atomically
 from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.effects.terms import arm_model

@@ -9,7 +9,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import optimize, stats
+from scipy import optimize
+from scipy.special import chdtri
 
 from armident.configs import RobotConfig
 from armident.identify.estimators.idim_ls import idim_ls
@@ -144,9 +145,9 @@ def _transition(
     # The likelihood of the serial correlation of what the best width leaves.
     profile = _Profile(prepared, decimation, j, profile.column, fit_ar(profile.residual(best), MAX_AR_ORDER))
     best, least = profile.lowest(logs)
-    clear = stats.chi2.isf(criteria.false_alarm_rate / prepared.model.n, 1)
+    clear = chdtri(1, criteria.false_alarm_rate / prepared.model.n)
 
-    def above(log: float, margin: float = stats.chi2.ppf(COVERAGE, 1)) -> float:
+    def above(log: float, margin: float = chdtri(1, 1.0 - COVERAGE)) -> float:
         return float(profile.rows * np.log(profile.misfit(log) / least) - margin)
 
     if above(float(np.log(1 / prepared.model.smoothing[j])), clear) <= 0 or above(logs[-1]) <= 0:

@@ -9,7 +9,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import signal, stats
+from scipy import signal
+from scipy.special import chdtri
 
 from armident.identify.estimators.auxiliary_model import AuxiliaryModel
 from armident.identify.identification.equations import Prepared, aligned_torque
@@ -123,7 +124,7 @@ def corrected(estimate: Estimate, found: SimulatedBias, blocks: Sequence[Experim
     """
     theta = estimate.theta - found.bias
     ratio = np.sqrt(found.share) * found.scatter / estimate.std
-    least = np.sqrt(stats.chi2.ppf(1.0 - SIGNIFICANCE, found.runs - 1) / (found.runs - 1))
+    least = np.sqrt(chdtri(found.runs - 1, SIGNIFICANCE) / (found.runs - 1))
     wider = np.where(ratio > least, ratio, 1.0)
     covariance = estimate.covariance * np.outer(wider, wider) + np.diag(
         found.scatter**2 / found.runs + (SIMULATION_ERROR * found.bias) ** 2

@@ -45,7 +45,7 @@ def export_model(
     import sys
     from json import dumps
 
-    from armident.identify.cli.terminal import progress
+    from armident.identify.cli.progress import progress
     from armident.identify.model_export.exported_model import load_exported_model
     from armident.identify.model_export.formats import check_format
     from armident.identify.model_export.formats import export_model as write

@@ -12,7 +12,8 @@ from typing import Any, Literal
 import clarabel as untyped_clarabel
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy import linalg, sparse, stats
+from scipy import linalg, sparse
+from scipy.special import chdtrc
 
 from armident.configs import ArmidentError, DataError
 from armident.identify.robot.arm import ArmModel
@@ -125,7 +126,7 @@ def nearest_consistent(
     if distance > NOTHING:
         standard = projection.lightest(whitened, standard, distance)
         degrees = projection.lost_dimensions(whitened)
-        p_value = float(stats.chi2.sf(distance**2, degrees))
+        p_value = float(chdtrc(degrees, distance**2))
     else:
         standard = standard + np.linalg.pinv(model.base.regroup) @ (theta - model.base.regroup @ standard)
     standard = _inside(model, standard, smallest_link)

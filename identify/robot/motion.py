@@ -2,11 +2,11 @@
 
 from dataclasses import dataclass, field
 from functools import cache, cached_property
+from itertools import count, islice
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import qmc
 
 from armident.compiled import ARITHMETIC, compiled
 
@@ -27,8 +27,19 @@ WORKSPACE_POSTURES = 64
 @cache
 def _spread(revolute: tuple[bool, ...]) -> Array:
     """Points (P, n) of the Halton sequence over a turn of each revolute joint, rad; prismatic joints are at zero."""
-    points = qmc.Halton(len(revolute), scramble=False).random(WORKSPACE_POSTURES)
+    primes = (p for p in count(2) if all(p % divisor for divisor in range(2, p)))
+    points = np.stack([_mirrored_digits(base) for base in islice(primes, len(revolute))], axis=1)
     return np.ascontiguousarray(np.where(revolute, np.pi * (2.0 * points - 1.0), 0.0))
+
+
+def _mirrored_digits(base: int) -> Array:
+    """Return the row numbers (P,), their digits mirrored at the point: of base 2 the points 0, 1/2, 1/4, 3/4, 1/8."""
+    rest, share, points = np.arange(WORKSPACE_POSTURES), 1.0, np.zeros(WORKSPACE_POSTURES)
+    while rest.any():
+        share /= base
+        points += share * (rest % base)
+        rest //= base
+    return points
 
 
 @dataclass(frozen=True)

@@ -29,27 +29,27 @@ if TYPE_CHECKING:
     from armident.daq.api import import_recording as import_recording
     from armident.daq.recording import Recording as Recording
     from armident.daq.recording import read_recording as read_recording
-    from armident.identify.api import ChangeTest as ChangeTest
-    from armident.identify.api import CheckedSetup as CheckedSetup
-    from armident.identify.api import Design as Design
-    from armident.identify.api import Diagnosis as Diagnosis
-    from armident.identify.api import Effect as Effect
-    from armident.identify.api import Identification as Identification
-    from armident.identify.api import Linear as Linear
-    from armident.identify.api import Motion as Motion
-    from armident.identify.api import Options as Options
-    from armident.identify.api import Place as Place
-    from armident.identify.api import RobotModel as RobotModel
-    from armident.identify.api import Shape as Shape
-    from armident.identify.api import TorquePrediction as TorquePrediction
-    from armident.identify.api import check as check
-    from armident.identify.api import compare as compare
-    from armident.identify.api import design_trajectory as design_trajectory
-    from armident.identify.api import diagnose as diagnose
-    from armident.identify.api import effects as effects
-    from armident.identify.api import identify as identify
-    from armident.identify.api import load_identification as load_identification
-    from armident.identify.api import predict as predict
+    from armident.identify.api.comparison_api import ChangeTest as ChangeTest
+    from armident.identify.api.comparison_api import compare as compare
+    from armident.identify.api.diagnosis_api import Diagnosis as Diagnosis
+    from armident.identify.api.diagnosis_api import diagnose as diagnose
+    from armident.identify.api.diagnosis_api import effects as effects
+    from armident.identify.api.identification_api import Identification as Identification
+    from armident.identify.api.identification_api import identify as identify
+    from armident.identify.api.identification_api import load_identification as load_identification
+    from armident.identify.api.prediction_api import TorquePrediction as TorquePrediction
+    from armident.identify.api.prediction_api import predict as predict
+    from armident.identify.api.setup_api import CheckedSetup as CheckedSetup
+    from armident.identify.api.setup_api import check as check
+    from armident.identify.api.trajectory_api import Design as Design
+    from armident.identify.api.trajectory_api import design_trajectory as design_trajectory
+    from armident.identify.effects.effect import Effect as Effect
+    from armident.identify.effects.effect import Linear as Linear
+    from armident.identify.effects.effect import Place as Place
+    from armident.identify.effects.effect import Shape as Shape
+    from armident.identify.identification.options import Options as Options
+    from armident.identify.identification.robot_model import RobotModel as RobotModel
+    from armident.identify.robot.motion import Motion as Motion
     from armident.virtual_robot.api import simulate_recording as simulate_recording
 
     __version__: str
@@ -58,11 +58,16 @@ _HOMES = {
     "armident.configs": ("ArmidentError", "ConfigError", "DataError", "load_robot", "load_session"),
     "armident.daq.api": ("capture", "import_recording"),
     "armident.daq.recording": ("Recording", "read_recording"),
-    "armident.identify.api": (
-        "ChangeTest", "CheckedSetup", "Design", "Diagnosis", "Effect", "Identification", "Linear", "Motion", "Options",
-        "Place", "RobotModel", "Shape", "TorquePrediction", "check", "compare", "design_trajectory", "diagnose",
-        "effects", "load_identification", "predict",
-    ),
+    "armident.identify.api.comparison_api": ("ChangeTest", "compare"),
+    "armident.identify.api.diagnosis_api": ("Diagnosis", "diagnose", "effects"),
+    "armident.identify.api.identification_api": ("Identification", "load_identification"),
+    "armident.identify.api.prediction_api": ("TorquePrediction", "predict"),
+    "armident.identify.api.setup_api": ("CheckedSetup", "check"),
+    "armident.identify.api.trajectory_api": ("Design", "design_trajectory"),
+    "armident.identify.effects.effect": ("Effect", "Linear", "Place", "Shape"),
+    "armident.identify.identification.options": ("Options",),
+    "armident.identify.identification.robot_model": ("RobotModel",),
+    "armident.identify.robot.motion": ("Motion",),
     "armident.virtual_robot.api": ("simulate_recording",),
 }  # fmt: skip
 """Names of the public API by the module that defines them; a name is imported when it is first used."""

@@ -75,13 +75,13 @@ def reduced_model(robot: RobotConfig, leave_out: str | None, joints: tuple[str, 
 def diagnose_file(task: DiagnosisTask) -> TimedDiagnosis:
     """Diagnose a recording; a ConfigError or DataError if the model or the recording does not support it."""
     # Imported here: the process of the command line needs none of it.
-    from armident.identify import api
+    from armident.identify.api.diagnosis_api import diagnose
     from armident.identify.diagnosis.diagnose import run_diagnosis
     from armident.identify.identification.from_recording import experiments_from_recording
 
     begin = time.perf_counter()
     if task.validation is not None:
-        found = api.diagnose(task.recording, task.robot, validate=task.validation)
+        found = diagnose(task.recording, task.robot, validate=task.validation)
         return TimedDiagnosis(found.document, time.perf_counter() - begin)
     robot = reduced_model(load_robot(task.robot), task.leave_out, task.joints)
     recording = read_recording(task.recording)

@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from armident.configs import ConfigError
-from armident.identify.cli.terminal import Report, progress
+from armident.identify.cli.progress import Report, progress
 from armident.identify.documents.files import write_atomically
 from tests.reproduction import chapter4, chapter5, chapter6
 from tests.reproduction.cached_estimates import Laboratory

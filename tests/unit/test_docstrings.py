@@ -17,7 +17,7 @@ import armident
 import armident.configs
 import armident.daq.recording
 from armident.daq.cli import GROUP
-from armident.identify.api import identify
+from armident.identify.api.identification_api import identify
 from armident.identify.estimators.methods import METHODS
 
 PACKAGES = ("configs", "drivers", "daq", "identify", "virtual_robot", "src/armident", "src/armident/testing")

@@ -2,7 +2,7 @@
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
+from scipy.special import chdtri
 
 from armident.configs import ArmidentError
 from armident.identify.estimators.reason import Reason
@@ -41,7 +41,7 @@ def physics(judged: Judged, criteria: IdentificationCriteria) -> list[Reason]:
         nearest = nearest_base(model, theta, covariance)
     except ArmidentError:
         nearest = None
-    far = nearest is not None and nearest.distance**2 > stats.chi2.isf(criteria.false_alarm_rate, theta.size)
+    far = nearest is not None and nearest.distance**2 > chdtri(theta.size, criteria.false_alarm_rate)
     if consistent is not None:
         far = consistent.p_value < criteria.false_alarm_rate
     if far and nearest is not None:

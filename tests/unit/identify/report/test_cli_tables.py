@@ -3,7 +3,7 @@
 import numba
 import pytest
 
-from armident.identify.cli.terminal import progress, time_left
+from armident.identify.cli.progress import progress, time_left
 
 
 def test_the_compiler_message_appears_once(capsys: pytest.CaptureFixture[str]) -> None:
@@ -23,7 +23,7 @@ def test_the_compiler_message_appears_once(capsys: pytest.CaptureFixture[str]) -
 def test_plain_progress_states_the_time_left(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("armident.identify.cli.terminal.SHOW_AFTER_S", 0.0)
+    monkeypatch.setattr("armident.identify.cli.progress.SHOW_AFTER_S", 0.0)
     with progress("trajectory") as report:
         report("searching", 0.0)
         report("searching", 0.5)
