@@ -15,8 +15,7 @@ from armident.identify.documents.base import reference
 from armident.identify.documents.diagnosis import DiagnosisDocument
 from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.effects.registry import catalogue
-from armident.identify.identification.from_recording import rest_notes
-from armident.identify.identification.identify_recording import experiments_of
+from armident.identify.identification.from_recording import experiments_of, rest_notes
 from armident.identify.report.robot_file import robot_yaml
 from armident.identify.signals.experiments import Experiment
 

@@ -21,9 +21,8 @@ from armident.identify.documents.base import reference, versions
 from armident.identify.documents.prediction import PredictionDocument
 from armident.identify.effects.recording_corrections import corrected_experiments
 from armident.identify.identification.equations import equations, least_rows, published_equations
-from armident.identify.identification.from_recording import NO_REFERENCE
+from armident.identify.identification.from_recording import NO_REFERENCE, experiments_of
 from armident.identify.identification.identification_result import relative_torque_errors
-from armident.identify.identification.identify_recording import experiments_of
 from armident.identify.identification.judgement import Notes
 from armident.identify.identification.options import Options
 from armident.identify.identification.pipeline import (

@@ -10,7 +10,7 @@ from armident.identify.api.result_base import Result
 from armident.identify.api.result_tables import Table
 from armident.identify.documents.base import plain, reference, versions
 from armident.identify.documents.setup import SetupDocument, SetupMistake
-from armident.identify.identification.identify_recording import experiments_of
+from armident.identify.identification.from_recording import experiments_of
 from armident.identify.setup.check import check_setup
 from armident.identify.setup.result import SetupCheck
 

@@ -13,7 +13,8 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import signal
+
+from armident.identify.signals.recursive import recursive_filter
 
 Array = NDArray[np.float64]
 
@@ -167,8 +168,7 @@ def pole_filter(x: Array, pole: float) -> Array:
     """``x / (1 - pole z^-1)`` along the first axis, from the steady state of its first sample."""
     if pole == 0.0 or x.size == 0:
         return x
-    filtered: Array = signal.lfilter([1.0], [1.0, -pole], x, axis=0, zi=x[:1] * pole / (1 - pole))[0]
-    return filtered
+    return np.asarray(recursive_filter([1.0], [1.0, -pole], x - x[0]) + x[0] / (1.0 - pole))
 
 
 def taps(structure: Structure, theta: Array, dt: float) -> tuple[Array, Array, Array]:

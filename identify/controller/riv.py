@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import signal
 
 from armident.configs import DataError
 from armident.identify.controller.law import (
@@ -21,6 +20,7 @@ from armident.identify.controller.law import (
     simulate_law,
 )
 from armident.identify.regression.ar_noise import WHITE, ArModel, fit_ar
+from armident.identify.signals.recursive import recursive_filter
 
 ITERATIONS = 40
 """Largest number of iterations."""
@@ -192,7 +192,7 @@ def _sandwich(rows: Sequence[_Rows]) -> Array:
     k = rows[0].x.shape[1]
     zx, middle = np.zeros((k, k)), np.zeros((k, k))
     for r in rows:
-        coloured = signal.lfilter([np.sqrt(noise.variance)], poles, r.z[::-1], axis=0)
+        coloured = recursive_filter([np.sqrt(noise.variance)], poles, r.z[::-1])
         zx, middle = zx + r.z.T @ r.x, middle + coloured.T @ coloured
     bread = np.linalg.inv(zx)
     covariance: Array = bread @ middle @ bread.T

@@ -131,7 +131,7 @@ class Competition:
         p = [1.0]
         for one in self.candidates:
             left, degrees = _rest_of(self.target, [one])
-            p.append(float(special.chdtrc(max(self.target.size - degrees, 1), max(whole - left @ left, 0.0))))
+            p.append(float(special.chdtrc(max(self.target.size - degrees, 1), max(whole - float(left @ left), 0.0))))
         return min(1.0, min(p) * len(self.candidates))
 
     def explained(self, alpha: float) -> Attribution:
@@ -231,7 +231,7 @@ class Competition:
             values[-m:],
             np.sqrt(dispersion * np.diag(covariance)[-m:]),
             own[-m:] > self.criteria.estimable,
-            float(special.chdtrc(max(free - left, 1), max(before @ before - after @ after, 0.0) / dispersion)),
+            float(special.chdtrc(max(free - left, 1), max(float(before @ before - after @ after), 0.0) / dispersion)),
             tuple(sorted(odds, key=lambda pair: -pair[1])),
         )
 

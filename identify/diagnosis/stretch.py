@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
 from armident.identify.signals.differentiate import Derivatives
 
@@ -78,6 +77,8 @@ def moving_rows(qd: Array, slowest: Array, width: int, instants: NDArray[np.int6
 
     It stays slower than its smoothed sign's width ``slowest`` (n,) for ``width`` samples to either side.
     """
+    from scipy.ndimage import maximum_filter1d, minimum_filter1d
+
     still = minimum_filter1d((np.abs(qd) < slowest).astype(np.int8), 2 * width + 1, axis=0, mode="nearest")
     spread = maximum_filter1d(still, 8 * width + 1, axis=0, mode="nearest")
     return np.asarray(spread[instants] == 0)

@@ -5,7 +5,6 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import signal
 
 from armident.configs import DataError, RobotConfig
 from armident.configs.schema.robot import Effect as Entry
@@ -25,6 +24,7 @@ from armident.identify.identification.options import CONTROLLERS, Options
 from armident.identify.identification.sign_smoothing import recorded_speeds, unsaturated_joints, with_sign_smoothing
 from armident.identify.identification.solvers import decimation_of
 from armident.identify.regression.ar_noise import ar_models
+from armident.identify.regression.fir import filter_columns
 from armident.identify.robot.arm import ArmModel
 from armident.identify.robot.motion import Motion
 from armident.identify.robot.simulation import Simulation
@@ -315,7 +315,7 @@ def _aligned(e: Experiment) -> Array:
     k = np.arange(-REACH, REACH + 1)
     taps = np.sinc(k - (e.torque_shift - 0.5)) * np.kaiser(k.size, KAISER)
     padded = np.pad(e.tau, ((REACH, REACH), (0, 0)), mode="edge")
-    return np.asarray(signal.oaconvolve(padded, taps[::-1, None] / taps.sum(), mode="valid", axes=0))
+    return filter_columns(taps[::-1] / taps.sum(), padded)
 
 
 def _simulated(

@@ -7,13 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import signal
 
 from armident.configs import RobotConfig
 from armident.configs.schema.robot import Effect as Entry
 from armident.identify.effects.effect import UNITLESS, Linear, Periodic, Place, Shape, TorqueDependent, Trials
 from armident.identify.robot.motion import Motion
 from armident.identify.signals.experiments import Experiment
+from armident.identify.signals.recursive import recursive_filter
 
 Array = NDArray[np.float64]
 
@@ -208,8 +208,7 @@ class ActuatorBandwidth(TimeDelay):
             return recorded
         ratio = 2.0 * value / dt
         b, a = np.array([1.0, 1.0]) / (1.0 + ratio), np.array([1.0, (1.0 - ratio) / (1.0 + ratio)])
-        late: Array = signal.lfilter(b, a, recorded, zi=recorded[:1] * (1.0 - b[0]))[0]
-        return late
+        return np.asarray(recursive_filter(b, a, recorded - recorded[0]) + recorded[0])
 
 
 class EncoderEccentricity(Periodic, TorqueDependent):

@@ -6,12 +6,12 @@ from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import signal
 
 from armident.identify.estimators.auxiliary_model import AuxiliaryModel
 from armident.identify.regression.ar_noise import ArModel, fit_spectrum
 from armident.identify.regression.equations import ExperimentEquations
 from armident.identify.robot.controller import DiscreteController
+from armident.identify.signals.recursive import recursive_filter
 
 FREQUENCIES = 2048
 """Points of the controller's frequency response, zero to the Nyquist frequency of the decimated equations."""
@@ -58,7 +58,7 @@ class InverseController:
         out = np.empty_like(values)
         for j, shape in enumerate(self.shapes):
             recursion = np.append(1.0, shape.coefficients)
-            out[:, j] = signal.lfilter([np.sqrt(shape.variance)], recursion, values[:, j], axis=0)
+            out[:, j] = recursive_filter([np.sqrt(shape.variance)], recursion, values[:, j])
         return out
 
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg, signal
+from scipy import linalg
 from scipy.special import chdtrc
 
 from armident.identify.regression.ar_noise import ArModel
@@ -18,6 +18,7 @@ from armident.identify.regression.hac import newey_west
 from armident.identify.regression.iv import factored
 from armident.identify.regression.least_squares import inverse_gram, least_squares
 from armident.identify.regression.whitening import whitened
+from armident.identify.signals.recursive import recursive_filter
 
 Array = NDArray[np.float64]
 
@@ -185,7 +186,7 @@ def _coloured(
         rows = np.zeros((kept.size, maps.shape[1]))
         rows[kept] = maps[place]
         numerator = np.sqrt(ar.variance / weight.variance) * np.append(1.0, weight.coefficients)
-        parts.append(signal.lfilter(numerator, np.append(1.0, ar.coefficients), rows[::-1], axis=0))
+        parts.append(recursive_filter(numerator, np.append(1.0, ar.coefficients), rows[::-1]))
     return np.concatenate(parts)
 
 

@@ -2,11 +2,11 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline
 
 from armident.configs import DataError, Joint, RobotConfig
 from armident.configs.schema.limits import ENDLESS
@@ -16,7 +16,7 @@ from armident.daq.recording.faults.zeros import NOTHING
 from armident.identify.identification.identification_criteria import IdentificationCriteria
 from armident.identify.identification.set_points import between_set_points
 from armident.identify.signals.experiments import Experiment
-from armident.identify.signals.streamed import OnDisk
+from armident.identify.signals.streamed import OnDisk, Streamed
 
 MAX_MISSING_SHARE = 0.05
 """Largest share of missing samples of an experiment; with more, the rest is no longer the designed motion."""
@@ -125,6 +125,28 @@ def _converted(
     return experiments, notes
 
 
+def experiments_of(
+    recordings: Sequence[Recording], robot: RobotConfig, *, name_files: bool, stretches: StretchRule = WHOLE
+) -> tuple[Sequence[Experiment], list[str]]:
+    """Experiments of recordings in order, and remarks, which begin with the file if ``name_files``.
+
+    Raises ConfigError if a recording is of another robot, DataError if one holds no experiment that can be used.
+    """
+    found: list[Sequence[Experiment]] = []
+    notes: list[str] = []
+    if sum(recording.samples.sync.size for recording in recordings) * robot.n > stretches.beyond:
+        stretches = StretchRule(0, stretches.length)
+    for recording in recordings:
+        experiments, remarks = experiments_from_recording(recording, robot, stretches)
+        found.append(experiments)
+        named = name_files and recording.path is not None
+        notes += [f"{recording.path.name}: {remark}" if named and recording.path else remark for remark in remarks]
+    if len(found) == 1:
+        return found[0], notes
+    joined = chain.from_iterable(found)
+    return OnDisk(joined) if isinstance(found[0], Streamed) else list(joined), notes
+
+
 def _of_stretches(
     recording: Recording, robot: RobotConfig, used: Sequence[NDArray[np.int64]], begin: int, notes: list[str]
 ) -> Iterator[Experiment]:
@@ -149,7 +171,7 @@ def _experiments(
     q_ref = None if demand is None else _reference(demand, samples, robot)
     return [
         Experiment(
-            q=_bridged(q[rows], samples.sync[rows], CubicSpline),
+            q=_bridged(q[rows], samples.sync[rows], _spline),
             tau=_bridged(tau[rows], samples.sync[rows], _linear),
             q_ref=None if q_ref is None else _bridged(q_ref[rows], samples.sync[rows], _linear),
             dt=dt,
@@ -158,6 +180,13 @@ def _experiments(
         )
         for rows in pieces
     ]
+
+
+def _spline(at: Array, x: Array) -> Callable[[Array], Array]:
+    """Cubic spline through values (N, n) at increasing places (N,); its library is imported for a gap only."""
+    from scipy.interpolate import CubicSpline
+
+    return CubicSpline(at, x)
 
 
 def _linear(at: Array, x: Array) -> Callable[[Array], Array]:

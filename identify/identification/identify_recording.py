@@ -2,14 +2,13 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from itertools import chain
 
 from armident.configs import DataError, RobotConfig
 from armident.daq.recording import Recording
 from armident.identify.documents.base import reference
 from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.identification.document import identification_document
-from armident.identify.identification.from_recording import WHOLE, StretchRule, experiments_from_recording
+from armident.identify.identification.from_recording import StretchRule, experiments_of
 from armident.identify.identification.identification_result import IdentificationResult
 from armident.identify.identification.options import Options
 from armident.identify.identification.pipeline import identify_experiment
@@ -17,7 +16,7 @@ from armident.identify.identification.sign_smoothing import with_numbers
 from armident.identify.setup.check import check_setup
 from armident.identify.setup.result import SetupCheck
 from armident.identify.signals.experiments import Experiment
-from armident.identify.signals.streamed import OnDisk, Streamed
+from armident.identify.signals.streamed import Streamed
 
 CHECKED_VALUES = 6_000_000
 """Number of values (samples times joints) of a long recording by which the set-up is checked."""
@@ -72,25 +71,3 @@ def _checked(experiments: Sequence[Experiment]) -> Sequence[Experiment]:
     while len(first) < len(experiments) and sum(e.q.size for e in first) < CHECKED_VALUES:
         first.append(experiments[len(first)])
     return first
-
-
-def experiments_of(
-    recordings: Sequence[Recording], robot: RobotConfig, *, name_files: bool, stretches: StretchRule = WHOLE
-) -> tuple[Sequence[Experiment], list[str]]:
-    """Experiments of recordings in order, and remarks, which begin with the file if ``name_files``.
-
-    Raises ConfigError if a recording is of another robot, DataError if one holds no experiment that can be used.
-    """
-    found: list[Sequence[Experiment]] = []
-    notes: list[str] = []
-    if sum(recording.samples.sync.size for recording in recordings) * robot.n > stretches.beyond:
-        stretches = StretchRule(0, stretches.length)
-    for recording in recordings:
-        experiments, remarks = experiments_from_recording(recording, robot, stretches)
-        found.append(experiments)
-        named = name_files and recording.path is not None
-        notes += [f"{recording.path.name}: {remark}" if named and recording.path else remark for remark in remarks]
-    if len(found) == 1:
-        return found[0], notes
-    joined = chain.from_iterable(found)
-    return OnDisk(joined) if isinstance(found[0], Streamed) else list(joined), notes

@@ -145,9 +145,9 @@ def _transition(
     # The likelihood of the serial correlation of what the best width leaves.
     profile = _Profile(prepared, decimation, j, profile.column, fit_ar(profile.residual(best), MAX_AR_ORDER))
     best, least = profile.lowest(logs)
-    clear = chdtri(1, criteria.false_alarm_rate / prepared.model.n)
+    clear = float(chdtri(1, criteria.false_alarm_rate / prepared.model.n))
 
-    def above(log: float, margin: float = chdtri(1, 1.0 - COVERAGE)) -> float:
+    def above(log: float, margin: float = float(chdtri(1, 1.0 - COVERAGE))) -> float:
         return float(profile.rows * np.log(profile.misfit(log) / least) - margin)
 
     if above(float(np.log(1 / prepared.model.smoothing[j])), clear) <= 0 or above(logs[-1]) <= 0:

@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import signal
 from scipy.special import chdtri
 
 from armident.identify.estimators.auxiliary_model import AuxiliaryModel
@@ -35,6 +34,7 @@ from armident.identify.signals.choices import DerivativesName
 from armident.identify.signals.decimate import Decimation
 from armident.identify.signals.differentiate import Derivatives, differentiate
 from armident.identify.signals.experiments import Experiment
+from armident.identify.signals.recursive import recursive_filter
 from armident.identify.signals.streamed import kept, mapped
 
 SIMULATION_ERROR = 0.15
@@ -195,7 +195,7 @@ def _torque_of_noise(controller: DiscreteController, noise: Array) -> Array:
         taps = np.zeros(length)
         taps[: controller.error_taps.shape[1]] -= controller.error_taps[i]
         taps[: controller.position_taps.shape[1]] += controller.position_taps[i]
-        torque[:, i] = signal.lfilter(taps, np.append(1.0, -controller.output_taps[i]), noise[:, i])
+        torque[:, i] = recursive_filter(taps, np.append(1.0, -controller.output_taps[i]), noise[:, i])
     return torque
 
 

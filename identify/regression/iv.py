@@ -12,7 +12,7 @@ from functools import cached_property, partial
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg, signal
+from scipy import linalg
 
 from armident.compiled import ARITHMETIC, compiled
 from armident.identify.regression.ar_noise import WHITE, ArModel
@@ -22,6 +22,7 @@ from armident.identify.regression.least_squares import column_norms
 from armident.identify.regression.qr import triangularize, triangularize_parts
 from armident.identify.regression.whitening import nonzero_columns, whitened
 from armident.identify.signals.decimate import Decimation
+from armident.identify.signals.recursive import recursive_filter
 
 Array = NDArray[np.float64]
 
@@ -124,7 +125,7 @@ def serial_covariance(
         for j, (weight, ar) in enumerate(zip(weights, noise, strict=True)):
             acting = nonzero_columns(z[:, j])
             own = z[:, j, acting] * used[:, j, None] / weight.variance
-            coloured = signal.lfilter([np.sqrt(ar.variance)], np.append(1.0, ar.coefficients), own[::-1], axis=0)
+            coloured = recursive_filter([np.sqrt(ar.variance)], np.append(1.0, ar.coefficients), own[::-1])
             meat[np.ix_(acting, acting)] += coloured.T @ coloured
     zs = np.sqrt(np.where(squares > 0.0, squares, 1.0))
     return IvProducts(meat / np.outer(zs, zs), cross / np.outer(zs, zs), np.zeros(b), zs).covariance

@@ -4,13 +4,13 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import signal
 
 from armident.configs import RobotConfig
 from armident.daq.recording.faults.jumps import JumpCriteria, jumps
 from armident.daq.recording.faults.updates import held, resolution
 from armident.identify.setup.plausible import NO_LIMIT
 from armident.identify.setup.result import SetupFinding
+from armident.identify.signals.bandwidth import velocity_spectra
 from armident.identify.signals.experiments import Experiment
 
 Array = NDArray[np.float64]
@@ -296,9 +296,7 @@ def _coarse(robot: RobotConfig, steps: dict[int, float], q: Array) -> SetupFindi
 
 def velocity_frequency(q: Array, dt: float) -> Array:
     """Return the frequency (n,), Hz, below which `POWER_SHARE` of each joint's velocity power lies."""
-    frequency, power = signal.periodogram(np.diff(q, axis=0) / dt, 1 / dt, window="hann", axis=0)
-    frequency, power = frequency[1:], power[1:]
-    position = power / (2 - 2 * np.cos(2 * np.pi * frequency * dt))[:, None]
+    frequency, power, position = velocity_spectra(q, dt)
     # A tenth of the spectrum is free of motion where the rate suffices; noise is white in the position.
     floor = np.quantile(position, 0.05, axis=0) / 0.0513
     cumulative = np.cumsum(np.where(position > SIGNIFICANT * floor, power, 0.0), axis=0)

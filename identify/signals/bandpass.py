@@ -1,12 +1,10 @@
 """Bandpass filtering of the thesis: zero-phase Butterworth filter and central differences (section 2.3.1)."""
 
-from functools import lru_cache
-
 import numpy as np
 from numpy.typing import NDArray
-from scipy import signal
 
 from armident.configs import DataError
+from armident.identify.signals.recursive import butterworth_sections, zero_phase
 
 
 def butterworth(
@@ -21,16 +19,8 @@ def butterworth(
     padlen = 3 * order if padlen is None else padlen
     if x.shape[0] <= padlen:
         raise DataError(f"filtering needs more than {padlen} samples, got {x.shape[0]}")
-    sections = _sections(order, 2 * cutoff_hz * dt)
-    filtered: NDArray[np.float64] = signal.sosfiltfilt(sections, x, axis=0, padlen=padlen)
-    return filtered
-
-
-@lru_cache(maxsize=64)
-def _sections(order: int, cutoff: float) -> NDArray[np.float64]:
-    """Second-order sections of a low-pass; ``cutoff`` relative to half the sampling rate."""
-    sections: NDArray[np.float64] = signal.butter(order, cutoff, output="sos")
-    return sections
+    sections = butterworth_sections(order, 2 * cutoff_hz * dt)
+    return zero_phase(sections, x, padlen)
 
 
 def central_difference(x: NDArray[np.float64], dt: float) -> NDArray[np.float64]:

@@ -4,7 +4,6 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import signal
 
 from armident.configs import DataError
 
@@ -42,7 +41,7 @@ def _highest(dt: float) -> float:
 
 def _velocity_bandwidth(q: NDArray[np.float64], dt: float) -> float:
     """Frequency (Hz) below which ``POWER_SHARE`` of the fastest joint's velocity power lies; 0 if no joint moves."""
-    frequency, power, position = _spectra(q, dt)
+    frequency, power, position = velocity_spectra(q, dt)
     floor = _noise_floor(frequency, position, dt)
     moving = (position > SIGNIFICANT * floor) & (frequency <= _highest(dt))[:, None]
     cumulative = np.cumsum(np.where(moving, power, 0.0), axis=0)
@@ -55,15 +54,20 @@ def _velocity_bandwidth(q: NDArray[np.float64], dt: float) -> float:
 
 def position_noise(q: NDArray[np.float64], dt: float) -> NDArray[np.float64]:
     """Standard deviation (n,) of the white noise of measured positions (N, n), rad or m."""
-    frequency, _, position = _spectra(q, dt)
+    frequency, _, position = velocity_spectra(q, dt)
     noise: NDArray[np.float64] = np.sqrt(_noise_floor(frequency, position, dt) * 0.5 * dt)
     return noise
 
 
-def _spectra(q: NDArray[np.float64], dt: float) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+def velocity_spectra(
+    q: NDArray[np.float64], dt: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Frequencies (F,), Hz, above 0, and spectral densities (F, n) of differences and positions over ``dt``."""
-    frequency, power = signal.periodogram(np.diff(q, axis=0) / dt, 1 / dt, window="hann", axis=0)
-    frequency, power = frequency[1:], power[1:]
+    velocity = np.diff(q, axis=0) / dt
+    window = np.hanning(velocity.shape[0] + 1)[:-1, None]
+    frequency = np.arange(1, velocity.shape[0] // 2 + 1) / (velocity.shape[0] * dt)
+    spectrum = np.fft.rfft((velocity - velocity.mean(axis=0)) * window, axis=0)[1:]
+    power: NDArray[np.float64] = np.abs(spectrum) ** 2 * (2.0 * dt / np.sum(window**2))
     return frequency, power, power / (2 - 2 * np.cos(2 * np.pi * frequency * dt))[:, None]
 
 

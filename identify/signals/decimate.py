@@ -5,7 +5,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.lib.stride_tricks import as_strided
 from numpy.typing import NDArray
-from scipy import signal
 
 from armident.configs import DataError
 
@@ -114,9 +113,11 @@ def design(dt: float, cutoff_hz: float, factor: int | None = None) -> Decimation
     if factor == 1:
         return Decimation(1, np.ones(1))
     width = TRANSITION * 2 * dt * cutoff_hz
-    length, beta = signal.kaiserord(STOPBAND_DB, width)
-    taps = signal.firwin(length | 1, 2 * dt * cutoff_hz, window=("kaiser", beta))
-    return Decimation(factor, np.asarray(taps, dtype=np.float64))
+    # Windowed sinc with the length and window of Kaiser (Oppenheim and Schafer, Discrete-time signal processing, 7.5).
+    half = int(np.ceil((STOPBAND_DB - 7.95) / (2.285 * np.pi * width)) + 1) // 2
+    k = np.arange(-half, half + 1)
+    taps = np.sinc(2 * dt * cutoff_hz * k) * np.kaiser(k.size, 0.1102 * (STOPBAND_DB - 8.7))
+    return Decimation(factor, taps / taps.sum())
 
 
 def _filtered(x: NDArray[np.float64], taps: NDArray[np.float64], factor: int, count: int) -> NDArray[np.float64]:

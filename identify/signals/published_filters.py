@@ -2,7 +2,6 @@
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import signal
 
 from armident.configs import DataError
 
@@ -15,6 +14,8 @@ def chebyshev_decimate(
     Second-order sections: one transfer function fails numerically for a ``factor`` above about 30. The samples kept are
     those of MATLAB's ``decimate``. ``padlen``: samples of odd extension at each end.
     """
+    from scipy import signal
+
     if x.shape[0] <= padlen:
         raise DataError(f"decimating needs more than {padlen} samples, got {x.shape[0]}")
     sections = signal.cheby1(order, ripple_db, 0.8 / factor, output="sos")

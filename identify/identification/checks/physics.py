@@ -41,7 +41,7 @@ def physics(judged: Judged, criteria: IdentificationCriteria) -> list[Reason]:
         nearest = nearest_base(model, theta, covariance)
     except ArmidentError:
         nearest = None
-    far = nearest is not None and nearest.distance**2 > chdtri(theta.size, criteria.false_alarm_rate)
+    far = nearest is not None and nearest.distance**2 > float(chdtri(theta.size, criteria.false_alarm_rate))
     if consistent is not None:
         far = consistent.p_value < criteria.false_alarm_rate
     if far and nearest is not None:
