@@ -4,7 +4,9 @@ A command is an entry point of group ``armident.commands`` that names a function
 import quickly: heavy imports belong into the function.
 """
 
+import atexit
 import functools
+import gc
 import importlib.metadata
 import logging
 import os
@@ -39,6 +41,8 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
         from armident.processes import end_with_parent
 
         end_with_parent()
+    # The last search for cycles of a process would take 0.2 s to free what ends with it.
+    atexit.register(gc.freeze)
     words = list(sys.argv[1:] if arguments is None else arguments)
     application(words)(args=words, prog_name="armident")
     raise SystemExit(0)

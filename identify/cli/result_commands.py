@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 
 from armident.configs import ConfigError, DataError
 from armident.configs.errors import FOUND
-from armident.identify.cli.short_process import shorten
 from armident.identify.diagnosis.diagnosis_options import DiagnosisOptions
 from armident.identify.documents.files import to_json, write_atomically
 from armident.identify.identification.options import Options
@@ -18,8 +17,6 @@ if TYPE_CHECKING:
     from armident.identify.api.result_base import Result
     from armident.identify.documents.prediction import PredictionDocument
     from armident.identify.identification.robot_model import RobotModel
-
-shorten()
 
 UNUSABLE = DataError.exit_code
 """Exit code: the data cannot support the request as they are configured, and the result says why."""

@@ -47,11 +47,6 @@ def test_the_check_needs_nothing_of_the_identification() -> None:
     assert "armident.identify.identification.pipeline" not in names
 
 
-def test_a_command_leaves_the_docstrings_of_scipy_as_they_are() -> None:
-    script = "import {}scipy.optimize\nprint('Array API' in scipy.optimize.minimize_scalar.__doc__ or 'no table')"
-    assert "no" in _imported(script.format("armident.identify.cli.result_commands, "))
-
-
 def test_kernels_run_without_the_registries_of_the_compiler() -> None:
     script = (
         "import numpy\nfrom armident.identify.signals.recursive import recursive_filter\n"
