@@ -86,7 +86,7 @@ def spectral_excess(
     the velocity ``slow``, where dry friction has no model, are left out.
     """
     e, qd = max(zip(series, velocities, strict=True), key=lambda pair: pair[0].size)
-    away = np.where(_turning(e, qd, slow), 0.0, e)
+    (away,) = away_from_reversals([e], [qd], slow)
     power = periodogram(hann_window(e.size) * away)
     f = np.arange(power.size) / (e.size * dt)
     used = np.flatnonzero((f > 0.0) & (f < HIGHEST * 0.5 / dt))
@@ -159,6 +159,11 @@ def _noise_level(f: Array, power: Array, used: NDArray[np.int64], dt: float) -> 
     return level
 
 
+def away_from_reversals(series: Sequence[Array], velocities: Sequence[Array], slow: float) -> list[Array]:
+    """Residuals (M,) of one joint, zero about reversals and under ``slow``, where dry friction has no model."""
+    return [np.where(_turning(e, qd, slow), 0.0, e) for e, qd in zip(series, velocities, strict=True)]
+
+
 def _turning(e: Array, qd: Array, slow: float) -> NDArray[np.bool_]:
     """True for samples about a reversal, rest, or slow motion, (M,)."""
     turns = np.append(False, np.sign(qd[1:]) != np.sign(qd[:-1])) | (e == 0.0) | (np.abs(qd) < slow)
@@ -202,8 +207,8 @@ def larger_errors(
 ) -> Excess | None:
     """Errors of the report part that are ``factor`` times as large as the training data explain.
 
-    ``training``, ``held``: residuals (M,) of one joint, held-out ones at ``times`` (M,); ``variance``: mean one of the
-    prediction by the uncertainty of the parameters.
+    ``training``, ``held``: residuals (M,) of one joint `away_from_reversals`, held-out ones at ``times`` (M,);
+    ``variance``: mean one of the prediction by the uncertainty of the parameters.
     """
     (one, count), (other, rest) = _power(training), _power(held)
     expected = one + variance

@@ -16,7 +16,14 @@ from numpy.typing import NDArray
 
 from armident.configs.schema.robot import Effect as Entry
 from armident.identify.diagnosis.criteria import Criteria
-from armident.identify.diagnosis.excess import Excess, bursts, larger_errors, spectral_excess, together
+from armident.identify.diagnosis.excess import (
+    Excess,
+    away_from_reversals,
+    bursts,
+    larger_errors,
+    spectral_excess,
+    together,
+)
 from armident.identify.diagnosis.free_functions import FINE, FreeFunction, free_functions, in_band
 from armident.identify.diagnosis.noise_beyond import noise_beyond
 from armident.identify.diagnosis.projection import JointResidual, Projection
@@ -234,32 +241,32 @@ class LackOfFit:
         slow = self.criteria.reversal * max(1.0 / float(study.robot.sign_smoothing[joint]), *transitions, 0.0)
         found: list[Excess] = []
         signals: list[Excess | None] = []
+        away: list[list[Array]] = []
         for held, stretches in ((False, study.train), (True, study.held)):
             errors = [e[:, joint] for e in self.fit.errors(self.fit.theta, held=held)]
-            if held:
-                errors = _refitted(errors, [e.z[:, joint] for e in self.fit.equations.held])
             at = [study.decimation.instants(s.measured.qd.shape[0]) for s in stretches]
             velocities = [s.measured.qd[rows, joint] for s, rows in zip(stretches, at, strict=True)]
+            away.append(away_from_reversals(errors, velocities, slow))
+            if held:
+                errors = _refitted(errors, [e.z[:, joint] for e in self.fit.equations.held])
             moments = bursts(errors, [s.t for s in stretches], velocities, slow)
             if moments is not None and moments.share >= self.criteria.burst_share:
                 found.append(moments)
             signals.append(spectral_excess(errors, velocities, study.dt * study.decimation.factor, slow))
         one, other = together(*signals)
-        larger = self._larger(joint)
+        times = [s.t for s in study.held]
+        training, unseen = away
+        larger = larger_errors(training, unseen, self._variance(joint), times, self.criteria.larger_residuals)
         if larger and other and other.kind == "unrecorded signal":
             # What the model lacks in the report part alone is in the band of the motion, too.
             other = None
         found += [signal for signal in (one, other) if signal is not None]
         return [*sorted(found, key=lambda event: -event.share), *([larger] if larger else [])]
 
-    def _larger(self, joint: int) -> Excess | None:
-        """Errors of a joint in the report part that are larger than those of the training data explain."""
-        fit, held = self.fit, self.fit.study.held
-        x = np.concatenate([e.x[:, joint] for e in fit.equations.held])
-        variance = float(np.mean(np.einsum("mb,mb->m", x @ fit.covariance, x)))
-        training, unseen = ([e[:, joint] for e in fit.errors(fit.theta, held=part)] for part in (False, True))
-        factor = self.criteria.larger_residuals
-        return larger_errors(training, unseen, variance, [s.t for s in held], factor)
+    def _variance(self, joint: int) -> float:
+        """Mean variance of the held-out prediction of a joint by the uncertainty of the parameters."""
+        x = np.concatenate([e.x[:, joint] for e in self.fit.equations.held])
+        return float(np.mean(np.einsum("mb,mb->m", x @ self.fit.covariance, x)))
 
     def _reverses(self, entry: Entry, joint: int) -> bool:
         """True for the entry with the transition of a joint's dry friction."""
