@@ -131,9 +131,9 @@ def test_typical_values_are_positions_in_the_grid_of_each_nonlinear_parameter() 
     period = 1.0 / SEARCH_RATE
     motion = arm_model(robot).motion(*sample_trajectory(usual, period), period)
     velocities, displacements = location.effect.trial_values(motion, Place(0))
-    assert len(displacements) == 4
+    assert len(displacements) == 5
     assert len(velocities) == 7
-    positions = ((2, 1), (3, 2), (4, 2))
+    positions = ((2, 1), (3, 2), (4, 3))
     assert [dict(one) for one in location.shapes] == [
         {"velocity": velocities[k], "displacement": displacements[d]} for k, d in positions
     ]
