@@ -101,16 +101,18 @@ def _identify_joint(
 ) -> JointResponse:
     longest = max(lengths)
     best: tuple[float, JointResponse] | None = None
+    # The correlations of the error alone are a part of those of both inputs.
+    inputs = [error, motion] if any(structures) else [error]
+    filters = (NO_FILTER, fit_ar(error, PREWHITENING_ORDER))
+    correlations = [_correlations(ar, inputs, nu, longest) for ar in filters]
+    plain = correlations[0][1]
+    power = sum(float(np.sum((b - b.mean()) ** 2)) for b in _held_out(nu, longest))
     for velocity in structures:
-        inputs = [error, motion] if velocity else [error]
-        plain = _correlations(NO_FILTER, inputs, nu, longest)
-        power = sum(float(np.sum((b - b.mean()) ** 2)) for b in _held_out(nu, longest))
-        for ar in (NO_FILTER, fit_ar(error, PREWHITENING_ORDER)):
-            fitted, judge = _correlations(ar, inputs, nu, longest) if ar.order else plain
+        for ar, (fitted, judge) in zip(filters, correlations, strict=True):
             for m in lengths:
-                chosen = np.concatenate([np.arange(m) + i * longest for i in range(len(inputs))])
+                chosen = np.concatenate([np.arange(m) + i * longest for i in range(1 + velocity)])
                 taps = _solve(fitted, chosen)
-                miss = plain[1].miss(taps, chosen)
+                miss = plain.miss(taps, chosen)
                 if best is None or miss < best[0] * (1 - GAIN_WORTH_A_TAP):
                     taps = _solve(fitted + judge, chosen)
                     response = JointResponse(
@@ -168,7 +170,12 @@ def _sums(
     inputs: Sequence[NDArray[np.float64]], b: NDArray[np.float64], length: int, first: int, last: int
 ) -> _Correlations:
     """Correlations over the samples ``first .. last - 1``, without a matrix of lagged inputs."""
-    auto = np.block([[_lag_products(u, v, length, first, last) for v in inputs] for u in inputs])
+    auto = np.empty((len(inputs) * length, len(inputs) * length))
+    for i, u in enumerate(inputs):
+        for j, v in enumerate(inputs[: i + 1]):
+            rows, columns = slice(i * length, (i + 1) * length), slice(j * length, (j + 1) * length)
+            auto[rows, columns] = _lag_products(u, v, length, first, last)
+            auto[columns, rows] = auto[rows, columns].T
     cross = np.concatenate([_products(b, u, length, first, last) for u in inputs])
     return _Correlations(auto, cross, float(b[first:last] @ b[first:last]))
 

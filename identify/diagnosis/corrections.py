@@ -27,7 +27,7 @@ def screened_correction(fit: IvFit, candidate: Candidate, column_cache: ColumnCa
     filtered noise.
     """
     effect, motor, limit, grid = _tested(fit, candidate)
-    return _largest(lambda values: _at_simulated(fit, effect, motor, limit, column_cache, values), grid)
+    return _largest(lambda values: _at_simulated(fit, effect, motor, limit, column_cache, values), grid, _worth(fit))
 
 
 def likely_correction(fit: IvFit, candidate: Candidate) -> tuple[float, float]:
@@ -36,8 +36,14 @@ def likely_correction(fit: IvFit, candidate: Candidate) -> tuple[float, float]:
     For effects so large that predicted torque or simulated motion are far from the true ones.
     """
     effect, motor, limit, grid = _tested(fit, candidate)
-    most, value = _largest(lambda values: _likelihoods(fit, effect, motor, limit, values), grid)
-    return most - float(_likelihoods(fit, effect, motor, limit, [0.0])[0]), value
+    none = float(_likelihoods(fit, effect, motor, limit, [0.0])[0])
+    return _largest(lambda values: _likelihoods(fit, effect, motor, limit, values) - none, grid, _worth(fit))
+
+
+def _worth(fit: IvFit) -> float:
+    """Twice the gain of log-likelihood on the grid below which no value between promises a finding."""
+    criteria = fit.study.criteria
+    return 2.0 * criteria.promising * criteria.needed_gain(1)
 
 
 def _tested(fit: IvFit, candidate: Candidate) -> tuple[Correction, int, float, list[float]]:
@@ -103,10 +109,14 @@ def _innovations(parts: Sequence[Array]) -> Array:
     return np.array([ar.variance for ar in ar_models(parts, NOISE_ORDER)])
 
 
-def _largest(criterion: Callable[[Sequence[float]], Array], grid: Sequence[float]) -> tuple[float, float]:
-    """Largest criterion and its value: the best of the grid, refined between its neighbours of the same sign."""
+def _largest(
+    criterion: Callable[[Sequence[float]], Array], grid: Sequence[float], worth: float
+) -> tuple[float, float]:
+    """Largest criterion and its value: the best of the grid; from ``worth`` on refined between its neighbours."""
     tried = criterion(grid)
     most, best = float(tried.max()), grid[int(np.argmax(tried))]
+    if most < worth:
+        return most, best
     near = [abs(value) for value in grid if value * best > 0.0]
     k, side = near.index(abs(best)), float(np.sign(best))
     low, high = near[max(k - 1, 0)], near[min(k + 1, len(near) - 1)]

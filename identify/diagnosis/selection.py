@@ -74,6 +74,7 @@ class StepwiseSelection:
     _steps: dict[str, SelectionStep] = field(default_factory=dict)
     _studies: dict[str, Study] = field(default_factory=dict)
     _visited: set[str] = field(default_factory=set)
+    _alike: set[Key] = field(default_factory=set)
 
     @property
     def criteria(self) -> Criteria:
@@ -126,7 +127,7 @@ class StepwiseSelection:
         key = _key(state.robot)
         if key in self._steps:
             return self._steps[key]
-        found = shortlist(state, incumbent)
+        found = shortlist(state, incumbent, self._alike)
         if not self._steps:
             self.hidden = found.hidden
         made: list[FittedCandidate] = []

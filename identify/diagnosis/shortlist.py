@@ -39,8 +39,11 @@ class Shortlist:
     hidden: frozenset[Key]
 
 
-def shortlist(state: ModelState, incumbent: Incumbent | None) -> Shortlist:
-    """Return the candidates with the highest statistics less their parameters; with ``incumbent``, its rivals alone."""
+def shortlist(state: ModelState, incumbent: Incumbent | None, alike: set[Key]) -> Shortlist:
+    """Return the candidates with the highest statistics less their parameters; with ``incumbent``, its rivals alone.
+
+    ``alike``: corrections that make no better loop, from one step to the next.
+    """
     criteria, column_cache = state.study.criteria, ColumnCache(state.study, state.fit.theta)
     noise = state.fit.renoised(state.weights)
     looks: list[tuple[float, Candidate, tuple[float, Shapes], Starts]] = []
@@ -58,8 +61,11 @@ def shortlist(state: ModelState, incumbent: Incumbent | None) -> Shortlist:
             statistic, start = screened_correction(noise, candidate, column_cache)
             gained, likely = likely_correction(noise, candidate)
             starts = (start, likely)
-            if 0.5 * statistic < criteria.needed_gain(1) < 0.5 * gained and _loop_improves(state, candidate, likely):
-                statistic, starts = gained, (likely,)
+            if candidate.key not in alike and 0.5 * statistic < criteria.needed_gain(1) < 0.5 * gained:
+                if _loop_improves(state, candidate, likely):
+                    statistic, starts = gained, (likely,)
+                else:
+                    alike.add(candidate.key)
             found = (statistic, ())
         else:
             found = screened(noise, candidate, column_cache)

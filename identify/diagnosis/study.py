@@ -117,7 +117,9 @@ class Study:
         """The study with the controller that its corrected torques identify, and the loop that this makes."""
         experiments = _continued(corrected_experiments([*self.sources[0], *self.sources[1]], self.robot))
         bandwidth = self.robot.bandwidth_hz or motion_bandwidth([e.q for e in experiments], experiments[0].dt)
-        simulated, loop, auxiliary, _ = _simulated(self.model, experiments, self.signals, bandwidth)
+        simulated, loop, auxiliary, _ = _simulated(
+            self.model, experiments, self.signals, bandwidth, self.auxiliary.anchor
+        )
         changed = replace(self, loop=loop, auxiliary=auxiliary)
         motions = dict(enumerate(simulated))
         return replace(changed, train=changed._moved(self.train, motions), held=changed._moved(self.held, motions))
@@ -319,17 +321,22 @@ def _aligned(e: Experiment) -> Array:
 
 
 def _simulated(
-    model: ArmModel, experiments: Sequence[Experiment], signals: Sequence[Derivatives], bandwidth: float
+    model: ArmModel,
+    experiments: Sequence[Experiment],
+    signals: Sequence[Derivatives],
+    bandwidth: float,
+    theta: Array | None = None,
 ) -> tuple[list[Derivatives], str, AuxiliaryModel, list[str]]:
-    """Motion of the simulated closed loop with the parameters of IDIM-LS, one per experiment."""
+    """Motion of the simulated closed loop at rigid ``theta`` (b,), by default that of IDIM-LS, one per experiment."""
     dt = experiments[0].dt
     rigid = model.without_terms()
     lengths = [e.q.shape[0] for e in experiments]
     decimation = decimation_of("idim-ls", dt, bandwidth, None, samples=lengths, rows=least_rows(rigid))
-    ls = idim_ls(equations(rigid, experiments, signals, decimation), rigid.base.names)
+    if theta is None:
+        theta = idim_ls(equations(rigid, experiments, signals, decimation), rigid.base.names).theta
     prepared = Prepared(rigid, experiments, signals)
     auxiliary, start, description, warnings = closed_loop(
-        prepared, Options(method="idim-iv"), ls.theta, decimation, bandwidth
+        prepared, Options(method="idim-iv"), theta, decimation, bandwidth
     )
     runs = auxiliary.simulate(start)
     if runs is None:

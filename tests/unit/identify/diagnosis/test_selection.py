@@ -116,9 +116,9 @@ def test_an_effect_beside_which_a_finding_stays_does_not_take_its_place() -> Non
 def test_only_effects_on_a_joint_of_a_finding_compete_with_it() -> None:
     worn = hide("asymmetric_viscous_friction", "joint_2", fva=0.2 * 5.5)
     _, first = selection(63, worn, arm="tx40", motion="tx40_excitation")
-    every = shortlist(first, None)
+    every = shortlist(first, None, set())
     joints = np.arange(6) == 1
-    chosen = shortlist(first, Incumbent(0.0, joints))
+    chosen = shortlist(first, Incumbent(0.0, joints), set())
     motion = first.study.motion(first.study.train[0], "measured", first.fit.theta)
 
     def acts(candidate: Candidate, shapes: Shapes) -> bool:
