@@ -1,4 +1,4 @@
-"""Calibration of a diagnosis on development arms: ``python -m tests.evaluation.calibrate DIR``.
+"""Calibration of a diagnosis on development arms: ``python -m tests.evaluation.calibrate DIR [DIR ...]``.
 
 DIR has the results of ``python -m tests.evaluation --arms random --half development --out DIR``. The command fits the
 map from evidence to probabilities and the level of the sets, prints how well both hold for arms that took no part
@@ -216,9 +216,9 @@ def _calibration_error(said: Array, right: NDArray[Any], parts: Sequence[NDArray
     return float(sum(abs(said[part].mean() - right[part].mean()) * part.size for part in parts) / said.size)
 
 
-def read(folder: Path) -> list[Entry]:
-    """Entries of the stored results of a folder, of any version of the code."""
-    results = Store(folder / RESULTS, "", any_version=True).results
+def read(folders: Sequence[Path]) -> list[Entry]:
+    """Entries of the stored results of folders, of any version of the code."""
+    results = [r for folder in folders for r in Store(folder / RESULTS, "", any_version=True).results]
     drawn = [(r.document, r.hidden) for r in results if r.document is not None and r.hidden is not None]
     arms = [(document, hidden) for document, hidden in drawn if hidden["family"] != "setup"]
     return [entry for k, arm in enumerate(arms) for entry in entries_of(k, *arm)]
@@ -227,10 +227,10 @@ def read(folder: Path) -> list[Entry]:
 def main() -> None:
     """Fit, judge and write the calibration."""
     parser = argparse.ArgumentParser(prog="python -m tests.evaluation.calibrate", description=main.__doc__)
-    parser.add_argument("folder", type=Path, help="folder of the results of the development half")
+    parser.add_argument("folders", nargs="+", type=Path, help="folders of the results of development arms")
     parser.add_argument("--out", type=Path, default=FILE, help="file of the calibration")
     options = parser.parse_args()
-    entries = read(options.folder)
+    entries = read(options.folders)
     rows: list[tuple[str, ...]] = []
     found = figures(entries, rows)
     known = calibrated(entries)
