@@ -166,10 +166,14 @@ class _Search:
         return made
 
     def _moved(self, place: Place, shapes: Shapes, factor: float, samples: float) -> Shapes:
-        """Return a transition beside another one, no less than the grid: a lead of zero would have no uncertainty."""
+        """Return a transition beside another one, no less than the grid: a lead of zero would have no uncertainty.
+
+        A motion may reach only a part of the joint's top speed: the largest velocity is the next one of the grid.
+        """
         given = dict(shapes)
-        velocities, leads = ([dict(one)[name] for one in self.grids[place]] for name in ("velocity", "lead"))
-        velocity = float(np.clip(given["velocity"] * np.exp(factor), min(velocities), max(velocities)))
+        velocities, leads = (sorted({dict(one)[name] for one in self.grids[place]}) for name in ("velocity", "lead"))
+        largest = velocities[-1] ** 2 / velocities[-2]
+        velocity = float(np.clip(given["velocity"] * np.exp(factor), velocities[0], largest))
         lead = max(given["lead"] + samples * self.sample, min(leads))
         return (("velocity", velocity), ("lead", lead))
 
