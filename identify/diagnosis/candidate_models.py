@@ -7,6 +7,7 @@ from armident.identify.diagnosis.candidate_comparison import FittedCandidate, ga
 from armident.identify.diagnosis.candidates import Candidate, Shapes
 from armident.identify.diagnosis.model_state import Fitter, ModelState, viscous_friction_rises, with_entries
 from armident.identify.diagnosis.shortlist import Starts
+from armident.identify.effects.effect import SIGN_TOLERANCE
 from armident.identify.effects.registry import known
 from armident.identify.effects.terms import entry_of
 
@@ -30,7 +31,9 @@ def model_with(
     term = made.term_of(entry)
     values, std = made.values_of(term)
     allowed = whole.allows(term.of_effect(values), term.of_effect(std), dict(term.shapes))
-    allowed = allowed and viscous_friction_rises(made, term)
+    motion = made.study.motion(made.study.train[0], "measured", made.fit.theta)
+    large = bool(np.all(np.abs(values) + SIGN_TOLERANCE * std >= whole.least(motion, term.place, term.shapes)))
+    allowed = allowed and large and viscous_friction_rises(made, term)
     one = FittedCandidate(candidate, shapes, entry, made, allowed)
     if not starts:
         return one

@@ -250,6 +250,20 @@ class Effect(ABC):
         """
         return True
 
+    def least(self, motion: Motion, place: Place, shapes: Mapping[str, float]) -> float:
+        """Return the least size of every linear parameter that this arm allows; 0 without a limit.
+
+        Parameters
+        ----------
+        motion
+            Motion of the model, with its parameters.
+        place
+            Location of the effect.
+        shapes
+            Nonlinear parameters by name.
+        """
+        return 0.0
+
     def is_convention(self, values: Array, uncertain: float) -> bool:
         """Return True if the effect is a part of every model at these values, and no finding.
 
