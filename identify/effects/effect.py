@@ -187,12 +187,8 @@ class Effect(ABC):
 
         Parameters
         ----------
-        motion
-            The motion, N samples.
-        place
-            Location of the effect.
-        shapes
-            All nonlinear parameters by name.
+        motion, place, shapes
+            Motion, N samples, location of the effect, and all nonlinear parameters by name.
 
         Returns
         -------
@@ -205,10 +201,8 @@ class Effect(ABC):
 
         Parameters
         ----------
-        motion
-            Motion that determines the ranges.
-        place
-            Location of the effect.
+        motion, place
+            Motion that determines the ranges, and location of the effect.
         """
         return ()
 
@@ -217,10 +211,8 @@ class Effect(ABC):
 
         Parameters
         ----------
-        motion
-            The motion.
-        place
-            Location of the effect.
+        motion, place
+            The motion, and location of the effect.
         """
         return None
 
@@ -229,12 +221,8 @@ class Effect(ABC):
 
         Parameters
         ----------
-        motion
-            Motion of the model.
-        place
-            Location of the effect.
-        present
-            Nonlinear parameters of the instances that the model has there.
+        motion, place, present
+            Motion of the model, location, and nonlinear parameters of the instances that the model has there.
         """
         return not present and self.invisible(motion, place) is None
 
@@ -243,10 +231,8 @@ class Effect(ABC):
 
         Parameters
         ----------
-        values
-            Linear parameters, (k,).
-        shapes
-            Nonlinear parameters by name.
+        values, shapes
+            Linear parameters, (k,), and nonlinear ones by name.
         """
         return True
 
@@ -255,12 +241,8 @@ class Effect(ABC):
 
         Parameters
         ----------
-        motion
-            Motion of the model, with its parameters.
-        place
-            Location of the effect.
-        shapes
-            Nonlinear parameters by name.
+        motion, place, shapes
+            Motion with the parameters of the model, location, and nonlinear parameters by name.
         """
         return 0.0
 
@@ -353,10 +335,8 @@ class Effect(ABC):
 
         Parameters
         ----------
-        motion
-            Motion that determines the ranges.
-        place
-            Location of the effect.
+        motion, place
+            Motion that determines the ranges, and location of the effect.
         """
         values = zip(self.shapes, self.trial_values(motion, place), strict=True)
         return tuple(product(*([(shape.name, float(v)) for v in of_shape] for shape, of_shape in values)))
@@ -378,10 +358,8 @@ class Effect(ABC):
 
         Parameters
         ----------
-        values, std
-            Linear parameters and their standard deviations, (k,) each.
-        shapes
-            Nonlinear parameters by name.
+        values, std, shapes
+            Linear parameters and their standard deviations, (k,) each, and nonlinear parameters by name.
         """
         return self.possible(values, shapes) and all(
             p.sign * value >= -SIGN_TOLERANCE * deviation
@@ -407,10 +385,8 @@ class Effect(ABC):
 
         Parameters
         ----------
-        robot
-            Configuration of the robot.
-        place
-            Location of the effect.
+        robot, place
+            Configuration of the robot, and location of the effect.
         """
         prismatic = robot.joints[place.joint].type == "prismatic"
         return tuple(shape.continuous[prismatic] for shape in self.shapes)
@@ -420,12 +396,8 @@ class Effect(ABC):
 
         Parameters
         ----------
-        robot
-            Configuration of the robot.
-        place
-            Location of the effect.
-        shapes
-            Nonlinear parameters by name.
+        robot, place, shapes
+            Configuration of the robot, location of the effect, and nonlinear parameters by name.
         """
         between = zip(self.shapes, self.refinable(robot, place), strict=True)
         return [s.name for s, may in between if (may or s.movable) and shapes[s.name] != 0.0]
@@ -435,12 +407,8 @@ class Effect(ABC):
 
         Parameters
         ----------
-        motion
-            The motion, N samples.
-        place
-            Location of the effect.
-        shapes
-            Nonlinear parameters by name; `defaults` may be left out.
+        motion, place, shapes
+            Motion, N samples, location, and nonlinear parameters by name; `defaults` may be left out.
         """
         columns = self.columns(motion, place, {**self.defaults, **shapes})
         if columns.ndim == 3:

@@ -108,15 +108,14 @@ class JointElasticity(TorqueDependent):
         return motion.response(j, *moves, links=True, rotor=rotor)[:, :, None]
 
     def least(self, motion: Motion, place: Place, shapes: Mapping[str, float]) -> float:
-        """Return half the compliance with which the link's mean inertia has the resonance; 0 if it is not determined.
+        """Return half the compliance of the resonance of the link's mean inertia; 0 where that is not determined.
 
-        A smaller compliance would need a heavier link. Half: as for a frequency that is 30 % too low.
+        Less would need a heavier link. Half: as of a frequency that is 30 % too low.
         """
         inertia = self._usual(motion, place.joint, shapes["rotor"])
         return 0.5 / (inertia * (2 * np.pi * shapes["frequency"]) ** 2) if inertia > 0.0 else 0.0
 
     def _usual(self, motion: Motion, joint: int, rotor: float) -> float:
-        """Mean inertia of the link over the arm's postures, kg m^2 or kg."""
         return float(motion.model.mass_matrix(motion.links, motion.postures)[:, joint, joint].mean()) - rotor
 
     def trial_values(self, motion: Motion, place: Place) -> Trials:

@@ -43,9 +43,11 @@ def test_transitions_predict_the_torques_of_their_joints_better(base: ModelState
         assert entry.parameters["lead"] > 0.0
 
 
-@pytest.mark.parametrize("share", [0.004, *(pytest.param(s, marks=pytest.mark.nightly) for s in (0.009, 0.017))])
-def test_the_velocity_of_a_smooth_reversal_is_found_between_the_values_of_the_grid(share: float) -> None:
-    """Dry friction ``fc tanh(v / (share top speed))``, without a lead."""
+@pytest.mark.parametrize(
+    "share", [0.004, 0.04, *(pytest.param(s, marks=pytest.mark.nightly) for s in (0.009, 0.017, 0.05))]
+)
+def test_the_velocity_of_a_smooth_reversal_is_found_between_the_values_of_the_grid_and_beyond(share: float) -> None:
+    """Dry friction ``fc tanh(v / (share top speed))``, without a lead; the grid ends at 3 % of the top speed."""
     robot = random_arm(3, 3)
     experiments = setups.record(robot, 0, noise=0.003)
     model, theta = arm_model(robot), setups.physical_parameters(robot, 0)

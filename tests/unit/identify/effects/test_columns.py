@@ -202,6 +202,17 @@ def test_an_elastic_axis_answers_a_sine_with_the_gain_of_its_two_masses(axis: Mo
     np.testing.assert_allclose(found[2500:], lag[2500:], atol=2e-3 * np.abs(lag).max())
 
 
+def test_an_elastic_axis_has_half_the_compliance_of_its_resonance_at_least(axis: Motion) -> None:
+    """The mass ``MASS`` on a spring of stiffness ``MASS w^2``, with the motor held."""
+    shapes = {"frequency": 6.0, "damping": 0.1, "rotor": 0.0}
+    least = catalogue()["joint_elasticity"].least(axis, Place(0), shapes)
+    assert least == pytest.approx(0.5 / (MASS * (2 * np.pi * 6.0) ** 2))
+    lighter = catalogue()["joint_elasticity"].least(axis, Place(0), {**shapes, "rotor": 0.75 * MASS})
+    assert lighter == pytest.approx(4.0 * least)
+    assert catalogue()["joint_elasticity"].least(axis, Place(0), {**shapes, "rotor": 1.5 * MASS}) == 0.0
+    assert catalogue()["joint_spring"].least(axis, Place(0), {}) == 0.0
+
+
 def test_a_link_swings_slower_where_it_has_more_inertia() -> None:
     dt, w, damping = 2e-4, 2 * np.pi * 9.0, 0.05
     t = dt * np.arange(10_000)
