@@ -5,7 +5,7 @@ import numpy as np
 from armident.configs.schema.robot import Effect as Entry
 from armident.identify.diagnosis.candidate_comparison import FittedCandidate, gain
 from armident.identify.diagnosis.candidates import Candidate, Shapes
-from armident.identify.diagnosis.model_state import Fitter, ModelState, viscous_friction_rises, with_entries
+from armident.identify.diagnosis.model_state import Fitter, ModelState, friction_allowed, with_entries
 from armident.identify.diagnosis.shortlist import Starts
 from armident.identify.effects.effect import SIGN_TOLERANCE
 from armident.identify.effects.registry import known
@@ -33,7 +33,7 @@ def model_with(
     allowed = whole.allows(term.of_effect(values), term.of_effect(std), dict(term.shapes))
     motion = made.study.motion(made.study.train[0], "measured", made.fit.theta)
     large = bool(np.all(np.abs(values) + SIGN_TOLERANCE * std >= whole.least(motion, term.place, term.shapes)))
-    allowed = allowed and large and viscous_friction_rises(made, term)
+    allowed = allowed and large and friction_allowed(made, term)
     one = FittedCandidate(candidate, shapes, entry, made, allowed)
     if not starts:
         return one

@@ -189,15 +189,15 @@ def with_report_part(state: ModelState) -> ModelState:
     return state.of_study(state.study.with_report_part(state.fit.theta))
 
 
-def viscous_friction_rises(state: ModelState, term: Term) -> bool:
-    """False if the viscous friction of a term's joint falls with the speed (Stribeck) by two standard deviations."""
-    slopes, names = term.effect.viscous_slope(term.shapes)[list(term.kept)], state.study.model.base.names
-    viscous = f"fv{term.place.joint + 1}"
-    if not slopes.any() or viscous not in names:
+def friction_allowed(state: ModelState, term: Term) -> bool:
+    """False if the friction of a term's joint that may not be negative is, by two standard deviations."""
+    (name, factors), names = term.effect.positive_friction(term.shapes), state.study.model.base.names
+    usual = f"{name}{term.place.joint + 1}"
+    if usual not in names:
         return True
     direction = np.zeros(state.fit.theta.size)
-    direction[[names.index(name) for name in term.names]] = slopes
-    direction[names.index(viscous)] = 1.0
+    direction[[names.index(name) for name in term.names]] = factors[list(term.kept)]
+    direction[names.index(usual)] = 1.0
     std = float(np.sqrt(direction @ state.fit.covariance @ direction))
     return bool(direction @ state.fit.theta >= -SIGN_TOLERANCE * std)
 

@@ -171,10 +171,9 @@ class _Search:
         A motion may reach only a part of the joint's top speed: the largest velocity is the next one of the grid.
         """
         given = dict(shapes)
-        velocities, leads = (sorted({dict(one)[name] for one in self.grids[place]}) for name in ("velocity", "lead"))
-        largest = velocities[-1] ** 2 / velocities[-2]
-        velocity = float(np.clip(given["velocity"] * np.exp(factor), velocities[0], largest))
-        lead = max(given["lead"] + samples * self.sample, min(leads))
+        speeds, leads = (sorted({dict(one)[name] for one in self.grids[place]}) for name in ("velocity", "lead"))
+        velocity = float(np.clip(given["velocity"] * np.exp(factor), speeds[0], speeds[-1] ** 2 / speeds[-2]))
+        lead = max(given["lead"] + samples * self.sample, leads[0])
         return (("velocity", velocity), ("lead", lead))
 
 

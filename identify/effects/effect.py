@@ -273,10 +273,8 @@ class Effect(ABC):
 
         Parameters
         ----------
-        joint
-            Name of the joint.
-        values, std
-            Estimable linear parameters by name, and their standard deviations.
+        joint, values, std
+            Name of the joint, estimable linear parameters by name, and their standard deviations.
         """
         each = ", ".join(f"{name} {value:+.3g} (standard deviation {std[name]:.2g})" for name, value in values.items())
         words = f"{self.change_title or self.title} at {joint}"
@@ -367,18 +365,17 @@ class Effect(ABC):
             for p, value, deviation in zip(self.linear, values, std, strict=True)
         )
 
-    def viscous_slope(self, shapes: Mapping[str, float]) -> Array:
-        """Return the slopes (k,) of a viscous friction over the velocity at rest, per unit of its linear parameters.
+    def positive_friction(self, shapes: Mapping[str, float]) -> tuple[str, Array]:
+        """Return a friction parameter of the joint and factors (k,) of the linear ones: their sum is not negative.
 
-        Viscous friction never falls with the speed: with that of the joint, the slope may not be negative. Zero for all
-        other effects.
+        An empty name for most effects. Viscous friction never falls with the speed, and Coulomb friction is positive.
 
         Parameters
         ----------
         shapes
             Nonlinear parameters by name.
         """
-        return np.zeros(len(self.linear))
+        return "", np.zeros(len(self.linear))
 
     def refinable(self, robot: RobotConfig, place: Place) -> tuple[bool, ...]:
         """Return, for each nonlinear parameter, True if it may lie between the values of its grid at a place.

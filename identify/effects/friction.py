@@ -146,6 +146,10 @@ class StribeckBell(Effect):
         bell = np.exp(-((motion.qd[:, place.joint] / shapes["velocity"]) ** 2))
         return (bell * self._side(motion, place, shapes["displacement"]))[:, None]
 
+    def positive_friction(self, shapes: Mapping[str, float]) -> tuple[str, Array]:
+        """Return Coulomb friction, to which the friction falls: below zero it is curved viscous friction."""
+        return "fc", np.zeros(len(self.linear))
+
     def _side(self, motion: Motion, place: Place, displacement: float) -> Array:
         """Return the direction of the friction (N,): the sign of the velocity, or that of a bristle, rad or m."""
         j = place.joint
@@ -246,9 +250,9 @@ class NonlinearViscousFriction(Effect):
         """Return `speeds`."""
         return (speeds(motion, place),)
 
-    def viscous_slope(self, shapes: Mapping[str, float]) -> Array:
-        """Return ``1 / velocity``, the slope at rest: friction that falls with the speed is Stribeck friction."""
-        return np.array([1.0 / shapes["velocity"]])
+    def positive_friction(self, shapes: Mapping[str, float]) -> tuple[str, Array]:
+        """Return viscous friction and the slope at rest: friction that falls with the speed is Stribeck friction."""
+        return "fv", np.array([1.0 / shapes["velocity"]])
 
 
 class LoadDependentFriction(TorqueDependent):

@@ -1,14 +1,26 @@
 """Model of a step: values of its effects, its configuration, and its loop on the report part."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from scipy import signal
 
 from armident.configs.schema.robot import Effect
 from armident.configs.schema.scenario import HiddenEffect
-from armident.identify.diagnosis.model_state import acted_on, rigid_parameters, viscous_friction_rises, with_report_part
+from armident.identify.diagnosis.model_state import (
+    acted_on,
+    fitted,
+    friction_allowed,
+    rigid_parameters,
+    with_report_part,
+)
+from armident.identify.diagnosis.study import build_study
 from armident.identify.effects.terms import arm_model
+from tests.fixtures import setups
 from tests.fixtures.arms import hide
 from tests.fixtures.diagnoses import SPRING, selection, with_effects
+from tests.fixtures.setups import random_arm
 
 pytestmark = pytest.mark.slow
 
@@ -73,4 +85,23 @@ def test_the_report_part_changes_no_parameter() -> None:
 def test_friction_that_falls_with_the_speed_is_not_viscous(hidden: HiddenEffect, rises: bool) -> None:
     entry = Effect(effect="nonlinear_viscous_friction", joint="joint_1", parameters={"velocity": 0.03})
     state = with_effects(selection(1, hidden)[1], entry)
-    assert viscous_friction_rises(state, state.term_of(entry)) is rises
+    assert friction_allowed(state, state.term_of(entry)) is rises
+
+
+@pytest.mark.parametrize(("kind", "allowed"), [("Stribeck", True), ("churning", False)])
+def test_friction_that_rises_at_every_speed_is_not_stribeck(kind: str, allowed: bool) -> None:
+    """The law of Stribeck with a large velocity fits it, beside a negative Coulomb friction."""
+    robot, made = random_arm(3, 3), []
+    for e in setups.record(robot, 0, noise=0.003):
+        speed = np.gradient(e.q[:, 0], e.dt)
+        share = speed / np.abs(speed).max()
+        size = np.exp(-np.abs(share) / 0.1) if kind == "Stribeck" else 20.0 * share**2
+        tau = e.tau.copy()
+        tau[:, 0] += signal.lfilter([0.5, 0.5], [1.0], size * np.tanh(share / 0.003))
+        made.append(replace(e, tau=tau))
+    study = build_study(made, [], robot)
+    velocity = (0.1 if kind == "Stribeck" else 0.35) * float(np.abs(speed).max())
+    entry = Effect(effect="stribeck_friction", law="exponential", joint="axis_1", parameters={"velocity": velocity})
+    state = with_effects(fitted(study, study.robot, None), entry)
+    assert float(state.values_of(state.term_of(entry))[0][0]) > 0.0
+    assert friction_allowed(state, state.term_of(entry)) is allowed

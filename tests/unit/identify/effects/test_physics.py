@@ -10,8 +10,12 @@ def test_the_slope_of_nonlinear_viscous_friction_at_rest_is_that_of_its_column()
     effect, velocity = known("nonlinear_viscous_friction"), 0.02
     step = 1e-6 * velocity
     slope = np.arcsinh(step / velocity) / step
-    assert effect.viscous_slope({"velocity": velocity}) == pytest.approx([slope])
-    assert not known("stribeck_friction").viscous_slope({"velocity": velocity, "displacement": 0.0}).any()
+    assert effect.positive_friction({"velocity": velocity}) == ("fv", pytest.approx([slope]))
+
+
+@pytest.mark.parametrize(("name", "friction"), [("stribeck_friction/exponential", "fc"), ("joint_spring", "")])
+def test_stribeck_friction_falls_to_the_coulomb_friction_of_the_joint(name: str, friction: str) -> None:
+    assert known(name).positive_friction({"velocity": 0.02}) == (friction, pytest.approx([0.0]))
 
 
 @pytest.mark.parametrize(("inertia", "allowed"), [(-0.0028, True), (-0.055, False), (0.055, True)])
