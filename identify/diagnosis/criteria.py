@@ -57,10 +57,6 @@ class Criteria:
     stiff_loop
         Most squared error of simulated velocities with an effect over that without, where a nominal controller follows
         the motion whatever the arm: with up to 22 % more error such a loop is as good.
-    largest_transition
-        Largest transition of dry friction at a reversal over the dry friction of the joint. Dry friction breaks away at
-        up to twice the level of slow motion (Armstrong-Helouvry, Dupont, Canudas de Wit 1994, Automatica 30(7)), and a
-        joint that sticks looks like that.
     noisy_motion
         Share of a torque beyond the simulated motion from which it counts as measurement noise: more than half.
     weighted_errors
@@ -134,7 +130,6 @@ class Criteria:
     held_out_share: float = 0.35
     band: float = 5.0
     stiff_loop: float = 1.5
-    largest_transition: float = 2.0
     noisy_motion: float = 0.5
     weighted_errors: float = 1.1
     beyond_model: float = 1e-3

@@ -12,10 +12,11 @@ from armident.identify.diagnosis.model_state import (
     ModelState,
     fitted,
     fitted_in_loop_of,
+    friction_allowed,
     with_entries,
     without_entry,
 )
-from armident.identify.effects.effect import SIGN_TOLERANCE, Place
+from armident.identify.effects.effect import Place
 from armident.identify.effects.friction import TRANSITION
 from armident.identify.effects.registry import known
 from armident.identify.effects.terms import entry_of
@@ -143,7 +144,7 @@ class _Search:
             score = float(made.score.own_log_likelihoods[place.joint])
             least = self.best[place][0] if place in self.best else -np.inf
             value = float(made.values_of(made.term_of(entry))[0][0])
-            if not _possible(made, entry, place.joint):
+            if not _possible(made, entry):
                 if value > 0.0:
                     self._large[place] = max(score, self._large.get(place, -np.inf))
             elif score > least:
@@ -182,23 +183,14 @@ def _clear(state: ModelState, less: ModelState | None, entry: Entry, joint: int)
 
     Each model predicts under noise models of its own, or both under those of the model without it.
     """
-    if less is None or not _possible(state, entry, joint):
+    if less is None or not _possible(state, entry):
         return False
     own = (state.score.own_log_likelihoods - less.score.own_log_likelihoods)[joint]
     alike = [one.score.log_likelihoods_under(less.weights)[joint] for one in (state, less)]
     return bool(max(own, alike[0] - alike[1]) > state.study.criteria.close)
 
 
-def _possible(state: ModelState, entry: Entry, joint: int) -> bool:
-    """True if a transition is positive, and at most `Criteria.largest_transition` within two standard deviations.
-
-    A larger one, with the smoothed sign, is friction that falls with the velocity: an effect (Stribeck).
-    """
-    names = state.study.model.base.names
-    own, dry = names.index(state.term_of(entry).names[0]), f"fc{joint + 1}"
-    if state.fit.theta[own] <= 0.0 or dry not in names:
-        return bool(state.fit.theta[own] > 0.0)
-    direction = np.zeros(state.fit.theta.size)
-    direction[own], direction[names.index(dry)] = 1.0, -state.study.criteria.largest_transition
-    std = float(np.sqrt(direction @ state.fit.covariance @ direction))
-    return bool(direction @ state.fit.theta <= SIGN_TOLERANCE * std)
+def _possible(state: ModelState, entry: Entry) -> bool:
+    """True if a transition is positive, and not too large: that is friction that falls with the speed (Stribeck)."""
+    term = state.term_of(entry)
+    return bool(state.values_of(term)[0][0] > 0.0) and friction_allowed(state, term)

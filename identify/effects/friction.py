@@ -36,6 +36,11 @@ def speeds(motion: Motion, place: Place) -> Sequence[float]:
     return [float(v) for v in float(motion.top_speed[place.joint]) * np.geomspace(SLOWEST, 0.35, 7)]
 
 
+LARGEST = 2.0
+"""Largest transition of dry friction at a reversal over the dry friction of the joint. Dry friction breaks away at up
+to twice the level of slow motion (Armstrong-Helouvry, Dupont, Canudas de Wit 1994, Automatica 30(7)), and a joint that
+sticks looks like that."""
+
 TRANSITION = "coulomb_transition"
 """Name of the transition of dry friction at a reversal: a part of the friction model, and no cause of a gap."""
 
@@ -72,6 +77,10 @@ class CoulombTransition(Effect):
         """Return velocities from 0.06 to 3 % of the joint's top speed, and leads from hardly any to four samples."""
         velocities = float(motion.top_speed[place.joint]) * np.geomspace(0.0006, SLOWEST, 7)
         return velocities, motion.dt * np.array([0.01, 0.25, 0.5, 1.0, 2.0, 4.0])
+
+    def positive_friction(self, shapes: Mapping[str, float]) -> tuple[str, Array]:
+        """Return Coulomb friction less that of the largest transition: beyond it, friction falls with the speed."""
+        return "fc", np.array([-1.0 / LARGEST])
 
     def is_convention(self, values: Array, uncertain: float) -> bool:
         """Return True: every model of dry friction has some transition, so that it is no missing effect."""

@@ -13,9 +13,14 @@ def test_the_slope_of_nonlinear_viscous_friction_at_rest_is_that_of_its_column()
     assert effect.positive_friction({"velocity": velocity}) == ("fv", pytest.approx([slope]))
 
 
-@pytest.mark.parametrize(("name", "friction"), [("stribeck_friction/exponential", "fc"), ("joint_spring", "")])
-def test_stribeck_friction_falls_to_the_coulomb_friction_of_the_joint(name: str, friction: str) -> None:
-    assert known(name).positive_friction({"velocity": 0.02}) == (friction, pytest.approx([0.0]))
+@pytest.mark.parametrize(
+    ("name", "friction", "factor"),
+    [("stribeck_friction/exponential", "fc", 0.0), ("coulomb_transition", "fc", -0.5), ("joint_spring", "", 0.0)],
+)
+def test_stribeck_friction_falls_to_the_coulomb_friction_and_a_transition_is_at_most_twice_that(
+    name: str, friction: str, factor: float
+) -> None:
+    assert known(name).positive_friction({"velocity": 0.02}) == (friction, pytest.approx([factor]))
 
 
 @pytest.mark.parametrize(("inertia", "allowed"), [(-0.0028, True), (-0.055, False), (0.055, True)])
