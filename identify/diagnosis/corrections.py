@@ -109,9 +109,7 @@ def _innovations(parts: Sequence[Array]) -> Array:
     return np.array([ar.variance for ar in ar_models(parts, NOISE_ORDER)])
 
 
-def _largest(
-    criterion: Callable[[Sequence[float]], Array], grid: Sequence[float], worth: float
-) -> tuple[float, float]:
+def _largest(criterion: Callable[[Sequence[float]], Array], grid: Sequence[float], worth: float) -> tuple[float, float]:
     """Largest criterion and its value: the best of the grid; from ``worth`` on refined between its neighbours."""
     tried = criterion(grid)
     most, best = float(tried.max()), grid[int(np.argmax(tried))]
