@@ -1,6 +1,6 @@
 """Physical least squares of a set-up hypothesis, and its held-out log predictive score."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,12 +67,14 @@ class Misfit:
     by_gravity: Array | None = None
 
 
-def misfit(bench: Bench, h: Hypothesis, *, turned: bool = False) -> Misfit:
+def misfit(bench: Bench, h: Hypothesis, used: NDArray[np.bool_] | None = None, *, turned: bool = False) -> Misfit:
     """Return the misfit of a hypothesis with slopes: the fitted parameters, which minimise it, do not change them.
 
-    ``turned``: with the slope by gravity.
+    ``used`` (n,): joints that count where each torque belongs to one. ``turned``: with the slope by gravity.
     """
     given = _of_one_joint_each(bench, h)
+    if given is not None and used is not None:
+        given = replace(given, normal=given.normal.of(used))
     if given is None:
         return Misfit(float(np.log(fit_shares(bench, h)[bench.moving]).sum()))
     found = given.solve(CONVERGED)

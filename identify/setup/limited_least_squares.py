@@ -4,7 +4,7 @@ Friction, offset and springs of a joint act on its own torque alone. They are el
 What is left serves for any weights, units and signs of the torques.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,6 +64,12 @@ class Normal:
         if not solvable:
             raise np.linalg.LinAlgError(SINGULAR)
         return Solution(theta, shares, explained)
+
+    def of(self, used: Mask) -> "Normal":
+        """Equations of some of the torques, with the limits of these joints alone."""
+        *parts, inner, outer = self.parts
+        held = np.resize(used, (inner.shape[0], 1))
+        return replace(self, parts=(*parts, inner * held, outer * held), used=used)
 
 
 def normal_equations(grams: Array, limits: Array, used: Mask, own: Places, shared: Places) -> Normal:

@@ -56,6 +56,12 @@ def plausible_factor(bench: Bench, h: Hypothesis) -> float:
     return 1.0 if _beyond(np.log(ratio), *TORQUE) >= -LEAST_ODDS else float(np.sqrt(TORQUE[0] * TORQUE[1])) / ratio
 
 
+def equal_shares(bench: Bench, h: Hypothesis) -> Array:
+    """Logarithms (n,) of the factors that bring all torques to their limits, as far as these are usable."""
+    (*_, logs), (*_, usable) = _logs(bench, h)
+    return np.where(usable, -logs, -np.median(logs[usable]) if usable.any() else 0.0)
+
+
 def log_plausibility(bench: Bench, h: Hypothesis) -> float:
     """Logarithm of the plausibility of the corrected signals against the limits, 0 or less."""
     rate = -math.log(bench.period * h.clock)

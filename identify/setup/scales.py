@@ -13,7 +13,7 @@ from armident.identify.setup.moves import Move, scaled
 
 Array = NDArray[np.float64]
 Criterion = Callable[[Hypothesis], float]
-SlopedCriterion = Callable[[Hypothesis], Misfit]
+SlopedCriterion = Callable[[Hypothesis, NDArray[np.bool_]], Misfit]
 
 FACTORS = (0.2, 0.32, 0.5, 0.7, 0.85, 1.0, 1.18, 1.4, 2.0, 3.1, 5.0)
 """True over configured values that are tried before the refinement."""
@@ -32,6 +32,9 @@ LEAST_GAIN = 1.3
 
 WIDEST = float(np.log(1e3))
 """Largest logarithm of a factor over its start: three decades."""
+
+STEPS = np.log(3.0) * np.arange(-6, 9)
+"""Logarithms that are tried of the torque of a joint over that of the next one farther out."""
 
 DIFFERENCE = 1e-3
 """Difference of a logarithm from which a slope is computed where the misfit has none."""
@@ -68,41 +71,43 @@ def scale_moves(
             yield made(factor)
 
 
-def torque_scales(h: Hypothesis, criterion: SlopedCriterion, starts: Sequence[Array]) -> Array | None:
+def torque_scales(
+    h: Hypothesis, criterion: SlopedCriterion, near: Array | None, sizes: Array, moving: NDArray[np.bool_]
+) -> Array | None:
     """Best factors (n,) of all torques together, or ``None`` if none of them is far from the others.
 
     Joints that carry the same links determine the proportions; the common factor is free: the median joint has 1.
+    ``near`` (n,): logarithms to begin from. Without them the joints follow one by one from the tip, because the misfit
+    of all has other minima; ``sizes`` (n,): of the torques.
     """
 
-    def misfit(logs: Array) -> Misfit:
-        return criterion(replace(h, torque=np.exp(logs)[:, None] * h.torque))
+    def misfit(logs: Array, used: NDArray[np.bool_]) -> Misfit:
+        return criterion(replace(h, torque=np.exp(logs)[:, None] * h.torque), used)
 
-    def value(logs: Array) -> float:
-        return misfit(logs).value
-
-    def sloped(logs: Array) -> tuple[float, Array]:
-        found = misfit(logs)
+    def sloped(logs: Array, used: NDArray[np.bool_]) -> tuple[float, Array]:
+        found = misfit(logs, used)
         if found.by_scale is None:
-            return found.value, np.asarray(optimize.approx_fprime(logs, value, DIFFERENCE))
+            slope = optimize.approx_fprime(logs, lambda x: misfit(x, used).value, DIFFERENCE)
+            return found.value, np.asarray(slope)
         return found.value, found.by_scale
 
-    found = [
-        optimize.minimize(
-            sloped,
-            np.log(np.abs(start)),
-            jac=True,
-            method="L-BFGS-B",
-            bounds=[(v - WIDEST, v + WIDEST) for v in np.log(np.abs(start))],
-            options={"maxiter": 12},
-        )
-        for start in starts
-    ]
-    best = min(found, key=lambda f: float(f.fun))
-    logs = np.asarray(best.x)
-    if np.max(np.abs(logs - np.median(logs))) < np.log(LEAST_TORQUE):
-        return None
-    factors: Array = np.exp(logs - np.median(logs))
-    return factors
+    def refined(start: Array, used: NDArray[np.bool_]) -> Array:
+        bounds = [(v - WIDEST, v + WIDEST) for v in start]
+        options = {"maxiter": 40}
+        found = optimize.minimize(sloped, start, used, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
+        return np.asarray(found.x)
+
+    if near is None:
+        near, used, last = -np.log(sizes), np.zeros(h.shift.size, np.bool_), 0.0
+        for j in np.flatnonzero(moving)[::-1]:
+            used[j] = True
+            tried = [near + (last + step) * (np.arange(used.size) == j) for step in STEPS]
+            near = refined(min(tried, key=lambda logs: misfit(logs, used).value), used)
+            last = near[j] + np.log(sizes[j])
+    else:
+        near = refined(near, moving)
+    logs: Array = near - np.median(near)
+    return None if np.abs(logs).max() < np.log(LEAST_TORQUE) else np.exp(logs)
 
 
 def _best(

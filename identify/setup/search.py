@@ -1,6 +1,6 @@
 """Search for the corrections of a set-up: best-first over single mistakes, and over whole permutations."""
 
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from itertools import product
@@ -12,7 +12,7 @@ from armident.identify.setup import assignment, gravity, moves, scales
 from armident.identify.setup.bench import Bench
 from armident.identify.setup.fit import Hypothesis, fit, fit_shares, held_out, joint_errors, misfit
 from armident.identify.setup.limited_least_squares import FLOOR
-from armident.identify.setup.plausible import LEAST_ODDS, log_plausibility, plausible_factor, worst_change
+from armident.identify.setup.plausible import LEAST_ODDS, equal_shares, log_plausibility, plausible_factor, worst_change
 from armident.identify.setup.prior import Mistake, between, composed, cost, wiring_cost
 
 Array = NDArray[np.float64]
@@ -165,11 +165,7 @@ class Search:
             # Several mistakes may be one that a set of joints shares.
             if not explained or len(best.families) > 1:
                 starts += self._sets(first)
-        # Several scales of torques may be parts of one of every torque.
-        if best.families.count("torque_scale") > 1:
-            scaled = composed(start, (m for m in best.mistakes if m.family == "torque_scale"))
-            begin = np.abs(np.diag(scaled.torque @ np.linalg.inv(start.torque)))
-            starts += [self._ranked(s, self.bench) for s in self._torque_scales(first, (begin,))]
+                starts += [self._ranked(s, self.bench) for s in self._torque_scales(first)]
         # An order or a set that explains no more than the configuration is no part of an explanation.
         starts = sorted((s for s in starts if s.rank < first.rank), key=lambda s: s.rank)
         self.met += [(first, s) for s in starts]
@@ -185,10 +181,10 @@ class Search:
         return best
 
     def _explained(self, h: Hypothesis) -> bool:
-        """True if the model leaves little of every joint's torque, apart from noise."""
+        """True if the model predicts every joint's torque where all move, or leaves little of it apart from noise."""
         # Torques of another order are wrong at rest, too.
         errors, memory = joint_errors(self.bench.everywhere, h, free=True)
-        errors = np.where(memory > STRUCTURED, errors, 0.0)
+        errors = np.minimum(np.where(memory > STRUCTURED, errors, 0.0), np.sqrt(self.held_out(h)))
         return bool(np.all(errors[self.bench.moving] <= WELL_UNDERSTOOD))
 
     def _greedy(self, step: Step) -> Step:
@@ -324,9 +320,7 @@ class Search:
         if h.gravity.any():
             yield self._made(step, "gravity_missing", "torques without gravity", gravity.without_gravity(h))
         if len(joints) > 1:
-            ratios = np.abs(np.diag(robot.transmission_matrix))
-            unequal = np.all(ratios > 0) and np.ptp(ratios) > 0
-            yield from self._torque_scales(step, (np.ones(bench.n), ratios) if unequal else (np.ones(bench.n),))
+            yield from self._torque_scales(step, equal_shares(bench, h))
         turned = gravity.best_direction(h, partial(misfit, bench, turned=True))
         yield self._made(step, "gravity_direction", "another direction of gravity", turned)
         for clock in CLOCKS:
@@ -334,10 +328,11 @@ class Search:
         late = gravity.best_shift(h, self.rank, bench.period, bench.moving)
         yield self._made(step, "time_shift", "all torques late by the same time", late)
 
-    def _torque_scales(self, step: Step, starts: Sequence[Array]) -> Iterator[Step]:
+    def _torque_scales(self, step: Step, near: Array | None = None) -> Iterator[Step]:
         """All torques in a unit of each drive's own: per mille of unknown rated torques, currents of the motors."""
         bench, h = self.bench, step.h
-        factors = scales.torque_scales(h, partial(misfit, bench), starts)
+        sizes = np.sqrt(bench.power(h.shift))
+        factors = scales.torque_scales(h, partial(misfit, bench), near, sizes, bench.moving)
         if factors is None:
             return
         scaled = replace(h, torque=factors[:, None] * h.torque)
