@@ -225,7 +225,7 @@ class StepwiseSelection:
 
         The evidence of each joint is limited: an effect, or feedback of disturbances, may look like a shift.
         """
-        if state.study.loop == "nominal" or not self.shifts:
+        if not self.shifts:
             return state
         models = [fitted(state.study.with_torque_shift(shift), state.robot, state) for shift in self.shifts]
         scores = np.array([model.score.log_likelihoods_under(state.weights) for model in models])

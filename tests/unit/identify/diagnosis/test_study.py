@@ -115,8 +115,9 @@ def test_torques_are_interpolated_without_loss_of_high_frequencies() -> None:
 
 
 @pytest.mark.slow
-def test_the_base_fit_decides_a_shift_that_the_check_leaves_open(study: Study) -> None:
-    sampled = replace(study, loop="followed").with_torque_shift(-LATE)
+@pytest.mark.parametrize("loop", ["followed", "nominal"])
+def test_the_base_fit_decides_a_shift_that_the_check_leaves_open(loop: str, study: Study) -> None:
+    sampled = replace(study, loop=loop).with_torque_shift(-LATE)
     # Relative to these the torques of the study are half a sample late.
     states = {
         shifts: StepwiseSelection(sampled, shifts=shifts).start() for shifts in ((), (-LATE, 0.0), (-LATE, -2 * LATE))
@@ -128,10 +129,3 @@ def test_the_base_fit_decides_a_shift_that_the_check_leaves_open(study: Study) -
     for shifts in ((), (-LATE, -2 * LATE)):
         assert states[shifts].study.sources[0][0].torque_shift == -LATE
         assert not any("late by" in line for line in states[shifts].study.warnings)
-
-
-@pytest.mark.slow
-def test_a_loop_that_contains_disturbances_decides_no_shift(study: Study) -> None:
-    sampled = replace(study, loop="nominal").with_torque_shift(-LATE)
-    state = StepwiseSelection(sampled, shifts=(-LATE, 0.0)).start()
-    assert state.study.sources[0][0].torque_shift == -LATE

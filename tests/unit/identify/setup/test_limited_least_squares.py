@@ -58,3 +58,16 @@ def test_the_elimination_changes_nothing_with_a_torque_that_does_not_count_and_a
     np.testing.assert_allclose(with_it.shares[used], without.shares[used], rtol=1e-9)
     assert not with_it.theta[[PLACES[1, 0], *PLACES[2]]].any()
     assert (limits @ with_it.theta)[:2].min() > -1e-9
+
+
+def test_equations_of_some_torques_are_those_in_which_only_these_count() -> None:
+    x, y, limits = problem(6)
+    used, power = np.array([True, False, True]), (y**2).sum(axis=1)
+    grams, products = x.transpose(0, 2, 1) @ x, np.einsum("mkc,mk->mc", x, y)
+    every = normal_equations(grams, limits, np.ones(N, np.bool_), PLACES, np.arange(SHARED))
+    held = limits * np.tile(used, 2)[:, None]
+    alone = normal_equations(grams, held, used, PLACES, np.arange(SHARED)).solve(products, power)
+    found = every.of(used).solve(products, power)
+    np.testing.assert_allclose(found.shares[used], alone.shares[used], rtol=1e-9)
+    np.testing.assert_allclose(found.theta[[*range(SHARED), *PLACES[0], *PLACES[2]]], alone.theta[alone.theta != 0])
+    assert np.abs(found.shares / every.solve(products, power).shares - 1.0)[used].max() > 1e-3
