@@ -13,7 +13,7 @@ from armident.identify.effects.wiring import PositionOffset
 from armident.identify.setup import signals
 from armident.identify.setup.bench import Bench, make_bench
 from armident.identify.setup.clipping import clipped_torques
-from armident.identify.setup.describe import effects_line
+from armident.identify.setup.describe import as_configured, effects_line
 from armident.identify.setup.fit import Hypothesis, joint_errors
 from armident.identify.setup.judge import NEXT_STEP, judged_search
 from armident.identify.setup.prior import Mistake
@@ -80,11 +80,11 @@ def _check(experiments: Sequence[Experiment], robot: RobotConfig) -> SetupCheck:
     if damaged:
         # No correction is right beside signals that are wrong.
         bench = make_bench(experiments, robot, moving)
-        errors = _errors(bench, _as_configured(robot))
+        errors = _errors(bench, as_configured(robot))
         return SetupCheck((*damaged, *findings), errors, errors, (), (), None)
     rates = signals.rate_findings(experiments, robot)
     if _noise_alone(rates, experiments, robot, moving):
-        errors = _errors(make_bench(experiments, robot, moving), _as_configured(robot))
+        errors = _errors(make_bench(experiments, robot, moving), as_configured(robot))
         names = tuple(joint.name for joint, moves in zip(robot.joints, moving, strict=True) if moves)
         return SetupCheck((*rates, *findings), errors, errors, names, (), None)
     bench, search, best = _searched(experiments, robot, moving)
@@ -94,7 +94,7 @@ def _check(experiments: Sequence[Experiment], robot: RobotConfig) -> SetupCheck:
     else:
         best = _unless_zero_explains(search, best)
     judged = judged_search(search, best, robot)
-    tried, before = search.tried | {PositionOffset.name: bench.n}, _errors(bench, _as_configured(robot))
+    tried, before = search.tried | {PositionOffset.name: bench.n}, _errors(bench, as_configured(robot))
     setup_findings, clock = judged.findings, judged.step.h.clock
     if clock != 1.0:
         # Velocities enter friction and limits: everything else is judged with the right clock.
@@ -154,7 +154,7 @@ def _noise_alone(
     coarse = {name for finding in rates if finding.kind == "position_resolution" for name in finding.joints}
     if not all(joint.name in coarse for joint, moves in zip(robot.joints, moving, strict=True) if moves):
         return False
-    errors, _ = joint_errors(make_bench(experiments, robot, moving), _as_configured(robot), free=True)
+    errors, _ = joint_errors(make_bench(experiments, robot, moving), as_configured(robot), free=True)
     return bool(np.all(errors[moving] > NOT_UNDERSTOOD))
 
 
@@ -184,7 +184,7 @@ def _stretch(bench: Bench, best: Step) -> tuple[Step, ChangedStretch | None]:
     """
     found = stretch(bench, best.h)
     if best.mistakes and best.h.clock == 1.0:
-        configured = Step(_as_configured(bench.robot))
+        configured = Step(as_configured(bench.robot))
         alone = stretch(bench, configured.h)
         if found is not None and alone is not None and alone.certain:
             left = found.left if found.certain else found.error
@@ -198,7 +198,7 @@ def _searched(
 ) -> tuple[Bench, Search, Step]:
     bench = make_bench(experiments, robot, moving)
     search = Search(bench)
-    best = search.run(_as_configured(robot))
+    best = search.run(as_configured(robot))
     if "time_shift" in best.families:
         best = _with_exact_shift(experiments, bench, best)
     elif moving.sum() > 1 and all(e.q_ref is not None for e in experiments):
@@ -258,10 +258,6 @@ def _clipped(bench: Bench, best: Step, robot: RobotConfig, known: set[str]) -> l
         unusable = clip.share >= signals.CLIPPED_UNUSABLE
         findings.append(SetupFinding("torque_clipped", (name,), 1.0, message, signals.CLIPPED_REMEDY, unusable))
     return findings
-
-
-def _as_configured(robot: RobotConfig) -> Hypothesis:
-    return Hypothesis(np.eye(robot.n), np.eye(robot.n), np.array(robot.gravity), np.zeros(robot.n))
 
 
 def _errors(bench: Bench, h: Hypothesis) -> tuple[float, ...]:

@@ -240,7 +240,7 @@ def _scale(step: Step, k: int, robot: RobotConfig, bench: Bench) -> tuple[SetupF
         message += f", nor that of {', '.join(others)}" if others else ""
         remedy = "joints: drive: gain or rated of each drive by its data sheet"
     elif len(joints) > 1:
-        h = _as_configured(robot)
+        h = as_configured(robot)
         message += (
             f": the largest positions are on average {position_ratio(bench, h):.3g} of their limits, "
             f"the largest torques {torque_ratio(bench, h):.3g}"
@@ -319,12 +319,13 @@ def _clock(step: Step, robot: RobotConfig, bench: Bench) -> SetupFinding:
     rate = 1.0 / (bench.period * step.h.clock)
     message = (
         f"the time column is in {unit}, not in s: at {1 / bench.period:.4g} Hz the largest velocities are on average "
-        f"{100 * velocity_ratio(bench, _as_configured(robot)):.2g} % of their limits"
+        f"{100 * velocity_ratio(bench, as_configured(robot)):.2g} % of their limits"
     )
     return SetupFinding("time_unit", names, 1.0, message, f"armident import FILE --rate {rate:.6g}", True)
 
 
-def _as_configured(robot: RobotConfig) -> Hypothesis:
+def as_configured(robot: RobotConfig) -> Hypothesis:
+    """The hypothesis that nothing is wrong."""
     return Hypothesis(np.eye(robot.n), np.eye(robot.n), np.array(robot.gravity), np.zeros(robot.n))
 
 

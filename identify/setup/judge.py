@@ -21,7 +21,6 @@ NEXT_STEP = (
     "columns, the units of the drives, and the home positions of the configuration"
 )
 
-
 LEAST_FALL = float(np.exp(0.5 * LEAST_DROP))
 """Least factor by which the error of a joint falls for a correction to copy: its residual power halves."""
 

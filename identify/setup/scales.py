@@ -36,9 +36,6 @@ WIDEST = float(np.log(1e3))
 STEPS = np.log(3.0) * np.arange(-6, 9)
 """Logarithms that are tried of the torque of a joint over that of the next one farther out."""
 
-DIFFERENCE = 1e-3
-"""Difference of a logarithm from which a slope is computed where the misfit has none."""
-
 LEAST_TORQUE = 3.0
 """Least factor of a single torque for a finding; a smaller one is an effect of the drive (`drive_gain_error`)."""
 
@@ -86,16 +83,11 @@ def torque_scales(
 
     def sloped(logs: Array, used: NDArray[np.bool_]) -> tuple[float, Array]:
         found = misfit(logs, used)
-        if found.by_scale is None:
-            slope = optimize.approx_fprime(logs, lambda x: misfit(x, used).value, DIFFERENCE)
-            return found.value, np.asarray(slope)
-        return found.value, found.by_scale
+        return found.value, 0.0 * logs if found.by_scale is None else found.by_scale
 
     def refined(start: Array, used: NDArray[np.bool_]) -> Array:
         bounds = [(v - WIDEST, v + WIDEST) for v in start]
-        options = {"maxiter": 40}
-        found = optimize.minimize(sloped, start, used, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
-        return np.asarray(found.x)
+        return np.asarray(optimize.minimize(sloped, start, used, jac=True, method="L-BFGS-B", bounds=bounds).x)
 
     if near is None:
         near, used, last = -np.log(sizes), np.zeros(h.shift.size, np.bool_), 0.0

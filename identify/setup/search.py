@@ -24,9 +24,7 @@ LEAST_DROP = float(np.log(2.0))
 """Least drop of the held-out residual power for a finding, nats, summed over the joints: half of one joint's."""
 
 LEAST_DROP_LATE = 0.2
-"""The same for torques that are late by one time: the phase of a few milliseconds is small in the band of a motion.
-
-"""
+"""The same for torques that are late by one time: the phase of a few milliseconds is small in the band of a motion."""
 
 LEAST_DROP_EARLY = 2.0
 """The same for torques that are early: noise in a closed loop, and current loops that lag, resemble it."""
@@ -158,7 +156,7 @@ class Search:
         best = self._greedy(first)
         explained = self._explained(best.h)
         starts: list[Step] = []
-        if self.bench.moving.sum() > 2:
+        if self.bench.moving.sum() > 1:
             # An exchange that needs a second mistake beside it may be a part of another order.
             if not explained or (len(best.families) > 1 and {"exchange", "assignment"} & set(best.families)):
                 starts += self._orders(first)

@@ -143,6 +143,29 @@ def test_a_common_unit_of_the_torques_is_named_and_not_certain(
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(
+    ("seed", "n", "limited"),
+    [(1, 3, True), (3, 5, False), *(pytest.param(5, 6, k, marks=pytest.mark.nightly) for k in (True, False))],
+)
+def test_torques_each_in_a_unit_of_its_own_are_told_with_and_without_limits(seed: int, n: int, limited: bool) -> None:
+    robot = setups.random_arm(seed, n)
+    factors = np.exp(np.random.default_rng(seed).uniform(-4.0, 4.0, n))
+    wrong = setups.with_torques(setups.record(robot, seed), np.diag(1.0 / factors))
+    if not limited:
+        joints = [
+            joint.model_copy(update={"limits": joint.limits.model_copy(update={"torque": 1e6})})
+            for joint in robot.joints
+        ]
+        robot = robot.model_copy(update={"joints": tuple(joints)})
+    found = check_setup(wrong, robot)
+    assert [(f.kind, f.correction) for f in found.findings] == [("torque_unit", True)]
+    assert found.corrected_robot is not None
+    told = {e.joint: e.parameters["torque"] for e in found.corrected_robot.effects}
+    off = np.log([told.get(joint.name, 1.0) for joint in robot.joints]) - np.log(factors)
+    assert np.abs(off - np.median(off)).max() < np.log(1.1)
+
+
+@pytest.mark.slow
 @pytest.mark.nightly
 def test_two_joints_turned_are_named_together() -> None:
     robot, both = setups.random_arm(3, 4), setups.turned(4, 0, 3)
