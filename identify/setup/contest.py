@@ -58,7 +58,12 @@ class Contest:
         self.moving = np.flatnonzero(self.bench.moving)
         self.rows = independent_rows(fit(self.bench, found.h).residual)[self.moving]
         self.wholes = list(_wholes(search, found))
-        self.weights = np.array([self._weight(search, step) for step in self.wholes])
+        weights = [self._weight(search, step) for step in self.wholes]
+        # What explains more than the mistakes found may be true beside them.
+        better = [step for step, weight in zip(self.wholes, weights, strict=True) if weight > weights[0]]
+        beside = [replace(found, mistakes=(*found.mistakes, *step.mistakes[-1:])) for step in better]
+        self.wholes += beside
+        self.weights = np.array([*weights, *(self._weight(search, step) for step in beside)])
         self.before, self.after = (self._explained(h) for h in (found.start, found.h))
         self.more_plausible = log_plausibility(self.bench, found.h) - log_plausibility(self.bench, found.start)
 
