@@ -170,7 +170,7 @@ class Search:
         for k, step in enumerate(starts):
             other = self._greedy(step)
             needed = 0.0 if best.families else LEAST_ODDS
-            better = self.gain(best, other, self.bench.everywhere)[0] > needed
+            better = all(self.gain(best, other, b)[0] > needed for b in (self.bench, self.bench.everywhere))
             if better and self._material(first.h, other.h, LEAST_TOGETHER):
                 best = other
             clear = all(0.5 * RANKED_ROWS * (s.rank - step.rank) > LEAST_ODDS for s in starts[k + 1 : k + 2])
