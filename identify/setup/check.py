@@ -12,6 +12,7 @@ from armident.identify.effects.recording_corrections import corrected_experiment
 from armident.identify.effects.wiring import PositionOffset
 from armident.identify.setup import signals
 from armident.identify.setup.bench import Bench, make_bench
+from armident.identify.setup.calibration import NAMED
 from armident.identify.setup.clipping import clipped_torques
 from armident.identify.setup.describe import as_configured, effects_line
 from armident.identify.setup.fit import Hypothesis, joint_errors
@@ -95,14 +96,15 @@ def _check(experiments: Sequence[Experiment], robot: RobotConfig) -> SetupCheck:
         best = _unless_zero_explains(search, best)
     judged = judged_search(search, best, robot)
     tried, before = search.tried | {PositionOffset.name: bench.n}, _errors(bench, as_configured(robot))
-    setup_findings, clock = judged.findings, judged.step.h.clock
+    setup_findings = judged.findings
+    of_clock = tuple(finding for finding in setup_findings if finding.kind == "time_unit")
+    clock = best.h.clock if any(finding.probability >= NAMED for finding in of_clock) else 1.0
     if clock != 1.0:
         # Velocities enter friction and limits: everything else is judged with the right clock.
         experiments = [replace(e, dt=e.dt * clock) for e in experiments]
         rates = signals.rate_findings(experiments, robot)
         bench, search, best = _searched(experiments, robot, moving)
         judged = judged_search(search, _unless_zero_explains(search, best), robot)
-        of_clock = tuple(finding for finding in setup_findings if finding.kind == "time_unit")
         setup_findings = (*of_clock, *judged.findings)
         tried = tried | search.tried
     best, corrected, likely = judged.step, judged.robot, judged.likely

@@ -84,11 +84,6 @@ def _refined(h: Hypothesis, size: float, start: Array, criterion: SlopedCriterio
     return float(found.fun), turned(np.asarray(found.x))[0]
 
 
-def without_gravity(h: Hypothesis) -> Hypothesis:
-    """Return the hypothesis that the torques contain no gravity."""
-    return replace(h, gravity=np.zeros(3))
-
-
 def best_shift(h: Hypothesis, criterion: Criterion, dt: float, mask: NDArray[np.bool_]) -> Hypothesis:
     """Return the hypothesis with the best common shift, up to 1000 samples, of the torques in ``mask``."""
 

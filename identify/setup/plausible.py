@@ -59,7 +59,7 @@ def plausible_factor(bench: Bench, h: Hypothesis) -> float:
 def equal_shares(bench: Bench, h: Hypothesis) -> Array:
     """Logarithms (n,) of the factors that bring all torques to their limits, as far as these are usable."""
     (*_, logs), (*_, usable) = _logs(bench, h)
-    return np.where(usable, -logs, -np.median(logs[usable]) if usable.any() else 0.0)
+    return np.asarray(np.where(usable, -logs, -np.median(logs[usable]) if usable.any() else 0.0))
 
 
 def log_plausibility(bench: Bench, h: Hypothesis) -> float:

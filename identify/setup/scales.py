@@ -87,7 +87,7 @@ def torque_scales(
 
     def refined(start: Array, used: NDArray[np.bool_]) -> Array:
         bounds = [(v - WIDEST, v + WIDEST) for v in start]
-        return np.asarray(optimize.minimize(sloped, start, used, jac=True, method="L-BFGS-B", bounds=bounds).x)
+        return np.asarray(optimize.minimize(sloped, start, (used,), jac=True, method="L-BFGS-B", bounds=bounds).x)
 
     if near is None:
         near, used, last = -np.log(sizes), np.zeros(h.shift.size, np.bool_), 0.0
@@ -118,8 +118,3 @@ def _best(
         options={"xatol": 2e-3, "maxiter": 15},
     )
     return float(np.exp(found.x))
-
-
-def with_clock(h: Hypothesis, factor: float) -> Hypothesis:
-    """Return the hypothesis with another unit of time; ``factor``: true over recorded duration."""
-    return replace(h, clock=h.clock * factor)

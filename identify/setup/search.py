@@ -78,10 +78,7 @@ MOST_IN_SETS = 8
 """Largest number of joints of which all sets are tried: 247 sets with ten mistakes each take seconds."""
 
 FEW_ROWS = 150
-"""Instants with which single mistakes are ranked first; the best `CANDIDATES` times four are ranked with all."""
-
-ORDER_ROWS = 150
-"""Instants with which orders are ranked: enough for residuals that differ by tens of percent."""
+"""Instants with which mistakes and orders are ranked first; the best `CANDIDATES` times four are ranked with all."""
 
 CLOCKS = (1e-3, 1e-6, 1e-9, 1e3)
 """Units of time that are tried: ms, us and ns taken for s, and s taken for ms."""
@@ -316,13 +313,13 @@ class Search:
         if len(joints) > 1:
             yield self._made(step, "assignment", "torques in another order", assignment.by_rows(bench, h))
         if h.gravity.any():
-            yield self._made(step, "gravity_missing", "torques without gravity", gravity.without_gravity(h))
+            yield self._made(step, "gravity_missing", "torques without gravity", replace(h, gravity=np.zeros(3)))
         if len(joints) > 1:
             yield from self._torque_scales(step, equal_shares(bench, h))
         turned = gravity.best_direction(h, partial(misfit, bench, turned=True))
         yield self._made(step, "gravity_direction", "another direction of gravity", turned)
         for clock in CLOCKS:
-            yield self._made(step, "time_unit", f"time in units of {clock:g} s", scales.with_clock(h, clock))
+            yield self._made(step, "time_unit", f"time in units of {clock:g} s", replace(h, clock=h.clock * clock))
         late = gravity.best_shift(h, self.rank, bench.period, bench.moving)
         yield self._made(step, "time_shift", "all torques late by the same time", late)
 
@@ -357,7 +354,7 @@ class Search:
     def _orders(self, first: Step) -> list[Step]:
         """Best orders of all joints, with torques in the order of positions, or as their friction assigns them."""
         n, start = self.bench.n, first.h
-        coarse = self.bench.everywhere.coarse(ORDER_ROWS)
+        coarse = self.bench.everywhere.coarse(FEW_ROWS)
         relative = [np.eye(n)]
         by_friction = assignment.by_friction(self.bench, start)
         if not np.array_equal(by_friction, np.eye(n)):
