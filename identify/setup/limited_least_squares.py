@@ -67,9 +67,9 @@ class Normal:
 
     def of(self, used: Mask) -> "Normal":
         """Equations of some of the torques, with the limits of these joints alone."""
-        *parts, inner, outer = self.parts
+        inner, outer = self.parts[5:]
         held = np.resize(used, (inner.shape[0], 1))
-        return replace(self, parts=(*parts, inner * held, outer * held), used=used)
+        return replace(self, parts=(*self.parts[:5], inner * held, outer * held), used=used)
 
 
 def normal_equations(grams: Array, limits: Array, used: Mask, own: Places, shared: Places) -> Normal:
