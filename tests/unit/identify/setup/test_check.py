@@ -166,6 +166,19 @@ def test_torques_each_in_a_unit_of_its_own_are_told_with_and_without_limits(seed
 
 
 @pytest.mark.slow
+def test_a_common_unit_stands_beside_a_small_common_delay(healthy: list[Experiment], arm: RobotConfig) -> None:
+    """Half a sample gains more likelihood than the limits, and is too small for a mistake: it hides no unit."""
+
+    def late(e: Experiment) -> Experiment:
+        at = np.arange(len(e.tau)) - 0.5
+        return replace(e, tau=np.stack([np.interp(at, at + 0.5, x) for x in e.tau.T], axis=1))
+
+    found = check_setup(setups.with_torques([late(e) for e in healthy], 1e3 * np.eye(AXES)), arm)
+    (finding,) = found.findings
+    assert (finding.kind, finding.joints, finding.decisive) == ("torque_unit", EVERY, True)
+
+
+@pytest.mark.slow
 @pytest.mark.nightly
 def test_two_joints_turned_are_named_together() -> None:
     robot, both = setups.random_arm(3, 4), setups.turned(4, 0, 3)
