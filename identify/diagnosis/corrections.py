@@ -27,7 +27,7 @@ def screened_correction(fit: IvFit, candidate: Candidate, column_cache: ColumnCa
     filtered noise.
     """
     effect, motor, limit, grid = _tested(fit, candidate)
-    return _largest(lambda values: _at_simulated(fit, effect, motor, limit, column_cache, values), grid, _worth(fit))
+    return _largest(fit, lambda values: _at_simulated(fit, effect, motor, limit, column_cache, values), grid)
 
 
 def likely_correction(fit: IvFit, candidate: Candidate) -> tuple[float, float]:
@@ -37,13 +37,7 @@ def likely_correction(fit: IvFit, candidate: Candidate) -> tuple[float, float]:
     """
     effect, motor, limit, grid = _tested(fit, candidate)
     none = float(_likelihoods(fit, effect, motor, limit, [0.0])[0])
-    return _largest(lambda values: _likelihoods(fit, effect, motor, limit, values) - none, grid, _worth(fit))
-
-
-def _worth(fit: IvFit) -> float:
-    """Twice the gain of log-likelihood on the grid below which no value between promises a finding."""
-    criteria = fit.study.criteria
-    return 2.0 * criteria.promising * criteria.needed_gain(1)
+    return _largest(fit, lambda values: _likelihoods(fit, effect, motor, limit, values) - none, grid)
 
 
 def _tested(fit: IvFit, candidate: Candidate) -> tuple[Correction, int, float, list[float]]:
@@ -109,11 +103,14 @@ def _innovations(parts: Sequence[Array]) -> Array:
     return np.array([ar.variance for ar in ar_models(parts, NOISE_ORDER)])
 
 
-def _largest(criterion: Callable[[Sequence[float]], Array], grid: Sequence[float], worth: float) -> tuple[float, float]:
-    """Largest criterion and its value: the best of the grid; from ``worth`` on refined between its neighbours."""
+def _largest(fit: IvFit, criterion: Callable[[Sequence[float]], Array], grid: Sequence[float]) -> tuple[float, float]:
+    """Largest criterion and its value: the best of the grid, refined between its neighbours if it promises a finding.
+
+    The criterion is twice a gain of log-likelihood.
+    """
     tried = criterion(grid)
     most, best = float(tried.max()), grid[int(np.argmax(tried))]
-    if most < worth:
+    if most < 2.0 * fit.study.criteria.promising * fit.study.criteria.needed_gain(1):
         return most, best
     near = [abs(value) for value in grid if value * best > 0.0]
     k, side = near.index(abs(best)), float(np.sign(best))

@@ -13,9 +13,6 @@ from armident.identify.signals.bandpass import butterworth, central_difference
 from armident.identify.signals.choices import NVR_RULES, DerivativesName, NvrRule
 from armident.identify.signals.irwsm import automatic_nvr, cross_validated_nvr, irwsm, optimal_nvr
 
-NVR_BY_HAND = 1e-5
-"""Noise-variance ratio chosen manually in the thesis (section 5.3.1)."""
-
 
 @dataclass(frozen=True, eq=False)
 class Derivatives:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from armident.compiled import compiled
 from armident.configs import DataError
 from armident.identify.signals.bandpass import butterworth
-from armident.identify.signals.differentiate import NVR_BY_HAND, Derivatives, differentiate
+from armident.identify.signals.differentiate import Derivatives, differentiate
 
 MASS = 96.0
 """Mass, kg."""
@@ -31,6 +31,8 @@ GAIN = 35.2
 """Drive gain, N/V."""
 SIGN_SMOOTHING = 150.0
 """``sign(x)`` is ``(2/pi) atan(150 x)`` in the simulations of the thesis (after equation 2.7)."""
+NVR_BY_HAND = 1e-5
+"""Noise-variance ratio chosen manually in the thesis (section 5.3.1)."""
 SNR_DB = 100.0
 CUTOFF_HZ = 40.0
 MODE_HZ = 8.0

@@ -9,12 +9,8 @@ from scipy import signal
 
 from armident.configs import DataError, load_robot
 from armident.identify.signals.choices import DerivativesName
-from armident.identify.signals.differentiate import (
-    NVR_BY_HAND,
-    differentiate,
-    encoder_resolution,
-    tracking_error_nvr,
-)
+from armident.identify.signals.differentiate import differentiate, encoder_resolution, tracking_error_nvr
+from tests.reproduction.emps_derivatives import NVR_BY_HAND
 
 DT = 2e-4
 
