@@ -89,7 +89,7 @@ def noise_beyond_shapes(fit: IvFit, column_cache: ColumnCache) -> list[ArModel]:
     # The measured motion is the same for all models: one factorisation serves them.
     key = ("smooth functions", *(s.measured for s in study.train), tuple(study.robot.sign_smoothing))
     motions = (column_cache.motion(s, "measured") for s in study.train)
-    *spans, sizes = study.regressors.get(key, lambda: _spans([_smooth_functions(study, m) for m in motions]))
+    *spans, sizes = study.regressors.get(key, lambda: _spans(_smooth_functions(study, list(motions))))
     every = np.concatenate(errors)
     left = np.stack([e - span @ (span.T @ e) for e, span in zip(every.T, spans, strict=True)], axis=1)
     parts = np.split(left, np.cumsum([e.shape[0] for e in errors])[:-1])
@@ -106,19 +106,22 @@ def _spans(columns: Sequence[Sequence[Array]]) -> tuple[Array, ...]:
     return (*spans, np.array([own.shape[1] for own in stacked]))
 
 
-def _smooth_functions(study: Study, motion: Motion) -> list[Array]:
-    """Hat functions of position, of position by direction, of velocity and of time, (M, k) for each joint."""
+def _smooth_functions(study: Study, motions: Sequence[Motion]) -> list[list[Array]]:
+    """Hat functions of position, of position by direction, of velocity and of time, (M, k) per stretch and joint."""
     rows = sum(s.y.shape[0] for s in study.train)
     knots = max(3, min(KNOTS, rows // (4 * study.criteria.rows_per_function)))
-    when, out = _quantile_hats(motion.t, knots), []
-    for j in range(motion.n):
-        q, qd, side = motion.q[:, j], motion.qd[:, j], motion.sign[:, j, None]
-        place = _quantile_hats(q, knots)
-        functions = [place, place * side, _quantile_hats(qd, knots), when, when * side]
-        out.append(study.decimation(np.concatenate(functions, axis=1)))
+    when = _quantile_hats([m.t for m in motions], knots)
+    out: list[list[Array]] = [[] for _ in motions]
+    for j in range(study.robot.n):
+        places, speeds = (_quantile_hats([getattr(m, name)[:, j] for m in motions], knots) for name in ("q", "qd"))
+        for own, motion, place, speed, time in zip(out, motions, places, speeds, when, strict=True):
+            side = motion.sign[:, j, None]
+            functions = [place, place * side, speed, time, time * side]
+            own.append(study.decimation(np.concatenate(functions, axis=1)))
     return out
 
 
-def _quantile_hats(values: Array, knots: int) -> Array:
-    """Piecewise linear functions, one at their own knot and zero at the others; knots at quantiles of the values."""
-    return hats(values, np.unique(np.quantile(values, np.linspace(0, 1, knots))))
+def _quantile_hats(values: Sequence[Array], knots: int) -> list[Array]:
+    """Piecewise linear functions, one at their own knot and zero at the others; knots at quantiles of all values."""
+    at = np.unique(np.quantile(np.concatenate(values), np.linspace(0, 1, knots)))
+    return [hats(one, at) for one in values]
