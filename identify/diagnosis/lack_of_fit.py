@@ -14,7 +14,6 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from armident.configs.schema.robot import Effect as Entry
 from armident.identify.diagnosis.criteria import Criteria
 from armident.identify.diagnosis.excess import (
     Excess,
@@ -203,8 +202,12 @@ class LackOfFit:
         elif isinstance(test, Excess):
             fall = test.error * left
         else:
+            # Times about reversals, where dry friction has no model, are no evidence.
             error = np.concatenate([e[:, joint] for e in self.fit.errors(self.fit.theta, held=True)])
-            fall = float(np.sqrt(np.mean(error**2))) * left
+            speeds, slow = self._speeds(joint, held=True)
+            (away,) = away_from_reversals([error], [np.concatenate(speeds)], slow)
+            removed, power = (error**2 - (error - test.change) ** 2)[away != 0.0].sum(), np.sum(error**2)
+            fall = float(np.sqrt(power) - np.sqrt(np.clip(power - removed, 0.0, power))) / np.sqrt(error.size)
         return float(100.0 * fall / max(float(np.sqrt(np.mean(torque**2))), 1e-300))
 
     def _dependence(self, p: Projection, own: JointResidual) -> ResidualDependence:
@@ -237,15 +240,12 @@ class LackOfFit:
     def _excesses(self, joint: int) -> list[Excess]:
         """Parts of a joint's residual that are no broadband noise, the largest one first."""
         study = self.fit.study
-        transitions = [e.parameters["velocity"] for e in study.robot.effects if self._reverses(e, joint)]
-        slow = self.criteria.reversal * max(1.0 / float(study.robot.sign_smoothing[joint]), *transitions, 0.0)
         found: list[Excess] = []
         signals: list[Excess | None] = []
         away: list[list[Array]] = []
         for held, stretches in ((False, study.train), (True, study.held)):
             errors = [e[:, joint] for e in self.fit.errors(self.fit.theta, held=held)]
-            at = [study.decimation.instants(s.measured.qd.shape[0]) for s in stretches]
-            velocities = [s.measured.qd[rows, joint] for s, rows in zip(stretches, at, strict=True)]
+            velocities, slow = self._speeds(joint, held=held)
             away.append(away_from_reversals(errors, velocities, slow))
             if held:
                 errors = _refitted(errors, [e.z[:, joint] for e in self.fit.equations.held])
@@ -268,9 +268,13 @@ class LackOfFit:
         x = np.concatenate([e.x[:, joint] for e in self.fit.equations.held])
         return float(np.mean(np.einsum("mb,mb->m", x @ self.fit.covariance, x)))
 
-    def _reverses(self, entry: Entry, joint: int) -> bool:
-        """True for the entry with the transition of a joint's dry friction."""
-        return entry.effect == TRANSITION and entry.joint == self.fit.study.joints[joint]
+    def _speeds(self, joint: int, *, held: bool) -> tuple[list[Array], float]:
+        """Velocities (M,) of a joint in every stretch, and that under which its dry friction reverses."""
+        study = self.fit.study
+        own = [e for e in study.robot.effects if e.effect == TRANSITION and e.joint == study.joints[joint]]
+        widths = [1.0 / float(study.robot.sign_smoothing[joint]), *(e.parameters["velocity"] for e in own)]
+        measured = [s.measured.qd[:, joint] for s in (study.held if held else study.train)]
+        return [qd[study.decimation.instants(qd.size)] for qd in measured], self.criteria.reversal * max(widths)
 
     def _of_excess(self, joint: int, excess: Excess) -> ResidualDependence:
         curve = Curve(excess.x, excess.value, excess.noise)

@@ -38,13 +38,19 @@ def with_transitions(state: ModelState, model: Fitter) -> ModelState:
     search = _Search(state)
     made, clear = search.clear(model)
     kept = _beside_curve(made, clear, model)
-    found = {entry.joint for entry in kept}
-    large = [place for place in search.large if state.study.joints[place.joint] not in found]
+    there = {entry.joint for entry in kept}
+    large = [place for place in search.large if state.study.joints[place.joint] not in there]
     tied = _tied(state, large, model) if large else []
-    robot = with_entries(state.robot, [*kept, *tied])
-    if not tied:
-        return model(robot, state) or state
-    return fitted(replace(state.study, tied=frozenset(str(entry.joint) for entry in tied)), robot, state)
+    joints, own = state.study.joints, state.score.own_log_likelihoods
+    while tied:
+        study = replace(state.study, tied=frozenset(str(entry.joint) for entry in tied))
+        found = fitted(study, with_entries(state.robot, [*kept, *tied]), state)
+        gain = found.score.own_log_likelihoods - own
+        better = [entry for entry in tied if gain[joints.index(str(entry.joint))] > 0.0]
+        if better == tied:
+            return found
+        tied = better
+    return model(with_entries(state.robot, kept), state) or state
 
 
 def _tied(state: ModelState, places: Sequence[Place], model: Fitter) -> list[Entry]:
