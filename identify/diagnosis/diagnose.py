@@ -23,7 +23,6 @@ from armident.identify.diagnosis.findings import (
     undetectable,
 )
 from armident.identify.diagnosis.lack_of_fit import LackOfFit, ResidualDependence
-from armident.identify.diagnosis.lack_of_fit import dependences as dependences_of
 from armident.identify.diagnosis.model_state import ModelState, with_entries, with_report_part
 from armident.identify.diagnosis.probabilities import judged
 from armident.identify.diagnosis.selected import Selected
@@ -84,7 +83,7 @@ class DiagnosisResult:
         if self.first is None:
             return ()
         with threadpool_limits(1):
-            return dependences_of(self.first)
+            return LackOfFit(self.first.fit).dependences
 
 
 def run_diagnosis(

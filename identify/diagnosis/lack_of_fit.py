@@ -9,7 +9,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,14 +44,6 @@ RANK = 1e-10
 
 OCTAVES = (0.0, 0.125, 0.25, 0.5, 1.0, 2.0, 4.0)
 """Edges of the frequencies of the spectrum of a dependence on the motion, over the bandwidth of the motion."""
-
-
-class Fitted(Protocol):
-    """A fitted model: `armident.identify.diagnosis.model_state.ModelState`."""
-
-    @property
-    def fit(self) -> IvFit:
-        """Fit of the model."""
 
 
 @dataclass(frozen=True)
@@ -105,11 +96,6 @@ class ResidualDependence:
             height = height / np.maximum(self.curve.band, 1e-300)
         at = self.where or (float(self.curve.x[int(np.argmax(height))]),)
         return hint_of(self.kind, self.joint, self.other, f"{', '.join(f'{x:.3g}' for x in at)} {self.unit}")
-
-
-def dependences(state: Fitted) -> tuple[ResidualDependence, ...]:
-    """Significant dependences of the residual, at most one for each joint and variable, largest share first."""
-    return LackOfFit(state.fit).dependences
 
 
 @dataclass(frozen=True, eq=False)

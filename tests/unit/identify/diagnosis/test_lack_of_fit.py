@@ -131,6 +131,26 @@ def test_a_bump_below_the_limit_of_the_user_is_too_small_to_matter() -> None:
     assert 0.2 < small["joint_2"][1] < 50.0
 
 
+def test_times_about_reversals_are_no_evidence_of_a_dependence() -> None:
+    """Friction at speeds under 2 mm/s, where dry friction reverses within 0.6 and 20 mm/s."""
+    study, _ = emps()
+
+    def braked(stretches: tuple[MotionStretch, ...]) -> tuple[MotionStretch, ...]:
+        out = []
+        for stretch in stretches:
+            qd = stretch.measured.qd
+            torque = 20.0 * np.tanh(qd / 1e-4) * np.exp(-((qd / 2e-3) ** 2))
+            out.append(replace(stretch, y=stretch.y + np.where(stretch.y == 0, 0.0, study.decimation(torque))))
+        return tuple(out)
+
+    sharp = LackOfFit(fit_model(replace(study, train=braked(study.train), held=braked(study.held))))
+    criteria = replace(study.criteria, reversal=100.0)
+    gradual = LackOfFit(sharp.fit.of_study(replace(sharp.fit.study, criteria=criteria)))
+    assert [d.varies_with for d in sharp.unexplained] == ["velocity"]
+    assert gradual.unexplained == ()
+    assert {d.varies_with for d in gradual.dependences} == {d.varies_with for d in sharp.dependences}
+
+
 def test_a_mains_line_beyond_the_band_of_the_comparison_is_found() -> None:
     (line,) = [d for d in strange().dependences if d.kind == "frequency"]
     assert line.joint == "joint_3"
