@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy import signal
 
 from armident.configs import RobotConfig
@@ -17,7 +16,7 @@ from armident.identify.effects.effect import Place
 from armident.identify.effects.registry import known
 from armident.identify.effects.terms import arm_model
 from armident.identify.signals.experiments import Experiment
-from tests.evaluation.plants.cases import Recording, make_case
+from tests.evaluation.plants.cases import make_case
 from tests.fixtures import setups
 from tests.fixtures.setups import random_arm
 
@@ -126,14 +125,13 @@ def test_a_transition_that_stribeck_friction_makes_too_large_is_tied_to_the_dry_
 def test_a_transition_that_predicts_worse_than_none_with_the_size_of_the_dry_friction_is_left_out() -> None:
     """A slow current loop makes the transition of axis_4 too large."""
     case = make_case("development", 143)
-    made = [Experiment(*(signals(one, name, 4) for name in ("q", "tau", "qr")), one["t"][1]) for one in case.recordings]
+    made = []
+    for one in case.recordings:
+        q, tau, qr = (np.column_stack([one[f"{name}{j + 1}"] for j in range(4)]) for name in ("q", "tau", "qr"))
+        made.append(Experiment(q, tau, qr, float(one["t"][1])))
     stage = set_up([made[0]], [made[1]], case.robot, Criteria())
     study = build_study(stage.training, stage.validation, stage.robot)
     state = fitted(study, study.robot, None)
     state = with_transitions(state, lambda one, before: fitted(study, one, before))
     assert not state.study.tied
     assert {entry.joint for entry in state.robot.effects} == set(study.joints[:3])
-
-
-def signals(one: Recording, name: str, joints: int) -> NDArray[np.float64]:
-    return np.column_stack([one[f"{name}{j + 1}"] for j in range(joints)])
