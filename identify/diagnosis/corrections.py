@@ -14,40 +14,31 @@ from armident.identify.regression.ar_noise import ar_models
 from armident.identify.regression.whitening import whitened, whitened_series
 
 Array = NDArray[np.float64]
+Look = tuple[float, float]
+"""Largest value of a criterion, and the parameter there."""
 
 REFINEMENTS = 10
 """Evaluations of the refinement between two values of the grid."""
 
 
-def screened_correction(fit: IvFit, candidate: Candidate, column_cache: ColumnCache) -> tuple[float, float]:
-    """Score statistic of an effect on the recorded torque of a motor, and the value of its parameter there.
+def screened_correction(fit: IvFit, candidate: Candidate, column_cache: ColumnCache) -> tuple[Look, Look]:
+    """Two looks at an effect on the recorded torque of a motor: a score statistic, and twice a gain of log-likelihood.
 
-    The statistic is the reduction of the squared whitened residual by the change of the predicted torque at the
-    simulated, noise-free motion. The likelihood of corrected torques is no evidence: smoothing favours low-pass
-    filtered noise.
+    The score statistic is the reduction of the squared whitened residual by the change of the predicted torque at the
+    simulated, noise-free motion. The likelihood is that of the corrected torques: for effects so large that predicted
+    torque or simulated motion are far from the true ones. It is no evidence: smoothing favours low-pass filtered noise.
     """
-    effect, motor, limit, grid = _tested(fit, candidate)
-    return _largest(fit, lambda values: _at_simulated(fit, effect, motor, limit, column_cache, values), grid)
-
-
-def likely_correction(fit: IvFit, candidate: Candidate) -> tuple[float, float]:
-    """Twice the gain of log-likelihood by a correction, and the value of its parameter there.
-
-    For effects so large that predicted torque or simulated motion are far from the true ones.
-    """
-    effect, motor, limit, grid = _tested(fit, candidate)
-    none = float(_likelihoods(fit, effect, motor, limit, [0.0])[0])
-    return _largest(fit, lambda values: _likelihoods(fit, effect, motor, limit, values) - none, grid)
-
-
-def _tested(fit: IvFit, candidate: Candidate) -> tuple[Correction, int, float, list[float]]:
-    """The effect of a candidate, its motor, the limit of its torque, and the values to test."""
     study, effect, motor = fit.study, candidate.effect, candidate.place.joint
     assert isinstance(effect, Correction)
     limit = motor_limit(study.robot, motor)
     shaft = np.linalg.inv(study.robot.transmission_matrix)[:, motor]
     recorded = np.concatenate([s.torque @ shaft for s in study.train])
-    return effect, motor, limit, [float(value) for value in effect.values_to_test(recorded, study.dt, limit)]
+    grid = [float(value) for value in effect.values_to_test(recorded, study.dt, limit)]
+    none = float(_likelihoods(fit, effect, motor, limit, [0.0])[0])
+    return (
+        _largest(fit, lambda values: _at_simulated(fit, effect, motor, limit, column_cache, values), grid),
+        _largest(fit, lambda values: _likelihoods(fit, effect, motor, limit, values) - none, grid),
+    )
 
 
 def _at_simulated(
@@ -103,11 +94,8 @@ def _innovations(parts: Sequence[Array]) -> Array:
     return np.array([ar.variance for ar in ar_models(parts, NOISE_ORDER)])
 
 
-def _largest(fit: IvFit, criterion: Callable[[Sequence[float]], Array], grid: Sequence[float]) -> tuple[float, float]:
-    """Largest criterion and its value: the best of the grid, refined between its neighbours if it promises a finding.
-
-    The criterion is twice a gain of log-likelihood.
-    """
+def _largest(fit: IvFit, criterion: Callable[[Sequence[float]], Array], grid: Sequence[float]) -> Look:
+    """Look at a criterion, twice a gain of log-likelihood: best of the grid, refined if it promises a finding."""
     tried = criterion(grid)
     most, best = float(tried.max()), grid[int(np.argmax(tried))]
     if most < 2.0 * fit.study.criteria.promising * fit.study.criteria.needed_gain(1):

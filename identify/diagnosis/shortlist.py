@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from armident.configs import DataError
 from armident.identify.diagnosis.candidates import Candidate, ColumnCache, Key, Shapes, candidates
-from armident.identify.diagnosis.corrections import likely_correction, screened_correction
+from armident.identify.diagnosis.corrections import screened_correction
 from armident.identify.diagnosis.model_state import ModelState, with_entries
 from armident.identify.diagnosis.order_analysis import motor_orders, nearby_orders
 from armident.identify.diagnosis.screening import contained, refined, screened
@@ -58,8 +58,7 @@ def shortlist(state: ModelState, incumbent: Incumbent | None, alike: set[Key]) -
         found: tuple[float, Shapes] | None
         starts: Starts = ()
         if isinstance(candidate.effect, Correction):
-            statistic, start = screened_correction(noise, candidate, column_cache)
-            gained, likely = likely_correction(noise, candidate)
+            (statistic, start), (gained, likely) = screened_correction(noise, candidate, column_cache)
             starts = (start, likely)
             if candidate.key not in alike and 0.5 * statistic < criteria.needed_gain(1) < 0.5 * gained:
                 if _loop_improves(state, candidate, likely):

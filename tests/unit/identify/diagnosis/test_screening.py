@@ -8,7 +8,7 @@ import pytest
 from armident.configs import load_robot
 from armident.configs.schema.scenario import HiddenEffect
 from armident.identify.diagnosis.candidates import ColumnCache, candidates
-from armident.identify.diagnosis.corrections import likely_correction, screened_correction
+from armident.identify.diagnosis.corrections import screened_correction
 from armident.identify.diagnosis.model_state import fitted as model_of
 from armident.identify.diagnosis.regression import IvFit
 from armident.identify.diagnosis.screening import orthogonal_directions, score_statistics
@@ -90,7 +90,7 @@ def test_a_delay_is_promised_with_about_its_value() -> None:
     fit = state.fit.renoised(state.weights)
     bench = ColumnCache(fit.study, state.fit.theta)
     late = next(c for c in candidates(bench) if c.effect.name == "time_delay")
-    statistic, start = screened_correction(fit, late, bench)
+    (statistic, start), (_, likely) = screened_correction(fit, late, bench)
     assert statistic > 100.0
     # The model absorbs a part of the delay; what remains is found from the corrected torques.
-    assert all(0.3 * delay < value < 1.1 * delay for value in (start, likely_correction(fit, late)[1]))
+    assert all(0.3 * delay < value < 1.1 * delay for value in (start, likely))
