@@ -306,8 +306,8 @@ def _stopped(selection: StepwiseSelection, findings: int) -> list[str]:
 
 
 def _verdict(findings: Sequence[Finding], left: Sequence[Unexplained]) -> Verdict:
-    """Verdict: terms without a name, and names that are more probably wrong than right, explain nothing."""
-    explains = [f.effect != UNNAMED and f.confidence >= LIKELY for f in findings]
+    """Verdict: terms without a name, doubtful names, and mistakes of the set-up left uncorrected explain nothing."""
+    explains = [f.effect != UNNAMED and f.confidence >= LIKELY and f.evidence.get("corrected", True) for f in findings]
     if not findings and not left:
         return "no_gap"
     if not any(explains):

@@ -1,6 +1,6 @@
 """First stage of a diagnosis: mistakes of the set-up are corrected and reported before any effect is looked for."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -11,10 +11,11 @@ from armident.identify.documents.diagnosis import Finding, Gap, Unexplained
 from armident.identify.identification.from_recording import MIN_PIECE_S
 from armident.identify.setup.calibration import NAMED
 from armident.identify.setup.check import check_setup
-from armident.identify.setup.result import CONVENTIONS, SetupCheck, SetupFinding, Span, with_torque_shift
+from armident.identify.setup.result import CONVENTIONS, WIRED, SetupCheck, SetupFinding, Span, with_torque_shift
 from armident.identify.signals.experiments import Experiment
 
-SIGNALS = {"position_sign": "position", "torque_sign": "torque"}
+EACH = {"position_sign": "sign_error", "torque_sign": "sign_error", "time_shift": "time_delay", "change_in_time": ""}
+"""Effect of each joint by kind of finding; empty: the kind itself."""
 
 REMARKS = (
     "rate_too_slow",
@@ -147,40 +148,33 @@ def _findings(finding: SetupFinding, check: SetupCheck, robot: RobotConfig) -> I
         "joints": list(finding.joints),
     }
 
-    def made(effect: str, joint: str, parameters: dict[str, float], other: str | None = None) -> Finding:
+    of_joint = {(e.effect, e.joint): e.parameters for e in entries}
+
+    def made(effect: str, joint: str, given: Mapping[str, float] | None = None, other: str | None = None) -> Finding:
         j = names.index(joint)
+        values = dict(of_joint.get((effect, joint), {}) if given is None else given)
         return Finding(
             effect=effect,
             joint=joint,
             other=other,
             kind="structure",
-            parameters=parameters,
+            parameters=values,
             confidence=finding.probability,
             alternatives=[],
             gap_before=check.relative_error_pct[j],
-            gap_after=check.corrected_error_pct[j],
-            evidence=evidence,
+            gap_after=(check.likely_error_pct or check.corrected_error_pct)[j],
+            evidence={**evidence, "corrected": finding.kind not in WIRED or bool(values)},
         )
 
-    of_joint = {(e.effect, e.joint): e.parameters for e in entries}
-    if finding.kind in SIGNALS:
+    worst = max(finding.joints, key=lambda name: check.relative_error_pct[names.index(name)], default="")
+    if finding.kind in EACH:
         for joint in finding.joints:
-            yield made("sign_error", joint, dict(of_joint.get(("sign_error", joint), {})))
-    elif finding.kind == "change_in_time":
-        for joint in finding.joints:
-            yield made(finding.kind, joint, {})
-    elif finding.kind == "time_shift":
-        for joint in finding.joints:
-            yield made("time_delay", joint, dict(of_joint.get(("time_delay", joint), {})))
+            yield made(EACH[finding.kind] or finding.kind, joint)
     elif finding.kind == "joint_order":
         first, second = finding.joints[:2]
-        parameters = [e.parameters for e in entries if e.effect == "joint_order" and e.joint in finding.joints]
-        yield made("joint_order", first, dict(parameters[0]) if parameters else {}, second)
+        order = [e.parameters for e in entries if e.effect == "joint_order" and e.joint in finding.joints]
+        yield made("joint_order", first, order[0] if order else {}, second)
     elif finding.kind == "gravity_direction":
-        axes = zip(("gravity_x", "gravity_y", "gravity_z"), corrected.gravity, strict=True)
-        worst = max(finding.joints, key=lambda name: check.relative_error_pct[names.index(name)])
-        yield made("gravity_direction", worst, dict(axes))
+        yield made(finding.kind, worst, {f"gravity_{k}": g for k, g in zip("xyz", corrected.gravity, strict=True)})
     else:
-        worst = max(finding.joints, key=lambda name: check.relative_error_pct[names.index(name)])
-        scales = of_joint.get(("signal_scale", worst), {})
-        yield made(finding.kind, worst, dict(scales))
+        yield made(finding.kind, worst, of_joint.get(("signal_scale", worst), {}))

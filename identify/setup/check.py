@@ -127,14 +127,11 @@ def _check(experiments: Sequence[Experiment], robot: RobotConfig) -> SetupCheck:
     lost = _not_explained(bench, best)
     if not (lost or of_scale or changed is not None or any(finding.decisive for finding in findings)):
         findings += weight_findings(bench, best.h, robot)
-    after = _errors(bench, best.h)
+    most = np.inf if changed is None else 100.0 * changed.left
+    after, likely_after = (_errors(bench, step.h, most) for step in (best, judged.likely_step))
     if changed is not None:
-        after = tuple(min(error, 100.0 * float(left)) for error, left in zip(after, changed.left, strict=True))
-        lost = tuple(
-            name
-            for j, name in enumerate(joint.name for joint in robot.joints)
-            if name in lost and changed.left[j] > NOT_UNDERSTOOD
-        )
+        pairs = zip(robot.joints, changed.left, strict=True)
+        lost = tuple(joint.name for joint, left in pairs if joint.name in lost and left > NOT_UNDERSTOOD)
     return SetupCheck(
         findings=(*setup_findings, *findings),
         relative_error_pct=before,
@@ -143,6 +140,7 @@ def _check(experiments: Sequence[Experiment], robot: RobotConfig) -> SetupCheck:
         tried=tuple(words for family, words in TRIED.items() if family in tried),
         corrected_robot=corrected,
         likely_robot=likely,
+        likely_error_pct=likely_after,
         clock=clock,
         torque_shift=None if lost else _torque_shift(experiments, bench, best),
         stretch=() if changed is None else spans(changed, bench),
@@ -262,9 +260,9 @@ def _clipped(bench: Bench, best: Step, robot: RobotConfig, known: set[str]) -> l
     return findings
 
 
-def _errors(bench: Bench, h: Hypothesis) -> tuple[float, ...]:
-    """Relative error of every joint's corrected torque, percent, (n,); 100 at a joint at rest."""
-    return tuple(float(100 * e) for e in np.where(bench.moving, joint_errors(bench, h)[0], 1.0))
+def _errors(bench: Bench, h: Hypothesis, most: Array | float = np.inf) -> tuple[float, ...]:
+    """Relative error of every joint's corrected torque, percent, (n,), at most ``most``; 100 at a joint at rest."""
+    return tuple(map(float, np.minimum(100 * np.where(bench.moving, joint_errors(bench, h)[0], 1.0), most)))
 
 
 def _not_explained(bench: Bench, best: Step) -> tuple[str, ...]:

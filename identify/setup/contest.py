@@ -11,6 +11,7 @@ from armident.identify.setup.fit import Hypothesis, fit, joint_errors
 from armident.identify.setup.moves import signs_of
 from armident.identify.setup.plausible import log_plausibility
 from armident.identify.setup.prior import WIRING, Mistake, cost
+from armident.identify.setup.result import WIRED
 from armident.identify.setup.search import Search, Step, angle_between, independent_rows
 
 Array = NDArray[np.float64]
@@ -87,7 +88,7 @@ class Contest:
             step
             for step, weight in zip(self.wholes[1:], self.weights[1:], strict=True)
             if weight > least and step.mistakes and step.mistakes[-1].family in WIRING
-            and kind in ("position_sign", "torque_sign", "joint_order") and not self._contains(step, kind, joints)
+            and kind in WIRED and not self._contains(step, kind, joints)
         ]  # fmt: skip
 
     def log_odds(self, kind: str, joints: Sequence[int], equal: Sequence[Step]) -> float:

@@ -11,7 +11,7 @@ from armident.identify.setup.calibration import CORRECTED, NAMED, probability
 from armident.identify.setup.contest import LEAST_ERROR, Contest, words_of
 from armident.identify.setup.describe import Described, corrected_robot, described, merged_scales
 from armident.identify.setup.plausible import LEAST_ODDS
-from armident.identify.setup.result import SetupFinding
+from armident.identify.setup.result import WIRED, SetupFinding
 from armident.identify.setup.search import LEAST_DROP, NOT_UNDERSTOOD, STRUCTURED, Search, Step
 
 Array = NDArray[np.float64]
@@ -29,13 +29,14 @@ LEAST_FALL = float(np.exp(0.5 * LEAST_DROP))
 class JudgedSearch:
     """Findings; the step with the mistakes that are corrected; the configuration with these corrections, if any.
 
-    ``likely``: the configuration with the corrections that are more likely right than wrong.
+    ``likely``, ``likely_step``: the same with the corrections that a diagnosis goes on with, see `SetupCheck`.
     """
 
     findings: tuple[SetupFinding, ...]
     step: Step
     robot: RobotConfig | None
     likely: RobotConfig | None
+    likely_step: Step
 
 
 def judged_search(search: Search, found: Step, robot: RobotConfig) -> JudgedSearch:
@@ -43,26 +44,27 @@ def judged_search(search: Search, found: Step, robot: RobotConfig) -> JudgedSear
     whole = merged_scales(found, search.bench)
     parts = described(whole, robot, search.bench)
     if not parts:
-        return JudgedSearch((), found, None, None)
+        return JudgedSearch((), found, None, None, found)
     contest = Contest(search, found, each_own=whole.each_own)
     judged = [judged_part(part, contest, robot) for part in parts]
     sure = _together(judged, [part.finding.correction for part in judged])
-    likely = [
-        part.finding.correction
-        or (part.finding.probability >= NAMED and explains(part.finding.kind, contest, _joints(part, robot)))
-        for part in judged
-    ]
-    kept = set().union(*(part.places for part in sure))
+    likely = _together(judged, [_is_likely(part.finding, contest, robot) for part in judged])
     named = set().union(*(part.places for part in judged))
     # Scales of torques that the motion does not determine are none.
     named |= {k for k, family in enumerate(whole.families) if family == "torque_scales"}
+
+    def corrected(parts: Sequence[Described]) -> Step:
+        kept = set().union(*(part.places for part in parts))
+        return whole.without(named - kept) if kept else replace(found, mistakes=())
+
     findings = [part.finding if part in sure else _doubtful(part, contest, robot) for part in judged]
     explained = not _lost(contest.before.errors, contest.before.memory)[contest.moving].any()
     return JudgedSearch(
         tuple(f for f in findings if f.correction or f.probability >= NAMED or not explained),
-        whole.without(named - kept) if kept else replace(found, mistakes=()),
+        corrected(sure),
         corrected_robot(sure, robot),
-        corrected_robot(_together(judged, likely), robot),
+        corrected_robot(likely, robot),
+        corrected(likely),
     )
 
 
@@ -72,8 +74,12 @@ def _together(parts: Sequence[Described], good: Sequence[bool]) -> list[Describe
     return [part for part in parts if not any(part.places & places for places in bad)]
 
 
-def _joints(part: Described, robot: RobotConfig) -> list[int]:
-    return indices(part.finding.joints, robot)
+def _is_likely(finding: SetupFinding, contest: Contest, robot: RobotConfig) -> bool:
+    """True for a correction that a diagnosis goes on with, see `SetupCheck`."""
+    joints = indices(finding.joints, robot)
+    before, after = (one.errors[contest.own(joints)] for one in (contest.before, contest.after))
+    likely = finding.probability >= NAMED and explains(finding.kind, contest, joints)
+    return finding.correction or (likely and (finding.kind not in WIRED or bool(np.all(before > LEAST_FALL * after))))
 
 
 def _lost(errors: Array, memory: Array) -> NDArray[np.bool_]:

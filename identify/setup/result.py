@@ -30,6 +30,10 @@ MOST_UNCERTAIN = 0.25
 """Largest standard deviation of a shift that is corrected, samples: half a sample is then known by a factor of 2."""
 
 
+WIRED = ("position_sign", "torque_sign", "joint_order")
+"""Kinds of findings that exchange or turn signals: every joint concerned is explained better by a right one."""
+
+
 @dataclass(frozen=True)
 class SetupFinding:
     """One mistake of the set-up.
@@ -147,8 +151,9 @@ class SetupCheck:
     ``relative_error_pct``, ``corrected_error_pct`` (n,): norm of the rigid model's torque residual over the torque,
     before and after correction. ``joints_not_understood``: over a third of the torque left, with no explanation.
     ``clock``: true over recorded duration. ``torque_shift``: common shift by less than a sample or two. ``stretch``:
-    the part of the time in which the arm is another one. ``likely_robot``: with the corrections that are more likely
-    right than wrong, which a diagnosis goes on with.
+    the part of the time in which the arm is another one. ``likely_robot``, ``likely_error_pct`` (n,): with the
+    corrections that a diagnosis goes on with: those more likely right than wrong, but of `WIRED` only the certain ones
+    and those that halve the error power of every joint concerned.
     """
 
     findings: tuple[SetupFinding, ...]
@@ -161,6 +166,7 @@ class SetupCheck:
     torque_shift: TorqueShift | None = None
     stretch: tuple[Span, ...] = ()
     likely_robot: RobotConfig | None = None
+    likely_error_pct: tuple[float, ...] = ()
 
 
 def with_torque_shift(experiments: Sequence[Experiment], shift: TorqueShift | None) -> Sequence[Experiment]:

@@ -168,7 +168,7 @@ class Search:
             other = self._greedy(step)
             needed = 0.0 if best.families else LEAST_ODDS
             better = all(self.gain(best, other, b)[0] > needed for b in (self.bench, self.bench.everywhere))
-            if better and self._material(first.h, other.h, LEAST_TOGETHER):
+            if better and self._material(first.h, other.h, LEAST_TOGETHER) and self._uncontradicted(first, other):
                 best = other
             clear = all(0.5 * RANKED_ROWS * (s.rank - step.rank) > LEAST_ODDS for s in starts[k + 1 : k + 2])
             if clear and self._explained(best.h):
@@ -250,6 +250,13 @@ class Search:
             powers.append(power / np.maximum((torque**2).sum(axis=0), 1e-300))
         falls = np.log(powers[0] / powers[1])[self.bench.moving]
         return float(min(falls.max(), np.clip(falls, -MOST_OF_ONE, MOST_OF_ONE).sum()))
+
+    def _uncontradicted(self, first: Step, other: Step) -> bool:
+        """True if no torque that another order or set changes is predicted worse by `LEAST_ODDS`."""
+        changed = np.any((first.h.position != other.h.position) | (first.h.torque != other.h.torque), axis=0)
+        drops = np.log(self.held_out(first.h) / self.held_out(other.h))
+        gains = 0.5 * independent_rows(fit(self.bench, other.h).residual) * drops
+        return bool(np.all(gains[changed & self.bench.moving] > -LEAST_ODDS))
 
     def _one_late(self, step: Step) -> Step | None:
         """Best delay of one drive alone; ``None`` for a single joint."""

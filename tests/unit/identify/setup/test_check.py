@@ -8,7 +8,10 @@ import pytest
 
 from armident.configs import DataError, RobotConfig, load_robot
 from armident.identify.identification.from_recording import experiments_from_recording
+from armident.identify.setup.bench import make_bench
 from armident.identify.setup.check import check_setup
+from armident.identify.setup.describe import as_configured
+from armident.identify.setup.search import Search, Step
 from armident.identify.setup.signals import one_way_findings
 from armident.identify.signals.experiments import Experiment
 from tests.fixtures import setups
@@ -383,3 +386,15 @@ def test_a_rotor_that_the_configuration_lacks_is_no_mistake_of_the_set_up(
     joints = list(arm.joints)
     joints[joint] = joints[joint].model_copy(update={"rotor_inertia": False})
     assert check_setup(healthy, arm.model_copy(update={"joints": tuple(joints)})).findings == ()
+
+
+@pytest.mark.parametrize("exchanged", [True, False])
+def test_both_torques_of_an_exchange_have_to_be_predicted_no_worse(exchanged: bool, arm: RobotConfig) -> None:
+    swap = setups.in_order(0, 2, 1)
+    recorded = setups.record(arm, 0)
+    search = Search(
+        make_bench(setups.with_torques(recorded, swap) if exchanged else recorded, arm, np.ones(3, np.bool_))
+    )
+    first = Step(as_configured(arm))
+    other = Step(replace(first.start, torque=swap))
+    assert search._uncontradicted(first, other) is exchanged
