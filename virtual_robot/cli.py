@@ -41,6 +41,13 @@ def robot(
     trajectory: Annotated[
         Path | None, typer.Option(help="Trajectory of --to-file. [default: that of the session's set points]")
     ] = None,
+    to_command: Annotated[
+        tuple[Path, Path] | None,
+        typer.Option(
+            help="Reference table (t, qr1 ...) to play without a bus, and the recording to write, with suffix .mcap: "
+            "the program of armident investigate --robot-command."
+        ),
+    ] = None,
     encoder_counts: Annotated[
         int | None, typer.Option(min=1, help="Counts per motor turn, with --to-file. [default: those of the robot]")
     ] = None,
@@ -81,6 +88,10 @@ def robot(
     from armident.virtual_robot.run import record_robot, run_robot
     from armident.virtual_robot.twin import STANDARD, ParameterChoice
 
+    if to_command is not None:
+        if to_file is not None or trajectory is not None:
+            raise ConfigError("--to-command has the trajectory and the file: leave --to-file and --trajectory out")
+        trajectory, to_file = to_command[0], to_command[1].with_suffix(".mcap")
     if to_file is None and (trajectory is not None or encoder_counts is not None):
         raise ConfigError("--trajectory and --encoder-counts belong to --to-file")
     if model is not None and draw_masses:

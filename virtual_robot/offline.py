@@ -1,12 +1,16 @@
 """Simulated recordings of the virtual arm without a bus, with the same drives and plant."""
 
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
 
 from armident.configs import ConfigError, RobotConfig, Trajectory
 from armident.configs.schema.scenario import Scenario
+from armident.configs.schema.trajectory import check_motion
 from armident.configs.units import counts_per_si
 from armident.daq.recording import Field, Mark, Recording, Stream
 from armident.virtual_robot import servo
@@ -21,9 +25,48 @@ COUNTER = 240
 """Overflow of the SYNC counter: SYNC k carries ``k % COUNTER + 1``."""
 
 
+@dataclass(frozen=True, eq=False)
+class ReferenceTable:
+    """Reference positions as a table: times (N,), s, and positions (N, n), rad or m; cubic between the rows."""
+
+    t: NDArray[np.float64]
+    q: NDArray[np.float64]
+
+    @classmethod
+    def read(cls, path: Path) -> "ReferenceTable":
+        """Read columns ``t`` and one reference per joint; raises ConfigError if the file is no such table."""
+        try:
+            table = np.loadtxt(path, delimiter=",", skiprows=1, ndmin=2)
+        except (OSError, ValueError) as error:
+            raise ConfigError(f"{path}: expected columns t and one reference per joint: {error}") from error
+        if table.shape[0] < 4 or table.shape[1] < 2 or not (np.diff(table[:, 0]) > 0.0).all():
+            raise ConfigError(f"{path}: expected at least four rows with increasing times and one joint or more")
+        return cls(table[:, 0] - table[0, 0], table[:, 1:])
+
+    @property
+    def period(self) -> float:
+        """Step of the table, s, to a nanosecond."""
+        return round(float(self.t[-1]) / (self.t.size - 1), 9)
+
+    @property
+    def start(self) -> tuple[float, ...]:
+        """Positions of the first row, rad or m, (n,)."""
+        return tuple(self.q[0].tolist())
+
+    def sample(self, period: float) -> NDArray[np.float64]:
+        """Return the positions (M, n), rad or m, at multiples of a period, s."""
+        times = np.arange(round(float(self.t[-1]) / period) + 1) * period
+        return np.asarray(CubicSpline(self.t, self.q)(np.minimum(times, self.t[-1])))
+
+    def check(self, robot: RobotConfig) -> None:
+        """Refuse a motion beyond the limits of a robot, as a trajectory does."""
+        period = 1e-3
+        check_motion(self.sample(period), period, robot, "reference")
+
+
 def simulate_recording(
     robot: RobotConfig,
-    trajectory: Trajectory,
+    trajectory: "Trajectory | ReferenceTable",
     seed: int,
     noise: float = 1.0,
     scenario: Scenario | None = None,

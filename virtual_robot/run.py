@@ -4,6 +4,7 @@ import json
 import logging
 import math
 import signal
+import zlib
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -15,6 +16,7 @@ from armident.configs import (
     RobotConfig,
     Scenario,
     SessionConfig,
+    Trajectory,
     load_robot,
     load_session,
     load_trajectory,
@@ -26,7 +28,7 @@ from armident.virtual_robot.arm import Arm, DriveBackend, design_drives
 from armident.virtual_robot.arm_parameters import with_scenario
 from armident.virtual_robot.inertias import base_parameters, has_stored_parameters
 from armident.virtual_robot.oddities import drive_oddities
-from armident.virtual_robot.offline import simulate_recording, with_encoder_counts
+from armident.virtual_robot.offline import ReferenceTable, simulate_recording, with_encoder_counts
 from armident.virtual_robot.plant import Plant
 from armident.virtual_robot.replay import Replay
 from armident.virtual_robot.server import Server
@@ -93,6 +95,8 @@ def record_robot(
 ) -> None:
     """Write a simulated recording of one trajectory of the virtual arm, without a bus; options as for ``run_robot``.
 
+    ``trajectory``: a trajectory, or a table of references (.csv), whose rate is that of the recording; each table has
+    noise of its own.
     ``encoder_counts``: per motor turn in place of the robot's, also for the control loops. Raises ConfigError if a file
     is wrong or exists, no trajectory is given, or the scenario has oddities.
     """
@@ -102,7 +106,12 @@ def record_robot(
     session, robot, setpoints = twin.session, twin.robot, twin.session.setpoints
     _describe(twin, config, None)
     file = trajectory if trajectory is not None or setpoints is None else setpoints.trajectory
-    if file is not None:
+    motion: Trajectory | ReferenceTable
+    period = session.sync_period
+    if file is not None and Path(file).suffix == ".csv":
+        motion = ReferenceTable.read(Path(file))
+        seed, period = seed + zlib.crc32(motion.q.tobytes()), motion.period
+    elif file is not None:
         motion = load_trajectory(file)
     elif twin.trajectory is not None:
         motion = twin.trajectory
@@ -117,7 +126,7 @@ def record_robot(
     if setpoints is not None:
         times = {"setpoint_every": setpoints.every, "settle": setpoints.settle_s}
     recording = simulate_recording(
-        robot, motion, seed, noise, hidden, session.sync_period,
+        robot, motion, seed, noise, hidden, period,
         velocity_feedback=velocity_feedback, parameters=twin.parameters, **times,
     )  # fmt: skip
     if truth is not None:

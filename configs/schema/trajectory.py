@@ -11,7 +11,7 @@ from armident.configs.schema.base import FrozenModel
 from armident.configs.schema.robot import RobotConfig
 
 RAMP_SHARE = 0.4
-"""Fraction of a move's duration spent accelerating, and again decelerating; the rest is at constant speed."""
+"""Usual share of a move's duration spent accelerating, and again decelerating; the rest is at constant speed."""
 
 LONGEST_S = 3600.0
 """Longest trajectory, s; its set points are kept in memory while it is played."""
@@ -31,11 +31,14 @@ class Move(FrozenModel):
         Duration of the move, s.
     dwell
         Time at rest after the move, s.
+    ramp
+        Share of the duration spent accelerating, and again decelerating; the rest is at constant speed.
     """
 
     to: tuple[float, ...]
     duration: Annotated[float, Field(gt=0)]
     dwell: Annotated[float, Field(ge=0)] = 0.0
+    ramp: Annotated[float, Field(gt=0, le=0.5)] = RAMP_SHARE
 
 
 class Fourier(FrozenModel):
@@ -152,7 +155,9 @@ class Trajectory(FrozenModel):
         for move in self.moves:
             target = np.array(move.to)
             inside = t >= begin - 1e-12
-            q[inside] = origin + _smooth_step((t[inside] - begin) / move.duration)[:, None] * (target - origin)
+            q[inside] = origin + _smooth_step((t[inside] - begin) / move.duration, move.ramp)[:, None] * (
+                target - origin
+            )
             origin, begin = target, begin + move.duration + move.dwell
         return q
 
@@ -171,32 +176,52 @@ class Trajectory(FrozenModel):
         ConfigError
             If a limit is exceeded or not known; names joint, limit and value.
         """
-        robot.check_movable(where)
-        if len(self.start) != robot.n:
-            raise ConfigError(f"{where}: {len(self.start)} joints, but {robot.name} has {robot.n}")
         period = 1e-3
-        q = self.sample(period)
-        qd = np.diff(q, axis=0) / period
-        qdd = np.diff(qd, axis=0) / period
-        for j, joint in enumerate(robot.joints):
-            low, high = joint.limits.position
-            if q[:, j].min() < low or q[:, j].max() > high:
-                raise ConfigError(
-                    f"{where}: {joint.name} moves over [{q[:, j].min():.3f}, {q[:, j].max():.3f}], "
-                    f"allowed is [{low:.3f}, {high:.3f}]"
-                )
-            for label, values, limit in (
-                ("velocity", qd[:, j], joint.limits.velocity),
-                ("acceleration", qdd[:, j], joint.limits.acceleration),
-            ):
-                peak = float(np.abs(values).max(initial=0.0))
-                if peak > limit * (1 + 1e-6):
-                    raise ConfigError(f"{where}: {joint.name} reaches {label} {peak:.3f}, allowed is {limit:.3f}")
+        check_motion(self.sample(period), period, robot, where)
 
 
-def _smooth_step(s: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Step from 0 to 1 for ``s`` in [0, 1] with a trapezoidal velocity whose ramps are half cosines."""
-    a = RAMP_SHARE
+def check_motion(q: NDArray[np.float64], period: float, robot: RobotConfig, where: str) -> None:
+    """Refuse sampled positions that exceed the limits of a robot.
+
+    Parameters
+    ----------
+    q
+        Positions, rad or m, shape (N, n).
+    period
+        Sampling period, s.
+    robot
+        Robot with limits of position, velocity and acceleration.
+    where
+        Name of the motion in messages.
+
+    Raises
+    ------
+    ConfigError
+        If a limit is exceeded or not known; names joint, limit and value.
+    """
+    robot.check_movable(where)
+    if q.shape[1] != robot.n:
+        raise ConfigError(f"{where}: {q.shape[1]} joints, but {robot.name} has {robot.n}")
+    qd = np.diff(q, axis=0) / period
+    qdd = np.diff(qd, axis=0) / period
+    for j, joint in enumerate(robot.joints):
+        low, high = joint.limits.position
+        if q[:, j].min() < low or q[:, j].max() > high:
+            raise ConfigError(
+                f"{where}: {joint.name} moves over [{q[:, j].min():.3f}, {q[:, j].max():.3f}], "
+                f"allowed is [{low:.3f}, {high:.3f}]"
+            )
+        for label, values, limit in (
+            ("velocity", qd[:, j], joint.limits.velocity),
+            ("acceleration", qdd[:, j], joint.limits.acceleration),
+        ):
+            peak = float(np.abs(values).max(initial=0.0))
+            if peak > limit * (1 + 1e-6):
+                raise ConfigError(f"{where}: {joint.name} reaches {label} {peak:.3f}, allowed is {limit:.3f}")
+
+
+def _smooth_step(s: NDArray[np.float64], a: float) -> NDArray[np.float64]:
+    """Step from 0 to 1 for ``s`` in [0, 1]; the ramps of its trapezoidal velocity are half cosines of length ``a``."""
     v = 1.0 / (1.0 - a)
     s = np.clip(s, 0.0, 1.0)
     rising = v * (s / 2 - a / (2 * np.pi) * np.sin(np.pi * s / a))

@@ -9,6 +9,7 @@ from armident.identify.documents.comparison import ComparisonDocument
 from armident.identify.documents.diagnosis import DiagnosisDocument
 from armident.identify.documents.files import write_atomically
 from armident.identify.documents.identification import IdentificationDocument
+from armident.identify.documents.investigation import InvestigationDocument
 from armident.identify.documents.prediction import PredictionDocument, PredictionsDocument
 from armident.identify.documents.setup import SetupDocument
 from armident.identify.documents.simulation import SimulationDocument
@@ -16,6 +17,7 @@ from armident.identify.documents.simulation import SimulationDocument
 SCHEMA_FILES: dict[str, type[Document]] = {
     "identification.schema.json": IdentificationDocument,
     "diagnosis.schema.json": DiagnosisDocument,
+    "investigation.schema.json": InvestigationDocument,
     "prediction.schema.json": PredictionDocument,
     "predictions.schema.json": PredictionsDocument,
     "comparison.schema.json": ComparisonDocument,

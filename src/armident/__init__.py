@@ -8,9 +8,9 @@
 
 Recordings: `Recording.from_arrays`, `read_recording`, `import_recording`, `simulate_recording`, `capture`.
 Configurations: `load_robot`, `load_session`.
-Work: `check`, `identify` with `Options`, `diagnose`, `compare`, `predict`, `design_trajectory`.
-Results: `CheckedSetup`, `Identification` (`load_identification`) and its `RobotModel`, `Diagnosis`, `ChangeTest`,
-`TorquePrediction`, `Design`. They print, show themselves in a notebook, and have ``report`` and ``save``.
+Work: `check`, `identify` with `Options`, `diagnose`, `investigate`, `compare`, `predict`, `design_trajectory`.
+Results: `CheckedSetup`, `Identification` (`load_identification`) and its `RobotModel`, `Diagnosis`, `Investigation`,
+`ChangeTest`, `TorquePrediction`, `Design`. They print, show themselves in a notebook, and have ``report`` and ``save``.
 Effects: `effects` lists them; `Effect`, `Linear`, `Shape`, `Place` and `Motion` make a new one.
 Errors: `ArmidentError`, and of it `ConfigError` and `DataError`.
 """
@@ -37,6 +37,8 @@ if TYPE_CHECKING:
     from armident.identify.api.identification_api import Identification as Identification
     from armident.identify.api.identification_api import identify as identify
     from armident.identify.api.identification_api import load_identification as load_identification
+    from armident.identify.api.investigation_api import Investigation as Investigation
+    from armident.identify.api.investigation_api import investigate as investigate
     from armident.identify.api.prediction_api import TorquePrediction as TorquePrediction
     from armident.identify.api.prediction_api import predict as predict
     from armident.identify.api.setup_api import CheckedSetup as CheckedSetup
@@ -61,6 +63,7 @@ _HOMES = {
     "armident.identify.api.comparison_api": ("ChangeTest", "compare"),
     "armident.identify.api.diagnosis_api": ("Diagnosis", "diagnose", "effects"),
     "armident.identify.api.identification_api": ("Identification", "load_identification"),
+    "armident.identify.api.investigation_api": ("Investigation", "investigate"),
     "armident.identify.api.prediction_api": ("TorquePrediction", "predict"),
     "armident.identify.api.setup_api": ("CheckedSetup", "check"),
     "armident.identify.api.trajectory_api": ("Design", "design_trajectory"),

@@ -1,0 +1,1 @@
+"""Investigation: motions that tell apart what a recording leaves open."""

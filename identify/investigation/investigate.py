@@ -1,0 +1,273 @@
+"""Questions to an arm until its recordings decide what is missing, or no allowed motion can tell."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import yaml
+
+from armident.configs import ConfigError, DataError, RobotConfig, Trajectory, load_robot
+from armident.configs.loading import load_trajectory
+from armident.daq.recording import Recording, read_recording
+from armident.daq.recording.writer import write_recording
+from armident.identify.diagnosis.criteria import Criteria
+from armident.identify.diagnosis.diagnose import DiagnosisResult, run_diagnosis
+from armident.identify.documents.base import reference, versions
+from armident.identify.documents.diagnosis import Finding
+from armident.identify.documents.files import load_document, to_json, write_atomically
+from armident.identify.documents.investigation import InvestigationDocument, InvestigationRound, Outcome
+from armident.identify.effects.unnamed import NAME as UNNAMED
+from armident.identify.excitation.collision import CollisionModel
+from armident.identify.identification.from_recording import experiments_of, rest_notes
+from armident.identify.investigation.choice import (
+    Chosen,
+    confirming_motion,
+    first_motion,
+    next_motion,
+    next_recording,
+)
+from armident.identify.investigation.rivals import uncertain
+from armident.identify.report.robot_file import robot_yaml
+
+Ask = Callable[[Trajectory], Recording]
+"""Plays a trajectory on the robot and returns the recording; DataError if it refuses to."""
+Progress = Callable[[str, float], None]
+
+FILE = "investigation.json"
+ROBOT = "robot.yaml"
+
+
+class Waiting(Exception):
+    """The recording of a motion comes later: the investigation pauses."""
+
+
+@dataclass
+class Investigating:
+    """An investigation that goes on: its document, its recordings, and the folder that keeps both.
+
+    A kill at any moment loses nothing but the diagnosis or the motion that runs: `resumed` goes on with the last round.
+    ``offered``: recordings of the past to ask in place of the arm.
+    """
+
+    robot: RobotConfig
+    recordings: list[Recording]
+    document: InvestigationDocument
+    folder: Path | None
+    criteria: Criteria
+    collision: CollisionModel
+    trajectories: list[Trajectory | None] = field(default_factory=list)
+    offered: Sequence[Recording] = ()
+    result: DiagnosisResult | None = None
+
+    @property
+    def pending(self) -> bool:
+        """True if the recording of the last motion is missing."""
+        last = self.document.rounds[-1] if self.document.rounds else None
+        return last is not None and last.recording is None and last.refused is None
+
+    def run(self, ask: Ask, progress: Progress | None = None) -> None:
+        """Ask until the outcome is known; `Waiting` of ``ask`` leaves the investigation as it is."""
+        report = progress or (lambda stage, share: None)
+        while self.document.outcome == "running":
+            if self.pending:
+                self._answer(ask, report)
+            else:
+                self._step(report)
+
+    def _step(self, progress: Progress) -> None:
+        """Diagnose all recordings, and enter the next motion or the outcome."""
+
+        def report(stage: str, share: float) -> None:
+            progress(f"round {len(self.document.rounds) + 1}: {stage}", share)
+
+        if not self.recordings:
+            self._enter(first_motion(self.robot, self.collision))
+            return
+        self.result = result = self._diagnosed(report)
+        document, rounds, state = result.document, self.document.rounds, result.first
+        self._update(explanations=document.explanations)
+        if self.folder is not None:
+            write_atomically(self.folder / "diagnosis.json", to_json(document))
+        healthy = document.verdict == "no_gap"
+        answered = any(one.recording is not None for one in rounds)
+        if state is None or (not uncertain(document.explanations) and (answered or not healthy)):
+            outcome, statement = _outcome(result)
+            self._update(outcome=outcome, statement=statement)
+        elif len(rounds) >= self.document.experiments:
+            self._stop(f"all {len(rounds)} motions have been used; allow more with --experiments")
+        else:
+            report("next motion", 1.0)
+            done = [one.chosen for one in rounds]
+            if self.offered:
+                chosen = next_recording(state, document.explanations, self.offered, done)
+            elif healthy:
+                chosen = confirming_motion(state, self.collision, done)
+            else:
+                chosen = next_motion(state, document.explanations, self.collision, done)
+            self._affordable(chosen)
+
+    def _affordable(self, chosen: Chosen) -> None:
+        """Enter a motion if there is one and the budget allows it; else stop."""
+        used, allowed, choice = self.document.motion_s, self.document.minutes, chosen.choice
+        if choice is None:
+            self._stop(_no_motion(chosen))
+        elif used + choice.duration_s > 60.0 * allowed:
+            self._stop(
+                f"{choice.words} takes {choice.duration_s:.0f} s, and {used:.0f} s of {allowed:g} min have been used; "
+                "allow more with --minutes"
+            )
+        else:
+            self._enter(chosen)
+
+    def _diagnosed(self, report: Progress) -> DiagnosisResult:
+        experiments, notes = experiments_of(self.recordings, self.robot, name_files=True)
+        notes += rest_notes(experiments, self.robot)
+        references = [reference(recording) for recording in self.recordings]
+        return run_diagnosis(
+            experiments, [], self.robot, references, None, list(dict.fromkeys(notes)), report, self.criteria
+        )
+
+    def _enter(self, chosen: Chosen) -> None:
+        """Enter a motion that is to be asked for, or the recording that answers already."""
+        assert chosen.choice is not None
+        number = len(self.document.rounds) + 1
+        name = None
+        if self.folder is not None and chosen.trajectory is not None:
+            name = f"motion_{number}.yaml"
+            content = chosen.trajectory.model_dump(mode="json", by_alias=True, exclude_defaults=True)
+            write_atomically(self.folder / name, yaml.safe_dump(content, sort_keys=False))
+        asked = InvestigationRound(
+            explanations=self.document.explanations,
+            question=chosen.question,
+            considered=list(chosen.considered),
+            chosen=chosen.choice,
+            trajectory=name,
+            recording=None if chosen.answer is None else reference(chosen.answer),
+        )
+        self.trajectories.append(chosen.trajectory)
+        self._update(rounds=[*self.document.rounds, asked])
+        if chosen.answer is not None:
+            self._keep(chosen.answer, chosen.choice.duration_s)
+
+    def _answer(self, ask: Ask, report: Progress) -> None:
+        """Ask for the last motion, and enter the recording, or the reason for which the robot refused it."""
+        rounds = self.document.rounds
+        last, trajectory = rounds[-1], self.trajectories[-1]
+        assert trajectory is not None
+        report(f"round {len(rounds)}: {last.chosen.words}", 0.0)
+        try:
+            recording = ask(trajectory)
+        except DataError as error:
+            self._update(rounds=[*rounds[:-1], last.model_copy(update={"refused": str(error)})])
+            return
+        if self.folder is not None and (recording.path is None or recording.path.parent != self.folder):
+            kept = self.folder / f"motion_{len(rounds)}.mcap"
+            write_recording(recording, kept)
+            recording = read_recording(kept)
+        answered = last.model_copy(update={"recording": reference(recording)})
+        self._update(rounds=[*rounds[:-1], answered])
+        self._keep(recording, trajectory.duration)
+
+    def _keep(self, recording: Recording, duration: float) -> None:
+        self.recordings.append(recording)
+        self._update(motion_s=self.document.motion_s + duration)
+
+    def _stop(self, reason: str) -> None:
+        """End without a decision, for a reason."""
+        assert self.result is not None
+        doubtful = uncertain(self.result.document.explanations)
+        unnamed = all(one.likely[0] == UNNAMED for one in doubtful)
+        outcome: Outcome = "unnamed" if doubtful and unnamed else "cannot_tell"
+        left = "; ".join(f"{one.joint}: {one.sentence}" for one in doubtful) or "nothing is decided"
+        self._update(outcome=outcome, statement=f"{left}. {reason[0].upper()}{reason[1:]}.")
+
+    def _update(self, **changes: object) -> None:
+        self.document = self.document.model_copy(update=changes)
+        if self.folder is not None:
+            write_atomically(self.folder / FILE, to_json(self.document))
+
+
+def started(
+    robot: RobotConfig,
+    recordings: Sequence[Recording],
+    experiments: int,
+    minutes: float,
+    criteria: Criteria,
+    collision: CollisionModel,
+    folder: Path | None,
+) -> Investigating:
+    """Return a new investigation. Raises ConfigError if the folder has one already, or a limit is not positive."""
+    if experiments < 1 or not minutes > 0.0:
+        raise ConfigError("--experiments and --minutes: expected at least one motion and a time greater than 0")
+    robot.check_movable("investigate")
+    kept = list(recordings)
+    if folder is not None:
+        if (folder / FILE).exists():
+            raise ConfigError(f"{folder}: has an investigation already; go on with --continue, or give another --out")
+        write_atomically(folder / ROBOT, robot_yaml(robot))
+        for k, recording in enumerate(kept):
+            if recording.path is None:
+                write_recording(recording, folder / f"start_{k + 1}.mcap")
+                kept[k] = read_recording(folder / f"start_{k + 1}.mcap")
+    document = InvestigationDocument(
+        robot=robot.name,
+        recordings=[reference(recording) for recording in kept],
+        experiments=experiments,
+        minutes=minutes,
+        versions=versions(),
+    )
+    found = Investigating(robot, kept, document, folder, criteria, collision)
+    found._update()
+    return found
+
+
+def resumed(folder: Path, criteria: Criteria, collision: CollisionModel | None = None) -> Investigating:
+    """Return the investigation of a folder. Raises ConfigError if there is none, DataError if a recording changed."""
+    if not (folder / FILE).is_file():
+        raise ConfigError(f"{folder}: no {FILE} in this folder")
+    document = load_document(folder / FILE, InvestigationDocument)
+    robot = load_robot(folder / ROBOT, "investigate")
+    expected = [*document.recordings, *(one.recording for one in document.rounds if one.recording is not None)]
+    recordings = []
+    for one in expected:
+        recordings.append(read_recording(Path(str(one.path))))
+        if recordings[-1].sha256 != one.sha256:
+            raise DataError(f"{one.path}: is not the recording that the investigation used; restore it")
+    trajectories = [
+        None if one.trajectory is None else load_trajectory(folder / one.trajectory) for one in document.rounds
+    ]
+    return Investigating(
+        robot, recordings, document, folder, criteria, collision or CollisionModel(robot, []), trajectories
+    )
+
+
+def _outcome(result: DiagnosisResult) -> tuple[Outcome, str]:
+    """Return the outcome of a diagnosis in which every joint is decided, in one word and in one sentence."""
+    document = result.document
+    findings = [one for one in document.findings if one.effect != UNNAMED]
+    mistakes = [one for one in findings if "odds" not in one.evidence and one.kind == "structure"]
+    if mistakes:
+        return "set_up", f"{_named(mistakes)}: correct the configuration, then record again."
+    if findings:
+        return "named", f"{_named(findings)}."
+    if document.verdict == "no_gap":
+        return "healthy", "The model explains all recordings; none of the motions shows a missing effect."
+    left = "; ".join(one.sentence for one in document.unexplained)
+    return "unnamed", f"Something is missing that has no name in the catalogue. {left}".strip()
+
+
+def _named(findings: Sequence[Finding]) -> str:
+    return "; ".join(
+        f"{one.effect.replace('_', ' ')} at {one.joint}, probability {one.probability}" for one in findings
+    )
+
+
+def _no_motion(chosen: Chosen) -> str:
+    """Return the reason for which no motion is left."""
+    barred = next((one for one in chosen.considered if one.excluded is not None), None)
+    if barred is not None:
+        return f"the motion that would tell most ({barred.words}) is not allowed: {barred.excluded}"
+    best = max((one.expected_gain or 0.0 for one in chosen.considered), default=0.0)
+    if best == 0.0:
+        return "no motion is left that has not been asked for"
+    return f"no motion of the list tells them apart: the best one promises {best:.2f} nats"

@@ -1,0 +1,112 @@
+"""Explanations of a joint's disagreement that a motion shall tell apart, with the torques that they predict."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from armident.configs import DataError
+from armident.identify.diagnosis.candidates import Candidate, ColumnCache, Shapes, candidates
+from armident.identify.diagnosis.model_state import ModelState, fitted_in_loop_of, with_entries
+from armident.identify.diagnosis.probabilities import NOTHING
+from armident.identify.diagnosis.screening import refined, screened
+from armident.identify.documents.diagnosis import Explanation
+from armident.identify.effects.recording_corrections import of_recording
+from armident.identify.effects.registry import known
+from armident.identify.effects.terms import Term, entry_of
+from armident.identify.effects.unnamed import NAME as UNNAMED
+from armident.identify.robot.chain import Floats
+from armident.identify.robot.motion import Motion
+
+LEAST = 0.02
+"""Least probability of a name that is a rival: others cannot be the answer of one more recording."""
+OTHERS = 3
+"""Effects that share the probability of something without a name: those whose score statistic is largest."""
+STEP = 1.1
+"""Ratio of a nonlinear parameter by which the derivative of a torque by it is taken."""
+
+
+@dataclass(frozen=True, eq=False)
+class Rival:
+    """One explanation of a joint: an effect with its estimated parameters, or nothing.
+
+    ``values`` (k,): linear parameters of the ``term``, SI; both are ``None`` for nothing.
+    """
+
+    name: str
+    probability: float
+    term: Term | None = None
+    values: Floats | None = None
+
+    def columns(self, motion: Motion) -> Floats:
+        """Return the torques of all joints per unit of each free parameter, (N, n, k + s).
+
+        The first k are the linear parameters, the others first-order changes by each continuous nonlinear one.
+        """
+        term = self.term
+        assert term is not None
+        assert self.values is not None
+        parts = [term.columns(motion)]
+        for name in term.effect.movable(motion.model.robot, term.place, term.shapes):
+            ends = [
+                replace(term, shapes={**term.shapes, name: factor * term.shapes[name]}).columns(motion)
+                for factor in (STEP, 1.0 / STEP)
+            ]
+            parts.append(((ends[0] - ends[1]) @ self.values)[:, :, None])
+        return np.concatenate(parts, axis=2)
+
+
+def rivals_of(state: ModelState, explanation: Explanation) -> list[Rival]:
+    """Return the explanations of a joint with their probabilities; the last one is that nothing is missing.
+
+    ``state``: model as configured, fitted to all recordings so far. What has no name is represented by those effects
+    that the data favour most; names that the recordings cannot show are left out.
+    """
+    joint = state.study.joints.index(explanation.joint)
+    cache, fit = ColumnCache(state.study, state.fit.theta), state.fit.renoised(state.weights)
+    best: dict[str, tuple[float, Candidate, Shapes]] = {}
+    for candidate in candidates(cache):
+        name, place = candidate.effect.name, candidate.place
+        here = candidate.effect.scope == "arm" or joint in (place.joint, place.other)
+        found = screened(fit, candidate, cache) if here and name != UNNAMED else None
+        if found is not None and found[0] > best.get(name, (-np.inf,))[0]:
+            best[name] = (found[0], candidate, found[1])
+    named = {name: p for name, p in explanation.names.items() if p >= LEAST and name in best}
+    others = sorted((name for name in best if name not in named), key=lambda name: -best[name][0])[:OTHERS]
+    shared = explanation.names.get(UNNAMED, 0.0) / max(len(others), 1)
+    if shared >= LEAST:
+        named |= {name: shared for name in others}
+    made = [one for name, p in named.items() if (one := _fitted(state, name, p, *best[name][1:])) is not None]
+    rest = max(1.0 - sum(one.probability for one in made), LEAST)
+    return [*made, Rival(NOTHING, rest)]
+
+
+def _fitted(state: ModelState, name: str, probability: float, candidate: Candidate, shapes: Shapes) -> Rival | None:
+    """Return a rival with its estimated parameters; ``None`` if the recordings do not determine them."""
+    effect, place = candidate.effect, candidate.place
+    if shapes:
+        cache, fit = ColumnCache(state.study, state.fit.theta), state.fit.renoised(state.weights)
+        found = screened(fit, candidate, cache)
+        shapes = shapes if found is None else refined(fit, candidate, cache, found)
+    spared = tuple(p.name for p in known(effect.key).linear if p not in effect.linear)
+    entry = entry_of(effect, place, state.robot, dict(shapes), spared)
+    made = None if of_recording(entry) else fitted_in_loop_of(state, with_entries(state.robot, [entry]))
+    if made is None:
+        return None
+    term = made.term_of(entry)
+    return Rival(name, probability, term, made.values_of(term)[0])
+
+
+def uncertain(explanations: Sequence[Explanation]) -> list[Explanation]:
+    """Return the explanations of joints that are not decided, the most uncertain one first."""
+    doubtful = [one for one in explanations if one.doubtful]
+    return sorted(doubtful, key=lambda one: -entropy(list(one.names.values())))
+
+
+def entropy(probabilities: Sequence[float]) -> float:
+    """Return the entropy of probabilities, nats."""
+    p = np.array([one for one in probabilities if one > 0.0])
+    if p.size == 0:
+        raise DataError("an explanation has no probabilities")
+    p = p / p.sum()
+    return float(-(p * np.log(p)).sum())

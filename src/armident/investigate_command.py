@@ -1,0 +1,202 @@
+"""Command ``armident investigate``: ask an arm by a program, by hand, or from recordings of the past."""
+
+import shlex
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import numpy as np
+import typer
+
+if TYPE_CHECKING:
+    from armident.configs import RobotConfig, Trajectory
+    from armident.daq.recording import Recording
+    from armident.identify.api.investigation_api import Investigation
+
+RATE_HZ = 1000.0
+"""Rate of a trajectory for a program where no recording gives one, Hz."""
+PRINTED = 400
+"""Last characters of the output of a program that a refusal quotes."""
+
+
+def investigate(
+    recordings: Annotated[
+        list[Path] | None,
+        typer.Argument(help="Recordings from before, or with --continue that of the last motion.", show_default=False),
+    ] = None,
+    config: Annotated[
+        Path | None,
+        typer.Option("--config", help="Robot configuration with limits. [default: the one inside the recording]"),
+    ] = None,
+    robot_command: Annotated[
+        str | None,
+        typer.Option(
+            "--robot-command",
+            help="Program that moves the robot: it is called with TRAJECTORY.csv and the file to write, and fails to "
+            "refuse the motion.",
+        ),
+    ] = None,
+    by_hand: Annotated[
+        bool, typer.Option("--by-hand", help="Write the next trajectory, say what to do, and end.")
+    ] = False,
+    choose_from: Annotated[
+        Path | None, typer.Option("--replay", help="Folder of recordings of the past to ask in place of the arm.")
+    ] = None,
+    resume: Annotated[Path | None, typer.Option("--continue", help="Folder of an investigation to go on with.")] = None,
+    experiments: Annotated[int, typer.Option("--experiments", help="Most motions.", min=1)] = 6,
+    minutes: Annotated[float, typer.Option("--minutes", help="Longest motion of all rounds together, min.")] = 10.0,
+    material: Annotated[
+        float, typer.Option("--material", help="Least change of a joint's torque by a finding, percent.", min=0.0)
+    ] = 0.2,
+    yes: Annotated[bool, typer.Option("--yes", help="Move without asking.")] = False,
+    out: Annotated[Path | None, typer.Option("--out", help="Folder for the results. [default: investigation]")] = None,
+    json: Annotated[bool, typer.Option("--json", help="Print only the result document on stdout.")] = False,
+) -> None:
+    """Ask an arm to move until its recordings decide what its model lacks.
+
+    Each round diagnoses all recordings and asks for the motion that tells the explanations apart most per second. It
+    ends with a name and its probability, or says why no motion can tell.
+
+    The program of --robot-command reads columns t and qr1, qr2 ... (s, rad or m, at the rate of the recordings), moves
+    the robot to the first row, plays the rows, and writes a file that `armident import` reads.
+
+    Exit code 0 if nothing is missing, 3 if the set-up is wrong, 4 if something is missing or is not decided, or waits.
+
+    Example: armident investigate monday.mcap --by-hand --out why
+
+    Example: armident investigate --continue why tuesday.mcap
+
+    Example: armident investigate monday.mcap --robot-command 'armident robot --config tx40.yaml --to-command'
+    """
+    from armident.configs import ConfigError, DataError, load_robot
+    from armident.configs.errors import FOUND
+    from armident.daq.recording import read_recording
+    from armident.identify.api.investigation_api import investigate as run
+    from armident.identify.documents.investigation import OUTCOMES
+
+    doors = [robot_command is not None, by_hand, choose_from is not None]
+    if sum(doors) > 1 or (resume is None and not any(doors)):
+        raise ConfigError("give one way to ask: --robot-command PROGRAM, --by-hand, or --replay FOLDER")
+    if resume is not None and (out is not None or config is not None):
+        raise ConfigError("--continue: robot and folder are those of the investigation; leave --config and --out out")
+    folder = resume or out or Path("investigation")
+    read = [read_recording(path) for path in recordings or ()]
+    if config is None and not read and resume is None:
+        raise ConfigError("--config: give the robot, or a recording from before")
+    offered = [] if choose_from is None else [read_recording(path) for path in sorted(choose_from.glob("*.mcap"))]
+    if choose_from is not None and not offered:
+        raise ConfigError(f"--replay {choose_from}: no recordings (.mcap) in this folder")
+    command = shlex.split(robot_command or "")
+    if robot_command is not None:
+        if shutil.which(next(iter(command), "")) is None:
+            raise ConfigError(f"--robot-command {robot_command}: no such program")
+        if not yes and not sys.stdin.isatty():
+            raise ConfigError("the robot would move, and nobody can be asked here: add --yes")
+    bars = _Bars()
+    door: Callable[[Trajectory], Recording] | None = None
+    if robot_command is not None:
+        given = folder / "robot.yaml" if resume is not None else config
+        robot = read[0].robot if given is None else load_robot(given, "trajectory")
+        door = _Program(command, robot, folder, read[0].sample_rate_hz if read else RATE_HZ)
+    asked = None if door is None else _confirmed(door, bars, always=yes)
+    with bars:
+        found = run(
+            config, asked, read, choose_from=offered, experiments=experiments, minutes=minutes, material=material,
+            out=None if resume is not None else folder, resume=resume, progress=bars.report,
+        )  # fmt: skip
+    written, html, model = found.save(folder)
+    if json:
+        sys.stdout.write(written.read_text(encoding="utf-8"))
+    else:
+        _print(found, folder, OUTCOMES[found.document.outcome])
+        print(f"result: {written}\nreport: {html}\nmodel:  {model}")
+    code = {"healthy": 0, "set_up": DataError.exit_code}.get(found.outcome, FOUND)
+    if code:
+        raise typer.Exit(code)
+
+
+def _print(found: "Investigation", folder: Path, meaning: str) -> None:
+    document = found.document
+    for number, one in enumerate(document.rounds, 1):
+        answer = one.refused or ("answered" if one.recording is not None else "awaited")
+        print(f"round {number}: {one.question}\n  {one.chosen.words}, {one.chosen.duration_s:.1f} s: {answer}")
+    print(f"{document.robot}: {document.outcome.replace('_', ' ')}. {document.statement or meaning}")
+    if found.pending is not None:
+        file = folder / str(document.rounds[-1].trajectory)
+        print(
+            f"next: record the motion of {file}, then: armident investigate --continue {folder} RECORDING\n"
+            f"  its set points as a table: armident simulate --trajectory {file} ...; on a bus: armident capture"
+        )
+
+
+class _Bars(ExitStack):
+    """Progress of the stages; it pauses while the user is asked."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._report: Callable[[str, float], None] | None = None
+        self.stage = ""
+
+    def report(self, stage: str, share: float) -> None:
+        """Show a stage and its share."""
+        from armident.identify.cli.progress import progress
+
+        self.stage = stage
+        if self._report is None:
+            self._report = self.enter_context(progress("investigate"))
+        self._report(stage, share)
+
+    def pause(self) -> None:
+        """Remove the bar until the next stage."""
+        self._report = None
+        self.close()
+
+
+def _confirmed(
+    door: "Callable[[Trajectory], Recording]", bars: _Bars, *, always: bool
+) -> "Callable[[Trajectory], Recording]":
+    """Return a door that says what it will do, and asks before it moves the robot."""
+
+    def asked(trajectory: "Trajectory") -> "Recording":
+        bars.pause()
+        print(f"{bars.stage}, {trajectory.duration:.1f} s", file=sys.stderr)
+        if not always and not typer.confirm("Move the robot?", err=True):
+            raise typer.Abort
+        return door(trajectory)
+
+    return asked
+
+
+class _Program:
+    """A program that moves the robot: ``PROGRAM TRAJECTORY.csv OUT``."""
+
+    def __init__(self, command: list[str], robot: "RobotConfig", folder: Path, rate_hz: float) -> None:
+        self._command, self._robot, self._folder, self._rate_hz = command, robot, folder, rate_hz
+
+    def __call__(self, trajectory: "Trajectory") -> "Recording":
+        """Call the program, and import the file that it leaves; DataError if it refuses or leaves none."""
+        from armident.configs import DataError
+        from armident.daq.interchange.importing import import_recording
+        from armident.daq.interchange.readers import reader_of
+        from armident.daq.recording import read_recording
+
+        number = 1 + len(list(self._folder.glob("reference_*.csv")))
+        reference, answer = self._folder / f"reference_{number}.csv", self._folder / f"answer_{number}.csv"
+        period = 1.0 / self._rate_hz
+        q = trajectory.sample(period)
+        header = ",".join(["t", *(f"qr{j + 1}" for j in range(q.shape[1]))])
+        table = np.column_stack([period * np.arange(len(q)), q])
+        np.savetxt(reference, table, "%.9g", delimiter=",", header=header, comments="")
+        words = [*self._command, str(reference), str(answer)]
+        done = subprocess.run(words, capture_output=True, text=True, check=False)
+        if done.returncode != 0:
+            printed = " ".join((done.stderr or done.stdout).split())[-PRINTED:]
+            raise DataError(f"the program ended with exit code {done.returncode}: {printed or 'it printed nothing'}")
+        written = [path for path in sorted(self._folder.glob(f"answer_{number}.*")) if path.is_file()]
+        if not written:
+            raise DataError(f"the program left no file {answer}")
+        return read_recording(written[0]) if reader_of(written[0]).own else import_recording(written[0], self._robot)
