@@ -58,7 +58,7 @@ def first_motion(robot: RobotConfig, collision: CollisionModel) -> Chosen:
 
 def confirming_motion(state: ModelState, collision: CollisionModel, done: Sequence[MotionChoice]) -> Chosen:
     """Return the motion that confirms that nothing is missing: an excitation of all joints, if it is not done yet."""
-    made = _excitation(state.robot, _reach(state), state.fit.theta, collision)
+    made = _excitation(state.robot, reach_of_recordings(state), state.fit.theta, collision)
     asked = "does a second motion show anything that is missing?"
     return Chosen(asked, (made[0],)) if _key(made[0]) in map(_key, done) else Chosen(asked, (made[0],), *made)
 
@@ -70,7 +70,7 @@ def next_motion(
 
     ``state``: model as configured, fitted to all recordings so far. ``explanations``: of its joints.
     """
-    reach, past = _reach(state), {_key(one) for one in done}
+    reach, past = reach_of_recordings(state), {_key(one) for one in done}
     open_questions, asked = _questions(state, explanations)
     made: list[tuple[float, MotionChoice, Trajectory]] = []
     for one, posed in open_questions:
@@ -187,7 +187,7 @@ def _excitation(
     return MotionChoice(motion=EXCITATION, words=words, duration_s=design.trajectory.duration), design.trajectory
 
 
-def _reach(state: ModelState) -> Reach:
+def reach_of_recordings(state: ModelState) -> Reach:
     """Return the limits of motions by the recordings so far."""
     every = [s.measured for s in (*state.study.train, *state.study.held)]
     speeds = np.max([np.abs(s.qd).max(axis=0) for s in every], axis=0)

@@ -12,10 +12,16 @@ from armident.daq.recording import Recording, read_recording
 from armident.daq.recording.writer import write_recording
 from armident.identify.diagnosis.criteria import Criteria
 from armident.identify.diagnosis.diagnose import DiagnosisResult, run_diagnosis
+from armident.identify.diagnosis.model_state import ModelState
 from armident.identify.documents.base import reference, versions
-from armident.identify.documents.diagnosis import Finding
+from armident.identify.documents.diagnosis import Explanation, Finding
 from armident.identify.documents.files import load_document, to_json, write_atomically
-from armident.identify.documents.investigation import InvestigationDocument, InvestigationRound, Outcome
+from armident.identify.documents.investigation import (
+    InvestigationDocument,
+    InvestigationRound,
+    MotionChoice,
+    Outcome,
+)
 from armident.identify.effects.unnamed import NAME as UNNAMED
 from armident.identify.excitation.collision import CollisionModel
 from armident.identify.identification.from_recording import experiments_of, rest_notes
@@ -97,14 +103,15 @@ class Investigating:
             self._stop(f"all {len(rounds)} motions have been used; allow more with --experiments")
         else:
             report("next motion", 1.0)
-            done = [one.chosen for one in rounds]
-            if self.offered:
-                chosen = next_recording(state, document.explanations, self.offered, done)
-            elif healthy:
-                chosen = confirming_motion(state, self.collision, done)
-            else:
-                chosen = next_motion(state, document.explanations, self.collision, done)
-            self._affordable(chosen)
+            self._affordable(self.choose(state, document.explanations, [one.chosen for one in rounds]))
+
+    def choose(self, state: ModelState, explanations: Sequence[Explanation], done: Sequence[MotionChoice]) -> Chosen:
+        """Return the next motion, or recording of the past. ``done``: those of earlier rounds."""
+        if self.offered:
+            return next_recording(state, explanations, self.offered, done)
+        if not uncertain(explanations):
+            return confirming_motion(state, self.collision, done)
+        return next_motion(state, explanations, self.collision, done)
 
     def _affordable(self, chosen: Chosen) -> None:
         """Enter a motion if there is one and the budget allows it; else stop."""

@@ -12,7 +12,8 @@ from tests.evaluation.plants.draft import Draft, configuration, draw_draft, nois
 from tests.evaluation.plants.effects import NAMED, OUTSIDE, HiddenEffect, Place, Shapes
 from tests.evaluation.plants.halves import HALVES, Half, Ranges
 from tests.evaluation.plants.mistakes import MISTAKES, SetUp
-from tests.evaluation.plants.plant import Diverged, Plant, Run
+from tests.evaluation.plants.motions import Motion
+from tests.evaluation.plants.plant import Diverged, Plant, Run, simulate
 from tests.evaluation.plants.slots import SMOOTHING
 from tests.evaluation.plants.truth import ACCEPTED, Family, block
 from tests.evaluation.plants.visibility import rigid_residual
@@ -125,10 +126,29 @@ def make_case(half: Half, index: int, *, with_twin: bool = False) -> RandomCase:
     ``half``: half of the suite; ``index``: number of the case, from 0; ``with_twin``: simulate the healthy twin of a
     case with an effect of the catalogue too. Raises Diverged if no drawn arm has a stable loop.
     """
+    return _drawn(half, index, with_twin)[2]
+
+
+def answering(half: Half, index: int) -> Callable[[Floats, int], Recording]:
+    """Return the arm of a case as a function of references at its step of control (K, n), and the number of its noise.
+
+    Rows of a recording differ from those of its case by motion and noise alone.
+    """
+    draft, hidden, _ = _drawn(half, index, False)
+
+    def play(position: Floats, number: int) -> Recording:
+        motion = Motion(position, np.gradient(position, draft.plant.step, axis=0))
+        run = noisy(draft, 1 + number, simulate(hidden.plant, motion, (*draft.seed, 11 + number)))
+        return _arrays(hidden.recorded(run), draft.with_reference)
+
+    return play
+
+
+def _drawn(half: Half, index: int, with_twin: bool) -> tuple[Draft, _Hidden, RandomCase]:
     family, kind = kind_of(half, index)
     ranges = HALVES[half]
     name = f"{half}_{index:04d}"
-    best: RandomCase | None = None
+    best: tuple[Draft, _Hidden, RandomCase] | None = None
     for attempt in range(ATTEMPTS):
         try:
             draft, hidden = _attempt(name, family, kind, ranges, (ranges.entropy, 2, index, attempt))
@@ -139,9 +159,9 @@ def make_case(half: Half, index: int, *, with_twin: bool = False) -> RandomCase:
                 case = replace(case, twin=_twin(name, draft))
         except Diverged:
             continue
-        if best is None or case.truth.visibility > best.truth.visibility:
-            best = case
-        if family not in ("effect", "outside") or best.truth.visibility >= LEAST_SEEN:
+        if best is None or case.truth.visibility > best[2].truth.visibility:
+            best = draft, hidden, case
+        if family not in ("effect", "outside") or best[2].truth.visibility >= LEAST_SEEN:
             break
     if best is None:
         raise Diverged(f"random arm {name}: no stable loop in {ATTEMPTS} attempts")

@@ -1,0 +1,174 @@
+"""Right names after each motion of an investigation of random arms: ``python -m tests.evaluation.asking --help``.
+
+The first recording of a case is given; up to four motions are asked for. ``best`` is the choice of `investigate`,
+``excitation`` another exciting trajectory each time, ``random`` a random motion of a random joint: same diagnosis.
+"""
+
+import argparse
+import json
+import multiprocessing
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from armident.configs import DataError, Trajectory
+from armident.daq.api import import_recording
+from armident.daq.recording import Recording
+from armident.identify.diagnosis.criteria import Criteria
+from armident.identify.diagnosis.model_state import ModelState
+from armident.identify.documents.diagnosis import Explanation
+from armident.identify.documents.investigation import MotionChoice
+from armident.identify.effects.unnamed import NAME as UNNAMED
+from armident.identify.excitation.collision import CollisionModel
+from armident.identify.excitation.design import design_trajectory
+from armident.identify.investigation import choice as choices
+from armident.identify.investigation.choice import Chosen
+from armident.identify.investigation.investigate import Investigating, started
+from armident.identify.investigation.motions import FAMILIES
+from tests.evaluation.process import ONE_THREAD
+
+MOTIONS = 4
+"""Most motions of a case."""
+MINUTES = 6.0
+"""Longest motion of a case, min."""
+SECONDS = (30.0, 60.0, 120.0)
+"""Times of motion after which the share of right names is counted, s."""
+RIGHT = 0.5
+"""Least probability of a name that counts."""
+
+
+class Excited(Investigating):
+    """Asks for exciting trajectories, each with another seed."""
+
+    def choose(self, state: ModelState, explanations: Sequence[Explanation], done: Sequence[MotionChoice]) -> Chosen:
+        """Return another exciting trajectory."""
+        made = design_trajectory(
+            state.robot, choices.EXCITATION_S, seed=len(done), evaluations=choices.EVALUATIONS, theta=state.fit.theta
+        )
+        motion = MotionChoice(motion="excitation", words="excitation", duration_s=made.trajectory.duration)
+        return Chosen("", (motion,), motion, made.trajectory)
+
+
+class Drawn(Investigating):
+    """Asks for random motions of random joints."""
+
+    def choose(self, state: ModelState, explanations: Sequence[Explanation], done: Sequence[MotionChoice]) -> Chosen:
+        """Return a random motion within the limits."""
+        rng = np.random.default_rng([len(done), int(self.recordings[0].sha256[:8], 16)])
+        reach = choices.reach_of_recordings(state)
+        while True:
+            family, joint = FAMILIES[rng.integers(len(FAMILIES))], int(rng.integers(state.robot.n))
+            other = (joint + 1) % state.robot.n
+            trajectory = family.trajectory(reach, joint, float(rng.choice(family.sizes)), other)
+            if choices.excluded(state.robot, trajectory, state.fit.theta, self.collision) is None:
+                motion = MotionChoice(motion=family.name, words=family.name, duration_s=trajectory.duration)
+                return Chosen("", (motion,), motion, trajectory)
+
+
+WAYS: dict[str, type[Investigating]] = {"best": Investigating, "excitation": Excited, "random": Drawn}
+
+
+def investigated(half: str, index: int, way: str, out: Path) -> dict[str, Any]:
+    """Return what is said after each motion of a case, with the truth."""
+    folder = out / f"{half}-{index:04d}-{way}"
+    folder.mkdir(parents=True, exist_ok=True)
+    plants = [sys.executable, "-m", "tests.evaluation.plants"]
+    subprocess.run([*plants, "--half", half, "--first", str(index), "--cases", "1", "--out", str(folder)], check=True)
+    name = f"{half}_{index:04d}"
+    truth = json.loads((folder / f"{name}.truth.json").read_text(encoding="utf-8"))
+    first = import_recording(folder / f"{name}_a.npz", folder / f"{name}.yaml")
+    begin = time.process_time()
+    going = started(first.robot, [first], MOTIONS, MINUTES, Criteria(), CollisionModel(first.robot, []), folder)
+    going = WAYS[way](going.robot, going.recordings, going.document, going.folder, going.criteria, going.collision)
+    program = [*plants[:2], "tests.evaluation.plants.answer", "--half", half, "--case", str(index)]
+    going.run(_ask(program, first, folder))
+    document = going.document
+    said = [[entry.names for entry in one.explanations] for one in document.rounds]
+    return {
+        "case": f"{half}-{index:04d}", "way": way, "family": truth["family"], "kind": truth["kind"],
+        "accepted": truth["accepted"], "visibility": truth["visibility"], "outcome": document.outcome,
+        "said": [*said, [entry.names for entry in document.explanations]],
+        "seconds": [0.0, *np.cumsum([one.chosen.duration_s for one in document.rounds])],
+        "motions": [one.chosen.motion for one in document.rounds],
+        "refused": sum(one.refused is not None for one in document.rounds),
+        "cpu_s": time.process_time() - begin,
+    }  # fmt: skip
+
+
+def _ask(program: Sequence[str], first: Recording, folder: Path) -> Callable[[Trajectory], Recording]:
+    def ask(trajectory: Trajectory) -> Recording:
+        period, number = 1.0 / first.sample_rate_hz, 1 + len(list(folder.glob("reference_*.csv")))
+        q = trajectory.sample(period)
+        reference, answer = folder / f"reference_{number}.csv", folder / f"answer_{number}.npz"
+        np.savetxt(reference, np.column_stack([period * np.arange(len(q)), q]), delimiter=",", header="t", comments="")
+        done = subprocess.run([*program, str(reference), str(answer)], capture_output=True, text=True, check=False)
+        if done.returncode != 0:
+            raise DataError(done.stderr.strip().splitlines()[-1])
+        return import_recording(answer, first.robot)
+
+    return ask
+
+
+def right(case: dict[str, Any], said: Sequence[dict[str, float]]) -> bool:
+    """Return True if the most probable name of all joints is right, or rightly none is probable."""
+    named = [(p, name) for names in said for name, p in names.items() if name not in (UNNAMED, "nothing")]
+    best = max(named, default=(0.0, ""))
+    if not case["accepted"]:
+        return best[0] < RIGHT
+    return best[0] >= RIGHT and best[1] in case["accepted"]
+
+
+def table(cases: Sequence[dict[str, Any]]) -> str:
+    """Return the shares of right answers by way, family, number of motions and seconds."""
+    head = ["way", "family", "cases", *(f"after {k}" for k in range(MOTIONS + 1)), *(f"{s:g} s" for s in SECONDS)]
+    lines = [f"| {' | '.join(head)} |", f"|{' --- |' * len(head)}"]
+    for way, family in sorted({(case["way"], case["family"]) for case in cases}):
+        own = [case for case in cases if (case["way"], case["family"]) == (way, family)]
+        counts = [sum(right(c, c["said"][min(k, len(c["said"]) - 1)]) for c in own) for k in range(MOTIONS + 1)]
+        for limit in SECONDS:
+            last = [int(np.flatnonzero(np.array(c["seconds"]) <= limit)[-1]) for c in own]
+            counts.append(sum(right(c, c["said"][k]) for c, k in zip(own, last, strict=True)))
+        lines.append(f"| {way} | {family} | {len(own)} | {' | '.join(map(str, counts))} |")
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """Investigate random arms and print how many names are right after each motion."""
+    parser = argparse.ArgumentParser(prog="python -m tests.evaluation.asking", description=main.__doc__)
+    parser.add_argument("--half", default="development")
+    parser.add_argument("--cases", type=int, nargs="+", required=True, help="numbers of the cases, from 0")
+    parser.add_argument("--ways", nargs="+", choices=list(WAYS), default=["best"])
+    parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--out", type=Path, required=True, help="folder of recordings and results; goes on in it")
+    options = parser.parse_args()
+    options.out.mkdir(parents=True, exist_ok=True)
+    results = options.out / "asking.jsonl"
+    done = [json.loads(line) for line in results.read_text().splitlines()] if results.exists() else []
+    known = {(case["case"], case["way"]) for case in done}
+    todo = [(k, way) for k in options.cases for way in options.ways if (f"{options.half}-{k:04d}", way) not in known]
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(options.jobs, context) as pool:
+        futures = {pool.submit(investigated, options.half, k, way, options.out): (k, way) for k, way in todo}
+        for future in as_completed(futures):
+            error = future.exception()
+            if error is not None:
+                print(f"{futures[future]}: {type(error).__name__}: {error}", file=sys.stderr, flush=True)
+                continue
+            done.append(future.result())
+            with results.open("a", encoding="utf-8") as file:
+                file.write(json.dumps(done[-1]) + "\n")
+            print(f"{len(done)} of {len(known) + len(todo)}: {done[-1]['case']} {done[-1]['way']}", file=sys.stderr)
+    print(table(done))
+
+
+if __name__ == "__main__":
+    import os
+
+    os.environ.update(ONE_THREAD)
+    main()
