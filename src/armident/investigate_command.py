@@ -9,7 +9,6 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import numpy as np
 import typer
 
 if TYPE_CHECKING:
@@ -179,6 +178,8 @@ class _Program:
 
     def __call__(self, trajectory: "Trajectory") -> "Recording":
         """Call the program, and import the file that it leaves; DataError if it refuses or leaves none."""
+        import numpy as np
+
         from armident.configs import DataError
         from armident.daq.interchange.importing import import_recording
         from armident.daq.interchange.readers import reader_of
