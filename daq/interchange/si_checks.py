@@ -30,7 +30,9 @@ _MOVED_SHARE = 1e-3
 _SAG_SHARE = 0.01
 """Share of its range by which a joint may give way to the others while its demand rests: 3 degrees of a turn."""
 _UNEXPLAINED_SHARE = 0.5
-"""Largest share of the power of a joint's motion that its demand may leave unexplained."""
+"""Largest share of the power of a joint's motion that its demand may leave unexplained, where they differ in size."""
+_SAME_SIZE = 2.0
+"""Ratio of the spans of two motions in one unit: a joint that lags behind fast moves swings less, by half at most."""
 
 
 def si_unit_of(quantity: str, robot: RobotConfig) -> str:
@@ -133,7 +135,8 @@ def _check_demand(path: Path, robot: RobotConfig, demand: NDArray[np.float64], p
     residual = np.sum((demand - demand.mean(axis=0) - position + position.mean(axis=0)) ** 2, axis=0)
     for k in np.flatnonzero(residual > _UNEXPLAINED_SHARE * motion):
         joint, moved, wanted = robot.joints[k], np.ptp(position[:, k]), np.ptp(demand[:, k])
-        if moved > (_MOVED_SHARE if wanted > 0.0 else _SAG_SHARE) * np.ptp(joint.limits.position):
+        checked = moved > (_MOVED_SHARE if wanted > 0.0 else _SAG_SHARE) * np.ptp(joint.limits.position)
+        if checked and not moved / _SAME_SIZE < wanted < _SAME_SIZE * moved:
             raise DataError(
                 f"{path}: {joint.name} moved by {moved:.4g}, but its demand by {wanted:.4g}: "
                 f"give both in the same unit, or omit the demand with --map demand={OMITTED}"

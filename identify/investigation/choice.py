@@ -12,8 +12,8 @@ from armident.identify.documents.diagnosis import Explanation
 from armident.identify.documents.investigation import MotionChoice
 from armident.identify.effects.terms import arm_model
 from armident.identify.excitation.collision import CollisionModel
-from armident.identify.excitation.design import Design, design_trajectory, excesses, predict_precision
-from armident.identify.excitation.safety import assumed_noise
+from armident.identify.excitation.design import PERIOD, Design, design_trajectory, excesses
+from armident.identify.excitation.point_to_point import predicted_torque, sample_trajectory, slow_share
 from armident.identify.identification.from_recording import experiments_of
 from armident.identify.investigation.motions import FAMILIES, MARGIN, Reach, reach_of
 from armident.identify.investigation.question import Question, question
@@ -51,16 +51,20 @@ class Chosen:
 def first_motion(robot: RobotConfig, collision: CollisionModel) -> Chosen:
     """Return the motion of an arm of which there is no recording: an excitation at the speeds of first contact."""
     still = np.zeros(robot.n)
-    reach = reach_of(robot, _home(robot), still, still)
-    made = _excitation(robot, reach, None, collision)
-    return Chosen(f"what is the model of {robot.name}?", (made[0],), *made)
+    made = _excitation(robot, reach_of(robot, _home(robot), still, still), None, collision)
+    return _alone(f"what is the model of {robot.name}?", *made)
 
 
 def confirming_motion(state: ModelState, collision: CollisionModel, done: Sequence[MotionChoice]) -> Chosen:
     """Return the motion that confirms that nothing is missing: an excitation of all joints, if it is not done yet."""
     made = _excitation(state.robot, reach_of_recordings(state), state.fit.theta, collision)
     asked = "does a second motion show anything that is missing?"
-    return Chosen(asked, (made[0],)) if _key(made[0]) in map(_key, done) else Chosen(asked, (made[0],), *made)
+    return Chosen(asked, (made[0],)) if _key(made[0]) in map(_key, done) else _alone(asked, *made)
+
+
+def _alone(asked: str, choice: MotionChoice, trajectory: Trajectory | None) -> Chosen:
+    """Return the only motion that was considered."""
+    return Chosen(asked, (choice,), None if trajectory is None else choice, trajectory)
 
 
 def next_motion(
@@ -77,11 +81,11 @@ def next_motion(
         for choice, trajectory in _of_joint(state, reach, one.joint):
             if _key(choice) not in past:
                 made.append(_rated(posed, choice, trajectory))
-    excitation = _excitation(state.robot, reach, state.fit.theta, collision)
-    if _key(excitation[0]) not in past:
-        rated = [_rated(posed, *excitation) for _, posed in open_questions]
-        made.append(max(rated, key=lambda each: each[0]) if rated else (0.0, *excitation))
-    made.sort(key=lambda each: -each[0])
+    choice, excitation = _excitation(state.robot, reach, state.fit.theta, collision)
+    if excitation is not None and _key(choice) not in past:
+        rated = [_rated(posed, choice, excitation) for _, posed in open_questions]
+        made.append(max(rated, key=lambda each: each[0]) if rated else (0.0, choice, excitation))
+    made.sort(key=lambda each: ((each[1].expected_gain or 0.0) < LEAST_GAIN, -each[0]))
     considered: list[MotionChoice] = []
     for _, choice, trajectory in made:
         reason = excluded(state.robot, trajectory, state.fit.theta, collision)
@@ -132,7 +136,9 @@ def excluded(robot: RobotConfig, trajectory: Trajectory, theta: Floats | None, c
         trajectory.check(robot, "motion")
     except ConfigError as error:
         return str(error)
-    design = predict_precision(arm_model(robot), trajectory, assumed_noise(robot), theta=theta, collision=collision)
+    q, qd, qdd = sample_trajectory(trajectory, PERIOD)
+    torque = None if theta is None else predicted_torque(arm_model(robot), theta, q, qd, qdd, PERIOD)
+    design = Design(trajectory, np.inf, None, slow_share(robot, qd), torque, closest=collision.closest(q))
     found = excesses(robot, design, collision, MARGIN)
     return f"needs {'; '.join(found)}" if found else None
 
@@ -167,24 +173,22 @@ def _of_joint(state: ModelState, reach: Reach, name: str) -> Iterator[tuple[Moti
 
 def _excitation(
     robot: RobotConfig, reach: Reach, theta: Floats | None, collision: CollisionModel
-) -> tuple[MotionChoice, Trajectory]:
-    """Return an exciting trajectory within the reach. Raises ConfigError if there is none."""
-    joints = tuple(
-        joint.model_copy(
-            update={
-                "limits": joint.limits.model_copy(
-                    update={"velocity": float(reach.velocity[k]), "acceleration": float(reach.acceleration[k])}
-                )
-            }
-        )
-        for k, joint in enumerate(robot.joints)
-    )
-    slow = robot.model_copy(update={"joints": joints})
-    design: Design = design_trajectory(
-        slow, EXCITATION_S, evaluations=EVALUATIONS, theta=theta, collision=collision, margin=MARGIN
-    )
+) -> tuple[MotionChoice, Trajectory | None]:
+    """Return an exciting trajectory within the reach; ``None`` with the reason if no trajectory keeps the limits."""
+    joints = []
+    for joint, velocity, acceleration in zip(robot.joints, reach.velocity, reach.acceleration, strict=True):
+        slower = {"velocity": float(velocity), "acceleration": float(acceleration)}
+        joints.append(joint.model_copy(update={"limits": joint.limits.model_copy(update=slower)}))
+    slow = robot.model_copy(update={"joints": tuple(joints)})
     words = "all joints at once along an exciting trajectory"
-    return MotionChoice(motion=EXCITATION, words=words, duration_s=design.trajectory.duration), design.trajectory
+    choice = MotionChoice(motion=EXCITATION, words=words, duration_s=EXCITATION_S)
+    try:
+        design = design_trajectory(
+            slow, EXCITATION_S, evaluations=EVALUATIONS, theta=theta, collision=collision, margin=MARGIN
+        )
+    except ConfigError as error:
+        return choice.model_copy(update={"excluded": str(error)}), None
+    return choice.model_copy(update={"duration_s": design.trajectory.duration}), design.trajectory
 
 
 def reach_of_recordings(state: ModelState) -> Reach:

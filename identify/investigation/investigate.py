@@ -1,7 +1,7 @@
 """Questions to an arm until its recordings decide what is missing, or no allowed motion can tell."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import yaml
@@ -34,6 +34,7 @@ from armident.identify.investigation.choice import (
 )
 from armident.identify.investigation.rivals import uncertain
 from armident.identify.report.robot_file import robot_yaml
+from armident.identify.signals.bandwidth import motion_bandwidth
 
 Ask = Callable[[Trajectory], Recording]
 """Plays a trajectory on the robot and returns the recording; DataError if it refuses to."""
@@ -87,7 +88,7 @@ class Investigating:
             progress(f"round {len(self.document.rounds) + 1}: {stage}", share)
 
         if not self.recordings:
-            self._enter(first_motion(self.robot, self.collision))
+            self._affordable(first_motion(self.robot, self.collision))
             return
         self.result = result = self._diagnosed(report)
         document, rounds, state = result.document, self.document.rounds, result.first
@@ -127,12 +128,17 @@ class Investigating:
             self._enter(chosen)
 
     def _diagnosed(self, report: Progress) -> DiagnosisResult:
+        """Diagnose all recordings in the band of the first one: in small motions, noise would count as motion."""
         experiments, notes = experiments_of(self.recordings, self.robot, name_files=True)
         notes += rest_notes(experiments, self.robot)
         references = [reference(recording) for recording in self.recordings]
-        return run_diagnosis(
-            experiments, [], self.robot, references, None, list(dict.fromkeys(notes)), report, self.criteria
+        first, _ = experiments_of(self.recordings[:1], self.robot, name_files=True)
+        band = self.robot.bandwidth_hz or motion_bandwidth([e.q for e in first], first[0].dt)
+        robot = self.robot.model_copy(update={"bandwidth_hz": band})
+        found = run_diagnosis(
+            experiments, [], robot, references, None, list(dict.fromkeys(notes)), report, self.criteria
         )
+        return replace(found, robot=found.robot.model_copy(update={"bandwidth_hz": self.robot.bandwidth_hz}))
 
     def _enter(self, chosen: Chosen) -> None:
         """Enter a motion that is to be asked for, or the recording that answers already."""
@@ -181,8 +187,7 @@ class Investigating:
 
     def _stop(self, reason: str) -> None:
         """End without a decision, for a reason."""
-        assert self.result is not None
-        doubtful = uncertain(self.result.document.explanations)
+        doubtful = uncertain(self.document.explanations)
         unnamed = all(one.likely[0] == UNNAMED for one in doubtful)
         outcome: Outcome = "unnamed" if doubtful and unnamed else "cannot_tell"
         left = "; ".join(f"{one.joint}: {one.sentence}" for one in doubtful) or "nothing is decided"

@@ -198,7 +198,12 @@ def test_a_demand_in_another_unit_is_refused_unless_omitted(tmp_path: Path) -> N
         import_recording(path, PANDA, rate_hz=1000.0)
     recording = import_recording(path, PANDA, rate_hz=1000.0, names={"demand": "-"})
     assert set(recording.samples.fields) == {"position", "torque"}
-    np.savez(path, positions=q, torques=tau, target_positions=q + 0.01)
+    # A joint that lags behind fast moves, and one that gives way under a demand that rests, are no other unit.
+    resting = q + 0.01
+    q[:, 6] = 1e-4 * (q[:, 0] - q[:, 0].mean()) + 0.5
+    resting[:, 6] = 0.5
+    resting[:, 0] = np.roll(q[:, 0], 400)
+    np.savez(path, positions=q, torques=tau, target_positions=resting)
     assert "demand" in import_recording(path, PANDA, rate_hz=1000.0).samples.fields
 
 
