@@ -187,5 +187,4 @@ def _any(recordings: Recorded | Sequence[Recorded]) -> bool:
 
 
 def _of(going: "Investigating") -> Investigation:
-    found = going.robot if going.result is None else going.result.robot
-    return Investigation(going.document, found, tuple(going.recordings), tuple(going.trajectories))
+    return Investigation(going.document, going.model, tuple(going.recordings), tuple(going.trajectories))

@@ -40,8 +40,8 @@ Ask = Callable[[Trajectory], Recording]
 """Plays a trajectory on the robot and returns the recording; DataError if it refuses to."""
 Progress = Callable[[str, float], None]
 
-FILE = "investigation.json"
-ROBOT = "robot.yaml"
+FILE, ROBOT, MODEL = "investigation.json", "robot.yaml", "model.yaml"
+"""Files of a folder: the document, the configuration, and the configuration with what was found."""
 
 
 class Waiting(Exception):
@@ -71,6 +71,14 @@ class Investigating:
         """True if the recording of the last motion is missing."""
         last = self.document.rounds[-1] if self.document.rounds else None
         return last is not None and last.recording is None and last.refused is None
+
+    @property
+    def model(self) -> RobotConfig:
+        """The configuration with what was found, in an earlier run of the folder if this one diagnosed nothing."""
+        if self.result is not None:
+            return self.result.robot
+        saved = None if self.folder is None else self.folder / MODEL
+        return self.robot if saved is None or not saved.exists() else load_robot(saved, "investigate")
 
     def run(self, ask: Ask, progress: Progress | None = None) -> None:
         """Ask until the outcome is known; `Waiting` of ``ask`` leaves the investigation as it is."""

@@ -62,7 +62,11 @@ def test_a_program_moves_the_robot_until_the_arm_is_healthy(first: Path, tmp_pat
     table = np.loadtxt(out / "reference_1.csv", delimiter=",", skiprows=1)
     np.testing.assert_allclose(np.diff(table[:, 0]), 1.0 / RATE_HZ, atol=1e-9)
     assert "all joints at once" in (out / "report.html").read_text(encoding="utf-8")
-    assert (out / "model.yaml").exists()
+    model = (out / "model.yaml").read_text(encoding="utf-8")
+    # Nothing is asked or lost when an investigation that has ended is continued.
+    (out / "model.yaml").write_text(model.replace("effects: []", "effects: [{effect: joint_spring, joint: joint_1}]"))
+    assert run("investigate", "--continue", str(out)).exit_code == 0
+    assert "joint_spring" in (out / "model.yaml").read_text(encoding="utf-8")
 
 
 def test_a_program_that_fails_refuses_the_motion_with_what_it_printed(first: Path, tmp_path: Path) -> None:
