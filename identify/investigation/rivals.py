@@ -76,18 +76,19 @@ def rivals_of(state: ModelState, explanation: Explanation) -> list[Rival]:
     shared = explanation.names.get(UNNAMED, 0.0) / max(len(others), 1)
     if shared >= LEAST:
         named |= {name: shared for name in others}
-    made = [one for name, p in named.items() if (one := _fitted(state, name, p, *best[name][1:])) is not None]
+    made = [one for name, p in named.items() if (one := _fitted(state, name, p, *best[name])) is not None]
     rest = max(1.0 - sum(one.probability for one in made), LEAST)
     return [*made, Rival(NOTHING, rest)]
 
 
-def _fitted(state: ModelState, name: str, probability: float, candidate: Candidate, shapes: Shapes) -> Rival | None:
+def _fitted(
+    state: ModelState, name: str, probability: float, statistic: float, candidate: Candidate, shapes: Shapes
+) -> Rival | None:
     """Return a rival with its estimated parameters; ``None`` if the recordings do not determine them."""
     effect, place = candidate.effect, candidate.place
     if shapes:
         cache, fit = ColumnCache(state.study, state.fit.theta), state.fit.renoised(state.weights)
-        found = screened(fit, candidate, cache)
-        shapes = shapes if found is None else refined(fit, candidate, cache, found)
+        shapes = refined(fit, candidate, cache, (statistic, shapes))
     spared = tuple(p.name for p in known(effect.key).linear if p not in effect.linear)
     entry = entry_of(effect, place, state.robot, dict(shapes), spared)
     made = None if of_recording(entry) else fitted_in_loop_of(state, with_entries(state.robot, [entry]))

@@ -126,10 +126,7 @@ def _print(found: "Investigation", folder: Path, meaning: str) -> None:
     print(f"{document.robot}: {document.outcome.replace('_', ' ')}. {document.statement or meaning}")
     if found.pending is not None:
         file = folder / str(document.rounds[-1].trajectory)
-        print(
-            f"next: record the motion of {file}, then: armident investigate --continue {folder} RECORDING\n"
-            f"  its set points as a table: armident simulate --trajectory {file} ...; on a bus: armident capture"
-        )
+        print(f"next: record the motion of {file}, then: armident investigate --continue {folder} RECORDING")
 
 
 class _Bars(ExitStack):
