@@ -7,12 +7,16 @@ The first recording of a case is given; up to four motions are asked for. ``best
 import argparse
 import json
 import multiprocessing
+import resource
+import shutil
+import signal
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 import numpy as np
@@ -41,6 +45,8 @@ SECONDS = (30.0, 60.0, 120.0)
 """Times of motion after which the share of right names is counted, s."""
 RIGHT = 0.5
 """Least probability of a name that counts."""
+LIMIT_S, LIMIT_BYTES = 900, 6 << 30
+"""Limits of a case: time, s, and memory of its process."""
 
 
 class Excited(Investigating):
@@ -76,8 +82,12 @@ WAYS: dict[str, type[Investigating]] = {"best": Investigating, "excitation": Exc
 
 def investigated(half: str, index: int, way: str, out: Path) -> dict[str, Any]:
     """Return what is said after each motion of a case, with the truth."""
+    resource.setrlimit(resource.RLIMIT_AS, (LIMIT_BYTES, LIMIT_BYTES))
+    signal.signal(signal.SIGALRM, _too_long)
+    signal.alarm(LIMIT_S)
     folder = out / f"{half}-{index:04d}-{way}"
-    folder.mkdir(parents=True, exist_ok=True)
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
     plants = [sys.executable, "-m", "tests.evaluation.plants"]
     subprocess.run([*plants, "--half", half, "--first", str(index), "--cases", "1", "--out", str(folder)], check=True)
     name = f"{half}_{index:04d}"
@@ -88,7 +98,9 @@ def investigated(half: str, index: int, way: str, out: Path) -> dict[str, Any]:
     going = WAYS[way](going.robot, going.recordings, going.document, going.folder, going.criteria, going.collision)
     program = [*plants[:2], "tests.evaluation.plants.answer", "--half", half, "--case", str(index)]
     going.run(_ask(program, first, folder))
+    signal.alarm(0)
     document = going.document
+    _keep(folder, len(document.rounds))
     said = [[entry.names for entry in one.explanations] for one in document.rounds]
     return {
         "case": f"{half}-{index:04d}", "way": way, "family": truth["family"], "kind": truth["kind"],
@@ -104,6 +116,7 @@ def investigated(half: str, index: int, way: str, out: Path) -> dict[str, Any]:
 def _ask(program: Sequence[str], first: Recording, folder: Path) -> Callable[[Trajectory], Recording]:
     def ask(trajectory: Trajectory) -> Recording:
         period, number = 1.0 / first.sample_rate_hz, 1 + len(list(folder.glob("reference_*.csv")))
+        _keep(folder, number - 1)
         q = trajectory.sample(period)
         reference, answer = folder / f"reference_{number}.csv", folder / f"answer_{number}.npz"
         np.savetxt(reference, np.column_stack([period * np.arange(len(q)), q]), delimiter=",", header="t", comments="")
@@ -113,6 +126,16 @@ def _ask(program: Sequence[str], first: Recording, folder: Path) -> Callable[[Tr
         return import_recording(answer, first.robot)
 
     return ask
+
+
+def _keep(folder: Path, motions: int) -> None:
+    """Keep the diagnosis after a number of motions: `calibrate` reads it."""
+    if (folder / "diagnosis.json").exists():
+        shutil.copy(folder / "diagnosis.json", folder / f"diagnosis_{motions}.json")
+
+
+def _too_long(_number: int, _frame: FrameType | None) -> None:
+    raise TimeoutError(f"no outcome in {LIMIT_S} s")
 
 
 def right(case: dict[str, Any], said: Sequence[dict[str, float]]) -> bool:
