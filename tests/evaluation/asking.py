@@ -10,18 +10,18 @@ import multiprocessing
 import resource
 import shutil
 import signal
-import subprocess
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from contextlib import closing
 from pathlib import Path
 from types import FrameType
 from typing import Any
 
 import numpy as np
 
-from armident.configs import DataError, Trajectory
+from armident.configs import ArmidentError, DataError, Trajectory
 from armident.daq.api import import_recording
 from armident.daq.recording import Recording
 from armident.identify.diagnosis.criteria import Criteria
@@ -35,7 +35,8 @@ from armident.identify.investigation import choice as choices
 from armident.identify.investigation.choice import Chosen
 from armident.identify.investigation.investigate import Investigating, started
 from armident.identify.investigation.motions import FAMILIES
-from tests.evaluation.process import ONE_THREAD
+from tests.evaluation.plants.halves import Half
+from tests.evaluation.process import ONE_THREAD, ByName, WorkerProcess
 
 MOTIONS = 4
 """Most motions of a case."""
@@ -43,6 +44,9 @@ MINUTES = 6.0
 """Longest motion of a case, min."""
 SECONDS = (30.0, 60.0, 120.0)
 """Times of motion after which the share of right names is counted, s."""
+RESULTS = "asking.jsonl"
+PROGRAM = "tests.evaluation.plants.answer"
+"""Module of the arm, whose process shares no code with the diagnosis."""
 RIGHT = 0.5
 """Least probability of a name that counts."""
 LIMIT_S, LIMIT_BYTES = 900, 6 << 30
@@ -80,49 +84,52 @@ class Drawn(Investigating):
 WAYS: dict[str, type[Investigating]] = {"best": Investigating, "excitation": Excited, "random": Drawn}
 
 
-def investigated(half: str, index: int, way: str, out: Path) -> dict[str, Any]:
-    """Return what is said after each motion of a case, with the truth."""
+def investigated(half: Half, index: int, ways: Sequence[str], out: Path) -> Iterator[dict[str, Any]]:
+    """Yield what is said after each motion of a case, with the truth, for every way to ask."""
     resource.setrlimit(resource.RLIMIT_AS, (LIMIT_BYTES, LIMIT_BYTES))
-    signal.signal(signal.SIGALRM, _too_long)
-    signal.alarm(LIMIT_S)
-    folder = out / f"{half}-{index:04d}-{way}"
-    shutil.rmtree(folder, ignore_errors=True)
-    folder.mkdir(parents=True)
-    plants = [sys.executable, "-m", "tests.evaluation.plants"]
-    subprocess.run([*plants, "--half", half, "--first", str(index), "--cases", "1", "--out", str(folder)], check=True)
     name = f"{half}_{index:04d}"
-    truth = json.loads((folder / f"{name}.truth.json").read_text(encoding="utf-8"))
-    first = import_recording(folder / f"{name}_a.npz", folder / f"{name}.yaml")
-    begin = time.process_time()
-    going = started(first.robot, [first], MOTIONS, MINUTES, Criteria(), CollisionModel(first.robot, []), folder)
-    going = WAYS[way](going.robot, going.recordings, going.document, going.folder, going.criteria, going.collision)
-    program = [*plants[:2], "tests.evaluation.plants.answer", "--half", half, "--case", str(index)]
-    going.run(_ask(program, first, folder))
-    signal.alarm(0)
-    document = going.document
-    _keep(folder, len(document.rounds))
-    said = [[entry.names for entry in one.explanations] for one in document.rounds]
-    return {
-        "case": f"{half}-{index:04d}", "way": way, "family": truth["family"], "kind": truth["kind"],
-        "accepted": truth["accepted"], "visibility": truth["visibility"], "outcome": document.outcome,
-        "said": [*said, [entry.names for entry in document.explanations]],
-        "seconds": [0.0, *np.cumsum([one.chosen.duration_s for one in document.rounds])],
-        "motions": [one.chosen.motion for one in document.rounds],
-        "refused": sum(one.refused is not None for one in document.rounds),
-        "cpu_s": time.process_time() - begin,
-    }  # fmt: skip
+    folder = out / name
+    shutil.rmtree(folder, ignore_errors=True)
+    with closing(WorkerProcess(name, out / "plants.log")) as arm:
+        arm.run(ByName(f"{PROGRAM}:first_answer"), (half, index, folder), LIMIT_S)
+        truth = json.loads((folder / f"{name}.truth.json").read_text(encoding="utf-8"))
+        first = import_recording(folder / f"{name}_a.npz", folder / f"{name}.yaml")
+        signal.signal(signal.SIGALRM, _too_long)
+        for way in ways:
+            signal.alarm(LIMIT_S)
+            begin = time.process_time()
+            kept = folder / way
+            going = started(first.robot, [first], MOTIONS, MINUTES, Criteria(), CollisionModel(first.robot, []), kept)
+            going = WAYS[way](going.robot, going.recordings, going.document, kept, going.criteria, going.collision)
+            going.run(_ask(arm, (half, index), first, kept))
+            signal.alarm(0)
+            document = going.document
+            _keep(kept, len(document.rounds))
+            said = [[entry.names for entry in one.explanations] for one in document.rounds]
+            yield {
+                "case": name, "way": way, "family": truth["family"], "kind": truth["kind"],
+                "accepted": truth["accepted"], "visibility": truth["visibility"], "outcome": document.outcome,
+                "said": [*said, [entry.names for entry in document.explanations]],
+                "seconds": [0.0, *np.cumsum([one.chosen.duration_s for one in document.rounds])],
+                "motions": [one.chosen.motion for one in document.rounds],
+                "refused": sum(one.refused is not None for one in document.rounds),
+                "cpu_s": time.process_time() - begin,
+            }  # fmt: skip
 
 
-def _ask(program: Sequence[str], first: Recording, folder: Path) -> Callable[[Trajectory], Recording]:
+def _ask(
+    arm: WorkerProcess, case: tuple[Half, int], first: Recording, folder: Path
+) -> Callable[[Trajectory], Recording]:
     def ask(trajectory: Trajectory) -> Recording:
         period, number = 1.0 / first.sample_rate_hz, 1 + len(list(folder.glob("reference_*.csv")))
         _keep(folder, number - 1)
         q = trajectory.sample(period)
         reference, answer = folder / f"reference_{number}.csv", folder / f"answer_{number}.npz"
         np.savetxt(reference, np.column_stack([period * np.arange(len(q)), q]), delimiter=",", header="t", comments="")
-        done = subprocess.run([*program, str(reference), str(answer)], capture_output=True, text=True, check=False)
-        if done.returncode != 0:
-            raise DataError(done.stderr.strip().splitlines()[-1])
+        try:
+            arm.run(ByName(f"{PROGRAM}:answer"), (*case, reference, answer), LIMIT_S)
+        except ArmidentError as error:
+            raise DataError(str(error)) from error
         return import_recording(answer, first.robot)
 
     return ask
@@ -161,6 +168,13 @@ def table(cases: Sequence[dict[str, Any]]) -> str:
     return "\n".join(lines)
 
 
+def _entered(half: Half, index: int, ways: Sequence[str], out: Path) -> None:
+    """Investigate a case and append each result to the file."""
+    for one in investigated(half, index, ways, out):
+        with (out / RESULTS).open("a", encoding="utf-8") as file:
+            file.write(json.dumps(one) + "\n")
+
+
 def main() -> None:
     """Investigate random arms and print how many names are right after each motion."""
     parser = argparse.ArgumentParser(prog="python -m tests.evaluation.asking", description=main.__doc__)
@@ -171,22 +185,17 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True, help="folder of recordings and results; goes on in it")
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
-    results = options.out / "asking.jsonl"
+    results = options.out / RESULTS
     done = [json.loads(line) for line in results.read_text().splitlines()] if results.exists() else []
     known = {(case["case"], case["way"]) for case in done}
-    todo = [(k, way) for k in options.cases for way in options.ways if (f"{options.half}-{k:04d}", way) not in known]
+    todo = {k: [w for w in options.ways if (f"{options.half}_{k:04d}", w) not in known] for k in options.cases}
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(options.jobs, context) as pool:
-        futures = {pool.submit(investigated, options.half, k, way, options.out): (k, way) for k, way in todo}
-        for future in as_completed(futures):
+        futures = {pool.submit(_entered, options.half, k, ways, options.out): k for k, ways in todo.items() if ways}
+        for number, future in enumerate(as_completed(futures), 1):
             error = future.exception()
-            if error is not None:
-                print(f"{futures[future]}: {type(error).__name__}: {error}", file=sys.stderr, flush=True)
-                continue
-            done.append(future.result())
-            with results.open("a", encoding="utf-8") as file:
-                file.write(json.dumps(done[-1]) + "\n")
-            print(f"{len(done)} of {len(known) + len(todo)}: {done[-1]['case']} {done[-1]['way']}", file=sys.stderr)
+            print(f"{number} of {len(futures)}: {futures[future]} {error or ''}", file=sys.stderr, flush=True)
+    done = [json.loads(line) for line in results.read_text().splitlines()]
     print(table(done))
 
 

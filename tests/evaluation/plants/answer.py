@@ -10,9 +10,10 @@ from pathlib import Path
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from tests.evaluation.plants.cases import answering
+from tests.evaluation.plants.cases import answering, make_case
+from tests.evaluation.plants.disk import write_case
 from tests.evaluation.plants.draft import CONTROL_HZ
-from tests.evaluation.plants.halves import HALVES
+from tests.evaluation.plants.halves import HALVES, Half
 
 
 def main() -> None:
@@ -23,13 +24,25 @@ def main() -> None:
     parser.add_argument("trajectory", type=Path)
     parser.add_argument("out", type=Path)
     options = parser.parse_args()
-    table = np.loadtxt(options.trajectory, delimiter=",", skiprows=1, ndmin=2)
+    answer((options.half, options.case, options.trajectory, options.out))
+
+
+def answer(task: tuple[Half, int, Path, Path]) -> None:
+    """Play the references of a file with the arm of a case: half, number, file to read and file to write."""
+    half, case, trajectory, out = task
+    table = np.loadtxt(trajectory, delimiter=",", skiprows=1, ndmin=2)
     t, q = table[:, 0] - table[0, 0], table[:, 1:]
     rate = (t.size - 1) / t[-1]
     step = 1.0 / (rate * np.ceil(CONTROL_HZ / rate))
     fine = CubicSpline(t, q)(np.arange(round(t[-1] / step) + 1) * step)
-    arrays = answering(options.half, options.case)(fine, zlib.crc32(q.tobytes()))
-    np.savez(options.out.with_suffix(".npz"), **arrays)  # type: ignore[arg-type]
+    arrays = answering(half, case)(fine, zlib.crc32(q.tobytes()))
+    np.savez(out.with_suffix(".npz"), **arrays)  # type: ignore[arg-type]
+
+
+def first_answer(task: tuple[Half, int, Path]) -> None:
+    """Write the configuration, the recordings and the truth of a case: half, number and folder."""
+    half, case, folder = task
+    write_case(make_case(half, case), folder)
 
 
 if __name__ == "__main__":

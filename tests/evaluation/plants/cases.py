@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -144,6 +145,7 @@ def answering(half: Half, index: int) -> Callable[[Floats, int], Recording]:
     return play
 
 
+@lru_cache(maxsize=1)
 def _drawn(half: Half, index: int, with_twin: bool) -> tuple[Draft, _Hidden, RandomCase]:
     family, kind = kind_of(half, index)
     ranges = HALVES[half]
