@@ -24,7 +24,7 @@ from armident.identify.diagnosis.findings import (
 )
 from armident.identify.diagnosis.lack_of_fit import LackOfFit, ResidualDependence
 from armident.identify.diagnosis.model_state import ModelState, with_entries, with_report_part
-from armident.identify.diagnosis.probabilities import judged
+from armident.identify.diagnosis.probabilities import calibration, judged
 from armident.identify.diagnosis.selected import Selected
 from armident.identify.diagnosis.selection import StepwiseSelection
 from armident.identify.diagnosis.setup_stage import set_up
@@ -223,7 +223,7 @@ def _diagnose(
     findings = [*first_findings, *(f for f, _ in explained)]
     chosen_for = [*(None for _ in first_findings), *(one for _, one in explained)]
     left = stage.left(change.left(named, rest, study.joints), after)
-    findings, explanations = judged(findings, left, study.joints)
+    findings, explanations = judged(findings, left, study.joints, calibration(several=len(training) > 1))
     steps("simulation")
     simulated = simulated_errors(first, final)
     steps("detection limits")

@@ -62,9 +62,9 @@ class Calibration:
 
 
 @cache
-def calibration() -> Calibration:
-    """Calibration of this version."""
-    content = json.loads(FILE.read_text(encoding="utf-8"))
+def calibration(*, several: bool = False) -> Calibration:
+    """Calibration of this version, for one recording or ``several``: those of other motions are worth more."""
+    content = json.loads(FILE.read_text(encoding="utf-8"))["several" if several else "one"]
     return Calibration(**{name: content[name] for name in Calibration.__dataclass_fields__})
 
 
@@ -117,14 +117,12 @@ def _rest(odds: Mapping[str, float], shares: Mapping[str, float], temper: float)
 
 
 def judged(
-    findings: Sequence[Finding], left: Sequence[Unexplained], joints: Sequence[str], known: Calibration | None = None
+    findings: Sequence[Finding], left: Sequence[Unexplained], joints: Sequence[str], known: Calibration
 ) -> tuple[list[Finding], list[Explanation]]:
     """Return the findings with their probabilities, and what may be missing at each joint.
 
-    ``findings``: those of the set-up and of changes among them. ``left``: unexplained dependences. ``known``: not that
-    of this version.
+    ``findings``: those of the set-up and of changes among them. ``left``: unexplained dependences.
     """
-    known = known or calibration()
     entries: list[Explanation] = []
     probable = []
     for finding in findings:

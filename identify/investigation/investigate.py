@@ -12,7 +12,7 @@ from armident.daq.recording import Recording, read_recording
 from armident.daq.recording.writer import write_recording
 from armident.identify.diagnosis.criteria import Criteria
 from armident.identify.diagnosis.diagnose import DiagnosisResult, run_diagnosis
-from armident.identify.diagnosis.model_state import ModelState, fitted_in_loop_of, with_entries
+from armident.identify.diagnosis.model_state import ModelState
 from armident.identify.documents.base import reference, versions
 from armident.identify.documents.diagnosis import Explanation, Finding
 from armident.identify.documents.files import load_document, to_json, write_atomically
@@ -32,7 +32,7 @@ from armident.identify.investigation.choice import (
     next_motion,
     next_recording,
 )
-from armident.identify.investigation.rivals import uncertain
+from armident.identify.investigation.rivals import uncertain, with_decided
 from armident.identify.report.robot_file import robot_yaml
 from armident.identify.signals.bandwidth import motion_bandwidth
 
@@ -112,7 +112,7 @@ class Investigating:
             self._stop(f"all {len(rounds)} motions have been used; allow more with --experiments")
         else:
             report("next motion", 1.0)
-            state = _with_decided(state, result)
+            state = with_decided(state, result.robot, document.explanations)
             self._affordable(self.choose(state, document.explanations, [one.chosen for one in rounds]))
 
     def choose(self, state: ModelState, explanations: Sequence[Explanation], done: Sequence[MotionChoice]) -> Chosen:
@@ -260,13 +260,6 @@ def resumed(folder: Path, criteria: Criteria, collision: CollisionModel | None =
     return Investigating(
         robot, recordings, document, folder, criteria, collision or CollisionModel(robot, []), trajectories
     )
-
-
-def _with_decided(state: ModelState, result: DiagnosisResult) -> ModelState:
-    """Return a model as configured with the effects that are decided: what is asked next is beside them."""
-    decided = {(one.joint, one.likely[0]) for one in result.document.explanations if not one.doubtful and one.likely}
-    sure = [e for e in result.robot.effects if e not in state.robot.effects and (e.joint, e.effect) in decided]
-    return (fitted_in_loop_of(state, with_entries(state.robot, sure)) if sure else None) or state
 
 
 def _outcome(result: DiagnosisResult) -> tuple[Outcome, str]:

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from armident.configs import DataError
+from armident.configs import DataError, RobotConfig
 from armident.identify.diagnosis.candidates import Candidate, ColumnCache, Shapes, candidates
 from armident.identify.diagnosis.model_state import ModelState, fitted_in_loop_of, with_entries
 from armident.identify.diagnosis.probabilities import NOTHING
@@ -96,6 +96,16 @@ def _fitted(
         return None
     term = made.term_of(entry)
     return Rival(name, probability, term, made.values_of(term)[0])
+
+
+def with_decided(state: ModelState, found: RobotConfig, explanations: Sequence[Explanation]) -> ModelState:
+    """Return the model with the effects that are decided: what is asked next stands beside them.
+
+    ``state``: model as configured. ``found``: configuration with what the diagnosis found.
+    """
+    decided = {(one.joint, one.likely[0]) for one in explanations if one.likely and not one.doubtful}
+    sure = [e for e in found.effects if e not in state.robot.effects and (e.joint, e.effect) in decided]
+    return (fitted_in_loop_of(state, with_entries(state.robot, sure)) if sure else None) or state
 
 
 def uncertain(explanations: Sequence[Explanation]) -> list[Explanation]:

@@ -2,7 +2,8 @@
 
 DIR has the results of ``python -m tests.evaluation --arms random --half development --out DIR``. The command fits the
 map from evidence to probabilities and the level of the sets, prints how well both hold for arms that took no part
-(cross-fitted), and writes ``identify/diagnosis/calibration.json``.
+(cross-fitted), and writes ``identify/diagnosis/calibration.json``. With ``--several``, DIR has the investigations of
+``python -m tests.evaluation.asking --half development --out DIR``: their diagnoses have a map of their own.
 """
 
 import argparse
@@ -27,6 +28,7 @@ from armident.identify.diagnosis.probabilities import (
     outcomes,
 )
 from armident.identify.documents.diagnosis import DiagnosisDocument, Finding
+from armident.identify.documents.files import load_document
 from armident.identify.effects.unnamed import NAME as UNNAMED
 from tests.evaluation.cases import VISIBLE
 from tests.evaluation.run import RESULTS
@@ -224,18 +226,32 @@ def read(folders: Sequence[Path]) -> list[Entry]:
     return [entry for k, arm in enumerate(arms) for entry in entries_of(k, *arm)]
 
 
+def read_several(folders: Sequence[Path]) -> list[Entry]:
+    """Entries of diagnoses of several recordings in folders of `tests.evaluation.asking`: one after each motion."""
+    entries: list[Entry] = []
+    truths = [truth for folder in folders for truth in sorted(folder.glob("*/*.truth.json"))]
+    for number, truth in enumerate(truths):
+        hidden = json.loads(truth.read_text(encoding="utf-8"))
+        if hidden["family"] != "setup":
+            for path in sorted(truth.parent.glob("*/diagnosis_[1-9].json")):
+                entries += entries_of(number, load_document(path, DiagnosisDocument), hidden)
+    return entries
+
+
 def main() -> None:
     """Fit, judge and write the calibration."""
     parser = argparse.ArgumentParser(prog="python -m tests.evaluation.calibrate", description=main.__doc__)
     parser.add_argument("folders", nargs="+", type=Path, help="folders of the results of development arms")
+    parser.add_argument(
+        "--several", action="store_true", help="of several recordings: folders of tests.evaluation.asking"
+    )
     parser.add_argument("--out", type=Path, default=FILE, help="file of the calibration")
     options = parser.parse_args()
-    entries = read(options.folders)
+    entries = (read_several if options.several else read)(options.folders)
     rows: list[tuple[str, ...]] = []
     found = figures(entries, rows)
-    known = calibrated(entries)
-    command = "python -m tests.evaluation.calibrate"
-    content = {"made_by": command, **asdict(known), "cross_fitted": asdict(found)}
+    content = json.loads(options.out.read_text(encoding="utf-8")) if options.out.exists() else {}
+    content["several" if options.several else "one"] = {**asdict(calibrated(entries)), "cross_fitted": asdict(found)}
     options.out.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
     print(table(["probability", "findings", "mean", "right"], rows))
     for name, value in asdict(found).items():

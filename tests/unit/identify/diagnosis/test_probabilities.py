@@ -80,17 +80,17 @@ def test_names_that_the_data_cannot_separate_are_in_the_set_together() -> None:
 def test_every_joint_has_an_entry_and_every_finding_its_own() -> None:
     findings = [finding(), finding("unnamed"), finding("backlash", "joint_3")]
     joints = ["joint_1", "joint_2", "joint_3"]
-    found, entries = judged(findings, [left("joint_2")], joints)
+    found, entries = judged(findings, [left("joint_2")], joints, calibration())
     assert [entry.joint for entry in entries] == ["joint_1", "joint_1", "joint_2", "joint_3"]
     # A term without a name claims that something is missing, and no cause.
     assert found[1].confidence == pytest.approx(1.0 - entries[1].names["nothing"])
 
 
 def test_a_joint_without_anything_is_healthy_and_one_with_a_dependence_is_not() -> None:
-    _, (clear,) = judged([], [], ["joint_1"])
+    _, (clear,) = judged([], [], ["joint_1"], calibration())
     assert clear.likely == ["nothing"]
     assert not clear.doubtful
-    _, (rest,) = judged([], [left()], ["joint_1"])
+    _, (rest,) = judged([], [left()], ["joint_1"], calibration())
     assert rest.likely[0] == "unnamed"
     assert rest.doubtful
 
@@ -100,7 +100,7 @@ def test_a_change_against_a_baseline_keeps_its_posterior_probability() -> None:
         effect="payload", joint="joint_1", kind="numbers", parameters={}, confidence=0.6, gap_before=5.0, gap_after=4.0,
         alternatives=[Alternative(effect="rotor_inertia", joint="joint_1", score=-1.0)], evidence={},
     )  # fmt: skip
-    (kept,), (entry,) = judged([change], [], ["joint_1"])
+    (kept,), (entry,) = judged([change], [], ["joint_1"], calibration())
     assert kept == change
     assert entry.names["payload"] == 0.6
     assert entry.names["rotor_inertia"] == pytest.approx(0.6 * 0.3679, rel=1e-3)

@@ -12,7 +12,7 @@ from armident.identify.documents.diagnosis import Explanation
 from armident.identify.identification.from_recording import experiments_of
 from armident.identify.investigation.motions import ConstantSpeeds, Reversals, Steps, reach_of
 from armident.identify.investigation.question import Question, question
-from armident.identify.investigation.rivals import Rival, entropy, rivals_of, uncertain
+from armident.identify.investigation.rivals import Rival, entropy, rivals_of, uncertain, with_decided
 
 pytestmark = pytest.mark.slow
 
@@ -70,6 +70,17 @@ def test_explanations_without_a_name_are_represented_by_what_the_data_favour(sta
     assert sum(one.probability for one in found) == pytest.approx(1.0)
     named = rivals_of(state, left.model_copy(update={"names": {"stribeck_friction": 0.7, "nothing": 0.3}}))
     assert [one.name for one in named] == ["stribeck_friction", NOTHING]
+
+
+def test_what_is_decided_is_part_of_the_model_that_is_asked(state: ModelState) -> None:
+    entry = Entry(effect="asymmetric_viscous_friction", joint="joint_1")
+    found = with_entries(state.robot, [entry])
+    sure = Explanation(joint="joint_1", names={entry.effect: 0.95, "nothing": 0.05}, likely=[entry.effect])
+    asked = with_decided(state, found, [sure])
+    assert asked.robot.effects == (*state.robot.effects, entry)
+    assert asked.fit.theta.size == state.fit.theta.size + 1
+    doubtful = sure.model_copy(update={"likely": [entry.effect, "nothing"]})
+    assert with_decided(state, found, [doubtful]) is state
 
 
 def test_only_undecided_joints_are_asked_the_most_uncertain_one_first() -> None:
