@@ -12,9 +12,11 @@ import shutil
 import signal
 import sys
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import closing
+from itertools import pairwise
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -26,6 +28,7 @@ from armident.daq.api import import_recording
 from armident.daq.recording import Recording
 from armident.identify.diagnosis.criteria import Criteria
 from armident.identify.diagnosis.model_state import ModelState
+from armident.identify.diagnosis.probabilities import NOTHING
 from armident.identify.documents.diagnosis import Explanation
 from armident.identify.documents.investigation import MotionChoice
 from armident.identify.effects.unnamed import NAME as UNNAMED
@@ -37,6 +40,7 @@ from armident.identify.investigation.investigate import Investigating, started
 from armident.identify.investigation.motions import FAMILIES
 from tests.evaluation.plants.halves import Half
 from tests.evaluation.process import ONE_THREAD, ByName, WorkerProcess
+from tests.tools.markdown import table
 
 MOTIONS = 4
 """Most motions of a case."""
@@ -49,6 +53,9 @@ PROGRAM = "tests.evaluation.plants.answer"
 """Module of the arm, whose process shares no code with the diagnosis."""
 RIGHT = 0.5
 """Least probability of a name that counts."""
+NO_NAME = (UNNAMED, NOTHING)
+BINS = (0.0, 0.2, 0.5, 0.8, 0.95, 1.01)
+"""Limits of the final probabilities of a table."""
 LIMIT_S, LIMIT_BYTES = 900, 6 << 30
 """Limits of a case: time, s, and memory of its process."""
 
@@ -147,25 +154,73 @@ def _too_long(_number: int, _frame: FrameType | None) -> None:
 
 def right(case: dict[str, Any], said: Sequence[dict[str, float]]) -> bool:
     """Return True if the most probable name of all joints is right, or rightly none is probable."""
-    named = [(p, name) for names in said for name, p in names.items() if name not in (UNNAMED, "nothing")]
-    best = max(named, default=(0.0, ""))
+    probability, name = best(said)
     if not case["accepted"]:
-        return best[0] < RIGHT
-    return best[0] >= RIGHT and best[1] in case["accepted"]
+        return probability < RIGHT
+    return probability >= RIGHT and name in case["accepted"]
 
 
-def table(cases: Sequence[dict[str, Any]]) -> str:
-    """Return the shares of right answers by way, family, number of motions and seconds."""
-    head = ["way", "family", "cases", *(f"after {k}" for k in range(MOTIONS + 1)), *(f"{s:g} s" for s in SECONDS)]
-    lines = [f"| {' | '.join(head)} |", f"|{' --- |' * len(head)}"]
+def best(said: Sequence[dict[str, float]]) -> tuple[float, str]:
+    """Return the most probable name of all joints with its probability; (0, "") if there is none."""
+    return max(((p, name) for names in said for name, p in names.items() if name not in NO_NAME), default=(0.0, ""))
+
+
+def right_after(cases: Sequence[dict[str, Any]]) -> list[str]:
+    """Return how many answers of cases are right after each motion; the last answer stays."""
+    return [str(sum(right(c, c["said"][min(k, len(c["said"]) - 1)]) for c in cases)) for k in range(MOTIONS + 1)]
+
+
+def by_family(cases: Sequence[dict[str, Any]]) -> str:
+    """Return the right answers by way and family, after each motion and after seconds of motion.
+
+    ``open``: cases that the first recording does not decide; the figures of effects are those of open cases, too.
+    """
+    rows = []
     for way, family in sorted({(case["way"], case["family"]) for case in cases}):
-        own = [case for case in cases if (case["way"], case["family"]) == (way, family)]
-        counts = [sum(right(c, c["said"][min(k, len(c["said"]) - 1)]) for c in own) for k in range(MOTIONS + 1)]
-        for limit in SECONDS:
-            last = [int(np.flatnonzero(np.array(c["seconds"]) <= limit)[-1]) for c in own]
-            counts.append(sum(right(c, c["said"][k]) for c, k in zip(own, last, strict=True)))
-        lines.append(f"| {way} | {family} | {len(own)} | {' | '.join(map(str, counts))} |")
-    return "\n".join(lines)
+        every = [case for case in cases if (case["way"], case["family"]) == (way, family)]
+        for name, own in ((family, every), (f"{family}, open", [case for case in every if case["motions"]])):
+            timed = []
+            for limit in SECONDS:
+                last = [int(np.flatnonzero(np.array(c["seconds"]) <= limit)[-1]) for c in own]
+                timed.append(str(sum(right(c, c["said"][k]) for c, k in zip(own, last, strict=True))))
+            rows.append((way, name, str(len(own)), *right_after(own), *timed))
+    after, seconds = (f"after {k}" for k in range(MOTIONS + 1)), (f"{s:g} s" for s in SECONDS)
+    return table(("way", "family", "cases", *after, *seconds), rows)
+
+
+def by_kind(cases: Sequence[dict[str, Any]]) -> str:
+    """Return the right answers of each kind, the motions that were asked for, and the last answers that are wrong."""
+    rows = []
+    for way, kind in sorted({(case["way"], case["kind"]) for case in cases}):
+        own = [case for case in cases if (case["way"], case["kind"]) == (way, kind)]
+        asked = Counter(motion for case in own for motion in case["motions"])
+        wrong = [
+            f"{best(c['said'][-1])[1] or 'none'} {best(c['said'][-1])[0]:.2f}"
+            for c in own
+            if not right(c, c["said"][-1])
+        ]
+        told = ", ".join(f"{motion} {count}" for motion, count in asked.most_common())
+        rows.append((way, kind, str(len(own)), *right_after(own), told, ", ".join(wrong)))
+    return table(("way", "kind", "cases", *(f"after {k}" for k in range(MOTIONS + 1)), "motions", "wrong"), rows)
+
+
+def calibration_of(cases: Sequence[dict[str, Any]]) -> str:
+    """Return the share of right names by the final probability of the most probable one."""
+    said = np.array([best(case["said"][-1])[0] for case in cases])
+    hit = np.array([best(case["said"][-1])[1] in case["accepted"] for case in cases])
+    rows = []
+    for low, high in pairwise(BINS):
+        own = (said >= low) & (said < high)
+        if own.any():
+            rows.append(
+                (
+                    f"{low:.2f} to {min(high, 1.0):.2f}",
+                    str(own.sum()),
+                    f"{said[own].mean():.2f}",
+                    f"{hit[own].mean():.2f}",
+                )
+            )
+    return table(("final probability", "cases", "mean", "right"), rows)
 
 
 def _entered(half: Half, index: int, ways: Sequence[str], out: Path) -> None:
@@ -196,7 +251,9 @@ def main() -> None:
             error = future.exception()
             print(f"{number} of {len(futures)}: {futures[future]} {error or ''}", file=sys.stderr, flush=True)
     done = [json.loads(line) for line in results.read_text().splitlines()]
-    print(table(done))
+    for way in options.ways:
+        own = [case for case in done if case["way"] == way]
+        print("\n\n".join(made(own) for made in (by_family, by_kind, calibration_of)) + "\n")
 
 
 if __name__ == "__main__":

@@ -5,13 +5,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.evaluation.asking import right, table
+from tests.evaluation.asking import by_family, by_kind, calibration_of, right
 from tests.evaluation.plants.cases import answering, make_case
 
 
 def case(family: str, accepted: list[str], *said: dict[str, float], seconds: list[float]) -> dict[str, Any]:
     return {
-        "way": "best", "family": family, "accepted": accepted, "said": [[names] for names in said],
+        "way": "best", "family": family, "kind": "play", "accepted": accepted,
+        "motions": ["steps"] * (len(said) - 1), "said": [[names] for names in said],
         "seconds": seconds,
     }  # fmt: skip
 
@@ -30,7 +31,16 @@ def test_the_table_counts_by_motions_and_by_seconds_and_an_end_keeps_its_answer(
     unsure, sure = {"backlash": 0.3, "nothing": 0.7}, {"backlash": 0.9, "nothing": 0.1}
     after_one = case("effect", ["backlash"], unsure, sure, seconds=[0.0, 25.0])
     after_two = case("effect", ["backlash"], unsure, unsure, sure, seconds=[0.0, 40.0, 90.0])
-    assert table([after_one, after_two]).splitlines()[-1] == "| best | effect | 2 | 0 | 1 | 2 | 2 | 2 | 1 | 1 | 2 |"
+    cells = [cell.strip() for cell in by_family([after_one, after_two]).splitlines()[2].strip("|").split("|")]
+    assert cells == ["best", "effect", "2", "0", "1", "2", "2", "2", "1", "1", "2"]
+
+
+def test_the_other_tables_say_what_was_asked_what_is_wrong_and_how_probable_it_was() -> None:
+    found = case("effect", ["backlash"], {"backlash": 0.3}, {"backlash": 0.9}, seconds=[0.0, 25.0])
+    missed = case("effect", ["backlash"], {"joint_spring": 0.9}, seconds=[0.0])
+    assert "steps 1" in by_kind([found, missed])
+    assert "joint_spring 0.90" in by_kind([found, missed])
+    assert calibration_of([found, missed]).splitlines()[-1].split("|")[2:5] == [" 2     ", " 0.90 ", " 0.50  "]
 
 
 @pytest.mark.slow
