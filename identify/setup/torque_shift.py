@@ -268,17 +268,22 @@ def _late(bench: Bench, torque: Array, k: int, shifts: int) -> Array:
 def _solved(
     z: Sequence[Sequence[Array]], x: Sequence[Sequence[Array]], y: Sequence[Sequence[Array]], noise: Sequence[ArModel]
 ) -> tuple[Array, Array]:
-    """Instrumental-variable estimate (2.33) of rows whitened by their noise, and its covariance."""
-    c = x[0][0].shape[1]
-    left, right, meat, rows = np.zeros((c, c)), np.zeros(c), np.zeros((c, c)), 0
+    """Instrumental-variable estimate (2.33) of rows whitened by their noise, and its covariance.
+
+    Noise may come in bursts, or with fast motion: the covariance is that of its own squares (White 1980, Econometrica
+    48(4)).
+    """
+    parts = []
     for zeta, phi, tau, ar in zip(z, x, y, noise, strict=True):
         for a, b, t in zip(zeta, phi, tau, strict=True):
-            wb, wt = ar.whiten(b), ar.whiten(t)
-            wa = wb if a is b else ar.whiten(a)
-            left, right, meat, rows = left + wa.T @ wb, right + wa.T @ wt, meat + wa.T @ wa, rows + wt.size
-    inverse = np.linalg.inv(left)
-    covariance = inverse @ meat @ inverse.T * (rows / max(rows - c, 1))
-    return inverse @ right, covariance
+            wb = ar.whiten(b)
+            parts.append((wb if a is b else ar.whiten(a), wb, ar.whiten(t)))
+    inverse = np.linalg.inv(sum(wa.T @ wb for wa, wb, _ in parts))
+    theta = inverse @ sum(wa.T @ wt for wa, _, wt in parts)
+    rows, c = sum(wt.size for _, _, wt in parts), theta.size
+    scores = [wa * (wt - wb @ theta)[:, None] for wa, wb, wt in parts]
+    covariance = inverse @ sum(one.T @ one for one in scores) @ inverse.T * (rows / max(rows - c, 1))
+    return theta, covariance
 
 
 def _common(found: _Shifts, reach: float) -> TorqueShift:
