@@ -56,8 +56,8 @@ RIGHT = 0.5
 NO_NAME = (UNNAMED, NOTHING)
 BINS = (0.0, 0.2, 0.5, 0.8, 0.95, 1.01)
 """Limits of the final probabilities of a table."""
-LIMIT_S, LIMIT_BYTES = 900, 6 << 30
-"""Limits of a case: time, s, and memory of its process."""
+LIMIT_S, LIMIT_BYTES = 600, 6 << 30
+"""Limits of a case and way: time of the processor, s, and memory of the process."""
 
 
 class Excited(Investigating):
@@ -101,15 +101,15 @@ def investigated(half: Half, index: int, ways: Sequence[str], out: Path) -> Iter
         arm.run(ByName(f"{PROGRAM}:first_answer"), (half, index, folder), LIMIT_S)
         truth = json.loads((folder / f"{name}.truth.json").read_text(encoding="utf-8"))
         first = import_recording(folder / f"{name}_a.npz", folder / f"{name}.yaml")
-        signal.signal(signal.SIGALRM, _too_long)
+        signal.signal(signal.SIGPROF, _too_long)
         for way in ways:
-            signal.alarm(LIMIT_S)
+            signal.setitimer(signal.ITIMER_PROF, LIMIT_S)
             begin = time.process_time()
             kept = folder / way
             going = started(first.robot, [first], MOTIONS, MINUTES, Criteria(), CollisionModel(first.robot, []), kept)
             going = WAYS[way](going.robot, going.recordings, going.document, kept, going.criteria, going.collision)
             going.run(_ask(arm, (half, index), first, kept))
-            signal.alarm(0)
+            signal.setitimer(signal.ITIMER_PROF, 0.0)
             document = going.document
             _keep(kept, len(document.rounds))
             said = [[entry.names for entry in one.explanations] for one in document.rounds]
@@ -149,7 +149,7 @@ def _keep(folder: Path, motions: int) -> None:
 
 
 def _too_long(_number: int, _frame: FrameType | None) -> None:
-    raise TimeoutError(f"no outcome in {LIMIT_S} s")
+    raise TimeoutError(f"no outcome in {LIMIT_S} s of the processor")
 
 
 def right(case: dict[str, Any], said: Sequence[dict[str, float]]) -> bool:
