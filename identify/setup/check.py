@@ -88,6 +88,8 @@ def _check(experiments: Sequence[Experiment], robot: RobotConfig) -> SetupCheck:
         errors = _errors(make_bench(experiments, robot, moving), as_configured(robot))
         names = tuple(joint.name for joint, moves in zip(robot.joints, moving, strict=True) if moves)
         return SetupCheck((*rates, *findings), errors, errors, names, (), None)
+    numbers = _whole(experiments, robot, moving)
+    experiments = [experiments[number] for number in numbers]
     bench, search, best = _searched(experiments, robot, moving)
     best, changed = _stretch(bench, best)
     if changed is not None:
@@ -143,8 +145,19 @@ def _check(experiments: Sequence[Experiment], robot: RobotConfig) -> SetupCheck:
         likely_error_pct=likely_after,
         clock=clock,
         torque_shift=None if lost else _torque_shift(experiments, bench, best),
-        stretch=() if changed is None else spans(changed, bench),
+        stretch=()
+        if changed is None
+        else tuple(replace(s, experiment=numbers[s.experiment]) for s in spans(changed, bench)),
     )
+
+
+def _whole(experiments: Sequence[Experiment], robot: RobotConfig, moving: NDArray[np.bool_]) -> list[int]:
+    """Return the numbers of the experiments that move all joints that move in any; all if there are none.
+
+    A joint at rest says nothing of its order, scale or clock, and its friction would pass for a mistake of them.
+    """
+    whole = [k for k, e in enumerate(experiments) if signals.moving_joints([e], robot)[moving].all()]
+    return whole or list(range(len(experiments)))
 
 
 def _noise_alone(

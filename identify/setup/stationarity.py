@@ -281,7 +281,7 @@ def _when(found: ChangedStretch, bench: Bench, number: int) -> str:
     first, last = (int(k) for k in np.flatnonzero(rows)[[0, -1]])
     begin = "" if first == 0 else f"from {_between(time[first - 1], time[first])} s on"
     end = "" if last == rows.size - 1 else f"until {_between(time[last], time[last + 1])} s"
-    part = f"in part {number + 1} of the recordings " if len(bench.segments) > 1 else ""
+    part = f"in part {number + 1} of the recordings compared " if len(bench.segments) > 1 else ""
     return f"{part}{begin or 'from the beginning on'} {end}".rstrip()
 
 

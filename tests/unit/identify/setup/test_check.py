@@ -309,6 +309,18 @@ def test_a_joint_at_rest_is_named_and_not_judged(arm: RobotConfig, healthy: list
     assert "axis_3" not in found.joints_not_understood
 
 
+def test_a_recording_in_which_joints_rest_does_not_judge_the_others(
+    arm: RobotConfig, healthy: list[Experiment]
+) -> None:
+    q = np.tile(healthy[0].q[:1], (healthy[0].q.shape[0], 1))
+    q[:, 1] = healthy[0].q[:, 1]
+    # Its torques are of another motion: alone or together they would contradict the configuration.
+    single = replace(healthy[0], q=q, q_ref=None, tau=-healthy[0].tau)
+    alone, together = check_setup(healthy, arm), check_setup([single, *healthy], arm)
+    assert together.relative_error_pct == alone.relative_error_pct
+    assert together.findings == alone.findings
+
+
 def test_a_joint_that_turns_one_way_only_is_named(arm: RobotConfig, healthy: list[Experiment]) -> None:
     moving, rng = np.ones(3, dtype=np.bool_), np.random.default_rng(0)
     assert one_way_findings(healthy, arm, moving) == []
