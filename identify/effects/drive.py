@@ -86,6 +86,7 @@ class DriveGainError(Correction):
     )
     reference = "Gautier, Briot 2014, IEEE Trans. Automatic Control 59(10), Global identification of drive gains"
     required_motion = "several joints that carry the same link; for a single axis a baseline"
+    direct_evidence = "a known payload, or a torque sensor behind the gear"
     excitation = ("load", "accelerations")
     linear = (
         Linear("gain_error", UNITLESS, "Relative error of the reported torque: 0.1: 10 % more.", bounds=(-0.6, 1.5)),
@@ -131,6 +132,7 @@ class DriveGainSaturation(Correction):
     )
     reference = "Leonhard 2001, Control of Electrical Drives, chapter 5"
     required_motion = "small and large torques"
+    direct_evidence = "a torque sensor behind the gear"
     excitation = ("load", "accelerations")
     linear = (Linear("gain_loss", UNITLESS, "Share of the torque lost at the torque limit of the joint."),)
 
@@ -164,6 +166,7 @@ class TimeDelay(Correction):
     )
     reference = "Brunot 2017, section 2.3.1"
     required_motion = "quick changes of the torque"
+    direct_evidence = "the demanded torque, recorded with the actual one"
     excitation = ("accelerations",)
     linear: tuple[Linear, ...] = (Linear("delay", ("s", "s"), "Time by which the reported torque is late.", sign=1),)
 
@@ -219,6 +222,7 @@ class EncoderEccentricity(Periodic, TorqueDependent):
     description = "the measured position has an error that is periodic in the angle: an encoder disc mounted off centre"
     reference = "Armstrong 1998, Mechanism and Machine Theory; de Silva 2007, Sensors and Actuators, chapter 5"
     required_motion = "fast motion over a wide range"
+    direct_evidence = "an encoder on the joint side"
     excitation = ("speeds", "range")
     linear = (
         Linear("ecc", ("rad", "m"), "Amplitude of the cosine component of the position error."),

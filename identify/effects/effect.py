@@ -137,6 +137,8 @@ class Effect(ABC):
         Source of the functional form.
     required_motion
         Motion or data that make the effect visible, in words.
+    direct_evidence
+        Signal or load beyond the usual recording that shows the effect directly, in words; empty: none.
     excitation
         Keywords of the motion that excites the effect, see `armident.identify.diagnosis.next_experiment`.
     scope
@@ -168,6 +170,7 @@ class Effect(ABC):
     description: str
     reference: str
     required_motion: str
+    direct_evidence: str = ""
     excitation: tuple[str, ...] = ("reversals", "speeds")
     scope: Scope = "joint"
     linear: tuple[Linear, ...]

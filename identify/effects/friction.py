@@ -272,6 +272,7 @@ class LoadDependentFriction(TorqueDependent):
     description = "Coulomb friction grows with the torque that the gear transmits"
     reference = "Hamon, Gautier, Garrec 2010, IROS, Dynamic identification with load-dependent dry friction"
     required_motion = "motion in both directions under small and under large load"
+    direct_evidence = "the same motion with a known payload"
     excitation = ("reversals", "load")
     linear = (Linear("fcl", UNITLESS, "Coulomb friction per transmitted torque.", sign=1),)
     shapes = (ROTOR,)
@@ -377,6 +378,7 @@ class FrictionDrift(Effect):
     description = "friction changes between the beginning and the end of the recording: the gear warms up"
     reference = "Simoni et al. 2015, IROS, Modelling the temperature in joint friction of industrial manipulators"
     required_motion = "the same motion early and late in the recordings"
+    direct_evidence = "the temperature of the drive, recorded with the motion"
     excitation = ("repeats",)
     linear: tuple[Linear, ...] = (
         Linear("fcdr", TORQUE, "Change of the Coulomb friction from the beginning to the end of the recordings."),

@@ -167,6 +167,7 @@ class GravityDirection(TorqueDependent):
     description = "the direction of gravity differs from the configuration: the base is tilted or hangs"
     reference = "Khalil, Dombre 2002, Modeling, Identification and Control of Robots, chapter 12"
     required_motion = "postures all over the workspace"
+    direct_evidence = "an inclinometer at the base"
     excitation = ("range", "load")
     scope = "arm"
     linear: tuple[Linear, ...] = (

@@ -86,6 +86,7 @@ class JointElasticity(TorqueDependent):
     description = "the link oscillates relative to its motor: an elastic gear, belt or coupling, or a bending link"
     reference = "Spong 1987, J. Dyn. Sys. Meas. Control 109(4)"
     required_motion = "quick accelerations near the resonance, under load"
+    direct_evidence = "an encoder on the joint side"
     excitation = ("accelerations",)
     linear = (Linear("compliance", ("rad/(N m)", "m/N"), "Compliance: deflection per transmitted torque.", sign=1),)
     shapes = (
@@ -154,6 +155,7 @@ class Backlash(TorqueDependent):
     )
     reference = "Nordin, Gutman 2002, Automatica 38(10)"
     required_motion = "many changes of the load's direction"
+    direct_evidence = "an encoder on the joint side"
     excitation = ("reversals", "accelerations")
     linear = (Linear("behind", UNITLESS, "Torque pulses over those of plastic impacts.", sign=1, bounds=(0.1, 1.5)),)
     shapes = (Shape("gap", POSITION, "Width of the gap at the joint, from side to side."), ROTOR)

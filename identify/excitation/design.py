@@ -44,6 +44,9 @@ PERIOD = 1e-3
 ASSUMED_NOISE = 0.02
 """Assumed torque noise below the cut-off where none is known, relative to the torque limit."""
 
+DEVIATIONS = 2.0
+"""Standard deviations of a predicted torque by which it may be larger: by more in one case of 44 (normal)."""
+
 
 @dataclass(frozen=True, eq=False)
 class Design:
@@ -53,6 +56,7 @@ class Design:
     (b,); ``None`` if the noise is unknown. ``slow_share``: share of the samples of each joint (n,) slower than `SLOW`
     of its limit. ``torque``: (N, n) at `PERIOD`, ``None`` without parameters. ``wanted``: standard deviations of the
     wanted effects. ``closest``: smallest distance between bodies; ``None`` if there are none to compare.
+    ``torque_std``: standard deviations (N, n) of the torques; ``None`` if those of the parameters are unknown.
     """
 
     trajectory: Trajectory
@@ -62,6 +66,7 @@ class Design:
     torque: Floats | None = None
     wanted: dict[str, float] | None = None
     closest: ClosestApproach | None = None
+    torque_std: Floats | None = None
 
 
 def design_trajectory(
@@ -121,11 +126,16 @@ def excesses(robot: RobotConfig, design: Design, collision: CollisionModel | Non
     """Return the violated limits of torque (times ``share``) and distance of a trajectory, in words."""
     found = []
     if design.torque is not None:
-        for joint, peak in zip(robot.joints, np.abs(design.torque).max(axis=0), strict=True):
-            allowed = share * joint.limits.torque
-            if peak > allowed:
+        part = f", {100 * share:.0f} % of limits.torque" if share < 1.0 else ""
+        known = design.torque_std is not None
+        spread = np.zeros_like(design.torque) if design.torque_std is None else DEVIATIONS * design.torque_std
+        peaks = (np.abs(design.torque) + spread).argmax(axis=0)
+        for j, (joint, k) in enumerate(zip(robot.joints, peaks, strict=True)):
+            torque, more, allowed = abs(design.torque[k, j]), spread[k, j], share * joint.limits.torque
+            if torque + more > allowed:
+                words = f"{torque:.1f} ± {more:.1f}" if known else f"{torque:.1f}"
                 unit = "N m" if joint.type == "revolute" else "N"
-                found.append(f"a torque of {peak:.1f} {unit} at {joint.name} (allowed {allowed:.1f})")
+                found.append(f"a torque of {words} {unit} at {joint.name} (allowed {allowed:.1f}{part})")
     if collision is not None and design.closest is not None and design.closest.distance < collision.clearance:
         time = design.closest.sample * PERIOD
         found.append(f"a distance of {design.closest} at {time:.2f} s (clearance {collision.clearance:g})")

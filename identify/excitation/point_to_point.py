@@ -291,6 +291,16 @@ def predicted_torque(model: ArmModel, theta: ArrayLike, q: Floats, qd: Floats, q
     return torque
 
 
+def torque_deviation(model: ArmModel, covariance: Floats, q: Floats, qd: Floats, qdd: Floats, period: float) -> Floats:
+    """Return the standard deviations (N, n) of torques predicted along a motion, N m or N.
+
+    ``model``: anchored where terms depend on its torques; ``covariance`` (b, b): of its base parameters.
+    """
+    x = model.base_regressor(q, qd, qdd, dt=period)
+    result: Floats = np.sqrt(np.maximum(np.einsum("kjb,kjb->kj", x @ covariance, x), 0.0))
+    return result
+
+
 def sample_trajectory(trajectory: Trajectory, period: float) -> tuple[Floats, Floats, Floats]:
     """Return positions, velocities and accelerations (N, n) along a trajectory by finite differences."""
     q = trajectory.sample(period)

@@ -13,7 +13,12 @@ from armident.identify.documents.investigation import MotionChoice
 from armident.identify.effects.terms import arm_model
 from armident.identify.excitation.collision import CollisionModel
 from armident.identify.excitation.design import PERIOD, Design, design_trajectory, excesses
-from armident.identify.excitation.point_to_point import predicted_torque, sample_trajectory, slow_share
+from armident.identify.excitation.point_to_point import (
+    predicted_torque,
+    sample_trajectory,
+    slow_share,
+    torque_deviation,
+)
 from armident.identify.identification.from_recording import experiments_of
 from armident.identify.investigation.motions import FAMILIES, MARGIN, Reach, reach_of
 from armident.identify.investigation.question import Question, question
@@ -57,9 +62,12 @@ def first_motion(robot: RobotConfig, collision: CollisionModel) -> Chosen:
 
 def confirming_motion(state: ModelState, collision: CollisionModel, done: Sequence[MotionChoice]) -> Chosen:
     """Return the motion that confirms that nothing is missing: an excitation of all joints, if it is not done yet."""
-    made = _excitation(state.robot, reach_of_recordings(state), state.fit.theta, collision)
-    asked = "does a second motion show anything that is missing?"
-    return Chosen(asked, (made[0],)) if _key(made[0]) in map(_key, done) else _alone(asked, *made)
+    theta, asked = state.fit.theta, "does a second motion show anything that is missing?"
+    choice, trajectory = _excitation(state.robot, reach_of_recordings(state), theta, collision)
+    if trajectory is not None:
+        reason = excluded(state.robot, trajectory, theta, collision, state.fit.covariance)
+        choice, trajectory = choice.model_copy(update={"excluded": reason}), None if reason else trajectory
+    return Chosen(asked, (choice,)) if _key(choice) in map(_key, done) else _alone(asked, choice, trajectory)
 
 
 def _alone(asked: str, choice: MotionChoice, trajectory: Trajectory | None) -> Chosen:
@@ -88,7 +96,7 @@ def next_motion(
     made.sort(key=lambda each: ((each[1].expected_gain or 0.0) < LEAST_GAIN, -each[0]))
     considered: list[MotionChoice] = []
     for _, choice, trajectory in made:
-        reason = excluded(state.robot, trajectory, state.fit.theta, collision)
+        reason = excluded(state.robot, trajectory, state.fit.theta, collision, state.fit.covariance)
         considered.append(choice.model_copy(update={"excluded": reason}))
         if reason is None:
             enough = not open_questions or (choice.expected_gain or 0.0) >= LEAST_GAIN
@@ -130,15 +138,29 @@ def _questions(
     return posed, words or "what do other recordings show?"
 
 
-def excluded(robot: RobotConfig, trajectory: Trajectory, theta: Floats | None, collision: CollisionModel) -> str | None:
-    """Return the limit that a motion violates, in words; ``theta`` (b,) predicts its torques."""
+def excluded(
+    robot: RobotConfig,
+    trajectory: Trajectory,
+    theta: Floats | None,
+    collision: CollisionModel,
+    covariance: Floats | None = None,
+) -> str | None:
+    """Return the limit that a motion violates, in words.
+
+    ``theta`` (b,) predicts its torques, with the uncertainty that follows from its ``covariance`` (b, b).
+    """
     try:
         trajectory.check(robot, "motion")
     except ConfigError as error:
         return str(error)
     q, qd, qdd = sample_trajectory(trajectory, PERIOD)
-    torque = None if theta is None else predicted_torque(arm_model(robot), theta, q, qd, qdd, PERIOD)
-    design = Design(trajectory, np.inf, None, slow_share(robot, qd), torque, closest=collision.closest(q))
+    torque = std = None
+    if theta is not None:
+        model = arm_model(robot).anchored(theta)
+        torque = predicted_torque(model, theta, q, qd, qdd, PERIOD)
+        std = None if covariance is None else torque_deviation(model, covariance, q, qd, qdd, PERIOD)
+    closest = collision.closest(q)
+    design = Design(trajectory, np.inf, None, slow_share(robot, qd), torque, closest=closest, torque_std=std)
     found = excesses(robot, design, collision, MARGIN)
     return f"needs {'; '.join(found)}" if found else None
 
@@ -176,8 +198,15 @@ def _excitation(
 ) -> tuple[MotionChoice, Trajectory | None]:
     """Return an exciting trajectory within the reach; ``None`` with the reason if no trajectory keeps the limits."""
     joints = []
-    for joint, velocity, acceleration in zip(robot.joints, reach.velocity, reach.acceleration, strict=True):
-        slower = {"velocity": float(velocity), "acceleration": float(acceleration)}
+    # No posture further than a quarter of the time: several moves fit at the speeds of first contact.
+    near = 0.25 * EXCITATION_S * reach.velocity
+    low, high = np.maximum(reach.low, reach.home - near), np.minimum(reach.high, reach.home + near)
+    for j, joint in enumerate(robot.joints):
+        slower = {
+            "position": (float(low[j]), float(high[j])),
+            "velocity": float(reach.velocity[j]),
+            "acceleration": float(reach.acceleration[j]),
+        }
         joints.append(joint.model_copy(update={"limits": joint.limits.model_copy(update=slower)}))
     slow = robot.model_copy(update={"joints": tuple(joints)})
     words = "all joints at once along an exciting trajectory"

@@ -13,6 +13,7 @@ from armident.daq.recording.writer import write_recording
 from armident.identify.diagnosis.criteria import Criteria
 from armident.identify.diagnosis.diagnose import DiagnosisResult, run_diagnosis
 from armident.identify.diagnosis.model_state import ModelState
+from armident.identify.diagnosis.probabilities import NOTHING
 from armident.identify.documents.base import reference, versions
 from armident.identify.documents.diagnosis import Explanation, Finding
 from armident.identify.documents.files import load_document, to_json, write_atomically
@@ -22,10 +23,12 @@ from armident.identify.documents.investigation import (
     MotionChoice,
     Outcome,
 )
+from armident.identify.effects.registry import known
 from armident.identify.effects.unnamed import NAME as UNNAMED
 from armident.identify.excitation.collision import CollisionModel
 from armident.identify.identification.from_recording import experiments_of, rest_notes
 from armident.identify.investigation.choice import (
+    LEAST_GAIN,
     Chosen,
     confirming_motion,
     first_motion,
@@ -127,7 +130,7 @@ class Investigating:
         """Enter a motion if there is one and the budget allows it; else stop."""
         used, allowed, choice = self.document.motion_s, self.document.minutes, chosen.choice
         if choice is None:
-            self._stop(_no_motion(chosen))
+            self._stop(_no_motion(chosen, uncertain(self.document.explanations)))
         elif used + choice.duration_s > 60.0 * allowed:
             self._stop(
                 f"{choice.words} takes {choice.duration_s:.0f} s, and {used:.0f} s of {allowed:g} min have been used; "
@@ -283,12 +286,18 @@ def _named(findings: Sequence[Finding]) -> str:
     )
 
 
-def _no_motion(chosen: Chosen) -> str:
-    """Return the reason for which no motion is left."""
+def _no_motion(chosen: Chosen, doubtful: Sequence[Explanation]) -> str:
+    """Return the reason for which no motion is left, and what would tell the explanations apart."""
+    gains = [one.expected_gain or 0.0 for one in chosen.considered]
     barred = next((one for one in chosen.considered if one.excluded is not None), None)
-    if barred is not None:
+    if barred is not None and (barred.expected_gain is None or barred.expected_gain >= LEAST_GAIN):
         return f"the motion that would tell most ({barred.words}) is not allowed: {barred.excluded}"
-    best = max((one.expected_gain or 0.0 for one in chosen.considered), default=0.0)
-    if best == 0.0:
-        return "no motion is left that has not been asked for"
-    return f"no motion of the list tells them apart: the best one promises {best:.2f} nats"
+    reason = f"no motion of the list tells them apart: the best one promises {max(gains, default=0.0):.2f} nats"
+    if not any(gains):
+        reason = "no motion is left that has not been asked for"
+    names = dict.fromkeys(name for one in doubtful for name in one.likely if name not in (NOTHING, UNNAMED))
+    needed = [
+        f"{name.replace('_', ' ')} by {effect.direct_evidence or effect.required_motion}"
+        for name, effect in ((name, known(name)) for name in names)
+    ]
+    return f"{reason}. These would show it: {'; '.join(needed)}" if needed else reason
