@@ -28,10 +28,10 @@ PAGES = sorted(
 """Pages with blocks; the others consist of directives."""
 BLOCK = re.compile(
     r"^(?P<indent> *)<!-- (?P<comment>run before|not run here):(?P<text>.*?)-->"
-    r"|^(?P<margin> *)```(?P<language>[\w{}]*)\n(?P<code>.*?)^ *```$",
+    r"|^(?P<margin> *)```(?P<language>[\w{}]*)(?: \S+)?\n(?P<code>.*?)^ *```$",
     re.MULTILINE | re.DOTALL,
 )
-LANGUAGES = {"sh", "python", "yaml", "toml", "json", "text", "ini", "{toctree}"}
+LANGUAGES = {"sh", "python", "yaml", "toml", "json", "text", "ini", "{toctree}", "{literalinclude}"}
 PAGE_S = 900.0
 """Time limit of a page, s: ten times what the slowest one takes on an idle machine."""
 TRAP = "trap 'code=$?; [ $code -eq 4 ] || { echo \"exit code $code: $BASH_COMMAND\" >&2; exit $code; }' ERR\n"
