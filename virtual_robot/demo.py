@@ -1,8 +1,9 @@
-"""``armident demo``: capture, identification and diagnosis of a virtual arm on one machine, by the real processes."""
+"""``armident demo``: capture, identification and investigation of a virtual arm on one machine, by real processes."""
 
 import json
 import logging
 import os
+import shlex
 import subprocess
 import sys
 import time
@@ -31,8 +32,8 @@ from armident.configs.schema.scenario import HiddenEffect
 from armident.drivers.vcan import ensure_vcan, have_socketcan, launcher_command, launcher_obstacle
 from armident.processes import CommandProcess, ProcessEnded, ProcessTimeout, start_command
 from armident.virtual_robot.demo_report import (
-    Diagnosed,
     Identified,
+    Investigated,
     print_next_steps,
     print_results,
     true_values,
@@ -52,17 +53,12 @@ from armident.virtual_robot.twin import (
 )
 
 CELL = "tx40_cell.yaml"
-SCENARIO = "scenarios/tx40_worn_joint2.yaml"
+SCENARIO = "scenarios/tx40_cable.yaml"
 VCAN = "vcan0"
 """Bus of a configured arm, in place of those of its session: real drives stay apart."""
 WEAR = 0.3
 """Share by which the viscous friction of a worn bearing differs from its mean, in either direction."""
 GUEST_VARIABLE = "ARMIDENT_GUEST"
-REPEATS = 3
-"""Number of runs of the trajectory in the second part: one run is too short for the small hidden effect."""
-JOINT_RUNS = 9
-"""Largest number of runs times joints of a configured arm: the diagnosis of more takes more memory than a process of
-the guest has where the launcher may not raise the limit of mappings (`armident.drivers.vcan.guest`)."""
 UDP_GROUP = "239.74.163.2"
 """Multicast address of the bus without SocketCAN."""
 UDP_PERIOD_US = 2000
@@ -118,13 +114,12 @@ class DemoOptions:
 
 @dataclass(frozen=True)
 class Subject:
-    """The arm of the demo, the scenario of the second part, and the repeats of its trajectory."""
+    """The arm of the demo, and the scenario of the second part."""
 
     session: SessionConfig
     robot: RobotConfig
     scenario: Path
     robot_options: tuple[str, ...] = ()
-    repeats: int = REPEATS
 
     def at(self, session: SessionConfig) -> "Subject":
         """Return the same arm in another session."""
@@ -139,7 +134,7 @@ def demo(options: DemoOptions) -> None:
     out.mkdir(parents=True, exist_ok=True)
     log.begin = time.monotonic()
     first, subject = _identify_part(subject, out)
-    second = None if options.quick else _diagnose_part(subject, out)
+    second = None if options.quick else _investigate_part(subject, out)
     report = write_report(out, subject.robot, first, second)
     print_results(first, second)
     if options.keep_going:
@@ -175,8 +170,7 @@ def _subject(options: DemoOptions, out: Path) -> Subject:
     words = ["--arm-seed", str(options.choice.seed), *(["--draw-masses"] * options.choice.draw_masses)]
     if options.choice.model is not None:
         words += ["--model", str(options.choice.model.resolve())]
-    repeats = min(REPEATS, max(1, JOINT_RUNS // twin.robot.n))
-    return Subject(session, twin.robot, scenario, tuple(words), repeats)
+    return Subject(session, twin.robot, scenario, tuple(words))
 
 
 def worn(twin: Twin) -> Scenario:
@@ -268,33 +262,29 @@ def _identify_part(subject: Subject, out: Path) -> tuple[Identified, Subject]:
     return Identified(document, Path(report), truth, recorded.lost), subject.at(session)
 
 
-def _diagnose_part(subject: Subject, out: Path) -> Diagnosed:
-    """Record the arm with a hidden effect and diagnose it."""
-    # The diagnosis needs a long motion, not a high rate.
+def _investigate_part(subject: Subject, out: Path) -> Investigated:
+    """Record the arm with a hidden effect, and ask it for the motion that tells what it is."""
+    # The investigation needs no high rate.
     session = _slower(subject.session) or subject.session
-    log.info(f"part 2: record the same arm at {_rate(session)} with a hidden effect, which the diagnosis has to find")
-    if session.setpoints is not None:
-        session = session.model_copy(
-            update={"setpoints": session.setpoints.model_copy(update={"repeat": subject.repeats})}
-        )
+    log.info(f"part 2: record the same arm at {_rate(session)} with a hidden effect, which has to be found")
     config = _write_session(session, out, "cell_worn")
-    robot_options = [*subject.robot_options, "--scenario", str(subject.scenario)]
-    recorded = _record("capture_worn", config, out, out / "recordings", robot_options)
-    log.info("diagnosing")
-    folder = out / "diagnosis"
-    with _running("diagnose", ["diagnose", str(recorded.path), "--out", str(folder), "--json"], out) as diagnosis:
-        diagnosis.wait(PART_S, accepted=(0, 4))
-    document = json.loads((folder / "diagnosis.json").read_text(encoding="utf-8"))
-    for finding in document["findings"]:
-        log.info(
-            f"found: {finding['effect'].replace('_', ' ')} in {finding['joint']}; its torque error on held-out data "
-            f"{finding['gap_before']:.2f} % -> {finding['gap_after']:.2f} %"
-        )
-    if not document["findings"]:
-        log.info(f"nothing found: verdict {document['verdict']}")
+    hidden = [*subject.robot_options, "--scenario", str(subject.scenario)]
+    recorded = _record("capture_worn", config, out, out / "recordings", hidden)
+    folder = out / "investigation" / time.strftime("%Y%m%dT%H%M%S")
+    program = shlex.join([*_armident(), "robot", "--config", str(config), *hidden, "--to-command"])
+    words = ["investigate", str(recorded.path), "--robot-command", program, "--experiments", "1", "--yes"]
+    log.info("what is hidden? The arm may be asked for one motion")
+    with _running("investigate", [*words, "--out", str(folder), "--json"], out) as investigation:
+        investigation.wait(PART_S, accepted=(0, 3, 4))
+    document, diagnosis = (
+        json.loads((folder / name).read_text(encoding="utf-8")) for name in ("investigation.json", "diagnosis.json")
+    )
+    for asked in document["rounds"]:
+        log.info(f"asked: {asked['question']} {asked['chosen']['words']}, {asked['chosen']['duration_s']:.1f} s")
+    log.info(f"{document['outcome'].replace('_', ' ')}: {document['statement']}")
     effects = load_scenario(subject.scenario).effects
-    hidden = tuple(f"{effect.effect.replace('_', ' ')} in {effect.joint}" for effect in effects)
-    return Diagnosed(document, folder / "report.html", hidden)
+    names = tuple(f"{effect.effect.replace('_', ' ')} in {effect.joint}" for effect in effects)
+    return Investigated(document, diagnosis, folder / "report.html", names)
 
 
 def _record(name: str, config: Path, out: Path, recordings: Path, robot_options: Sequence[str]) -> Recorded:

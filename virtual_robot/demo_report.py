@@ -27,10 +27,15 @@ class Identified:
 
 
 @dataclass(frozen=True)
-class Diagnosed:
-    """Results of the second part; ``hidden``: effects that were hidden, each with its joint."""
+class Investigated:
+    """Results of the second part.
+
+    ``document``, ``diagnosis``: contents of ``investigation.json`` and of the last ``diagnosis.json``; ``hidden``:
+    effects that were hidden, each with its joint.
+    """
 
     document: dict[str, Any]
+    diagnosis: dict[str, Any]
     report: Path
     hidden: tuple[str, ...]
 
@@ -53,7 +58,7 @@ def true_values(document: Mapping[str, Any], truth: Mapping[str, float], robot: 
     return out
 
 
-def write_report(out: Path, robot: RobotConfig, first: Identified, second: Diagnosed | None) -> Path:
+def write_report(out: Path, robot: RobotConfig, first: Identified, second: Investigated | None) -> Path:
     """Join the reports of both parts to one page ``report.html``; ``None``: the second was left out."""
     page = first.report.read_text(encoding="utf-8")
     parts = [_part(page)] + ([] if second is None else [_part(second.report.read_text(encoding="utf-8"))])
@@ -90,21 +95,24 @@ $second
 """)
 
 
-def _summary(robot: RobotConfig, first: Identified, second: Diagnosed | None) -> dict[str, str]:
+def _summary(robot: RobotConfig, first: Identified, second: Investigated | None) -> dict[str, str]:
     document = first.document
     compared = _against_truth(first)
     worst = max(compared, key=lambda row: abs(row[4]), default=None)
     line = ""
     if second is not None:
-        found = second.document["findings"]
-        names = ", ".join(f"{f['effect'].replace('_', ' ')} in {f['joint']}" for f in found) or "nothing"
-        gap = second.document["gap"]["validation"]
+        gap = second.diagnosis["gap"]["validation"]
+        asked = " ".join(
+            f"The recording left a question: {one['question']} The arm was asked for a motion of "
+            f"{one['chosen']['duration_s']:.1f} s: {one['chosen']['words']}."
+            for one in second.document["rounds"]
+        )
         line = (
             f"<li>Then {escape(', '.join(second.hidden)) or 'nothing'} was hidden in the arm, unknown to the "
-            "diagnosis. The diagnosis found: "
-            f"<b>{escape(names)}</b>. On held-out data the relative torque error decreased from "
+            f"investigation. {escape(asked) or 'The recording was enough.'} The result: "
+            f"<b>{escape(second.document['statement'])}</b> On held-out data the relative torque error decreased from "
             f"{gap['before']['all']:.2f} % to {gap['after']['all']:.2f} %; "
-            f"the noise floor is {second.document['noise_floor']['all']:.2f} %.</li>"
+            f"the noise floor is {second.diagnosis['noise_floor']['all']:.2f} %.</li>"
         )
     counters = {} if worst is None else {"worst": f"{worst[0]}, {abs(worst[4]):.1f}"}
     return {
@@ -132,16 +140,18 @@ def _against_truth(first: Identified) -> list[tuple[str, float, float, float, fl
     ]
 
 
-def print_results(first: Identified, second: Diagnosed | None) -> None:
+def print_results(first: Identified, second: Investigated | None) -> None:
     """Print the identified parameters beside the true ones, and the findings of the second part, if any."""
     print(f"\n{'parameter':>10} {'identified':>11} {'+- std':>9} {'true':>9} {'off by':>9}")
     for name, value, std, truth, distance in _against_truth(first):
         print(f"{name:>10} {value:11.4f} {std:9.4f} {truth:9.4f} {distance:5.1f} std")
     if second is not None:
-        gap = second.document["gap"]["validation"]
+        gap = second.diagnosis["gap"]["validation"]
         print(f"\nhidden: {', '.join(second.hidden) or 'nothing'}")
-        print(f"diagnosis: {second.document['verdict'].replace('_', ' ')}")
-        for f in second.document["findings"]:
+        for asked in second.document["rounds"]:
+            print(f"question: {asked['question']}\n  {asked['chosen']['words']}, {asked['chosen']['duration_s']:.1f} s")
+        print(f"answer: {second.document['outcome'].replace('_', ' ')}. {second.document['statement']}")
+        for f in second.diagnosis["findings"]:
             print(
                 f"  {f['effect']} in {f['joint']}: {f['gap_before']:.2f} % -> {f['gap_after']:.2f} % on held-out data"
             )
