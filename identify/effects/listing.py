@@ -77,7 +77,10 @@ def _one(effect: Effect) -> None:
         if linear.requires is not None:
             print(f"{linear.name} requires {linear.requires} and absorbs {linear.absorbs} of the joint;")
             print(f"  `without: [{linear.name}]` in the configuration keeps {linear.absorbs}")
-    print(f"required motion: {effect.required_motion}\nsource: {effect.reference}")
+    print(f"required motion: {effect.required_motion}")
+    if effect.direct_evidence:
+        print(f"shown directly by: {effect.direct_evidence}")
+    print(f"source: {effect.reference}")
     values = [f"{p.name}: ..." for p in effect.parameters_of_entry]
     law = f", law: {effect.law}" if effect.law else ""
     other = ", other: joint_2" if effect.two_joints else ""

@@ -21,7 +21,7 @@ def investigation_report(
     document: InvestigationDocument, trajectories: Sequence[Trajectory | None], robot: RobotConfig
 ) -> str:
     """Return the HTML page of an investigation, complete in one file."""
-    after = [one.explanations for one in document.rounds[1:]] + [document.explanations]
+    after = [*(one.explanations for one in document.rounds), document.explanations][1:]
     return render(
         "investigation.html",
         document=document,

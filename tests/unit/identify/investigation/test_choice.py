@@ -8,12 +8,13 @@ import pytest
 
 from armident.configs import load_robot, load_trajectory
 from armident.identify.documents.diagnosis import Explanation
-from armident.identify.documents.investigation import MotionChoice
+from armident.identify.documents.investigation import InvestigationDocument, MotionChoice
 from armident.identify.effects.terms import arm_model
 from armident.identify.excitation.collision import CollisionModel
 from armident.identify.excitation.point_to_point import sample_trajectory
 from armident.identify.investigation.choice import Chosen, excluded, first_motion
 from armident.identify.investigation.investigate import _no_motion
+from armident.identify.report.investigation_report import investigation_report
 
 ARM = Path(__file__).resolve().parents[4] / "docs" / "examples" / "mujoco_arm.yaml"
 MASS, VISCOUS, DRY = 95.0, 200.0, 20.0
@@ -61,3 +62,13 @@ def test_an_end_without_a_motion_names_the_limit_or_the_signal_that_would_tell()
         "no motion of the list tells them apart: the best one promises 0.02 nats. These would show it: backlash by an "
         "encoder on the joint side; stribeck friction by slow motion in both directions"
     )
+
+
+def test_an_arm_that_its_first_recording_decides_has_a_report_without_questions() -> None:
+    statement = "backlash at joint_1, probability 99.0 %."
+    document = InvestigationDocument(
+        robot="emps", recordings=[], experiments=1, minutes=1.0, outcome="named", statement=statement, versions={}
+    )
+    page = investigation_report(document, (), load_robot("emps"))
+    assert statement in page
+    assert "Round 1" not in page
