@@ -1,6 +1,6 @@
 """Configuration files of robots, sessions, trajectories and scenarios, and the schema that checks them."""
 
-from armident.configs.errors import ArmidentError, ConfigError, DataError
+from armident.configs.errors import ArmidentError, ConfigError, DataError, MotionStopped
 from armident.configs.loading import config_path, load_robot, load_scenario, load_session, load_trajectory
 from armident.configs.schema.robot import Coupling, Drive, Joint, Limits, Mdh, RobotConfig
 from armident.configs.schema.scenario import Scenario
@@ -16,6 +16,7 @@ __all__ = [
     "Joint",
     "Limits",
     "Mdh",
+    "MotionStopped",
     "RobotConfig",
     "Scenario",
     "SessionConfig",

@@ -10,6 +10,10 @@ class ArmidentError(Exception):
     exit_code = 1
 
 
+class MotionStopped(ArmidentError):
+    """A guard stopped a motion; the message says why. The arm must not move again before somebody has looked."""
+
+
 class ConfigError(ArmidentError):
     """Error of usage or configuration; the message names the file, the key and the expected value."""
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import yaml
 
-from armident.configs import ConfigError, DataError, RobotConfig, Trajectory, load_robot
+from armident.configs import ConfigError, DataError, MotionStopped, RobotConfig, Trajectory, load_robot
 from armident.configs.loading import load_trajectory
 from armident.daq.recording import Recording, read_recording
 from armident.daq.recording.writer import write_recording
@@ -40,7 +40,7 @@ from armident.identify.report.robot_file import robot_yaml
 from armident.identify.signals.bandwidth import motion_bandwidth
 
 Ask = Callable[[Trajectory], Recording]
-"""Plays a trajectory on the robot and returns the recording; DataError if it refuses to."""
+"""Plays a trajectory on the robot and returns the recording; DataError if it refuses to, MotionStopped ends all."""
 Progress = Callable[[str, float], None]
 
 FILE, ROBOT, MODEL = "investigation.json", "robot.yaml", "model.yaml"
@@ -180,13 +180,19 @@ class Investigating:
         last, trajectory = rounds[-1], self.trajectories[-1]
         assert trajectory is not None
         report(f"round {len(rounds)}: {last.chosen.words}", 0.0)
+        kept = None if self.folder is None else self.folder / f"motion_{len(rounds)}.mcap"
         try:
-            recording = ask(trajectory)
-        except DataError as error:
+            # A process that was killed may have written the recording and not entered it.
+            recording = read_recording(kept) if kept is not None and kept.exists() else ask(trajectory)
+        except (DataError, MotionStopped) as error:
             self._update(rounds=[*rounds[:-1], last.model_copy(update={"refused": str(error)})])
+            if isinstance(error, MotionStopped):
+                self._stop(
+                    f"{last.chosen.words} was stopped: {error}. Find the cause before the arm moves again, then begin "
+                    "with another --out"
+                )
             return
-        if self.folder is not None and (recording.path is None or recording.path.parent != self.folder):
-            kept = self.folder / f"motion_{len(rounds)}.mcap"
+        if kept is not None and (recording.path is None or recording.path.resolve().parent != kept.resolve().parent):
             write_recording(recording, kept)
             recording = read_recording(kept)
         answered = last.model_copy(update={"recording": reference(recording)})

@@ -9,7 +9,7 @@ from pathlib import Path
 from types import FrameType
 from typing import IO
 
-from armident.configs import ArmidentError, ConfigError, DataError
+from armident.configs import ArmidentError, ConfigError, DataError, MotionStopped
 from armident.daq.recording import Recording, join_parts, read_recording
 from armident.processes import CommandProcess, Process, ProcessEnded, Start, start_command
 
@@ -41,7 +41,8 @@ class Interrupted(ArmidentError):
 def record_run(config: Path, out: Path, say: Say, start: Start = start_process) -> Recording:
     """Play the set points of a session once under a guard and return the recording, which is always kept.
 
-    Raises ConfigError if the bus is not as configured, ArmidentError if guard or drive stopped, or Interrupted.
+    Raises ConfigError if the bus is not as configured, MotionStopped if the guard stopped the drives, Interrupted, or
+    ArmidentError if the capture failed.
     """
     # The guard runs from before the first motion until after the last.
     with _interruptible(), _command(["guard", "--config", str(config)], start) as guard:
@@ -57,11 +58,11 @@ def record_run(config: Path, out: Path, say: Say, start: Start = start_process) 
                 raise
             if capture.running:
                 capture.stop(CAPTURE_ENDS_S)
-                raise ArmidentError(_kept(guard.last_error(), capture))
+                raise MotionStopped(_kept(guard.last_error(), capture))
             guard.stop(GUARD_ENDS_S, signal.SIGUSR1)
             if guard.exit_code == 1:
                 # The guard stopped the drives, and the capture ended for that reason.
-                raise ArmidentError(_kept(guard.last_error(), capture))
+                raise MotionStopped(_kept(guard.last_error(), capture))
             if capture.exit_code:
                 raise _ERRORS.get(capture.exit_code, ArmidentError)(capture.last_error())
             say(capture.errors().strip().splitlines()[-1])

@@ -16,7 +16,6 @@ from armident.configs import (
     RobotConfig,
     SessionConfig,
     load_robot,
-    load_session,
     load_trajectory,
 )
 from armident.configs.errors import FOUND
@@ -31,6 +30,7 @@ from armident.identify.excitation.point_to_point import sample_trajectory
 from armident.identify.excitation.previous_estimate import previous_estimate
 from armident.identify.identification.options import options_of
 from armident.identify.monitoring.reidentify.baseline import Baseline, baseline_of
+from armident.identify.monitoring.reidentify.cell import load_moving_session
 from armident.identify.monitoring.reidentify.identify_once import identify_once
 from armident.identify.monitoring.reidentify.keep import HistoryEntry, history_or_reason, recorded_in_history
 from armident.identify.monitoring.reidentify.publish import StatusPublisher
@@ -109,18 +109,8 @@ def prepare(config: Path, baseline: Path | None, store: str, out: Path | None, f
 
     Raises ConfigError if set points are missing or beyond limits, DataError if the baseline does not fit.
     """
-    session = load_session(config)
+    session = load_moving_session(config)
     robot = load_robot(session.robot)
-    if session.setpoints is None:
-        raise ConfigError(f"{config}: setpoints: missing, so nothing would move; name an exciting trajectory")
-    if session.sync.role != "producer":
-        raise ConfigError(
-            f"{config}: sync.role: {session.sync.role}; expected producer, which sends SYNC and can move the arm"
-        )
-    if session.recording.trigger is not None:
-        raise ConfigError(
-            f"{config}: recording.trigger: records only events; remove it, the job needs the whole motion"
-        )
     history, warning = history_or_reason(store, needed=baseline is None or not baseline.exists())
     chosen = baseline_of(baseline, history, robot.name, session.cell)
     check_trajectory(session, robot, chosen)
