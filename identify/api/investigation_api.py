@@ -6,11 +6,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
-from armident.configs import RobotConfig, Trajectory
+from armident.configs import DataError, RobotConfig, Trajectory
 from armident.daq.recording import Recording
 from armident.identify.api.arguments import Progress, Recorded, Robot, recordings_of, robot_of
+from armident.identify.api.identification_api import Identification, identified
 from armident.identify.api.result_base import Result
 from armident.identify.api.result_tables import Table
+from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.documents.investigation import InvestigationDocument
 from armident.identify.report.robot_file import robot_yaml
 
@@ -93,6 +95,7 @@ def investigate(
     recordings: Recorded | Sequence[Recorded] = (),
     *,
     choose_from: Recorded | Sequence[Recorded] = (),
+    baseline: Identification | IdentificationDocument | str | Path | None = None,
     experiments: int = 6,
     minutes: float = 10.0,
     material: float = 0.2,
@@ -111,13 +114,16 @@ def investigate(
         Configuration with joint limits, or the path or shipped name of one; by default the one inside the first
         recording.
     ask
-        Plays a trajectory on the robot and returns the recording; it raises `DataError` if the robot refuses to move.
-        By default the investigation ends with the motion in ``pending``, and ``resume`` goes on.
+        Plays a trajectory on the robot and returns the recording; it raises `DataError` if the robot refuses to move,
+        and `armident.configs.MotionStopped` if the arm was stopped and must not move again. By default the
+        investigation ends with the motion in ``pending``, and ``resume`` goes on.
     recordings
         Recordings from before; without them the first motion is a slow excitation of all joints. With ``resume``, the
         recording of the pending motion.
     choose_from
         Recordings of the past to ask in place of the arm.
+    baseline
+        An identification of the arm before it changed; then the question is what has changed since.
     experiments
         Most motions.
     minutes
@@ -141,7 +147,8 @@ def investigate(
     ConfigError
         If a file does not exist, a configuration is wrong, or the folder has an investigation already.
     DataError
-        If the recordings cannot support a diagnosis, or one changed since the investigation used it.
+        If the recordings cannot support a diagnosis, one changed since the investigation used it, or the baseline is
+        of another robot.
 
     Examples
     --------
@@ -165,7 +172,11 @@ def investigate(
         config = robot_of(robot, (*given, *offered), "trajectory")
         source = robot if isinstance(robot, str | Path) else None
         collision = safety_model(config, source, None).collision
-        going = started(config, given, experiments, minutes, criteria, collision, None if out is None else Path(out))
+        before = None if baseline is None else identified(baseline)[0]
+        if before is not None and before.robot != config.name:
+            raise DataError(f"the baseline is of robot {before.robot!r}, the arm is {config.name!r}")
+        folder = None if out is None else Path(out)
+        going = started(config, given, experiments, minutes, criteria, collision, folder, before)
         answers = iter(())
     going.offered = offered
 

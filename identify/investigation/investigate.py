@@ -17,6 +17,7 @@ from armident.identify.diagnosis.probabilities import NOTHING
 from armident.identify.documents.base import reference, versions
 from armident.identify.documents.diagnosis import Explanation, Finding
 from armident.identify.documents.files import load_document, to_json, write_atomically
+from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.documents.investigation import (
     InvestigationDocument,
     InvestigationRound,
@@ -43,8 +44,8 @@ Ask = Callable[[Trajectory], Recording]
 """Plays a trajectory on the robot and returns the recording; DataError if it refuses to, MotionStopped ends all."""
 Progress = Callable[[str, float], None]
 
-FILE, ROBOT, MODEL = "investigation.json", "robot.yaml", "model.yaml"
-"""Files of a folder: the document, the configuration, and the configuration with what was found."""
+FILE, ROBOT, MODEL, BASELINE = "investigation.json", "robot.yaml", "model.yaml", "baseline.json"
+"""Files of a folder: the document, the configuration, the same with what was found, and the arm before it changed."""
 
 
 class Waiting(Exception):
@@ -56,7 +57,7 @@ class Investigating:
     """An investigation that goes on: its document, its recordings, and the folder that keeps both.
 
     A kill at any moment loses nothing but the diagnosis or the motion that runs: `resumed` goes on with the last round.
-    ``offered``: recordings of the past to ask in place of the arm.
+    ``offered``: recordings of the past to ask in place of the arm. ``baseline``: see `run_diagnosis`.
     """
 
     robot: RobotConfig
@@ -67,6 +68,7 @@ class Investigating:
     collision: CollisionModel
     trajectories: list[Trajectory | None] = field(default_factory=list)
     offered: Sequence[Recording] = ()
+    baseline: IdentificationDocument | None = None
     result: DiagnosisResult | None = None
 
     @property
@@ -148,7 +150,7 @@ class Investigating:
         band = self.robot.bandwidth_hz or motion_bandwidth([e.q for e in first], first[0].dt)
         robot = self.robot.model_copy(update={"bandwidth_hz": band})
         found = run_diagnosis(
-            experiments, [], robot, references, None, list(dict.fromkeys(notes)), report, self.criteria
+            experiments, [], robot, references, self.baseline, list(dict.fromkeys(notes)), report, self.criteria
         )
         return replace(found, robot=found.robot.model_copy(update={"bandwidth_hz": self.robot.bandwidth_hz}))
 
@@ -170,9 +172,11 @@ class Investigating:
             recording=None if chosen.answer is None else reference(chosen.answer),
         )
         self.trajectories.append(chosen.trajectory)
-        self._update(rounds=[*self.document.rounds, asked])
-        if chosen.answer is not None:
-            self._keep(chosen.answer, chosen.choice.duration_s)
+        rounds = [*self.document.rounds, asked]
+        if chosen.answer is None:
+            self._update(rounds=rounds)
+        else:
+            self._keep(chosen.answer, chosen.choice.duration_s, rounds)
 
     def _answer(self, ask: Ask, report: Progress) -> None:
         """Ask for the last motion, and enter the recording, or the reason for which the robot refused it."""
@@ -185,31 +189,31 @@ class Investigating:
             # A process that was killed may have written the recording and not entered it.
             recording = read_recording(kept) if kept is not None and kept.exists() else ask(trajectory)
         except (DataError, MotionStopped) as error:
-            self._update(rounds=[*rounds[:-1], last.model_copy(update={"refused": str(error)})])
-            if isinstance(error, MotionStopped):
-                self._stop(
-                    f"{last.chosen.words} was stopped: {error}. Find the cause before the arm moves again, then begin "
-                    "with another --out"
-                )
+            refused = [*rounds[:-1], last.model_copy(update={"refused": str(error)})]
+            if isinstance(error, DataError):
+                self._update(rounds=refused)
+            else:
+                reason = f"{last.chosen.words} was stopped: {error}. Find the cause before the arm moves again"
+                self._stop(f"{reason}; then begin with another --out", rounds=refused)
             return
         if kept is not None and (recording.path is None or recording.path.resolve().parent != kept.resolve().parent):
             write_recording(recording, kept)
             recording = read_recording(kept)
         answered = last.model_copy(update={"recording": reference(recording)})
-        self._update(rounds=[*rounds[:-1], answered])
-        self._keep(recording, trajectory.duration)
+        self._keep(recording, trajectory.duration, [*rounds[:-1], answered])
 
-    def _keep(self, recording: Recording, duration: float) -> None:
+    def _keep(self, recording: Recording, duration: float, rounds: Sequence[InvestigationRound]) -> None:
+        """Enter a recording of a motion, duration in s, with the rounds that have it."""
         self.recordings.append(recording)
-        self._update(motion_s=self.document.motion_s + duration)
+        self._update(rounds=list(rounds), motion_s=self.document.motion_s + duration)
 
-    def _stop(self, reason: str) -> None:
-        """End without a decision, for a reason."""
+    def _stop(self, reason: str, **changes: object) -> None:
+        """End without a decision, for a reason; ``changes``: of the document, with which it is written once."""
         doubtful = uncertain(self.document.explanations)
         unnamed = all(one.likely[0] == UNNAMED for one in doubtful)
         outcome: Outcome = "unnamed" if doubtful and unnamed else "cannot_tell"
         left = "; ".join(f"{one.joint}: {one.sentence}" for one in doubtful) or "nothing is decided"
-        self._update(outcome=outcome, statement=f"{left}. {reason[0].upper()}{reason[1:]}.")
+        self._update(outcome=outcome, statement=f"{left}. {reason[0].upper()}{reason[1:]}.", **changes)
 
     def _update(self, **changes: object) -> None:
         self.document = self.document.model_copy(update=changes)
@@ -225,16 +229,25 @@ def started(
     criteria: Criteria,
     collision: CollisionModel,
     folder: Path | None,
+    baseline: IdentificationDocument | None = None,
 ) -> Investigating:
-    """Return a new investigation. Raises ConfigError if the folder has one already, or a limit is not positive."""
+    """Return a new investigation. Raises ConfigError if the folder has one that has begun, or a limit is not positive.
+
+    An investigation without a motion and without a diagnosis has not begun.
+    """
     if experiments < 1 or not minutes > 0.0:
         raise ConfigError("--experiments and --minutes: expected at least one motion and a time greater than 0")
     robot.check_movable("investigate")
     kept = list(recordings)
     if folder is not None:
-        if (folder / FILE).exists():
+        former = load_document(folder / FILE, InvestigationDocument) if (folder / FILE).exists() else None
+        if former is not None and (former.rounds or former.explanations):
             raise ConfigError(f"{folder}: has an investigation already; go on with --continue, or give another --out")
         write_atomically(folder / ROBOT, robot_yaml(robot))
+        if baseline is None:
+            (folder / BASELINE).unlink(missing_ok=True)
+        else:
+            write_atomically(folder / BASELINE, to_json(baseline))
         for k, recording in enumerate(kept):
             if recording.path is None:
                 write_recording(recording, folder / f"start_{k + 1}.mcap")
@@ -246,7 +259,7 @@ def started(
         minutes=minutes,
         versions=versions(),
     )
-    found = Investigating(robot, kept, document, folder, criteria, collision)
+    found = Investigating(robot, kept, document, folder, criteria, collision, baseline=baseline)
     found._update()
     return found
 
@@ -266,16 +279,16 @@ def resumed(folder: Path, criteria: Criteria, collision: CollisionModel | None =
     trajectories = [
         None if one.trajectory is None else load_trajectory(folder / one.trajectory) for one in document.rounds
     ]
-    return Investigating(
-        robot, recordings, document, folder, criteria, collision or CollisionModel(robot, []), trajectories
-    )
+    baseline = load_document(folder / BASELINE, IdentificationDocument) if (folder / BASELINE).exists() else None
+    collision = collision or CollisionModel(robot, [])
+    return Investigating(robot, recordings, document, folder, criteria, collision, trajectories, baseline=baseline)
 
 
 def _outcome(result: DiagnosisResult) -> tuple[Outcome, str]:
     """Return the outcome of a diagnosis in which every joint is decided, in one word and in one sentence."""
     document = result.document
     findings = [one for one in document.findings if one.effect != UNNAMED]
-    mistakes = [one for one in findings if "odds" not in one.evidence and one.kind == "structure"]
+    mistakes = [one for one in findings if "corrected" in one.evidence]
     if mistakes:
         return "set_up", f"{_named(mistakes)}: correct the configuration, then record again."
     if findings:

@@ -1,4 +1,4 @@
-"""Command ``armident investigate``: ask an arm by a program, by hand, or from recordings of the past."""
+"""Command ``armident investigate``: ask an arm on its bus, by a program, by hand, or from recordings of the past."""
 
 import shlex
 import shutil
@@ -29,7 +29,11 @@ def investigate(
     ] = None,
     config: Annotated[
         Path | None,
-        typer.Option("--config", help="Robot configuration with limits. [default: the one inside the recording]"),
+        typer.Option(
+            "--config",
+            help="Session whose arm is asked on its bus under the guard, or robot configuration with limits. [default: "
+            "the robot inside the recording]",
+        ),
     ] = None,
     robot_command: Annotated[
         str | None,
@@ -44,6 +48,10 @@ def investigate(
     ] = False,
     choose_from: Annotated[
         Path | None, typer.Option("--replay", help="Folder of recordings of the past to ask in place of the arm.")
+    ] = None,
+    baseline: Annotated[
+        Path | None,
+        typer.Option("--baseline", help="identification.json of the arm before: asks what has changed since."),
     ] = None,
     resume: Annotated[Path | None, typer.Option("--continue", help="Folder of an investigation to go on with.")] = None,
     experiments: Annotated[int, typer.Option("--experiments", help="Most motions.", min=1)] = 6,
@@ -63,6 +71,9 @@ def investigate(
     The program of --robot-command reads columns t and qr1, qr2 ... (s, rad or m, at the rate of the recordings), moves
     the robot to the first row, plays the rows, and writes a file that `armident import` reads.
 
+    With a session the arm moves on its bus under the guard, as by reidentify. A motion that the guard stops is the
+    last one.
+
     Exit code 0 if nothing is missing, 3 if the set-up is wrong, 4 if something is missing or is not decided, or waits.
 
     Example: armident investigate monday.mcap --by-hand --out why
@@ -70,18 +81,31 @@ def investigate(
     Example: armident investigate --continue why tuesday.mcap
 
     Example: armident investigate monday.mcap --robot-command 'armident robot --config tx40.yaml --to-command'
+
+    Example: armident investigate monday.mcap --config cell.yaml
     """
-    from armident.configs import ConfigError, DataError, load_robot
+    from armident.configs import ConfigError, DataError, config_path, load_robot
     from armident.configs.errors import FOUND
+    from armident.configs.loading import is_session
     from armident.daq.recording import read_recording
     from armident.identify.api.investigation_api import investigate as run
-    from armident.identify.documents.investigation import OUTCOMES
+    from armident.identify.documents.files import load_document
+    from armident.identify.documents.investigation import OUTCOMES, InvestigationDocument
+    from armident.identify.monitoring.reidentify.cell import Cell, load_moving_session
 
     doors = [robot_command is not None, by_hand, choose_from is not None]
-    if sum(doors) > 1 or (resume is None and not any(doors)):
-        raise ConfigError("give one way to ask: --robot-command PROGRAM, --by-hand, or --replay FOLDER")
-    if resume is not None and (out is not None or config is not None):
-        raise ConfigError("--continue: robot and folder are those of the investigation; leave --config and --out out")
+    session = None
+    if config is not None and not any(doors) and is_session(file := config_path(config, of_folder="session.yaml")):
+        session = load_moving_session(file)
+    if sum(doors) > 1 or (resume is None and session is None and not any(doors)):
+        raise ConfigError(
+            "give one way to ask: --config with a session, --robot-command PROGRAM, --by-hand, or --replay FOLDER"
+        )
+    if resume is not None and (out is not None or baseline is not None or (config is not None and session is None)):
+        raise ConfigError(
+            "--continue: robot, baseline and folder are those of the investigation; leave --config, --baseline and "
+            "--out out"
+        )
     folder = resume or out or Path("investigation")
     read = [read_recording(path) for path in recordings or ()]
     if config is None and not read and resume is None:
@@ -90,21 +114,30 @@ def investigate(
     if choose_from is not None and not offered:
         raise ConfigError(f"--replay {choose_from}: no recordings (.mcap) in this folder")
     command = shlex.split(robot_command or "")
-    if robot_command is not None:
-        if shutil.which(next(iter(command), "")) is None:
-            raise ConfigError(f"--robot-command {robot_command}: no such program")
-        if not yes and not sys.stdin.isatty():
-            raise ConfigError("the robot would move, and nobody can be asked here: add --yes")
+    if robot_command is not None and shutil.which(next(iter(command), "")) is None:
+        raise ConfigError(f"--robot-command {robot_command}: no such program")
+    moves = robot_command is not None or session is not None
+    if moves and not yes and not sys.stdin.isatty():
+        raise ConfigError("the robot would move, and nobody can be asked here: add --yes")
     bars = _Bars()
     door: Callable[[Trajectory], Recording] | None = None
     if robot_command is not None:
         given = folder / "robot.yaml" if resume is not None else config
         robot = read[0].robot if given is None else load_robot(given, "trajectory")
         door = _Program(command, robot, folder, read[0].sample_rate_hz if read else RATE_HZ)
+    elif session is not None:
+        door = Cell(session, folder, lambda line: print(f"investigate: {line}", file=sys.stderr, flush=True))
+        config = session.robot
     asked = None if door is None else _confirmed(door, bars, always=yes)
+    if door is not None:
+        former = None if resume is None else load_document(resume / "investigation.json", InvestigationDocument)
+        most = experiments if former is None else former.experiments - len(former.rounds)
+        left_s = 60.0 * minutes if former is None else 60.0 * former.minutes - former.motion_s
+        print(f"investigate: at most {most} more motions of {left_s:.0f} s together", file=sys.stderr)
     with bars:
         found = run(
-            config, asked, read, choose_from=offered, experiments=experiments, minutes=minutes, material=material,
+            None if resume is not None else config, asked, read, choose_from=offered, baseline=baseline,
+            experiments=experiments, minutes=minutes, material=material,
             out=None if resume is not None else folder, resume=resume, progress=bars.report,
         )  # fmt: skip
     written, html, model = found.save(folder)

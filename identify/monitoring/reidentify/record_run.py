@@ -45,11 +45,11 @@ def record_run(config: Path, out: Path, say: Say, start: Start = start_process) 
     ArmidentError if the capture failed.
     """
     # The guard runs from before the first motion until after the last.
-    with _interruptible(), _command(["guard", "--config", str(config)], start) as guard:
+    with _interruptible(), running(["guard", "--config", str(config)], start) as guard:
         _until_ready(guard)
         say("guard: ready")
         options = ["capture", "--config", str(config), "--out", str(out), "--json"]
-        with _command(options, start) as capture:
+        with running(options, start) as capture:
             try:
                 while capture.running and guard.running:
                     time.sleep(POLL_S)
@@ -93,7 +93,8 @@ def _until_ready(guard: CommandProcess) -> None:
 
 
 @contextmanager
-def _command(words: Sequence[str], start: Start) -> Iterator[CommandProcess]:
+def running(words: Sequence[str], start: Start = start_process) -> Iterator[CommandProcess]:
+    """Run a command of ours inside the block, and end it in time to stop the arm and to finish its files."""
     command = CommandProcess(words, start=start).start()
     try:
         yield command

@@ -34,3 +34,8 @@ class ReidentifyOptions:
         flag=_DIAGNOSIS["time_limit_s"]["flag"],
         **_DIAGNOSIS["time_limit_s"]["typer"],
     )
+    investigate: bool = option(
+        "If the arm has changed, move it along further motions that tell what has changed, without asking.", False
+    )
+    experiments: int = option("With --investigate: most motions.", 3, min=1)
+    minutes: float = option("With --investigate: longest motion of all together, min.", 3.0, min=0.01)

@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,7 @@ from armident.identify.diagnosis.change_test import ParameterChangeTest, compare
 from armident.identify.documents.diagnosis import DiagnosisDocument
 from armident.identify.documents.files import from_json, to_json
 from armident.identify.documents.identification import IdentificationDocument
+from armident.identify.documents.investigation import InvestigationDocument
 from armident.identify.effects.terms import arm_model
 from armident.identify.excitation.point_to_point import sample_trajectory
 from armident.identify.excitation.previous_estimate import previous_estimate
@@ -34,10 +36,9 @@ from armident.identify.monitoring.reidentify.cell import load_moving_session
 from armident.identify.monitoring.reidentify.identify_once import identify_once
 from armident.identify.monitoring.reidentify.keep import HistoryEntry, history_or_reason, recorded_in_history
 from armident.identify.monitoring.reidentify.publish import StatusPublisher
-from armident.identify.monitoring.reidentify.record_run import Say, record_run, start_process
+from armident.identify.monitoring.reidentify.record_run import POLL_S, Say, record_run, running
 from armident.identify.monitoring.reidentify.reidentify_options import ReidentifyOptions
 from armident.identify.monitoring.reidentify.summary import change_lines, finding_lines
-from armident.processes import Start
 
 CHECK_PERIOD = 1e-3
 """Sampling period of predicted torques, s."""
@@ -47,7 +48,7 @@ DIAGNOSIS_S = 3600.0
 
 @dataclass(frozen=True)
 class Job:
-    """Checked inputs of a job."""
+    """Checked inputs of a job; ``experiments``: most motions of an investigation, 0 for none."""
 
     config: Path
     session: SessionConfig
@@ -58,12 +59,17 @@ class Job:
     false_alarms: float
     material: float | None = None
     time_limit_s: float | None = None
+    experiments: int = 0
+    minutes: float = 0.0
     warning: str | None = None
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """Result of a job; ``drift`` is ``None`` for a first run, and for a changed arm whose run is not usable."""
+    """Result of a job; ``drift`` is ``None`` for a first run, and for a changed arm whose run is not usable.
+
+    ``investigation``: document of the investigation, whose outcome is ``answer``.
+    """
 
     document: IdentificationDocument
     path: Path
@@ -72,6 +78,8 @@ class Outcome:
     diagnosis: Path | None = None
     findings: tuple[str, ...] = ()
     unusable: bool = False
+    investigation: Path | None = None
+    answer: str | None = None
 
     @property
     def changed(self) -> bool:
@@ -91,6 +99,8 @@ def reidentify_command(asked: ReidentifyOptions, *, as_json: bool) -> int:
         raise ConfigError("--config: give the session of the cell, or --recordings")
     job = prepare(asked.config, asked.baseline, asked.store, asked.out, asked.false_alarms)
     job = replace(job, material=asked.material, time_limit_s=asked.time_limit_s)
+    if asked.investigate:
+        job = replace(job, experiments=asked.experiments, minutes=asked.minutes)
 
     def say(line: str) -> None:
         print(f"reidentify: {line}", file=sys.stderr, flush=True)
@@ -139,14 +149,14 @@ def check_trajectory(session: SessionConfig, robot: RobotConfig, baseline: Basel
             )
 
 
-def carry_out(job: Job, announcer: StatusPublisher, say: Say, start: Start = start_process) -> Outcome:
+def carry_out(job: Job, announcer: StatusPublisher, say: Say) -> Outcome:
     """Carry out a job, store its result in the history, and publish it; raises ArmidentError if it fails."""
     say(f"{job.robot.name} in cell {job.session.cell}; baseline: {job.baseline.name}")
     if job.warning is not None:
         say(f"warning: {job.warning}; the run goes on with the baseline that is given")
     announcer.status("moving")
     job.out.mkdir(parents=True, exist_ok=True)
-    recording = record_run(job.config, job.out, say, start)
+    recording = record_run(job.config, job.out, say)
     say(f"recorded {recording.path}")
     announcer.status("identifying", recording=str(recording.path))
     options = options_of(job.session)
@@ -196,7 +206,8 @@ def _concluded(
         outcome = _diagnosed(job, recording, Outcome(document, path, drift, tuple(change_lines(drift, job.robot))), say)
         if outcome.diagnosis is not None:
             announcer.diagnosis(outcome.diagnosis.read_text(encoding="utf-8"))
-    announcer.status("done", drifted=outcome.changed, words=list(outcome.words), findings=list(outcome.findings))
+        outcome = _investigated(job, recording, outcome, announcer, say)
+    _announce(outcome, announcer)
     return outcome
 
 
@@ -225,8 +236,18 @@ def _unexpected(
         if outcome.diagnosis is None or not outcome.findings:
             raise unknown
         announcer.diagnosis(outcome.diagnosis.read_text(encoding="utf-8"))
-        announcer.status("done", drifted=True, words=list(outcome.words), findings=list(outcome.findings))
+        outcome = _investigated(job, recording, outcome, announcer, say)
+        _announce(outcome, announcer)
         return outcome
+
+
+def _announce(outcome: Outcome, announcer: StatusPublisher) -> None:
+    """Publish that the job is done, with all that it found."""
+    words, findings = list(outcome.words), list(outcome.findings)
+    asked = None if outcome.investigation is None else str(outcome.investigation)
+    announcer.status(
+        "done", drifted=outcome.changed, words=words, findings=findings, investigation=asked, answer=outcome.answer
+    )
 
 
 def _diagnosed(job: Job, recording: Recording, outcome: Outcome, say: Say) -> Outcome:
@@ -258,6 +279,34 @@ def _diagnosed(job: Job, recording: Recording, outcome: Outcome, say: Say) -> Ou
     return replace(outcome, diagnosis=path, findings=findings)
 
 
+def _investigated(job: Job, recording: Recording, outcome: Outcome, announcer: StatusPublisher, say: Say) -> Outcome:
+    """Return the outcome with what the arm answered to further motions; a failure only prints a warning."""
+    if job.experiments == 0:
+        return outcome
+    say(f"investigating: at most {job.experiments} motions of {job.minutes:g} min")
+    announcer.status("investigating", words=list(outcome.words), findings=list(outcome.findings))
+    folder, before = _beside(recording, job.out, "investigation"), _beside(recording, job.out, "diagnosis")
+    command = ["investigate", str(recording.path), "--config", str(job.config), "--yes", "--json", "--out", str(folder)]
+    command += ["--baseline", str(before / "baseline.json")]
+    command += ["--experiments", str(job.experiments), "--minutes", f"{job.minutes:g}"]
+    command += [] if job.material is None else ["--material", f"{job.material:g}"]
+    until = time.monotonic() + (job.experiments + 1) * DIAGNOSIS_S
+    try:
+        with running(command) as process:
+            while process.running:
+                if time.monotonic() > until:
+                    raise ArmidentError("it takes too long")
+                time.sleep(POLL_S)
+        if not process.output():
+            raise ArmidentError(process.last_error())
+        document = from_json(process.output(), InvestigationDocument, "investigation")
+    except ArmidentError as error:
+        say(f"warning: no investigation: {error}")
+        return outcome
+    answer = f"{document.outcome.replace('_', ' ')}: {document.statement}"
+    return replace(outcome, investigation=folder / "investigation.json", answer=answer)
+
+
 def _beside(recording: Recording, out: Path, suffix: str) -> Path:
     name = "recording" if recording.path is None else recording.path.name.removesuffix(".mcap")
     return out / f"{name}.{suffix}"
@@ -277,6 +326,8 @@ def entry(job: Job, outcome: Outcome) -> dict[str, Any]:
         "words": list(outcome.words),
         "diagnosis": None if outcome.diagnosis is None else str(outcome.diagnosis),
         "findings": list(outcome.findings),
+        "investigation": None if outcome.investigation is None else str(outcome.investigation),
+        "answer": outcome.answer,
     }
 
 
@@ -295,6 +346,10 @@ def show(job: Job, outcome: Outcome) -> None:
         if outcome.findings:
             print("diagnosis:")
             print("\n".join(f"  {line}" for line in outcome.findings))
+        if outcome.answer is not None:
+            print(f"investigation:\n  {outcome.answer}")
     print(f"result: {outcome.path}")
     if outcome.diagnosis is not None:
         print(f"diagnosis: {outcome.diagnosis}")
+    if outcome.investigation is not None:
+        print(f"investigation: {outcome.investigation}")

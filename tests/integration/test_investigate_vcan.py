@@ -1,0 +1,132 @@
+"""``armident investigate`` and ``reidentify --investigate`` with a virtual arm on a real bus, under the guard."""
+
+import signal
+from pathlib import Path
+
+import pytest
+import yaml
+
+from armident.daq.recording import read_recording
+from armident.drivers.can.frames import frame, frames
+from armident.drivers.can.socketcan import RawSocket
+from armident.drivers.canopen.objects import COB_EMCY, DriveState, drive_state
+from armident.identify.documents.files import load_document
+from armident.identify.documents.investigation import InvestigationDocument
+from tests.fixtures.processes import ForkedProcess, armident
+from tests.integration.test_reidentify_vcan import QUICK, _await_motion, _rows, _until_ended, arm
+from tests.statistics.weeks import cell_file
+
+pytestmark = [pytest.mark.vcan, pytest.mark.slow]
+
+
+def scenario(folder: Path, effect: str, joint: str, other: str | None = None, **parameters: float) -> tuple[str, str]:
+    """Options of a virtual arm that hide an effect in it."""
+    hidden = {"effect": effect, "joint": joint, "parameters": parameters} | ({"other": other} if other else {})
+    content = {"schema": "armident/scenario/1", "description": effect, "effects": [hidden]}
+    path = folder / "hidden.yaml"
+    path.write_text(yaml.safe_dump(content), encoding="utf-8")
+    return "--scenario", str(path)
+
+
+def asking(config: Path, out: Path, *options: object) -> ForkedProcess:
+    """The command on the bus of a cell."""
+    return armident("investigate", "--config", config, "--yes", "--out", out, *options)
+
+
+def ended(process: ForkedProcess, out: Path, timeout: float = 500.0) -> InvestigationDocument:
+    """The document after the command has ended."""
+    _, err = process.communicate(timeout=timeout)
+    assert process.returncode in (0, 4), err
+    assert "Traceback" not in err
+    return load_document(out / "investigation.json", InvestigationDocument)
+
+
+def emps(folder: Path, bus: str, name: str) -> Path:
+    """Session of the EMPS."""
+    return cell_file(folder, bus, name, shipped="emps_cell.yaml", **QUICK)
+
+
+def test_a_hidden_effect_is_named_on_the_bus(vcan_bus: str, tmp_path: Path) -> None:
+    config, out = emps(tmp_path, vcan_bus, "asked"), tmp_path / "why"
+    with arm(config, *scenario(tmp_path, "joint_spring", "joint_1", stiffness=200.0)):
+        document = ended(asking(config, out, "--experiments", "1"), out)
+    assert document.outcome == "named", document.statement
+    assert document.statement.startswith("joint spring at joint_1")
+    played = [read_recording(path) for path in out.glob("*.mcap")]
+    assert [one.sha256 for one in played] == [document.rounds[0].recording.sha256]  # type: ignore[union-attr]
+    session = played[0].session
+    assert session is not None
+    assert session.setpoints is not None
+    assert session.setpoints.trajectory == out / "motion_1.yaml"
+
+
+def test_a_motion_that_the_guard_stops_ends_the_investigation(vcan_bus: str, tmp_path: Path) -> None:
+    """An EMCY in the middle: the answer is what the guard said; nothing is asked again, also not by --continue."""
+    config, out = emps(tmp_path, vcan_bus, "stopped"), tmp_path / "why"
+    with arm(config), RawSocket(vcan_bus) as listener, RawSocket(vcan_bus, filters=()) as sender:
+        process = asking(config, out)
+        _await_motion(listener, process)
+        sender.send(frame(COB_EMCY + 1, b"\x10\x43\x08\0\0\0\0\0"))
+        document = ended(process, out)
+        (kept,) = out.glob("*.mcap")
+        words = ("all joints at once", "joint_1: EMCY 4310h", "the drives were stopped", str(kept), "--out")
+        assert all(one in document.statement for one in words), document.statement
+        assert document.outcome == "cannot_tell"
+        assert [one.recording for one in document.rounds] == [None]
+        assert str(document.rounds[0].refused).startswith("guard: joint_1: EMCY")
+        again = armident("investigate", "--config", config, "--yes", "--continue", out)
+        assert ended(again, out) == document.model_copy(update={"model": str(out / "model.yaml")})
+    assert list(out.glob("*.mcap")) == [kept]
+    assert read_recording(kept).missing is None
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGKILL])
+def test_an_investigation_that_ends_during_a_motion_stops_the_arm_and_goes_on(
+    vcan_bus: str, tmp_path: Path, sent: signal.Signals
+) -> None:
+    config, out = emps(tmp_path, vcan_bus, "interrupted"), tmp_path / "why"
+    with arm(config), RawSocket(vcan_bus) as listener:
+        process = asking(config, out)
+        _await_motion(listener, process)
+        process.send_signal(sent)
+        rows = _until_ended(listener, process)
+        batch = frames(4096)
+        # Guard and capture end by themselves after their parent.
+        while listener.poll(2.0):
+            rows += _rows(batch[: listener.receive(batch)])
+        assert any(can_id == 0x301 and data == b"\x02\x00" for _, can_id, data in rows)
+        states = [drive_state(int.from_bytes(data[6:8], "little")) for _, can_id, data in rows if can_id == 0x181]
+        assert DriveState.QUICK_STOP_ACTIVE in states
+        document = load_document(out / "investigation.json", InvestigationDocument)
+        assert [(one.recording, one.refused) for one in document.rounds] == [(None, None)]
+        torn = {path.name for path in out.glob("*.mcap")}
+        document = ended(armident("investigate", "--config", config, "--yes", "--continue", out), out)
+    assert document.outcome == "healthy", document.statement
+    answers = {Path(str(one.recording.path)).name for one in document.rounds if one.recording is not None}
+    assert len(answers) == len(document.rounds)
+    assert not answers & torn
+
+
+@pytest.mark.nightly
+def test_a_recorded_motion_of_a_killed_investigation_is_not_played_again(vcan_bus: str, tmp_path: Path) -> None:
+    """Killed between the end of the capture and the entry of its recording."""
+    config, out = emps(tmp_path, vcan_bus, "killed"), tmp_path / "why"
+    with arm(config):
+        process = asking(config, out)
+        assert process.stderr is not None
+        for line in process.stderr:
+            if line.startswith("investigate: recorded"):
+                process.kill()
+        process.wait(60)
+        document = load_document(out / "investigation.json", InvestigationDocument)
+        assert [one.recording for one in document.rounds] == [None]
+        (kept,) = out.glob("*.mcap")
+        again = armident("investigate", "--config", config, "--yes", "--continue", out)
+        _, err = again.communicate(timeout=500)
+    document = load_document(out / "investigation.json", InvestigationDocument)
+    assert f"{kept} has this motion already" in err
+    assert document.rounds[0].recording is not None
+    assert document.rounds[0].recording.path == str(kept)
+    assert document.outcome == "healthy", document.statement
+    assert len(list(out.glob("*.mcap"))) == len(document.rounds)
