@@ -207,7 +207,10 @@ class _Program:
         self._command, self._robot, self._folder, self._rate_hz = command, robot, folder, rate_hz
 
     def __call__(self, trajectory: "Trajectory") -> "Recording":
-        """Call the program, and import the file that it leaves; DataError if it refuses or leaves none."""
+        """Return the file that the program leaves, imported; DataError if it refuses or leaves none.
+
+        A file of the last motion in the folder is whole, of a command that was killed: the program is not called again.
+        """
         import numpy as np
 
         from armident.configs import DataError
@@ -215,19 +218,27 @@ class _Program:
         from armident.daq.interchange.readers import reader_of
         from armident.daq.recording import read_recording
 
-        number = 1 + len(list(self._folder.glob("reference_*.csv")))
-        reference, answer = self._folder / f"reference_{number}.csv", self._folder / f"answer_{number}.csv"
-        period = 1.0 / self._rate_hz
-        q = trajectory.sample(period)
-        header = ",".join(["t", *(f"qr{j + 1}" for j in range(q.shape[1]))])
-        table = np.column_stack([period * np.arange(len(q)), q])
-        np.savetxt(reference, table, "%.9g", delimiter=",", header=header, comments="")
-        words = [*self._command, str(reference), str(answer)]
-        done = subprocess.run(words, capture_output=True, text=True, check=False)
-        if done.returncode != 0:
-            printed = " ".join((done.stderr or done.stdout).split())[-PRINTED:]
-            raise DataError(f"the program ended with exit code {done.returncode}: {printed or 'it printed nothing'}")
-        written = [path for path in sorted(self._folder.glob(f"answer_{number}.*")) if path.is_file()]
-        if not written:
-            raise DataError(f"the program left no file {answer}")
-        return read_recording(written[0]) if reader_of(written[0]).own else import_recording(written[0], self._robot)
+        number = len(list(self._folder.glob("motion_*.yaml")))
+        if not (answers := list(self._folder.glob(f"answer_{number}.*"))):
+            reference, left = self._folder / f"reference_{number}.csv", self._folder / f"left_{number}.csv"
+            period = 1.0 / self._rate_hz
+            q = trajectory.sample(period)
+            header = ",".join(["t", *(f"qr{j + 1}" for j in range(q.shape[1]))])
+            table = np.column_stack([period * np.arange(len(q)), q])
+            np.savetxt(reference, table, "%.9g", delimiter=",", header=header, comments="")
+            for torn in self._folder.glob(f"{left.stem}.*"):
+                torn.unlink()
+            words = [*self._command, str(reference), str(left)]
+            done = subprocess.run(words, capture_output=True, text=True, check=False)
+            if done.returncode != 0:
+                printed = " ".join((done.stderr or done.stdout).split())[-PRINTED:]
+                raise DataError(
+                    f"the program ended with exit code {done.returncode}: {printed or 'it printed nothing'}"
+                )
+            written = [path for path in sorted(self._folder.glob(f"{left.stem}.*")) if path.is_file()]
+            if not written:
+                raise DataError(f"the program left no file {left}")
+            name = f"answer_{number}{written[0].name.removeprefix(left.stem)}"
+            answers = [written[0].replace(self._folder / name)]
+        answer = answers[0]
+        return read_recording(answer) if reader_of(answer).own else import_recording(answer, self._robot)

@@ -1,6 +1,7 @@
 """``armident investigate`` and ``reidentify --investigate`` with a virtual arm on a real bus, under the guard."""
 
 import signal
+import time
 from pathlib import Path
 
 import pytest
@@ -69,7 +70,7 @@ def test_a_motion_that_the_guard_stops_ends_the_investigation(vcan_bus: str, tmp
         sender.send(frame(COB_EMCY + 1, b"\x10\x43\x08\0\0\0\0\0"))
         document = ended(process, out)
         (kept,) = out.glob("*.mcap")
-        words = ("all joints at once", "joint_1: EMCY 4310h", "the drives were stopped", str(kept), "--out")
+        words = ("joints at once", "joint_1: EMCY 4310h", "the drives were stopped", str(kept), "--out")
         assert all(one in document.statement for one in words), document.statement
         assert document.outcome == "cannot_tell"
         assert [one.recording for one in document.rounds] == [None]
@@ -93,8 +94,10 @@ def test_an_investigation_that_ends_during_a_motion_stops_the_arm_and_goes_on(
         rows = _until_ended(listener, process)
         batch = frames(4096)
         # Guard and capture end by themselves after their parent.
-        while listener.poll(2.0):
-            rows += _rows(batch[: listener.receive(batch)])
+        until = time.monotonic() + 5.0
+        while time.monotonic() < until:
+            if listener.poll(0.1):
+                rows += _rows(batch[: listener.receive(batch)])
         assert any(can_id == 0x301 and data == b"\x02\x00" for _, can_id, data in rows)
         states = [drive_state(int.from_bytes(data[6:8], "little")) for _, can_id, data in rows if can_id == 0x181]
         assert DriveState.QUICK_STOP_ACTIVE in states
