@@ -1,5 +1,6 @@
 """``armident investigate`` and ``reidentify --investigate`` with a virtual arm on a real bus, under the guard."""
 
+import json
 import signal
 import time
 from pathlib import Path
@@ -7,6 +8,7 @@ from pathlib import Path
 import pytest
 import yaml
 
+from armident.configs import config_path
 from armident.daq.recording import read_recording
 from armident.drivers.can.frames import frame, frames
 from armident.drivers.can.socketcan import RawSocket
@@ -14,7 +16,7 @@ from armident.drivers.canopen.objects import COB_EMCY, DriveState, drive_state
 from armident.identify.documents.files import load_document
 from armident.identify.documents.investigation import InvestigationDocument
 from tests.fixtures.processes import ForkedProcess, armident
-from tests.integration.test_reidentify_vcan import QUICK, _await_motion, _rows, _until_ended, arm
+from tests.integration.test_reidentify_vcan import QUICK, _await_motion, _rows, _until_ended, arm, finished, job
 from tests.statistics.weeks import cell_file
 
 pytestmark = [pytest.mark.vcan, pytest.mark.slow]
@@ -133,3 +135,27 @@ def test_a_recorded_motion_of_a_killed_investigation_is_not_played_again(vcan_bu
     assert document.rounds[0].recording.path == str(kept)
     assert document.outcome == "healthy", document.statement
     assert len(list(out.glob("*.mcap"))) == len(document.rounds)
+
+
+@pytest.mark.nightly
+@pytest.mark.timeout(1200)
+def test_reidentify_asks_a_changed_arm_within_its_budget(vcan_bus: str, tmp_path: Path) -> None:
+    """A healthy run, then a dry screw: exit code 4 of the job, its findings, and what further motions say."""
+    config = emps(tmp_path, vcan_bus, "weekly")
+    with arm(config, "--seed", "1"):
+        finished(job(config, tmp_path, "--investigate"), 0)
+    assert not list((tmp_path / "out").glob("*.investigation"))
+    with arm(config, "--seed", "2", "--scenario", str(config_path("scenarios/emps_dry_screw.yaml"))):
+        process = job(config, tmp_path, "--investigate", "--experiments", "2", "--minutes", "2")
+        out, err = process.communicate(timeout=900)
+    assert process.returncode == 4, err
+    found = json.loads(out)
+    assert found["changed"], err
+    assert found["findings"], err
+    document = load_document(Path(found["investigation"]), InvestigationDocument)
+    assert found["answer"].startswith(document.outcome.replace("_", " "))
+    assert [one.sha256 for one in document.recordings] == [read_recording(found["recording"]).sha256]
+    assert 1 <= len(document.rounds) <= 2
+    assert document.motion_s <= 120.0
+    print(found["findings"], found["answer"])
+    assert "presliding friction" in found["answer"]

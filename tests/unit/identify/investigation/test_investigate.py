@@ -3,11 +3,14 @@
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import armident
-from armident.configs import ConfigError, DataError, Trajectory
+from armident.configs import ConfigError, DataError, MotionStopped, Trajectory
+from armident.configs.schema.scenario import HiddenEffect
 from armident.identify.documents.investigation import InvestigationDocument
+from tests.fixtures.arms import recording
 
 pytestmark = pytest.mark.slow
 
@@ -68,12 +71,54 @@ def test_a_refused_motion_is_noted_and_not_asked_again() -> None:
     assert found.document.motion_s == 0.0
 
 
-def test_the_budget_of_motion_ends_an_investigation_with_the_reason() -> None:
+def test_a_motion_that_was_stopped_is_the_last_one(tmp_path: Path) -> None:
+    arm = Arm(None)
+
+    def stops(trajectory: Trajectory) -> armident.Recording:
+        arm.asked.append(trajectory)
+        raise MotionStopped("guard: joint_1: following error (recording: a.mcap)")
+
+    found = armident.investigate("emps", stops, arm.first(), out=tmp_path)
+    assert found.outcome == "cannot_tell"
+    assert "joint_1: following error (recording: a.mcap)" in found.document.statement
+    assert [one.refused for one in found.document.rounds] == ["guard: joint_1: following error (recording: a.mcap)"]
+    assert armident.investigate(resume=tmp_path, ask=arm).document == found.document
+    assert len(arm.asked) == 1
+
+
+def test_an_investigation_that_has_not_begun_is_begun_again(tmp_path: Path) -> None:
+    """The first recording is too short for a diagnosis; another one is taken in the same folder."""
+    t = np.arange(60) / 1000.0
+    short = armident.Recording.from_arrays(t, 0.01 * np.sin(9.0 * t), 50.0 * np.cos(9.0 * t), robot="emps")
+    with pytest.raises(DataError):
+        armident.investigate("emps", None, short, out=tmp_path)
+    again = armident.investigate("emps", None, Arm(None).first(), out=tmp_path)
+    assert again.pending is not None
+    with pytest.raises(ConfigError, match="has an investigation already"):
+        armident.investigate("emps", None, Arm(None).first(), out=tmp_path)
+
+
+def test_the_change_since_a_baseline_is_named_and_kept_for_a_later_run(tmp_path: Path) -> None:
+    """Viscous friction a quarter larger: no effect is missing, and beside the baseline it has a name."""
+    before = armident.identify(Arm(None).first(), "emps")
+    drier = HiddenEffect(effect="friction_drift", joint="joint_1", parameters={"change": 0.25, "time_constant": 1e-6})
+    now = recording("emps", "emps_excitation", 3, drier)
+    found = armident.investigate("emps", None, now, baseline=before, out=tmp_path)
+    assert found.outcome == "named"
+    assert "friction" in found.document.statement
+    assert (tmp_path / "baseline.json").exists()
+    assert armident.investigate(resume=tmp_path).document == found.document
+    with pytest.raises(DataError, match="the baseline is of robot 'emps', the arm is 'tx40'"):
+        armident.investigate("tx40", None, (), baseline=before)
+
+
+def test_the_budget_of_motion_ends_an_investigation_with_the_reason(tmp_path: Path) -> None:
     arm = Arm(None)
     found = armident.investigate("emps", arm, arm.first(), minutes=0.01)
     assert found.outcome == "cannot_tell"
     assert "--minutes" in found.document.statement
     assert arm.asked == []
+    assert "--minutes" in found.report(tmp_path / "report.html").read_text(encoding="utf-8")
 
 
 def test_recordings_of_the_past_answer_in_place_of_the_arm(tmp_path: Path) -> None:
