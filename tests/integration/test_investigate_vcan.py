@@ -2,6 +2,8 @@
 
 import json
 import signal
+import subprocess
+import sys
 import time
 from pathlib import Path
 
@@ -15,6 +17,8 @@ from armident.drivers.can.socketcan import RawSocket
 from armident.drivers.canopen.objects import COB_EMCY, DriveState, drive_state
 from armident.identify.documents.files import load_document
 from armident.identify.documents.investigation import InvestigationDocument
+from armident.identify.report.robot_file import robot_yaml
+from armident.virtual_robot.twin import load_twin
 from tests.fixtures.processes import ForkedProcess, armident
 from tests.integration.test_reidentify_vcan import QUICK, _await_motion, _rows, _until_ended, arm, finished, job
 from tests.statistics.weeks import cell_file
@@ -159,3 +163,53 @@ def test_reidentify_asks_a_changed_arm_within_its_budget(vcan_bus: str, tmp_path
     assert document.motion_s <= 120.0
     print(found["findings"], found["answer"])
     assert "presliding friction" in found["answer"]
+
+
+FAMILIES = {
+    "friction": ("position_dependent_friction", 0, {"ratio": 0.4}),
+    "transmission": ("backlash", 0, {"gap": 0.0125}),
+    "load": ("joint_spring", 1, {"stiffness": 4.0}),
+    "electrical": ("drive_gain_saturation", 1, {"drop": 0.1}),
+}
+"""One effect of each family of the catalogue: name, joint from 0, and parameters."""
+
+
+def random_cell(folder: Path, bus: str) -> tuple[Path, list[str]]:
+    """Session of a random arm of two joints, with what its configuration leaves open assumed; names of its joints."""
+    plants = [sys.executable, "-m", "tests.evaluation.plants", "--half", "development"]
+    subprocess.run([*plants, "--first", "1", "--cases", "1", "--out", str(folder)], check=True, capture_output=True)
+    robot = load_twin(folder / "development_0001.yaml").robot
+    (folder / "robot.yaml").write_text(robot_yaml(robot), encoding="utf-8")
+    joints = [joint.name for joint in robot.joints]
+    home = [0.0] * robot.n
+    played = {"schema": "armident/trajectory/1", "start": home, "moves": [{"to": home, "duration": 1.0}]}
+    (folder / "rest.yaml").write_text(yaml.safe_dump(played), encoding="utf-8")
+    eds = str(config_path("eds/cia402_servo.eds"))
+    config = cell_file(
+        folder, bus, "random", robot=str(folder / "robot.yaml"),
+        drives=[{"joint": name, "node_id": 1 + k, "eds": eds} for k, name in enumerate(joints)],
+        streams={"samples": {"tpdo": 1, "every": 1, "objects": ["position", "torque", "status"]},
+                 "demand": {"tpdo": 2, "every": 1, "objects": ["demand"]}},
+        setpoints={"rpdo": 1, "every": 1, "trajectory": str(folder / "rest.yaml")},
+    )  # fmt: skip
+    return config, joints
+
+
+@pytest.mark.nightly
+@pytest.mark.timeout(3600)
+@pytest.mark.parametrize("family", FAMILIES)
+@pytest.mark.parametrize("robot", ["random", "tx40"])
+def test_an_effect_of_each_family_is_named_on_the_bus(vcan_bus: str, tmp_path: Path, robot: str, family: str) -> None:
+    """From nothing, with four motions at most: the most probable name at the joint is the hidden one."""
+    config, joints = cell_file(tmp_path, vcan_bus, "tx40"), [f"joint_{k}" for k in range(1, 7)]
+    if robot == "random":
+        config, joints = random_cell(tmp_path, vcan_bus)
+    effect, number, parameters = FAMILIES[family]
+    out = tmp_path / "why"
+    with arm(config, "--seed", "1", *scenario(tmp_path, effect, joints[number], **parameters)):
+        document = ended(asking(config, out, "--experiments", "4"), out, 3500.0)
+    said = [(one.chosen.words, one.chosen.duration_s, one.refused) for one in document.rounds]
+    print(robot, family, document.outcome, document.motion_s, said, document.statement)
+    assert [one.refused for one in document.rounds if one.refused] == []
+    named = {(next(iter(one.names)), one.joint) for one in document.explanations}
+    assert (effect, joints[number]) in named, document.statement
