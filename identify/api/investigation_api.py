@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
-from armident.configs import DataError, RobotConfig, Trajectory
+from armident.configs import ConfigError, DataError, RobotConfig, Trajectory
 from armident.daq.recording import Recording
 from armident.identify.api.arguments import Progress, Recorded, Robot, recordings_of, robot_of
 from armident.identify.api.identification_api import Identification, identified
@@ -133,7 +133,8 @@ def investigate(
     out
         Folder of documents, trajectories and recordings: an investigation that is kept can be resumed.
     resume
-        Folder of an investigation to go on with; ``robot`` and limits are those of the folder.
+        Folder of an investigation to go on with; robot and limits are those of the folder, and ``robot``, if it is
+        given, has the shapes of the bodies.
     progress
         Called with the name of a stage and the share done, 0 to 1.
 
@@ -165,12 +166,16 @@ def investigate(
 
     criteria = Criteria(material_pct=material)
     given, offered = (recordings_of(each) if _any(each) else () for each in (recordings, choose_from))
+    source = robot if isinstance(robot, str | Path) else None
     if resume is not None:
-        going = resumed(Path(resume), criteria)
+        known = None if robot is None else robot_of(robot, (), "trajectory")
+        shapes = None if known is None else safety_model(known, source, None).collision
+        going = resumed(Path(resume), criteria, shapes)
+        if known is not None and known.name != going.document.robot:
+            raise ConfigError(f"{resume}: is an investigation of robot {going.document.robot!r}, not {known.name!r}")
         answers: Iterator[Recording] = iter(given)
     else:
         config = robot_of(robot, (*given, *offered), "trajectory")
-        source = robot if isinstance(robot, str | Path) else None
         collision = safety_model(config, source, None).collision
         before = None if baseline is None else identified(baseline)[0]
         if before is not None and before.robot != config.name:

@@ -109,7 +109,9 @@ class Investigating:
         if self.folder is not None:
             write_atomically(self.folder / "diagnosis.json", to_json(document))
         healthy = document.verdict == "no_gap"
-        answered = any(one.recording is not None for one in rounds)
+        # The first motion of an arm without a recording is slow and answers no question.
+        asked = [one for one in rounds if one.explanations]
+        answered = any(one.recording is not None for one in asked)
         if state is None or (not uncertain(document.explanations) and (answered or not healthy)):
             outcome, statement = _outcome(result)
             self._update(outcome=outcome, statement=statement)
@@ -118,7 +120,7 @@ class Investigating:
         else:
             report("next motion", 1.0)
             state = with_decided(state, result.robot, document.explanations)
-            self._affordable(self.choose(state, document.explanations, [one.chosen for one in rounds]))
+            self._affordable(self.choose(state, document.explanations, [one.chosen for one in asked]))
 
     def choose(self, state: ModelState, explanations: Sequence[Explanation], done: Sequence[MotionChoice]) -> Chosen:
         """Return the next motion, or recording of the past. ``done``: those of earlier rounds."""

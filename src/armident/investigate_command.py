@@ -136,9 +136,8 @@ def investigate(
         print(f"investigate: at most {most} more motions of {left_s:.0f} s together", file=sys.stderr)
     with bars:
         found = run(
-            None if resume is not None else config, asked, read, choose_from=offered, baseline=baseline,
-            experiments=experiments, minutes=minutes, material=material,
-            out=None if resume is not None else folder, resume=resume, progress=bars.report,
+            config, asked, read, choose_from=offered, baseline=baseline, experiments=experiments, minutes=minutes,
+            material=material, out=None if resume is not None else folder, resume=resume, progress=bars.report,
         )  # fmt: skip
     written, html, model = found.save(folder)
     if json:

@@ -97,7 +97,11 @@ def test_by_hand_it_says_what_to_record_and_goes_on_with_it(first: Path, tmp_pat
     [
         ([], "give one way to ask"),
         (["--by-hand", "--robot-command", "x"], "give one way to ask"),
-        (["--by-hand", "--continue", "a", "--out", "b"], "leave --config and --out out"),
+        (["--by-hand", "--continue", "a", "--out", "b"], "leave --config, --baseline and --out out"),
+        (["--config", "emps_cell.yaml"], "add --yes"),
+        (["--config", "emps_cell.yaml", "--by-hand"], "a robot file is wanted"),
+        (["--config", "tx40_replay.yaml", "--yes"], "tx40_replay.yaml: setpoints: missing"),
+        (["--config", "emps.yaml", "--yes"], "give one way to ask: --config with a session"),
         (["--robot-command", TWIN], "add --yes"),
         (["--yes", "--robot-command", "./no_such_program"], "--robot-command ./no_such_program: no such program"),
         (["--replay", "/nowhere"], "no recordings"),

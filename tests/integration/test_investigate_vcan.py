@@ -17,18 +17,19 @@ from armident.drivers.can.socketcan import RawSocket
 from armident.drivers.canopen.objects import COB_EMCY, DriveState, drive_state
 from armident.identify.documents.files import load_document
 from armident.identify.documents.investigation import InvestigationDocument
+from armident.identify.monitoring.reidentify.record_run import record_run
 from armident.identify.report.robot_file import robot_yaml
 from armident.virtual_robot.twin import load_twin
 from tests.fixtures.processes import ForkedProcess, armident
 from tests.integration.test_reidentify_vcan import QUICK, _await_motion, _rows, _until_ended, arm, finished, job
-from tests.statistics.weeks import cell_file
+from tests.statistics.weeks import cell_file, start_forked
 
 pytestmark = [pytest.mark.vcan, pytest.mark.slow]
 
 
-def scenario(folder: Path, effect: str, joint: str, other: str | None = None, **parameters: float) -> tuple[str, str]:
+def scenario(folder: Path, effect: str, joint: str, **parameters: float) -> tuple[str, str]:
     """Options of a virtual arm that hide an effect in it."""
-    hidden = {"effect": effect, "joint": joint, "parameters": parameters} | ({"other": other} if other else {})
+    hidden = {"effect": effect, "joint": joint, "parameters": parameters}
     content = {"schema": "armident/scenario/1", "description": effect, "effects": [hidden]}
     path = folder / "hidden.yaml"
     path.write_text(yaml.safe_dump(content), encoding="utf-8")
@@ -178,19 +179,19 @@ def random_cell(folder: Path, bus: str) -> tuple[Path, list[str]]:
     """Session of a random arm of two joints, with what its configuration leaves open assumed; names of its joints."""
     plants = [sys.executable, "-m", "tests.evaluation.plants", "--half", "development"]
     subprocess.run([*plants, "--first", "1", "--cases", "1", "--out", str(folder)], check=True, capture_output=True)
-    robot = load_twin(folder / "development_0001.yaml").robot
-    (folder / "robot.yaml").write_text(robot_yaml(robot), encoding="utf-8")
-    joints = [joint.name for joint in robot.joints]
-    home = [0.0] * robot.n
-    played = {"schema": "armident/trajectory/1", "start": home, "moves": [{"to": home, "duration": 1.0}]}
-    (folder / "rest.yaml").write_text(yaml.safe_dump(played), encoding="utf-8")
+    twin = load_twin(folder / "development_0001.yaml")
+    assert twin.trajectory is not None
+    (folder / "robot.yaml").write_text(robot_yaml(twin.robot), encoding="utf-8")
+    joints = [joint.name for joint in twin.robot.joints]
+    played = twin.trajectory.model_dump(mode="json", by_alias=True, exclude_defaults=True)
+    (folder / "motion.yaml").write_text(yaml.safe_dump(played), encoding="utf-8")
     eds = str(config_path("eds/cia402_servo.eds"))
     config = cell_file(
         folder, bus, "random", robot=str(folder / "robot.yaml"),
         drives=[{"joint": name, "node_id": 1 + k, "eds": eds} for k, name in enumerate(joints)],
         streams={"samples": {"tpdo": 1, "every": 1, "objects": ["position", "torque", "status"]},
                  "demand": {"tpdo": 2, "every": 1, "objects": ["demand"]}},
-        setpoints={"rpdo": 1, "every": 1, "trajectory": str(folder / "rest.yaml")},
+        setpoints={"rpdo": 1, "every": 1, "trajectory": str(folder / "motion.yaml")},
     )  # fmt: skip
     return config, joints
 
@@ -200,14 +201,15 @@ def random_cell(folder: Path, bus: str) -> tuple[Path, list[str]]:
 @pytest.mark.parametrize("family", FAMILIES)
 @pytest.mark.parametrize("robot", ["random", "tx40"])
 def test_an_effect_of_each_family_is_named_on_the_bus(vcan_bus: str, tmp_path: Path, robot: str, family: str) -> None:
-    """From nothing, with four motions at most: the most probable name at the joint is the hidden one."""
+    """From a recording along the set points, with four motions at most: the most probable name is the hidden one."""
     config, joints = cell_file(tmp_path, vcan_bus, "tx40"), [f"joint_{k}" for k in range(1, 7)]
     if robot == "random":
         config, joints = random_cell(tmp_path, vcan_bus)
     effect, number, parameters = FAMILIES[family]
     out = tmp_path / "why"
     with arm(config, "--seed", "1", *scenario(tmp_path, effect, joints[number], **parameters)):
-        document = ended(asking(config, out, "--experiments", "4"), out, 3500.0)
+        first = record_run(config, tmp_path, print, start_forked)
+        document = ended(asking(config, out, first.path, "--experiments", "4"), out, 3500.0)
     said = [(one.chosen.words, one.chosen.duration_s, one.refused) for one in document.rounds]
     print(robot, family, document.outcome, document.motion_s, said, document.statement)
     assert [one.refused for one in document.rounds if one.refused] == []
