@@ -5,6 +5,7 @@ from pathlib import Path
 
 from armident import configs
 from armident.identify.documents.base import Document
+from armident.identify.documents.commissioning import CommissioningDocument
 from armident.identify.documents.comparison import ComparisonDocument
 from armident.identify.documents.diagnosis import DiagnosisDocument
 from armident.identify.documents.files import write_atomically
@@ -18,6 +19,7 @@ SCHEMA_FILES: dict[str, type[Document]] = {
     "identification.schema.json": IdentificationDocument,
     "diagnosis.schema.json": DiagnosisDocument,
     "investigation.schema.json": InvestigationDocument,
+    "commissioning.schema.json": CommissioningDocument,
     "prediction.schema.json": PredictionDocument,
     "predictions.schema.json": PredictionsDocument,
     "comparison.schema.json": ComparisonDocument,

@@ -56,14 +56,14 @@ class Chosen:
 def first_motion(robot: RobotConfig, collision: CollisionModel) -> Chosen:
     """Return the motion of an arm of which there is no recording: an excitation at the speeds of first contact."""
     still = np.zeros(robot.n)
-    made = _excitation(robot, reach_of(robot, _home(robot), still, still), None, collision)
+    made = excitation_of(robot, reach_of(robot, home_of(robot), still, still), None, collision)
     return _alone(f"what is the model of {robot.name}?", *made)
 
 
 def confirming_motion(state: ModelState, collision: CollisionModel, done: Sequence[MotionChoice]) -> Chosen:
     """Return the motion that confirms that nothing is missing: an excitation of all joints, if it is not done yet."""
     theta, asked = state.fit.theta, "does a second motion show anything that is missing?"
-    choice, trajectory = _excitation(state.robot, reach_of_recordings(state), theta, collision)
+    choice, trajectory = excitation_of(state.robot, reach_of_recordings(state), theta, collision)
     if trajectory is not None:
         reason = excluded(state.robot, trajectory, theta, collision, state.fit.covariance)
         choice, trajectory = choice.model_copy(update={"excluded": reason}), None if reason else trajectory
@@ -89,7 +89,7 @@ def next_motion(
         for choice, trajectory in _of_joint(state, reach, one.joint):
             if _key(choice) not in past:
                 made.append(_rated(posed, choice, trajectory))
-    choice, excitation = _excitation(state.robot, reach, state.fit.theta, collision)
+    choice, excitation = excitation_of(state.robot, reach, state.fit.theta, collision)
     if excitation is not None and _key(choice) not in past:
         rated = [_rated(posed, choice, excitation) for _, posed in open_questions]
         made.append(max(rated, key=lambda each: each[0]) if rated else (0.0, choice, excitation))
@@ -193,13 +193,18 @@ def _of_joint(state: ModelState, reach: Reach, name: str) -> Iterator[tuple[Moti
                 )
 
 
-def _excitation(
-    robot: RobotConfig, reach: Reach, theta: Floats | None, collision: CollisionModel
+def excitation_of(
+    robot: RobotConfig,
+    reach: Reach,
+    theta: Floats | None,
+    collision: CollisionModel,
+    duration: float = EXCITATION_S,
+    seed: int = 0,
 ) -> tuple[MotionChoice, Trajectory | None]:
     """Return an exciting trajectory within the reach; ``None`` with the reason if no trajectory keeps the limits."""
     joints = []
     # No posture further than a quarter of the time: several moves fit at the speeds of first contact.
-    near = 0.25 * EXCITATION_S * reach.velocity
+    near = 0.25 * duration * reach.velocity
     low, high = np.maximum(reach.low, reach.home - near), np.minimum(reach.high, reach.home + near)
     for j, joint in enumerate(robot.joints):
         slower = {
@@ -210,10 +215,10 @@ def _excitation(
         joints.append(joint.model_copy(update={"limits": joint.limits.model_copy(update=slower)}))
     slow = robot.model_copy(update={"joints": tuple(joints)})
     words = "all joints at once along an exciting trajectory"
-    choice = MotionChoice(motion=EXCITATION, words=words, duration_s=EXCITATION_S)
+    choice = MotionChoice(motion=EXCITATION, words=words, duration_s=duration)
     try:
         design = design_trajectory(
-            slow, EXCITATION_S, evaluations=EVALUATIONS, theta=theta, collision=collision, margin=MARGIN
+            slow, duration, seed, evaluations=EVALUATIONS, theta=theta, collision=collision, margin=MARGIN
         )
     except ConfigError as error:
         return choice.model_copy(update={"excluded": str(error)}), None
@@ -231,7 +236,7 @@ def reach_of_recordings(state: ModelState) -> Reach:
     return reach_of(state.robot, np.round(first, 4), speeds, accelerations)
 
 
-def _home(robot: RobotConfig) -> Floats:
+def home_of(robot: RobotConfig) -> Floats:
     """Return the posture (n,) at which motions begin: zero, or the nearest one within the limits."""
     bounds = np.array([joint.limits.position for joint in robot.joints])
     return np.clip(np.zeros(robot.n), bounds[:, 0], bounds[:, 1])

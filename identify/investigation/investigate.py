@@ -1,10 +1,8 @@
 """Questions to an arm until its recordings decide what is missing, or no allowed motion can tell."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-
-import yaml
 
 from armident.configs import ConfigError, DataError, MotionStopped, RobotConfig, Trajectory, load_robot
 from armident.configs.loading import load_trajectory
@@ -36,13 +34,10 @@ from armident.identify.investigation.choice import (
     next_motion,
     next_recording,
 )
+from armident.identify.investigation.folder import Ask, Progress, answer_of, keep_motion, read_again
 from armident.identify.investigation.rivals import uncertain, with_decided
 from armident.identify.report.robot_file import robot_yaml
 from armident.identify.signals.bandwidth import motion_bandwidth
-
-Ask = Callable[[Trajectory], Recording]
-"""Plays a trajectory on the robot and returns the recording; DataError if it refuses to, MotionStopped ends all."""
-Progress = Callable[[str, float], None]
 
 FILE, ROBOT, MODEL, BASELINE = "investigation.json", "robot.yaml", "model.yaml", "baseline.json"
 """Files of a folder: the document, the configuration, the same with what was found, and the arm before it changed."""
@@ -162,9 +157,7 @@ class Investigating:
         number = len(self.document.rounds) + 1
         name = None
         if self.folder is not None and chosen.trajectory is not None:
-            name = f"motion_{number}.yaml"
-            content = chosen.trajectory.model_dump(mode="json", by_alias=True, exclude_defaults=True)
-            write_atomically(self.folder / name, yaml.safe_dump(content, sort_keys=False))
+            name = keep_motion(self.folder, number, chosen.trajectory)
         asked = InvestigationRound(
             explanations=self.document.explanations,
             question=chosen.question,
@@ -186,10 +179,8 @@ class Investigating:
         last, trajectory = rounds[-1], self.trajectories[-1]
         assert trajectory is not None
         report(f"round {len(rounds)}: {last.chosen.words}", 0.0)
-        kept = None if self.folder is None else self.folder / f"motion_{len(rounds)}.mcap"
         try:
-            # A process that was killed may have written the recording and not entered it.
-            recording = read_recording(kept) if kept is not None and kept.exists() else ask(trajectory)
+            recording = answer_of(self.folder, len(rounds), trajectory, ask)
         except (DataError, MotionStopped) as error:
             refused = [*rounds[:-1], last.model_copy(update={"refused": str(error)})]
             if isinstance(error, DataError):
@@ -198,9 +189,6 @@ class Investigating:
                 reason = f"{last.chosen.words} was stopped: {error}. Find the cause before the arm moves again"
                 self._stop(f"{reason}; then begin with another --out", rounds=refused)
             return
-        if kept is not None and (recording.path is None or recording.path.resolve().parent != kept.resolve().parent):
-            write_recording(recording, kept)
-            recording = read_recording(kept)
         answered = last.model_copy(update={"recording": reference(recording)})
         self._keep(recording, trajectory.duration, [*rounds[:-1], answered])
 
@@ -273,11 +261,7 @@ def resumed(folder: Path, criteria: Criteria, collision: CollisionModel | None =
     document = load_document(folder / FILE, InvestigationDocument)
     robot = load_robot(folder / ROBOT, "investigate")
     expected = [*document.recordings, *(one.recording for one in document.rounds if one.recording is not None)]
-    recordings = []
-    for one in expected:
-        recordings.append(read_recording(Path(str(one.path))))
-        if recordings[-1].sha256 != one.sha256:
-            raise DataError(f"{one.path}: is not the recording that the investigation used; restore it")
+    recordings = [read_again(one) for one in expected]
     trajectories = [
         None if one.trajectory is None else load_trajectory(folder / one.trajectory) for one in document.rounds
     ]

@@ -147,18 +147,22 @@ def _wiring(step: Step, first: int, last: int, robot: RobotConfig) -> list[tuple
         groups: list[tuple[NDArray[np.int64], tuple[str, ...]]] = [(orders[0], ("position", "torque"))]
     else:
         groups = [(orders[0], ("position",)), (orders[1], ("torque",))]
-    found = [_order(order, signals, names) for order, signals in groups if not np.array_equal(order, np.arange(n))]
+    found = [
+        order_finding(order, signals, names) for order, signals in groups if not np.array_equal(order, np.arange(n))
+    ]
     for mask, signals in (
         (turned[0] & turned[1], ("position", "torque")),
         (turned[0] & ~turned[1], ("position",)),
         (~turned[0] & turned[1], ("torque",)),
     ):
         if mask.any():
-            found.append(_sign([names[j] for j in np.flatnonzero(mask)], signals))
+            found.append(sign_finding([names[j] for j in np.flatnonzero(mask)], signals))
     return found
 
 
-def _order(order: NDArray[np.int64], signals: Sequence[str], names: Sequence[str]) -> tuple[SetupFinding, list[Effect]]:
+def order_finding(
+    order: NDArray[np.int64], signals: Sequence[str], names: Sequence[str]
+) -> tuple[SetupFinding, list[Effect]]:
     """Recorded column ``order[j]`` belongs to joint j."""
     moved = [j for j in range(len(names)) if order[j] != j]
     entries = [_entry("joint_order", names[a], signals, names[b]) for a, b in transpositions(order)]
@@ -199,7 +203,8 @@ def _raw_exchange(step: Step, k: int, robot: RobotConfig) -> tuple[SetupFinding,
     return SetupFinding("joint_order", tuple(names), 1.0, message, effects_line([entry]), True), [entry]
 
 
-def _sign(joints: Sequence[str], signals: Sequence[str]) -> tuple[SetupFinding, list[Effect]]:
+def sign_finding(joints: Sequence[str], signals: Sequence[str]) -> tuple[SetupFinding, list[Effect]]:
+    """Signals (``position``, ``torque``) of some joints have the wrong sign."""
     entries = [_entry("sign_error", name, signals) for name in joints]
     verb = "have" if len(joints) > 1 or len(signals) > 1 else "has"
     message = f"{' and '.join(signals)} of {', '.join(joints)} {verb} the wrong sign"
@@ -215,7 +220,7 @@ def _scale(step: Step, k: int, robot: RobotConfig, bench: Bench) -> tuple[SetupF
     changed = sum(np.abs(m - np.eye(robot.n)).max(axis=1) for m in (position, torque)) > 1e-12
     joints = [int(j) for j in np.flatnonzero(changed)]
     names = tuple(robot.joints[j].name for j in joints)
-    entries = [*_linear_map(position, "position", robot), *_linear_map(torque, "torque", robot)]
+    entries = [*linear_map(position, "position", robot), *linear_map(torque, "torque", robot)]
     remedy, message = effects_line(entries), step.mistakes[k].words
     j = joints[0]
     if family == "gear_ratio":
@@ -262,7 +267,7 @@ def _determined(h: Hypothesis, bench: Bench) -> list[int]:
     return [j for j in moving if min(rise(j, 0.5), rise(j, 2.0)) > least]
 
 
-def _linear_map(matrix: Array, signal: str, robot: RobotConfig) -> list[Effect]:
+def linear_map(matrix: Array, signal: str, robot: RobotConfig) -> list[Effect]:
     """Entries of `signal_scale` for a matrix (n, n): factors of an upper, a diagonal and a lower triangular matrix."""
     n, names = robot.n, [joint.name for joint in robot.joints]
     _, lower, upper = linalg.lu(matrix) if not _diagonal(matrix) else (None, np.eye(n), matrix)
