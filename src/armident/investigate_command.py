@@ -1,25 +1,15 @@
 """Command ``armident investigate``: ask an arm on its bus, by a program, by hand, or from recordings of the past."""
 
-import shlex
-import shutil
-import subprocess
 import sys
-from collections.abc import Callable
-from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-if TYPE_CHECKING:
-    from armident.configs import RobotConfig, Trajectory
-    from armident.daq.recording import Recording
-    from armident.identify.api.investigation_api import Investigation
+from armident.asking import RATE_HZ, Bars, confirmed, door_of
 
-RATE_HZ = 1000.0
-"""Rate of a trajectory for a program where no recording gives one, Hz."""
-PRINTED = 400
-"""Last characters of the output of a program that a refusal quotes."""
+if TYPE_CHECKING:
+    from armident.identify.api.investigation_api import Investigation
 
 
 def investigate(
@@ -84,14 +74,14 @@ def investigate(
 
     Example: armident investigate monday.mcap --config cell.yaml
     """
-    from armident.configs import ConfigError, DataError, config_path, load_robot
+    from armident.configs import ConfigError, DataError, RobotConfig, config_path, load_robot
     from armident.configs.errors import FOUND
     from armident.configs.loading import is_session
     from armident.daq.recording import read_recording
     from armident.identify.api.investigation_api import investigate as run
     from armident.identify.documents.files import load_document
     from armident.identify.documents.investigation import OUTCOMES, InvestigationDocument
-    from armident.identify.monitoring.reidentify.cell import Cell, load_moving_session
+    from armident.identify.monitoring.reidentify.cell import load_moving_session
 
     doors = [robot_command is not None, by_hand, choose_from is not None]
     session = None
@@ -113,22 +103,16 @@ def investigate(
     offered = [] if choose_from is None else [read_recording(path) for path in sorted(choose_from.glob("*.mcap"))]
     if choose_from is not None and not offered:
         raise ConfigError(f"--replay {choose_from}: no recordings (.mcap) in this folder")
-    command = shlex.split(robot_command or "")
-    if robot_command is not None and shutil.which(next(iter(command), "")) is None:
-        raise ConfigError(f"--robot-command {robot_command}: no such program")
-    moves = robot_command is not None or session is not None
-    if moves and not yes and not sys.stdin.isatty():
-        raise ConfigError("the robot would move, and nobody can be asked here: add --yes")
-    bars = _Bars()
-    door: Callable[[Trajectory], Recording] | None = None
-    if robot_command is not None:
-        given = folder / "robot.yaml" if resume is not None else config
-        robot = read[0].robot if given is None else load_robot(given, "trajectory")
-        door = _Program(command, robot, folder, read[0].sample_rate_hz if read else RATE_HZ)
-    elif session is not None:
-        door = Cell(session, folder, lambda line: print(f"investigate: {line}", file=sys.stderr, flush=True))
+    bars, given = Bars("investigate"), folder / "robot.yaml" if resume is not None else config
+
+    def robot() -> RobotConfig:
+        return read[0].robot if given is None else load_robot(given, "trajectory")
+
+    rate_hz = read[0].sample_rate_hz if read else RATE_HZ
+    door = door_of("investigate", robot_command, session, robot, folder, rate_hz, yes=yes)
+    if session is not None:
         config = session.robot
-    asked = None if door is None else _confirmed(door, bars, always=yes)
+    asked = None if door is None else confirmed(door, bars, always=yes)
     if door is not None:
         former = None if resume is None else load_document(resume / "investigation.json", InvestigationDocument)
         most = experiments if former is None else former.experiments - len(former.rounds)
@@ -159,85 +143,3 @@ def _print(found: "Investigation", folder: Path, meaning: str) -> None:
     if found.pending is not None:
         file = folder / str(document.rounds[-1].trajectory)
         print(f"next: record the motion of {file}, then: armident investigate --continue {folder} RECORDING")
-
-
-class _Bars(ExitStack):
-    """Progress of the stages; it pauses while the user is asked."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self._report: Callable[[str, float], None] | None = None
-        self.stage = ""
-
-    def report(self, stage: str, share: float) -> None:
-        """Show a stage and its share."""
-        from armident.identify.cli.progress import progress
-
-        self.stage = stage
-        if self._report is None:
-            self._report = self.enter_context(progress("investigate"))
-        self._report(stage, share)
-
-    def pause(self) -> None:
-        """Remove the bar until the next stage."""
-        self._report = None
-        self.close()
-
-
-def _confirmed(
-    door: "Callable[[Trajectory], Recording]", bars: _Bars, *, always: bool
-) -> "Callable[[Trajectory], Recording]":
-    """Return a door that says what it will do, and asks before it moves the robot."""
-
-    def asked(trajectory: "Trajectory") -> "Recording":
-        bars.pause()
-        print(f"{bars.stage}, {trajectory.duration:.1f} s", file=sys.stderr)
-        if not always and not typer.confirm("Move the robot?", err=True):
-            raise typer.Abort
-        return door(trajectory)
-
-    return asked
-
-
-class _Program:
-    """A program that moves the robot: ``PROGRAM TRAJECTORY.csv OUT``."""
-
-    def __init__(self, command: list[str], robot: "RobotConfig", folder: Path, rate_hz: float) -> None:
-        self._command, self._robot, self._folder, self._rate_hz = command, robot, folder, rate_hz
-
-    def __call__(self, trajectory: "Trajectory") -> "Recording":
-        """Return the file that the program leaves, imported; DataError if it refuses or leaves none.
-
-        A file of the last motion in the folder is whole, of a command that was killed: the program is not called again.
-        """
-        import numpy as np
-
-        from armident.configs import DataError
-        from armident.daq.interchange.importing import import_recording
-        from armident.daq.interchange.readers import reader_of
-        from armident.daq.recording import read_recording
-
-        number = len(list(self._folder.glob("motion_*.yaml")))
-        if not (answers := list(self._folder.glob(f"answer_{number}.*"))):
-            reference, left = self._folder / f"reference_{number}.csv", self._folder / f"left_{number}.csv"
-            period = 1.0 / self._rate_hz
-            q = trajectory.sample(period)
-            header = ",".join(["t", *(f"qr{j + 1}" for j in range(q.shape[1]))])
-            table = np.column_stack([period * np.arange(len(q)), q])
-            np.savetxt(reference, table, "%.9g", delimiter=",", header=header, comments="")
-            for torn in self._folder.glob(f"{left.stem}.*"):
-                torn.unlink()
-            words = [*self._command, str(reference), str(left)]
-            done = subprocess.run(words, capture_output=True, text=True, check=False)
-            if done.returncode != 0:
-                printed = " ".join((done.stderr or done.stdout).split())[-PRINTED:]
-                raise DataError(
-                    f"the program ended with exit code {done.returncode}: {printed or 'it printed nothing'}"
-                )
-            written = [path for path in sorted(self._folder.glob(f"{left.stem}.*")) if path.is_file()]
-            if not written:
-                raise DataError(f"the program left no file {left}")
-            name = f"answer_{number}{written[0].name.removeprefix(left.stem)}"
-            answers = [written[0].replace(self._folder / name)]
-        answer = answers[0]
-        return read_recording(answer) if reader_of(answer).own else import_recording(answer, self._robot)
