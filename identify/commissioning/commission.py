@@ -113,7 +113,7 @@ class CommissioningRun:
         theta = self._theta()
         first, second = (self._excite(theta, MARGIN, FULL_S, seed) for seed in SEEDS)
         self._progress(f"{self._title}: identification", 0.0)
-        self.identification = found = identify(first, self.robot)
+        self.identification = found = identify([self.recordings[self._played - 3], first], self.robot)
         if self.folder is not None:
             found.save(self.folder / MODEL)
             write_atomically(self.folder / MODEL / ROBOT, robot_yaml(found.robot))
@@ -135,7 +135,9 @@ class CommissioningRun:
         return Ended("not_trusted", sentence, f"{step}; or: armident investigate {motions}")
 
     def _theta(self) -> Floats:
-        return model_so_far(self.robot, self._experiments(self.recordings[: self._played]), self.safety.theta)
+        """Return the model of the motions of all joints so far, else of the small ones."""
+        so_far = self.recordings[: self._played]
+        return model_so_far(self.robot, self._experiments(so_far[self.robot.n :] or so_far), self.safety.theta)
 
     def _excite(self, theta: Floats, share: float, duration: float, seed: int) -> Recording:
         """Move all joints at a share of their limits, as far as a model of the motions so far allows it."""

@@ -32,7 +32,7 @@ def model_so_far(robot: RobotConfig, experiments: Sequence[Experiment], known: F
     """
     arm, dt = arm_model(robot), experiments[0].dt
     bandwidth = robot.bandwidth_hz or motion_bandwidth([e.q for e in experiments], dt)
-    signals = smoothed_derivatives(experiments, robot, Options(), bandwidth)
+    signals = smoothed_derivatives(experiments, robot, Options(derivatives="bandpass"), bandwidth)
     lengths = [e.q.shape[0] for e in experiments]
     decimation = decimation_of("idim-ls", dt, bandwidth, None, samples=lengths, rows=least_rows(arm))
     blocks = equations(arm, experiments, signals, decimation)

@@ -8,18 +8,19 @@ import pytest
 import yaml
 
 import armident
-from armident.configs import DataError, Trajectory, load_robot
+from armident.configs import DataError, RobotConfig, Trajectory, load_robot
 from armident.identify.commissioning.small_motion import SmallMotion, wrong_answer
 from armident.identify.excitation.point_to_point import sample_trajectory
-from armident.identify.identification.from_recording import experiments_of
+from armident.identify.identification.from_recording import experiments_of, joint_positions, joint_torques
 from armident.identify.investigation.choice import home_of
 from armident.identify.investigation.motions import FIRST_CONTACT, reach_of
 from armident.identify.signals.experiments import Experiment
+from armident.virtual_robot.twin import complete
 
 pytestmark = pytest.mark.slow
 
-PICKER = "docs/examples/integration_test/picker.yaml"
-"""A lift, a shoulder and an elbow, with masses in the URDF."""
+PICKER, _, _ = complete(load_robot("docs/examples/integration_test/picker.yaml"))
+"""A lift, a shoulder and an elbow, with masses in the URDF and the drives that a virtual arm assumes."""
 PERIOD = 1e-3
 ELBOW = 2
 
@@ -27,7 +28,7 @@ ELBOW = 2
 class Arm:
     """A virtual arm whose signals may be turned or exchanged: columns of positions and torques, and their signs."""
 
-    def __init__(self, robot: str, position: tuple[int, ...] = (), torque: tuple[int, ...] = ()) -> None:
+    def __init__(self, robot: str | RobotConfig, position: tuple[int, ...] = (), torque: tuple[int, ...] = ()) -> None:
         self.robot, self.position, self.torque, self.asked = robot, position, torque, list[Trajectory]()
 
     def __call__(self, trajectory: Trajectory) -> armident.Recording:
@@ -35,9 +36,9 @@ class Arm:
         made = armident.simulate_recording(self.robot, trajectory, seed=len(self.asked), period=PERIOD)
         if not self.position and not self.torque:
             return made
-        (e,), _ = experiments_of([made], made.robot, name_files=False)
-        q, tau = _columns(e.q, self.position), _columns(e.tau, self.torque)
-        return armident.Recording.from_arrays(PERIOD * np.arange(len(q)), q, tau, robot=made.robot, reference=e.q_ref)
+        q = _columns(joint_positions(made.samples, "position", made.robot), self.position)
+        tau = _columns(joint_torques(made.samples, made.robot), self.torque)
+        return armident.Recording.from_arrays(PERIOD * np.arange(len(q)), q, tau, robot=made.robot)
 
 
 def _columns(x: np.ndarray, order: tuple[int, ...]) -> np.ndarray:
@@ -46,7 +47,7 @@ def _columns(x: np.ndarray, order: tuple[int, ...]) -> np.ndarray:
 
 
 def test_a_new_arm_becomes_a_trusted_model_without_a_step_in_the_dark(tmp_path: Path) -> None:
-    arm, robot, lines = Arm(PICKER), load_robot(PICKER), list[str]()
+    arm, robot, lines = Arm(PICKER), PICKER, list[str]()
     found = armident.commission(PICKER, arm, out=tmp_path, say=lines.append)
     assert found.outcome == "trusted", found
     assert len(lines) == len(found.document.stages) == 4
@@ -87,36 +88,44 @@ def test_a_new_arm_becomes_a_trusted_model_without_a_step_in_the_dark(tmp_path: 
         ),
     ],
 )
-def test_a_mistake_stops_at_the_first_joint_that_shows_it_and_its_line_corrects_it(
-    tmp_path: Path, position: tuple[int, ...], torque: tuple[int, ...], asked: int, line: str
+def test_a_mistake_stops_at_the_first_joint_that_shows_it_with_the_line_that_corrects_it(
+    position: tuple[int, ...], torque: tuple[int, ...], asked: int, line: str
 ) -> None:
     arm = Arm(PICKER, position, torque)
-    found = armident.commission(PICKER, arm, out=tmp_path)
+    found = armident.commission(PICKER, arm)
     assert found.outcome == "set_up"
+    assert list(found.document.stages) == ["configuration", "small motions"]
     assert len(arm.asked) == asked
     assert found.document.next_step == f"effects: [{line}]"
+
+
+def test_the_line_corrects_the_recordings_of_before_and_the_other_joints_follow(tmp_path: Path) -> None:
+    arm = Arm(PICKER, torque=(-1, 2, 3))
+    found = armident.commission(PICKER, arm, out=tmp_path)
+    assert len(arm.asked) == 1
     corrected = yaml.safe_load((tmp_path / "robot.yaml").read_text()) | yaml.safe_load(found.document.next_step)
     (tmp_path / "robot.yaml").write_text(yaml.safe_dump(corrected), encoding="utf-8")
 
     def ends(trajectory: Trajectory) -> armident.Recording:
-        if len(arm.asked) == 3:
+        if len(arm.asked) == PICKER.n:
             raise DataError("enough")
         return arm(trajectory)
 
-    # The recordings of before are judged by the corrected configuration, and the other joints follow.
     again = armident.commission(None, ends, resume=tmp_path)
-    assert list(again.document.stages) == ["configuration", "small motions", "scale"]
     assert again.outcome == "stopped"
+    assert "every joint moves as asked" in again.document.stages["small motions"]
+    assert list(again.document.stages)[-1] == "scale"
 
 
 def _answer(factor: float) -> tuple[np.ndarray, list[Experiment]]:
     """Positions of the elbow that were asked for, and a recording whose revolute positions have a wrong factor."""
-    robot = load_robot(PICKER)
+    robot = PICKER
     still = np.zeros(robot.n)
     trajectory = SmallMotion().trajectory(reach_of(robot, home_of(robot), still, still), ELBOW, 0.1)
     recording = armident.simulate_recording(PICKER, trajectory, seed=1, period=PERIOD)
-    (e,), _ = experiments_of([recording], robot, name_files=False)
-    return trajectory.sample(PERIOD)[:, ELBOW], [replace(e, q=e.q * np.array([1.0, factor, factor]))]
+    recorded, _ = experiments_of([recording], robot, name_files=False)
+    scale = np.array([1.0, factor, factor])
+    return trajectory.sample(PERIOD)[:, ELBOW], [replace(e, q=e.q * scale) for e in recorded]
 
 
 @pytest.mark.parametrize(
@@ -128,11 +137,11 @@ def _answer(factor: float) -> tuple[np.ndarray, list[Experiment]]:
     ],
 )
 def test_a_wrong_unit_is_named_by_the_motion_that_was_asked_for(factor: float, message: str, remedy: str) -> None:
-    mistake = wrong_answer(load_robot(PICKER), ELBOW, *_answer(factor))
+    mistake = wrong_answer(PICKER, ELBOW, *_answer(factor))
     assert mistake is not None
     assert message in mistake.message
     assert remedy in mistake.remedy
-    assert wrong_answer(load_robot(PICKER), ELBOW, *_answer(1.0)) is None
+    assert wrong_answer(PICKER, ELBOW, *_answer(1.0)) is None
 
 
 def test_a_kill_loses_only_the_motion_that_runs(tmp_path: Path) -> None:
