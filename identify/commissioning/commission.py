@@ -68,8 +68,9 @@ class CommissioningRun:
             self._title = f"stage {number} of {len(stages)}, {name}"
             try:
                 sentence, changes = stage(), dict[str, object]()
-            except Ended as ended:
-                outcome, sentence, next_step = ended.args
+            except (Ended, DataError) as error:
+                unusable = ("stopped", str(error), "mend the cause, then begin with another --out")
+                outcome, sentence, next_step = error.args if isinstance(error, Ended) else unusable
                 changes = {"outcome": outcome, "next_step": next_step}
             self._update(stages={**self.document.stages, name: sentence}, **changes)
             say(f"{self._title}: {sentence}")
