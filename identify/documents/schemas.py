@@ -5,6 +5,7 @@ from pathlib import Path
 
 from armident import configs
 from armident.identify.documents.base import Document
+from armident.identify.documents.characterisation import CharacterisationDocument
 from armident.identify.documents.commissioning import CommissioningDocument
 from armident.identify.documents.comparison import ComparisonDocument
 from armident.identify.documents.diagnosis import DiagnosisDocument
@@ -20,6 +21,7 @@ SCHEMA_FILES: dict[str, type[Document]] = {
     "diagnosis.schema.json": DiagnosisDocument,
     "investigation.schema.json": InvestigationDocument,
     "commissioning.schema.json": CommissioningDocument,
+    "characterisation.schema.json": CharacterisationDocument,
     "prediction.schema.json": PredictionDocument,
     "predictions.schema.json": PredictionsDocument,
     "comparison.schema.json": ComparisonDocument,

@@ -8,11 +8,11 @@
 
 Recordings: `Recording.from_arrays`, `read_recording`, `import_recording`, `simulate_recording`, `capture`.
 Configurations: `load_robot`, `load_session`.
-Work: `commission`, `check`, `identify` with `Options`, `diagnose`, `investigate`, `compare`, `predict`,
+Work: `commission`, `check`, `identify` with `Options`, `diagnose`, `investigate`, `characterise`, `compare`, `predict`,
 `design_trajectory`.
 Results: `CheckedSetup`, `Identification` (`load_identification`) and its `RobotModel`, `Diagnosis`, `Investigation`,
-`Commissioning`, `ChangeTest`, `TorquePrediction`, `Design`. They print, show themselves in a notebook, and have
-``report`` and ``save``.
+`Commissioning`, `Characterisation`, `ChangeTest`, `TorquePrediction`, `Design`. They print, show themselves in a
+notebook, and have ``report`` and ``save``.
 Effects: `effects` lists them; `Effect`, `Linear`, `Shape`, `Place` and `Motion` make a new one.
 Errors: `ArmidentError`, and of it `ConfigError` and `DataError`.
 """
@@ -31,6 +31,8 @@ if TYPE_CHECKING:
     from armident.daq.api import import_recording as import_recording
     from armident.daq.recording import Recording as Recording
     from armident.daq.recording import read_recording as read_recording
+    from armident.identify.api.characterisation_api import Characterisation as Characterisation
+    from armident.identify.api.characterisation_api import characterise as characterise
     from armident.identify.api.commissioning_api import Commissioning as Commissioning
     from armident.identify.api.commissioning_api import commission as commission
     from armident.identify.api.comparison_api import ChangeTest as ChangeTest
@@ -64,6 +66,7 @@ _HOMES = {
     "armident.configs": ("ArmidentError", "ConfigError", "DataError", "load_robot", "load_session"),
     "armident.daq.api": ("capture", "import_recording"),
     "armident.daq.recording": ("Recording", "read_recording"),
+    "armident.identify.api.characterisation_api": ("Characterisation", "characterise"),
     "armident.identify.api.commissioning_api": ("Commissioning", "commission"),
     "armident.identify.api.comparison_api": ("ChangeTest", "compare"),
     "armident.identify.api.diagnosis_api": ("Diagnosis", "diagnose", "effects"),

@@ -21,6 +21,20 @@ PRINTED = 400
 """Last characters of the output of a program that a refusal quotes."""
 
 
+def moving_session(config: Path | None) -> "SessionConfig | None":
+    """Return the session of a configuration whose arm can be moved; ``None`` for the configuration of a robot.
+
+    Raises ConfigError if the session cannot move its arm.
+    """
+    from armident.configs import config_path
+    from armident.configs.loading import is_session
+    from armident.identify.monitoring.reidentify.cell import load_moving_session
+
+    if config is None or not is_session(file := config_path(config, of_folder="session.yaml")):
+        return None
+    return load_moving_session(file)
+
+
 def door_of(
     name: str,
     robot_command: str | None,

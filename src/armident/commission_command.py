@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from armident.asking import RATE_HZ, Bars, confirmed, door_of
+from armident.asking import RATE_HZ, Bars, confirmed, door_of, moving_session
 
 
 def commission(
@@ -42,17 +42,15 @@ def commission(
 
     Example: armident commission tx40.yaml --robot-command 'armident robot --config tx40.yaml --to-command'
     """
-    from armident.configs import ConfigError, DataError, config_path, load_robot
+    from armident.configs import ConfigError, DataError, load_robot
     from armident.configs.errors import FOUND
-    from armident.configs.loading import is_session
     from armident.daq.doctor import checks_for
     from armident.identify.api.commissioning_api import commission as run
-    from armident.identify.monitoring.reidentify.cell import load_moving_session
 
     if resume is not None and out is not None:
         raise ConfigError("--continue: the results stay in its folder; leave --out out")
-    folder, file = resume or out or Path("commissioning"), config_path(config, of_folder="session.yaml")
-    session = load_moving_session(file) if robot_command is None and is_session(file) else None
+    folder = resume or out or Path("commissioning")
+    session = moving_session(config) if robot_command is None else None
     robot = config if session is None else session.robot
     if robot_command is None and session is None:
         raise ConfigError(f"{config}: is no session; add --robot-command PROGRAM, which moves the robot")

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from armident.asking import RATE_HZ, Bars, confirmed, door_of
+from armident.asking import RATE_HZ, Bars, confirmed, door_of, moving_session
 
 if TYPE_CHECKING:
     from armident.identify.api.investigation_api import Investigation
@@ -74,19 +74,15 @@ def investigate(
 
     Example: armident investigate monday.mcap --config cell.yaml
     """
-    from armident.configs import ConfigError, DataError, RobotConfig, config_path, load_robot
+    from armident.configs import ConfigError, DataError, RobotConfig, load_robot
     from armident.configs.errors import FOUND
-    from armident.configs.loading import is_session
     from armident.daq.recording import read_recording
     from armident.identify.api.investigation_api import investigate as run
     from armident.identify.documents.files import load_document
     from armident.identify.documents.investigation import OUTCOMES, InvestigationDocument
-    from armident.identify.monitoring.reidentify.cell import load_moving_session
 
     doors = [robot_command is not None, by_hand, choose_from is not None]
-    session = None
-    if config is not None and not any(doors) and is_session(file := config_path(config, of_folder="session.yaml")):
-        session = load_moving_session(file)
+    session = None if any(doors) else moving_session(config)
     if sum(doors) > 1 or (resume is None and session is None and not any(doors)):
         raise ConfigError(
             "give one way to ask: --config with a session, --robot-command PROGRAM, --by-hand, or --replay FOLDER"

@@ -38,7 +38,6 @@ from armident.identify.investigation import choice as choices
 from armident.identify.investigation.choice import Chosen
 from armident.identify.investigation.investigate import Investigating, started
 from armident.identify.investigation.motions import FAMILIES
-from tests.evaluation.plants.halves import Half
 from tests.evaluation.process import ONE_THREAD, ByName, WorkerProcess
 from tests.tools.markdown import table
 
@@ -91,7 +90,7 @@ class Drawn(Investigating):
 WAYS: dict[str, type[Investigating]] = {"best": Investigating, "excitation": Excited, "random": Drawn}
 
 
-def investigated(half: Half, index: int, ways: Sequence[str], out: Path) -> Iterator[dict[str, Any]]:
+def investigated(half: str, index: int, ways: Sequence[str], out: Path) -> Iterator[dict[str, Any]]:
     """Yield what is said after each motion of a case, with the truth, for every way to ask."""
     resource.setrlimit(resource.RLIMIT_AS, (LIMIT_BYTES, LIMIT_BYTES))
     name = f"{half}_{index:04d}"
@@ -125,7 +124,7 @@ def investigated(half: Half, index: int, ways: Sequence[str], out: Path) -> Iter
 
 
 def _ask(
-    arm: WorkerProcess, case: tuple[Half, int], first: Recording, folder: Path
+    arm: WorkerProcess, case: tuple[str, int], first: Recording, folder: Path
 ) -> Callable[[Trajectory], Recording]:
     def ask(trajectory: Trajectory) -> Recording:
         period, number = 1.0 / first.sample_rate_hz, 1 + len(list(folder.glob("reference_*.csv")))
@@ -223,7 +222,7 @@ def calibration_of(cases: Sequence[dict[str, Any]]) -> str:
     return table(("final probability", "cases", "mean", "right"), rows)
 
 
-def _entered(half: Half, index: int, ways: Sequence[str], out: Path) -> None:
+def _entered(half: str, index: int, ways: Sequence[str], out: Path) -> None:
     """Investigate a case and append each result to the file."""
     for one in investigated(half, index, ways, out):
         with (out / RESULTS).open("a", encoding="utf-8") as file:
