@@ -50,17 +50,19 @@ def characterised(recordings: Sequence[Recording], robot: RobotConfig, joint: st
     motions = alone(experiments, robot, number)
     groups = plateaus(motions)
     friction = ripple = presliding = None
+    orders: list[float] = []
     statements = dict.fromkeys(("friction", "ripple"), NO_PLATEAU.format(joint=joint))
     if groups:
         levels = measured_levels([plateau for group in groups for plateau in group])
         found = ripples(levels)
         ripple = _ripple(found, 2.0 * np.pi if revolute else 1.0, robot, number, torque)
-        levels = levels if found is None else found.levels
+        if found is not None:
+            levels, orders = found.levels, [order for order, _, _ in found.peaks]
         friction = _friction(groups, levels, friction_curve(levels, robot, number), torque, position)
         statements["friction"] = _friction_words(friction)
         statements["ripple"] = _ripple_words(ripple, torque, "revolution" if revolute else "metre")
     statements["stiffness"] = NO_REVERSAL.format(joint=joint)
-    turned = reversals(motions, float(arm_model(robot).smoothing[number]))
+    turned = reversals(motions, float(arm_model(robot).smoothing[number]), orders)
     if turned is not None:
         unit = f"{torque}/{position}"
         half = NORMAL_95 * turned.std
@@ -109,15 +111,15 @@ def _friction(
 ) -> Friction:
     """Return friction at each speed: half differences of pairs, and with a curve the friction in each direction."""
     size = len(levels.plateaus)
-    values, covariance = levels.fit.theta[:size], levels.fit.covariance[:size, :size]
+    # Levels scatter about the curve by what the noise within a plateau does not show (Birge 1932).
+    scatter = 1.0 if curve is None else curve.misfit**2
+    values, covariance = levels.fit.theta[:size], scatter * levels.fit.covariance[:size, :size]
     side = np.sign([p.speed for p in levels.plateaus])
-    against, spread = side * values, None
+    against, spread = side * values, np.empty(0)
     if curve is not None:
         shift = np.eye(size) - curve.offset
         against = side * (shift @ values)
-        spread = np.diag(shift @ covariance @ shift.T) + (curve.misfit**2 - 1.0) * (
-            curve.offset @ covariance @ curve.offset
-        )
+        spread = np.diag(shift @ covariance @ shift.T)
     points, first = [], 0
     for group in groups:
         own = range(first, first + len(group))
@@ -125,13 +127,15 @@ def _friction(
         half = np.zeros(size)
         half[list(own)] = 0.5 * side[list(own)]
         directions = {
-            "forward" if side[k] > 0.0 else "backward": _estimate(against[k], spread[k], torque)
-            for k in (own if spread is not None else ())
+            "forward" if side[k] > 0.0 else "backward": _estimate(float(against[k]), float(spread[k]), torque)
+            for k in (own if spread.size else ())
         }
         points.append(
             FrictionPoint(
                 speed=abs(group[0].speed),
-                friction=_estimate(half @ values, half @ covariance @ half, torque) if len(group) == 2 else None,
+                friction=_estimate(float(half @ values), float(half @ covariance @ half), torque)
+                if len(group) == 2
+                else None,
                 **directions,
             )
         )
@@ -154,7 +158,7 @@ def _friction_words(friction: Friction) -> str:
     low, high = friction.points[0].speed, friction.points[-1].speed
     text = f"{len(friction.points)} constant speeds from {low:.3g} to {high:.3g}"
     if not friction.curve:
-        return f"{text}; too few for a curve, which needs six in each direction"
+        return f"{text}; a curve needs two different ones in each direction"
     stribeck = "" if "fst" in friction.curve else "; no Stribeck friction is seen"
     return f"{text}; {', '.join(f'{name} {_in_words(e)}' for name, e in friction.curve.items())}{stribeck}"
 

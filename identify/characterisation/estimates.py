@@ -48,21 +48,30 @@ def fitted(columns: Sequence[Array], values: Sequence[Array]) -> Fitted:
 
     Series longer than the noise model share it, each with its own variance: slow motion sticks, and fast motion shakes.
     """
-    theta = np.linalg.lstsq(np.concatenate(columns), np.concatenate(values), rcond=None)[0]
+    theta = solved(np.concatenate(columns), np.concatenate(values))
     errors = [y - a @ theta for a, y in zip(columns, values, strict=True)]
-    noise = fit_ar(errors, min(MAX_AR_ORDER, min(e.size for e in errors) // 2))
+    equal = [e / max(float(np.std(e)), 1e-9) for e in errors]
+    noise = fit_ar(equal, min(MAX_AR_ORDER, min(e.size for e in errors) // 2))
     white = [noise.whiten(e) for e in errors]
     rest = max(sum(w.size for w in white) - theta.size, 1)
     free = rest / sum(w.size for w in white)
     scale = np.array([max(float(np.sqrt(np.mean(w**2) / free)), 1e-9) for w in white])
+    # Few rows may look quiet by chance: none counts more than usual.
+    scale = np.maximum(scale, np.median(scale))
     first = Fitted(theta, np.empty((0, 0)), noise, scale, np.empty((0, 0)), np.empty(0))
     a, y = first.whiten(columns), first.whiten(values)
-    covariance = np.linalg.pinv(a.T @ a)
+    covariance = np.asarray(np.linalg.pinv(a.T @ a), dtype=np.float64)
     theta = covariance @ (a.T @ y)
     return Fitted(theta, covariance, noise, scale, a, y - a @ theta)
+
+
+def solved(columns: Array, values: Array) -> Array:
+    """Return the least-squares solution (k,) of values (M,) by columns (M, k)."""
+    return np.asarray(np.linalg.lstsq(columns, values, rcond=None)[0], dtype=np.float64)
 
 
 def averaged(x: Array, block: int) -> Array:
     """Return means (M // block, ...) of blocks of rows (M, ...)."""
     whole = x.shape[0] // block * block
-    return x[:whole].reshape(-1, block, *x.shape[1:]).mean(axis=1)
+    means: Array = x[:whole].reshape(-1, block, *x.shape[1:]).mean(axis=1)
+    return means

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
 from armident.configs import RobotConfig
-from armident.identify.characterisation.estimates import RATE_HZ, SEEN, Fitted, averaged, fitted
+from armident.identify.characterisation.estimates import RATE_HZ, SEEN, Fitted, averaged, fitted, solved
 from armident.identify.characterisation.motion import SLOWEST, Alone, Plateau
 from armident.identify.effects.effect import Place
 from armident.identify.effects.friction import AsymmetricViscousFriction, StribeckBell
@@ -21,8 +21,10 @@ from armident.identify.robot.motion import Motion
 
 Array = NDArray[np.float64]
 
-SPEEDS = 6
-"""Least number of different speeds in each direction: as many as the curve has parameters."""
+SPEEDS = 2
+"""Least number of different speeds in each direction: four torques for four parameters."""
+CURVED = 6
+"""That for Stribeck friction: as many as the curve then has parameters."""
 LAST = 0.35
 """Largest Stribeck velocity over the top speed, as that of a diagnosis."""
 TRIALS = 20
@@ -77,8 +79,8 @@ def _means(motion: Alone, rows: NDArray[np.intp], top: float) -> tuple[Array, Ar
     """Return block means of rigid columns, functions of the speed, torque and position."""
     block = motion.block(RATE_HZ)
     shape = np.column_stack([motion.qd, motion.friction(top) * np.sign(motion.qd)[:, None]])
-    signals = (motion.rigid(), shape, motion.tau, motion.q)
-    return tuple(averaged(each[rows], block) for each in signals)
+    rigid, shape, tau, q = (averaged(each[rows], block) for each in (motion.rigid(), shape, motion.tau, motion.q))
+    return rigid, shape, tau, q
 
 
 def _moving(motions: Sequence[Alone], top: float) -> tuple[float, Array]:
@@ -86,7 +88,7 @@ def _moving(motions: Sequence[Alone], top: float) -> tuple[float, Array]:
     parts = [_means(m, np.flatnonzero(m.alone & (np.abs(m.speed) > SLOWEST * top)), top) for m in motions]
     columns = np.concatenate([np.hstack([rigid, shape]) for rigid, shape, _, _ in parts])
     rigid = parts[0][0].shape[1]
-    theta = np.linalg.lstsq(columns, np.concatenate([tau for _, _, tau, _ in parts]), rcond=None)[0]
+    theta = solved(columns, np.concatenate([tau for _, _, tau, _ in parts]))
     return float(theta[0]), theta[rigid:]
 
 
@@ -109,7 +111,8 @@ class Curve:
 def friction_curve(found: Levels, robot: RobotConfig, joint: int) -> Curve | None:
     """Return the curve, with Stribeck friction where it is seen; ``None`` for too few speeds, or one direction only."""
     speeds = np.array([p.speed for p in found.plateaus])
-    if min(np.unique(np.round(np.log(np.abs(speeds[speeds * side > 0.0])), 1)).size for side in (1.0, -1.0)) < SPEEDS:
+    different = min(np.unique(np.round(np.log(np.abs(speeds[speeds * side > 0.0])), 1)).size for side in (1.0, -1.0))
+    if different < SPEEDS or speeds.size <= 2 * SPEEDS:
         return None
     levels = found.fit.theta[: speeds.size]
     root = np.linalg.inv(np.linalg.cholesky(found.fit.covariance[: speeds.size, : speeds.size]))
@@ -125,21 +128,25 @@ def friction_curve(found: Levels, robot: RobotConfig, joint: int) -> Curve | Non
             parts.append(bell.columns(motion, place, {"velocity": velocity, "displacement": 0.0})[:, 0])
         return np.stack(parts, axis=1)
 
-    def solved(sharp: bool, velocity: float | None) -> tuple[float, Array]:
+    def tried(sharp: bool, velocity: float | None) -> tuple[float, Array]:
         a, y = root @ columns(speeds, sharp, velocity), root @ levels
-        theta = np.linalg.lstsq(a, y, rcond=None)[0]
+        theta = solved(a, y)
         return float(np.sum((y - a @ theta) ** 2)), theta
 
     slowest, top = np.abs(speeds).min(), np.abs(speeds).max()
     trials = np.geomspace(slowest, LAST * top, TRIALS)
-    bare, sharp = min((solved(sharp, None)[0], sharp) for sharp in (True, False))
-    error, curved, k = min((solved(one, v)[0], one, k) for one in (True, False) for k, v in enumerate(trials))
+    bare, sharp = min((tried(sharp, None)[0], sharp) for sharp in (True, False))
+    error, curved, k = min((tried(one, v)[0], one, k) for one in (True, False) for k, v in enumerate(trials))
     velocity: float | None = None
-    if bare - error > SEEN * max(error / (speeds.size - 6), 1.0) and solved(curved, trials[k])[1][-1] > 0.0:
+    if (
+        different >= CURVED
+        and bare - error > SEEN * max(error / max(speeds.size - 6, 1), 1.0)
+        and tried(curved, trials[k])[1][-1] > 0.0
+    ):
         around = np.log(trials[[max(k - 1, 0), min(k + 1, TRIALS - 1)]])
-        best = minimize_scalar(lambda x: solved(curved, float(np.exp(x)))[0], bounds=tuple(around), method="bounded")
+        best = minimize_scalar(lambda x: tried(curved, float(np.exp(x)))[0], bounds=tuple(around), method="bounded")
         velocity, sharp = float(np.exp(best.x)), curved
-    error, theta = solved(sharp, velocity)
+    error, theta = tried(sharp, velocity)
     names = ["fc", "fv", "fva", "offset"]
     a = columns(speeds, sharp, velocity)
     if velocity is not None:
@@ -147,7 +154,7 @@ def friction_curve(found: Levels, robot: RobotConfig, joint: int) -> Curve | Non
         a = np.column_stack([a, (high - low) / (2.0 * STEP * velocity)])
         names, theta = [*names, "fst", "velocity"], np.append(theta, velocity)
     misfit = float(np.sqrt(max(error / (speeds.size - len(names)), 1.0)))
-    covariance = np.linalg.inv((root @ a).T @ (root @ a))
+    covariance: Array = np.asarray(np.linalg.inv((root @ a).T @ (root @ a)), dtype=np.float64)
     weights = (covariance @ (root @ a).T @ root)[3]
 
     def at(v: Array) -> Array:

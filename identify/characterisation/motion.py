@@ -92,7 +92,7 @@ def alone(experiments: Sequence[Experiment], robot: RobotConfig, joint: int) -> 
         signals = differentiate(e.q[:, [joint]], e.dt)
         speeds = _mean_speed(e.q if e.q_ref is None else e.q_ref, e.dt)
         least = RESTING * np.where(np.isfinite(limits), limits, np.abs(speeds[:, joint]).max())
-        others = np.delete(np.abs(speeds) <= least, joint, axis=1).all(axis=1)
+        others = np.asarray(np.delete(np.abs(speeds) <= least, joint, axis=1).all(axis=1))
         revolute = robot.joints[joint].type == "revolute"
         found.append(
             Alone(
@@ -121,7 +121,13 @@ def plateaus(motions: Sequence[Alone]) -> list[tuple[Plateau, ...]]:
         steady = one.alone & (change <= CONSTANT * np.abs(v)) & (np.abs(v) > SLOWEST * np.abs(v).max())
         rows = np.flatnonzero(steady)
         runs = np.split(rows, np.flatnonzero((np.diff(rows) > 1) | (np.diff(np.sign(v[rows])) != 0)) + 1)
-        found += _paired([Plateau(one, run, float(v[run].mean())) for run in runs if _long(run, one)])
+        found += _paired(
+            [
+                Plateau(one, run, float(v[run].mean()))
+                for run in runs
+                if _long(run, one) and np.ptp(v[run]) <= CONSTANT * np.abs(v[run]).min()
+            ]
+        )
     return sorted(found, key=lambda group: abs(group[0].speed))
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from armident.identify.characterisation.estimates import RATE_HZ, SEEN, averaged, fitted
+from armident.identify.characterisation.estimates import RATE_HZ, SEEN, averaged, fitted, solved
 from armident.identify.characterisation.motion import KNOTS, Alone
 from armident.identify.effects.friction import dahl
 
@@ -41,11 +41,12 @@ class Reversals:
     drawn: Array
 
 
-def reversals(motions: Sequence[Alone], smoothing: float) -> Reversals | None:
+def reversals(motions: Sequence[Alone], smoothing: float, orders: Sequence[float] = ()) -> Reversals | None:
     """Return the stiffness of presliding friction; ``None`` if the joint does not reverse alone.
 
     Friction is that of a bristle (LuGre: Canudas de Wit et al. 1995, IEEE TAC 40(3)), which slides at a level for each
     speed. ``smoothing``: of the sign of the velocity, s/rad or s/m, for the explanation without a bristle.
+    ``orders``: of the ripples of the joint, cycles per rad or m.
     """
     used = [m for m in motions if np.any(m.turns & m.alone)]
     if not used:
@@ -57,13 +58,15 @@ def reversals(motions: Sequence[Alone], smoothing: float) -> Reversals | None:
     def rows(each: Sequence[Array]) -> list[Array]:
         return [averaged(x[m.alone], m.block(RATE_HZ)) for x, m in zip(each, used, strict=True)]
 
-    torques, linear = rows([m.tau for m in used]), rows([np.column_stack([m.rigid(), m.qd]) for m in used])
+    torques = rows([m.tau for m in used])
+    waves = [2.0 * np.pi * m.q[:, None] * np.array(orders) for m in used]
+    linear = rows([np.column_stack([m.rigid(), m.qd, np.cos(w), np.sin(w)]) for m, w in zip(used, waves, strict=True)])
 
     def unexplained(sides: Sequence[Array], whiten: bool = True) -> tuple[float, Array]:
         parts = rows([shape * side[:, None] for shape, side in zip(shapes, sides, strict=True)])
         columns = [np.hstack(pair) for pair in zip(linear, parts, strict=True)]
         a, y = (fit.whiten(x) if whiten else np.concatenate(x) for x in (columns, torques))
-        theta = np.linalg.lstsq(a, y, rcond=None)[0]
+        theta = solved(a, y)
         return float(np.sum((y - a @ theta) ** 2)), theta[-len(KNOTS) :]
 
     def bristles(p: Array) -> list[Array]:
