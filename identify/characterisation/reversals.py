@@ -22,6 +22,8 @@ STEP = 0.01
 """Relative change of a parameter for the derivative of the torque."""
 LEAST = 0.2
 """Least friction at any speed over the usual one, for the displacement at that speed."""
+OFTEN = 0.5
+"""Least reversals per second of a recording over those of the one with most: others show the speeds between them."""
 DRAWN, TRAVEL = 600, 20.0
 """Most points that are drawn, and their travel over the displacement in which friction builds up."""
 
@@ -48,9 +50,10 @@ def reversals(motions: Sequence[Alone], smoothing: float, orders: Sequence[float
     speed. ``smoothing``: of the sign of the velocity, s/rad or s/m, for the explanation without a bristle.
     ``orders``: of the ripples of the joint, cycles per rad or m.
     """
-    used = [m for m in motions if np.any(m.turns & m.alone)]
-    if not used:
+    often = [float(np.mean(m.turns & m.alone)) / m.dt for m in motions]
+    if max(often) == 0.0:
         return None
+    used = [m for m, rate in zip(motions, often, strict=True) if rate >= OFTEN * max(often)]
     top = max(float(np.abs(m.speed).max()) for m in used)
     span = max(float(np.ptp(m.q[m.alone])) for m in used)
     shapes = [m.friction(top) for m in used]
