@@ -34,7 +34,8 @@ FILE, ROBOT, MODEL = "commissioning.json", "robot.yaml", "model"
 STEPS = ((FIRST_CONTACT, 16.0), (0.5, 10.0), (MARGIN, 10.0))
 """Motions of all joints: share of the limits of velocity and acceleration, and duration, s."""
 FULL_S, SEEDS = 10.0, (11, 12)
-"""Duration of a full excitation, s, and seeds of that which is identified and of that which is predicted."""
+"""Duration of a full excitation, s, and seeds: of that which is identified with the last of `STEPS`, and of that which
+is predicted."""
 
 
 class Ended(Exception):
