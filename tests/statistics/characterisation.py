@@ -1,6 +1,6 @@
 """Coverage of the 95 % intervals of a characterisation on the virtual EMPS, with known effects and without.
 
-    python -m tests.statistics.characterisation            # 20 seeds; the counts of tests/README.md
+    python -m tests.statistics.characterisation            # 20 seeds
     python -m tests.statistics.characterisation --seeds 5
 
 Each seed plays constant speeds and reversals. Counted are the intervals that contain the truth, and on the healthy
