@@ -38,7 +38,6 @@ def test_the_torques_of_the_mujoco_arm_are_those_of_its_parameters(tmp_path: Pat
     spring = Effect.model_validate({"effect": "joint_spring", "joint": "elbow"})
     fitted = armident.identify(recording, robot.model_copy(update={"effects": (spring,)}))
     found = {p.name: p.value for p in fitted.document.parameters}
-    # MuJoCo rounds dry friction off near standstill: it is found 4 to 5 % larger.
     true = {"mx2": 0.3, "ia2": 0.1, "fv1": 4.0, "fv2": 1.5, "fc1": 3.0, "fc2": 1.5, "ks2": 6.0}
     assert {name: found[name] for name in true} == pytest.approx(true, rel=0.1)
     assert found["ks2"] == pytest.approx(6.0, rel=0.02)
