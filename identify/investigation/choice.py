@@ -29,8 +29,9 @@ EXCITATION = "fast_excitation"
 """Name of the motion of all joints that is designed for the parameters of the model."""
 EXCITATION_S, EVALUATIONS = 8.0, 150
 """Length of that motion, s, and number of candidates of its design."""
-OVERHEAD_S = 3.0
-"""Robot time of one more motion beside its duration, s: approach, start and end of a recording."""
+OVERHEAD_S = 20.0
+"""Time of one more round beside its motion, s: approach, begin and end of a recording, and a diagnosis while the arm
+waits. With less, motions that tell little win because they are short."""
 JOINTS = 2
 """Joints at which motions are compared: the most doubtful ones."""
 LISTED = 8
