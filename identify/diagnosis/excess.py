@@ -167,7 +167,8 @@ def away_from_reversals(series: Sequence[Array], velocities: Sequence[Array], sl
 def _turning(e: Array, qd: Array, slow: float) -> NDArray[np.bool_]:
     """True for samples about a reversal, rest, or slow motion, (M,)."""
     turns = np.append(False, np.sign(qd[1:]) != np.sign(qd[:-1])) | (e == 0.0) | (np.abs(qd) < slow)
-    return np.asarray(np.convolve(turns, np.ones(WINDOW + 1), mode="same") > 0.0)
+    begin = WINDOW // 2
+    return np.asarray(np.convolve(turns, np.ones(WINDOW + 1))[begin : begin + e.size] > 0.0)
 
 
 def bursts(

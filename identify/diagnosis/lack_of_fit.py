@@ -353,7 +353,7 @@ class LackOfFit:
 
     def _whitened(self, fit: IvFit) -> tuple[JointResidual, ...]:
         blocks, rows = fit.equations.held, fit.regression.rows_of
-        held_rows = rows_of_joints(sum(e.y.shape[0] - ar.order for e in blocks) for ar in fit.noise)
+        held_rows = rows_of_joints(sum(max(e.y.shape[0] - ar.order, 0) for e in blocks) for ar in fit.noise)
         regressor, instruments, _ = fit.held
         errors = fit.errors(fit.theta, held=True)
         most = self.criteria.robust_deviations

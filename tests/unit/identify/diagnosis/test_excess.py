@@ -5,7 +5,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy import signal
 
-from armident.identify.diagnosis.excess import bursts, larger_errors, spectral_excess, together
+from armident.identify.diagnosis.excess import away_from_reversals, bursts, larger_errors, spectral_excess, together
 from armident.identify.diagnosis.spectral_lines import has_line
 
 Array = NDArray[np.float64]
@@ -149,3 +149,8 @@ def test_a_line_of_measured_motion_is_one_of_set_points_only_at_their_rate(frequ
     assert has_line(motion, sample, frequency, 0.1, 100.0, recorded=True)
     assert has_line(motion, sample, frequency, 0.1, 100.0, recorded=False) is own
     assert not has_line(motion, sample, 61.3, 0.1, 100.0, recorded=True)
+
+
+def test_a_series_shorter_than_the_window_about_a_reversal_keeps_its_length() -> None:
+    (away,) = away_from_reversals([np.ones(6)], [np.array([1.0, 1.0, 1.0, 1.0, 1.0, -1.0])], 0.1)
+    np.testing.assert_array_equal(away, [0.0 if abs(k - 5) <= 4 else 1.0 for k in range(6)])
