@@ -1,7 +1,4 @@
-"""A ROS 2 arm as the program of `armident investigate --robot-command 'python3 ros2_robot.py'`.
-
-The motion is a goal of FollowJointTrajectory; positions and efforts are those of /joint_states.
-"""
+"""A ROS 2 arm (FollowJointTrajectory, /joint_states) as the program of `armident investigate --robot-command`."""
 
 import sys
 
