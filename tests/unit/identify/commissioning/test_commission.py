@@ -87,7 +87,7 @@ def test_exchanged_joints_stop_at_the_first_one_that_shows_it(
     assert found.outcome == "set_up"
     assert list(found.document.stages) == ["configuration", "small motions"]
     assert len(arm.asked) == asked
-    assert found.document.next_step == f"effects: [{{effect: joint_order, {line}, joint_side: 1}}}}]"
+    assert found.document.next_step == f"effects: [{{effect: joint_order, {line}}}]"
 
 
 @pytest.mark.parametrize("turned", [["position"], ["voltage"], ["position", "voltage"]])
