@@ -15,6 +15,7 @@ from armident.daq.recording import read_recording
 from armident.drivers.can.frames import frame, frames
 from armident.drivers.can.socketcan import RawSocket
 from armident.drivers.canopen.objects import COB_EMCY, DriveState, drive_state
+from armident.identify.documents.characterisation import CharacterisationDocument
 from armident.identify.documents.files import load_document
 from armident.identify.documents.investigation import InvestigationDocument
 from armident.identify.monitoring.reidentify.record_run import record_run
@@ -86,6 +87,19 @@ def test_a_motion_that_the_guard_stops_ends_the_investigation(vcan_bus: str, tmp
         assert ended(again, out) == document.model_copy(update={"model": str(out / "model.yaml")})
     assert list(out.glob("*.mcap")) == [kept]
     assert read_recording(kept).missing is None
+
+
+@pytest.mark.nightly
+def test_a_joint_is_characterised_on_its_bus(vcan_bus: str, tmp_path: Path) -> None:
+    config, out = emps(tmp_path, vcan_bus, "axis"), tmp_path / "axis"
+    with arm(config):
+        process = armident("characterise", "--config", config, "--joint", "joint_1", "--yes", "--out", out)
+        _, err = process.communicate(timeout=500.0)
+    assert process.returncode == 0, err
+    document = load_document(out / "characterisation.json", CharacterisationDocument)
+    assert document.friction is not None
+    assert document.friction.curve["fc"].value == pytest.approx(20.39, rel=0.05)
+    assert len(list(out.glob("*.mcap"))) == 2
 
 
 @pytest.mark.nightly
