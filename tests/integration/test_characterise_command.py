@@ -20,6 +20,7 @@ def run(*words: str) -> Result:
     return CliRunner().invoke(application(list(words)), list(words))
 
 
+@pytest.mark.nightly
 def test_a_program_moves_the_joint_and_its_recordings_give_the_same_again(tmp_path: Path) -> None:
     out = tmp_path / "axis"
     words = ("characterise", "--joint", "joint_1", "--config", "emps.yaml", "--robot-command", TWIN, "--out", str(out))
