@@ -203,7 +203,10 @@ class Investigating:
         unnamed = all(one.likely[0] == UNNAMED for one in doubtful)
         outcome: Outcome = "unnamed" if doubtful and unnamed else "cannot_tell"
         left = "; ".join(f"{one.joint}: {one.sentence}" for one in doubtful) or "nothing is decided"
-        self._update(outcome=outcome, statement=f"{left}. {reason[0].upper()}{reason[1:]}.", **changes)
+        sure = [one for one in self.document.explanations if not one.doubtful and one.likely != [NOTHING]]
+        found = "; ".join(f"{one.joint}: {one.sentence}" for one in sure)
+        statement = f"{left}. {reason[0].upper()}{reason[1:]}."
+        self._update(outcome=outcome, statement=f"Found: {found}. Open: {statement}" if found else statement, **changes)
 
     def _update(self, **changes: object) -> None:
         self.document = self.document.model_copy(update=changes)
