@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 SPEEDS = 2
 """Least number of different speeds in each direction: four torques for four parameters."""
 CURVED = 6
-"""That for Stribeck friction: as many as the curve then has parameters."""
+"""Least number of speeds for Stribeck friction: as many as the curve then has parameters."""
 LAST = 0.35
 """Largest Stribeck velocity over the top speed, as that of a diagnosis."""
 TRIALS = 20

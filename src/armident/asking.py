@@ -7,7 +7,7 @@ import sys
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -17,6 +17,15 @@ if TYPE_CHECKING:
 
 RATE_HZ = 1000.0
 """Rate of a trajectory for a program where no recording gives one, Hz."""
+RobotCommand = Annotated[
+    str | None,
+    typer.Option(
+        "--robot-command",
+        help="Program that moves the robot: it is called with TRAJECTORY.csv and the file to write, and fails to "
+        "refuse the motion.",
+    ),
+]
+"""Option of the commands that move a robot by a program."""
 PRINTED = 400
 """Last characters of the output of a program that a refusal quotes."""
 

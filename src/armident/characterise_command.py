@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from armident.asking import RATE_HZ, Bars, confirmed, door_of, moving_session
+from armident.asking import RATE_HZ, Bars, RobotCommand, confirmed, door_of, moving_session
 
 if TYPE_CHECKING:
     from armident.configs import Trajectory
@@ -28,10 +28,7 @@ def characterise(
             "inside the recording]",
         ),
     ] = None,
-    robot_command: Annotated[
-        str | None,
-        typer.Option("--robot-command", help="Program that moves the robot, as of `armident investigate`."),
-    ] = None,
+    robot_command: RobotCommand = None,
     yes: Annotated[bool, typer.Option("--yes", help="Move without asking.")] = False,
     out: Annotated[
         Path | None, typer.Option("--out", help="Folder for the results. [default: characterisation]")

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from armident.asking import RATE_HZ, Bars, confirmed, door_of, moving_session
+from armident.asking import RATE_HZ, Bars, RobotCommand, confirmed, door_of, moving_session
 
 
 def commission(
@@ -14,14 +14,7 @@ def commission(
         Path,
         typer.Argument(help="Session whose arm moves on its bus under the guard, or robot configuration with limits."),
     ],
-    robot_command: Annotated[
-        str | None,
-        typer.Option(
-            "--robot-command",
-            help="Program that moves the robot: it is called with TRAJECTORY.csv and the file to write, and fails to "
-            "refuse the motion.",
-        ),
-    ] = None,
+    robot_command: RobotCommand = None,
     resume: Annotated[
         Path | None,
         typer.Option("--continue", help="Folder of a commissioning to go on with, by the robot.yaml in it."),

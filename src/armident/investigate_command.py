@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from armident.asking import RATE_HZ, Bars, confirmed, door_of, moving_session
+from armident.asking import RATE_HZ, Bars, RobotCommand, confirmed, door_of, moving_session
 
 if TYPE_CHECKING:
     from armident.identify.api.investigation_api import Investigation
@@ -25,14 +25,7 @@ def investigate(
             "the robot inside the recording]",
         ),
     ] = None,
-    robot_command: Annotated[
-        str | None,
-        typer.Option(
-            "--robot-command",
-            help="Program that moves the robot: it is called with TRAJECTORY.csv and the file to write, and fails to "
-            "refuse the motion.",
-        ),
-    ] = None,
+    robot_command: RobotCommand = None,
     by_hand: Annotated[
         bool, typer.Option("--by-hand", help="Write the next trajectory, say what to do, and end.")
     ] = False,
