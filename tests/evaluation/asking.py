@@ -16,6 +16,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import closing
+from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
 from types import FrameType
@@ -27,6 +28,7 @@ from armident.configs import ArmidentError, DataError, Trajectory
 from armident.daq.api import import_recording
 from armident.daq.recording import Recording
 from armident.identify.diagnosis.criteria import Criteria
+from armident.identify.diagnosis.diagnose import DiagnosisResult
 from armident.identify.diagnosis.model_state import ModelState
 from armident.identify.diagnosis.probabilities import NOTHING
 from armident.identify.documents.diagnosis import Explanation
@@ -36,6 +38,7 @@ from armident.identify.excitation.collision import CollisionModel
 from armident.identify.excitation.design import design_trajectory
 from armident.identify.investigation import choice as choices
 from armident.identify.investigation.choice import Chosen
+from armident.identify.investigation.folder import Progress
 from armident.identify.investigation.investigate import Investigating, started
 from armident.identify.investigation.motions import FAMILIES
 from tests.evaluation.process import ONE_THREAD, ByName, WorkerProcess
@@ -59,7 +62,21 @@ LIMIT_S, LIMIT_BYTES = 600, 6 << 30
 """Limits of a case and way: time of the processor, s, and memory of the process."""
 
 
-class Excited(Investigating):
+@dataclass
+class Asking(Investigating):
+    """Asks by the choice of `investigate`; ``first`` (one or none): the diagnosis of the first recording."""
+
+    first: list[DiagnosisResult] = field(default_factory=list)
+
+    def _diagnosed(self, report: Progress) -> DiagnosisResult:
+        if len(self.recordings) > 1:
+            return super()._diagnosed(report)
+        if not self.first:
+            self.first.append(super()._diagnosed(report))
+        return self.first[0]
+
+
+class Excited(Asking):
     """Asks for exciting trajectories, each with another seed."""
 
     def choose(self, state: ModelState, explanations: Sequence[Explanation], done: Sequence[MotionChoice]) -> Chosen:
@@ -71,7 +88,7 @@ class Excited(Investigating):
         return Chosen("", (motion,), motion, made.trajectory)
 
 
-class Drawn(Investigating):
+class Drawn(Asking):
     """Asks for random motions of random joints."""
 
     def choose(self, state: ModelState, explanations: Sequence[Explanation], done: Sequence[MotionChoice]) -> Chosen:
@@ -87,7 +104,7 @@ class Drawn(Investigating):
                 return Chosen("", (motion,), motion, trajectory)
 
 
-WAYS: dict[str, type[Investigating]] = {"best": Investigating, "excitation": Excited, "random": Drawn}
+WAYS: dict[str, type[Asking]] = {"best": Asking, "excitation": Excited, "random": Drawn}
 
 
 def investigated(half: str, index: int, ways: Sequence[str], out: Path) -> Iterator[dict[str, Any]]:
@@ -101,12 +118,14 @@ def investigated(half: str, index: int, ways: Sequence[str], out: Path) -> Itera
         truth = json.loads((folder / f"{name}.truth.json").read_text(encoding="utf-8"))
         first = import_recording(folder / f"{name}_a.npz", folder / f"{name}.yaml")
         signal.signal(signal.SIGPROF, _too_long)
+        known: list[DiagnosisResult] = []
         for way in ways:
             signal.setitimer(signal.ITIMER_PROF, LIMIT_S)
             begin = time.process_time()
             kept = folder / way
             going = started(first.robot, [first], MOTIONS, MINUTES, Criteria(), CollisionModel(first.robot, []), kept)
-            going = WAYS[way](going.robot, going.recordings, going.document, kept, going.criteria, going.collision)
+            parts = going.robot, going.recordings, going.document, kept, going.criteria, going.collision
+            going = WAYS[way](*parts, first=known)
             going.run(_ask(arm, (half, index), first, kept))
             signal.setitimer(signal.ITIMER_PROF, 0.0)
             document = going.document
