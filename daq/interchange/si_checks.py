@@ -27,8 +27,6 @@ _WINDOWS = 200
 
 _MOVED_SHARE = 1e-3
 """Share of its position range that a joint must move for its demand to be checked."""
-_SAG_SHARE = 0.01
-"""Share of its range by which a joint may give way to the others while its demand rests: 3 degrees of a turn."""
 _UNEXPLAINED_SHARE = 0.5
 """Largest share of the power of a joint's motion that its demand may leave unexplained, where they differ in size."""
 _SAME_SIZE = 2.0
@@ -130,12 +128,17 @@ def limit_notes(
 
 
 def _check_demand(path: Path, robot: RobotConfig, demand: NDArray[np.float64], position: NDArray[np.float64]) -> None:
-    """Refuse a demand that does not move like the joints: another unit, or another quantity."""
+    """Refuse a demand that does not move like the joints: another unit, or another quantity.
+
+    Of a demand that rests, only if its joint moves like those whose demands move: it may give way to them.
+    """
     motion = np.sum((position - position.mean(axis=0)) ** 2, axis=0)
     residual = np.sum((demand - demand.mean(axis=0) - position + position.mean(axis=0)) ** 2, axis=0)
+    spans, wished = np.ptp(position, axis=0), np.ptp(demand, axis=0)
+    others = float(spans[wished > 0.0].max(initial=0.0))
     for k in np.flatnonzero(residual > _UNEXPLAINED_SHARE * motion):
-        joint, moved, wanted = robot.joints[k], np.ptp(position[:, k]), np.ptp(demand[:, k])
-        checked = moved > (_MOVED_SHARE if wanted > 0.0 else _SAG_SHARE) * np.ptp(joint.limits.position)
+        joint, moved, wanted = robot.joints[k], spans[k], wished[k]
+        checked = moved > max(_MOVED_SHARE * np.ptp(joint.limits.position), 0.0 if wanted else others / _SAME_SIZE)
         if checked and not moved / _SAME_SIZE < wanted < _SAME_SIZE * moved:
             raise DataError(
                 f"{path}: {joint.name} moved by {moved:.4g}, but its demand by {wanted:.4g}: "

@@ -200,11 +200,16 @@ def test_a_demand_in_another_unit_is_refused_unless_omitted(tmp_path: Path) -> N
     assert set(recording.samples.fields) == {"position", "torque"}
     # A joint that lags behind fast moves, and one that gives way under a demand that rests, are no other unit.
     resting = q + 0.01
-    q[:, 6] = 1e-4 * (q[:, 0] - q[:, 0].mean()) + 0.5
     resting[:, 6] = 0.5
     resting[:, 0] = np.roll(q[:, 0], 400)
-    np.savez(path, positions=q, torques=tau, target_positions=resting)
-    assert "demand" in import_recording(path, PANDA, rate_hz=1000.0).samples.fields
+    largest = q[:, np.argmax(np.ptp(q[:, :6], axis=0))]
+    for share in (0.25, 0.75):
+        q[:, 6] = share * (largest - largest.mean()) + 0.5
+        np.savez(path, positions=q, torques=tau, target_positions=resting)
+        if share < 0.5:
+            assert "demand" in import_recording(path, PANDA, rate_hz=1000.0).samples.fields
+    with pytest.raises(DataError, match=r"joint_7 moved by .*, but its demand by 0"):
+        import_recording(path, PANDA, rate_hz=1000.0)
 
 
 @pytest.mark.parametrize("kind", ["csv", "npz", "mat", "parquet"])
