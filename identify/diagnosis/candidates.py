@@ -111,22 +111,20 @@ class ColumnCache:
         self, effect: Effect, place: Place, grid: Sequence[Shapes], stretch: MotionStretch, kind: str
     ) -> list[Kept]:
         """Columns of one stretch in the band of the comparison, of every shape."""
-        motion, moving = self.motion(stretch, kind), stretch.moving
+        motion, weights = self.motion(stretch, kind), stretch.weights
         narrow: list[Array] = []
         out: list[Kept] = []
         for shapes in grid:
             columns = effect.columns(motion, place, dict(shapes))[motion.lead :]
             if columns.ndim == 3:
                 wide = self._decimated(columns)
-                out.append((wide if moving is None else wide * moving[:, :, None], False))
+                out.append((wide * weights[:, :, None], False))
             else:
                 narrow.append(columns)
         if narrow:
             # A filter is hardly slower for many columns than for one.
             sizes = np.cumsum([columns.shape[1] for columns in narrow])[:-1]
-            band = self.study.decimation(np.concatenate(narrow, axis=1))
-            if moving is not None:
-                band = band * moving[:, place.joint, None]
+            band = self.study.decimation(np.concatenate(narrow, axis=1)) * weights[:, place.joint, None]
             out += [(columns, True) for columns in np.split(band, sizes, axis=1)]
         return out
 

@@ -52,7 +52,7 @@ def _at_simulated(
         torque = motion.motor_torque[motion.lead :, motor]
         change = torque[:, None] - _true(effect, torque, values, study.dt, limit)
         at_joints = study.decimation(change)[:, None] * transmission[joints][:, None]
-        changes.append(at_joints * s.moving[:, joints, None])
+        changes.append(at_joints * s.weights[:, joints, None])
     series = whitened_series(changes, [fit.noise[j] for j in joints])
     columns = [(int(j), np.concatenate(parts)) for j, parts in zip(joints, series, strict=True)]
     gram, score = fit.regression.orthogonal_products(columns, len(values))
@@ -74,7 +74,7 @@ def _likelihoods(fit: IvFit, effect: Correction, motor: int, limit: float, value
         moved = _true(effect, torque + noise, values, study.dt, limit) - true
         both = study.decimation(np.hstack([true - torque[:, None], moved]))
         at_joints = both[:, None, : len(values)] * transmission[motor][:, None]
-        changes.append(np.where(s.moving[:, :, None], at_joints, 0.0))
+        changes.append(at_joints * s.weights[:, :, None])
         disturbed.append(both[:, len(values) :])
     left = fit.residual[:, None] + fit.regression.without_model(whitened(changes, fit.noise))
     rows = fit.regression.rows_of[int(np.argmax(np.abs(transmission[motor])))]

@@ -181,7 +181,7 @@ class LackOfFit:
 
     def _fall(self, test: Projection | SpectralLine | Excess, joint: int) -> float:
         """By how much the error of a joint falls without a dependence, percent of its torque."""
-        torque = np.concatenate([s.y[:, joint] for s in self.fit.study.train])
+        torque = np.concatenate([s.torques[:, joint] for s in self.fit.study.train])
         left = 1.0 - np.sqrt(max(1.0 - test.share, 0.0))
         if isinstance(test, SpectralLine):
             fall = test.size
@@ -392,7 +392,7 @@ class LackOfFit:
             made = in_band(self.fit.study, self._motion(stretch), every)
             for j, own in enumerate(self.functions):
                 columns = np.concatenate([made[f.key] for f in own], axis=1)
-                out[j].append(columns * stretch.moving[:, j, None])
+                out[j].append(columns * stretch.weights[:, j, None])
         return out
 
     def _sets(self, joint: int) -> list[NDArray[np.int64]]:

@@ -111,7 +111,7 @@ def regressors(study: Study, stretch: MotionStretch, theta: Array | None) -> tup
             motions[kind].fill(term, whole[:, :, first:last])
         first = last
     for whole in (x, z):
-        whole *= stretch.moving[:, :, None]
+        whole *= stretch.weights[:, :, None]
     return x, z
 
 

@@ -122,18 +122,17 @@ class PredictiveScore:
         ]
 
     def innovations(self, noise: Sequence[ArModel]) -> Array:
-        """Mean squares of the innovations of each joint under noise models, (N m)^2 or N^2, (n,)."""
-        return np.array(
-            [
-                ar.variance * float(np.mean(np.concatenate([ar.whiten(part) for part in parts]) ** 2))
-                for ar, parts in zip(noise, self._parts, strict=True)
-            ]
-        )
+        """Mean squares of the innovations of each joint and stretch under noise models, (N m)^2 or N^2, (n, S)."""
+        found = [
+            [ar.variance * _mean_square(ar.whiten(part)) for part in parts]
+            for ar, parts in zip(noise, self._parts, strict=True)
+        ]
+        return np.maximum(found, 1e-300)
 
     @cached_property
     def rows(self) -> Array:
-        """Number of rows of each joint while it moves, (n,)."""
-        return np.array([float(np.count_nonzero(errors)) for errors in self.errors])
+        """Number of rows of each joint and stretch while it moves, (n, S)."""
+        return np.array([[float(np.count_nonzero(part)) for part in parts] for parts in self._parts])
 
     @cached_property
     def rms(self) -> Array:
@@ -142,8 +141,11 @@ class PredictiveScore:
 
     @cached_property
     def own_noise(self) -> tuple[ArModel, ...]:
-        """Noise models of the predicted errors, one for each joint."""
-        return tuple(one for parts in self._parts for one in ar_models([part[:, None] for part in parts], MAX_AR_ORDER))
+        """Noise models of the predicted errors, one for each joint, with one filter for stretches of any size."""
+        found = []
+        for parts, size in zip(self._parts, self.rms, strict=True):
+            found += ar_models([part[:, None] * (size / _size(part)) for part in parts], MAX_AR_ORDER)
+        return tuple(found)
 
     @cached_property
     def own_log_likelihoods(self) -> Array:
@@ -160,9 +162,12 @@ class PredictiveScore:
         return self.fit.study.volume
 
     def log_likelihoods_under(self, noise: Sequence[ArModel]) -> Array:
-        """Log-likelihood of the data of each joint under noise models, without constants of these data, (n,)."""
-        own = np.maximum(self.innovations(noise), 1e-300)
-        return np.asarray(self.rows * (self.volume - 0.5 * np.log(own)))
+        """Log-likelihood of the data of each joint under noise models, without constants of these data, (n,).
+
+        The noise of each stretch has a size of its own: models fit slow and fast motions differently well.
+        """
+        each = self.volume[:, None] - 0.5 * np.log(self.innovations(noise))
+        return np.asarray(np.sum(self.rows * each, axis=1))
 
     def log_likelihood_under(self, noise: Sequence[ArModel]) -> float:
         """Log-likelihood of the data of all joints, see `log_likelihoods_under`."""
@@ -175,8 +180,10 @@ class PredictiveScore:
         """
         found = []
         for ar, own, less in zip(noise, self._parts, other._parts, strict=True):
-            e1 = np.concatenate([ar.whiten(part) for part in own])
-            change = np.concatenate([ar.whiten(part) for part in less]) - e1
+            white = [ar.whiten(part) for part in own]
+            sizes = [_size(part) for part in white]
+            e1 = np.concatenate([part / size for part, size in zip(white, sizes, strict=True)])
+            change = np.concatenate([ar.whiten(part) / size for part, size in zip(less, sizes, strict=True)]) - e1
             sums = np.array([part.sum() for part in np.array_split(change * e1, SUMS)])
             naive = float(np.mean(e1**2) * (change @ change))
             found.append(max(1.0, float(np.sum((sums - sums.mean()) ** 2)) * SUMS / (SUMS - 1) / max(naive, 1e-300)))
@@ -187,11 +194,18 @@ class PredictiveScore:
 
         These should be of a model in which nothing is missing. Others would take what is missing for noise.
         """
-        own, less = self.innovations(noise), other.innovations(noise)
-        rows = self.rows
-        ratio = np.log(np.maximum(less, 1e-300) / np.maximum(own, 1e-300))
-        each = rows * (0.5 * ratio + self.volume - other.volume)
+        ratio = np.log(other.innovations(noise) / self.innovations(noise))
+        each = np.sum(self.rows * (0.5 * ratio + (self.volume - other.volume)[:, None]), axis=1)
         return float(np.sum(each / self.inflation_over(other, noise)))
+
+
+def _mean_square(errors: Array) -> float:
+    return float(np.mean(errors**2)) if errors.size else 0.0
+
+
+def _size(errors: Array) -> float:
+    """Return the root mean square of errors, or 1 if all are zero."""
+    return float(np.sqrt(_mean_square(errors))) or 1.0
 
 
 def _solved(a: Array, c: Array) -> Array:

@@ -28,7 +28,7 @@ from armident.identify.diagnosis.candidate_comparison import (
     materiality,
 )
 from armident.identify.diagnosis.candidate_models import model_with
-from armident.identify.diagnosis.candidates import Key
+from armident.identify.diagnosis.candidates import ColumnCache, Key
 from armident.identify.diagnosis.confirmation import confirmed
 from armident.identify.diagnosis.criteria import Criteria
 from armident.identify.diagnosis.model_state import (
@@ -42,6 +42,7 @@ from armident.identify.diagnosis.model_state import (
     with_report_part,
     without_entry,
 )
+from armident.identify.diagnosis.noise_beyond import noise_sizes
 from armident.identify.diagnosis.precision import p_value_of_effect
 from armident.identify.diagnosis.selected import Selected
 from armident.identify.diagnosis.shortlist import Incumbent, shortlist
@@ -86,7 +87,8 @@ class StepwiseSelection:
         state = self._aligned(fitted(self.study, self.study.robot, None))
         self.study = state.study
         if not self.study.sign_given:
-            state = with_own_noise(with_transitions(state, self._state))
+            state = with_own_noise(with_transitions(self._with_noise_sizes(state), self._state))
+        state = self._with_noise_sizes(state)
         state = with_references(with_first_motions(state))
         own = state.study
         self.study = replace(self.study, robot=state.robot, model=own.model, references=own.references, tied=own.tied)
@@ -240,6 +242,15 @@ class StepwiseSelection:
         )
         study = models[best].study
         return models[best].of_study(replace(study, warnings=(*study.warnings, line)))
+
+    def _with_noise_sizes(self, state: ModelState) -> ModelState:
+        """Return the model fitted again with the size of the noise of each recording."""
+        if len(state.study.train) == 1:
+            return state
+        sizes = noise_sizes(state.fit, ColumnCache(state.study, state.fit.theta))
+        state = with_own_noise(fitted(state.study.with_noise(sizes), state.robot, state))
+        self.study, self._states = state.study, {}
+        return state
 
     def _state(self, robot: RobotConfig, before: ModelState) -> ModelState | None:
         """Fit of a model in its own closed loop, cached; ``None`` if the motion does not determine its parameters."""

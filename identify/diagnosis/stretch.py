@@ -21,7 +21,8 @@ class MotionStretch:
     ``simulated``: motion of the simulated closed loop without noise: instruments. ``y`` (M, n), ``t`` (M,): torques and
     instants in the band of the comparison; ``torque`` (N, n): the full band. ``rows``: samples in its experiment;
     ``span``: after decimation to the working rate. ``before``: motion before the stretch, where effects with internal
-    states start. ``moving`` (M, n): false where a joint stands still.
+    states start. ``moving`` (M, n): false where a joint stands still. ``noise`` (n,): size of the noise of each joint
+    here beside that in all stretches; ``y`` is divided by it, as all equations are.
     """
 
     measured: Derivatives
@@ -33,7 +34,22 @@ class MotionStretch:
     rows: NDArray[np.int64]
     span: slice
     moving: NDArray[np.bool_]
+    noise: Array
     before: tuple[Derivatives, Derivatives] | None = None
+
+    @property
+    def weights(self) -> Array:
+        """Weights of the equations, (M, n): zero where a joint stands still, else one over the size of the noise."""
+        return self.moving / self.noise
+
+    @property
+    def torques(self) -> Array:
+        """Torques in the band of the comparison, (M, n), N m or N."""
+        return self.y * self.noise
+
+    def with_noise(self, noise: Array) -> "MotionStretch":
+        """Return the stretch with another size of the noise of each joint, (n,)."""
+        return replace(self, y=self.y * (self.noise / noise), noise=noise)
 
     def resimulated(self, motion: Derivatives, dt: float, factor: int) -> "MotionStretch":
         """Stretch with another simulation of the whole experiment, decimated by ``factor`` to the working rate."""

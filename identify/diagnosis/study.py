@@ -106,12 +106,17 @@ class Study:
         if wiring[0] == wiring[1]:
             return changed._with_torques(self.sources)
         rebuilt = build_study(*self.sources, robot, criteria=self.criteria)
+        rebuilt = rebuilt.with_noise(np.array([s.noise for s in self.train]))
         return replace(rebuilt, sought=self.sought, tied=self.tied)
 
     def with_torque_shift(self, samples: float) -> "Study":
         """The study with all torques late by another time, samples."""
         training, validation = ([replace(e, torque_shift=samples) for e in part] for part in self.sources)
         return self._with_torques((training, validation))
+
+    def with_noise(self, noise: Array) -> "Study":
+        """The study whose training stretches have noise of these sizes beside that of all, (S, n)."""
+        return replace(self, train=tuple(s.with_noise(own) for s, own in zip(self.train, noise, strict=True)))
 
     def with_own_controller(self) -> "Study":
         """The study with the controller that its corrected torques identify, and the loop that this makes."""
@@ -131,7 +136,7 @@ class Study:
 
         def of(s: MotionStretch) -> MotionStretch:
             torque = torques[s.experiment][s.span]
-            return replace(s, torque=torque, y=np.where(s.moving, self.decimation(torque), 0.0))
+            return replace(s, torque=torque, y=self.decimation(torque) * s.weights)
 
         return replace(
             self, sources=sources, train=tuple(map(of, self.train)), held=tuple(map(of, self.held)),
@@ -281,7 +286,8 @@ def build_study(
             at = second.instants(rows.size)
             moving = moving_rows(measured.qd, slowest, second.factor, at)
             y = np.where(moving, y, 0.0)
-            into.append(MotionStretch(measured, noiseless, y, torque[span], t, k, rows, span, moving, before))
+            even = np.ones(robot.n)
+            into.append(MotionStretch(measured, noiseless, y, torque[span], t, k, rows, span, moving, even, before))
     duration = max(e.start + dt * e.q.shape[0] for e in experiments)
     return Study(
         robot, model, second, dt * factor, duration, tuple(train), tuple(held), loop, auxiliary, first,
