@@ -50,16 +50,19 @@ def friction_at(speed: float) -> float:
     return FC + FV * speed + STRIBECK * float(np.exp(-((speed / VELOCITY) ** 2)))
 
 
-def contained(found: armident.Characterisation) -> dict[str, bool]:
-    """Return, for each quantity of the axis with `EFFECTS`, True if its interval contains the truth."""
-    document = found.document
+def contained(found: armident.Characterisation, beside: armident.Characterisation) -> dict[str, bool]:
+    """Return, for each quantity of the axis with `EFFECTS`, True if its interval contains the truth.
+
+    ``beside``: the same axis without the Stribeck friction, which has no bristle in the simulation: for the stiffness.
+    """
+    document, presliding = found.document, beside.document.presliding
     assert document.friction is not None
     assert document.ripple is not None
-    assert document.presliding is not None
+    assert presliding is not None
     truth = {"fc": FC, "fv": FV, "fva": 0.0, "fst": STRIBECK, "velocity": VELOCITY}
     estimates = {name: document.friction.curve.get(name) for name in truth}
     estimates["ripple"] = document.ripple.peaks[0].amplitude if document.ripple.peaks else None
-    estimates["stiffness"] = document.presliding.stiffness
+    estimates["stiffness"] = presliding.stiffness
     truth |= {"ripple": RIPPLE, "stiffness": FC / DISPLACEMENT}
     return {name: one is not None and one.low <= truth[name] <= one.high for name, one in estimates.items()}
 
@@ -85,7 +88,8 @@ def main() -> None:
     right, points, inside, false = Counter[str](), 0, 0, Counter[str]()
     for seed in range(1, seeds + 1):
         found = armident.characterise(recordings(seed, EFFECTS), "joint_1")
-        right.update(name for name, yes in contained(found).items() if yes)
+        beside = armident.characterise(recordings(seed, EFFECTS[1:]), "joint_1")
+        right.update(name for name, yes in contained(found, beside).items() if yes)
         assert found.document.friction is not None
         for point in found.document.friction.points:
             if point.friction is not None:
