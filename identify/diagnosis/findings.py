@@ -12,7 +12,6 @@ from armident.identify.diagnosis.lack_of_fit import ResidualDependence
 from armident.identify.diagnosis.model_state import ModelState
 from armident.identify.diagnosis.next_experiment import recommended_experiment
 from armident.identify.diagnosis.precision import standard_deviations
-from armident.identify.diagnosis.regression import relative_fit_errors
 from armident.identify.diagnosis.selected import Selected
 from armident.identify.documents.diagnosis import Alternative, Finding, Gap, Negligible, NotVisible, Unexplained
 from armident.identify.effects.effect import Effect
@@ -168,12 +167,14 @@ def negligible(
 
 def gap_of(state: ModelState, *, held: bool) -> Gap:
     """Relative torque errors of a model. ``held``: True for the held-out data, false for the training data."""
-    overall, each = relative_fit_errors(state.fit, held=held)
-    errors = np.concatenate(state.fit.errors(state.fit.theta, held=held))
-    rms = np.sqrt(np.mean(errors**2, axis=0))
+    stretches, errors = state.study.held if held else state.study.train, state.fit.errors(state.fit.theta, held=held)
+    error = np.concatenate([e * s.noise for e, s in zip(errors, stretches, strict=True)])
+    torque = np.concatenate([s.torques for s in stretches])
+    each = 100 * np.linalg.norm(error, axis=0) / np.maximum(np.linalg.norm(torque, axis=0), 1e-300)
+    rms = np.sqrt(np.mean(error**2, axis=0))
     joints = state.study.joints
     return Gap(
-        all=overall,
+        all=100 * float(np.linalg.norm(error) / np.linalg.norm(torque)),
         by_joint=dict(zip(joints, (float(v) for v in each), strict=True)),
         rms=dict(zip(joints, (float(v) for v in rms), strict=True)),
     )

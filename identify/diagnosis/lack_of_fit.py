@@ -29,7 +29,6 @@ from armident.identify.diagnosis.regression import IvFit
 from armident.identify.diagnosis.spectral_lines import SpectralLine, bandwidth_of_motion, lines_of_joints
 from armident.identify.diagnosis.stretch import MotionStretch
 from armident.identify.diagnosis.variables import Kind, hint_of, unit_of_variable
-from armident.identify.effects.friction import TRANSITION
 from armident.identify.regression.whitening import rows_of_joints
 from armident.identify.robot.motion import Motion
 from armident.identify.signals.periodogram import hann_window, periodogram
@@ -257,10 +256,8 @@ class LackOfFit:
     def _speeds(self, joint: int, *, held: bool) -> tuple[list[Array], float]:
         """Velocities (M,) of a joint in every stretch, and that under which its dry friction reverses."""
         study = self.fit.study
-        own = [e for e in study.robot.effects if e.effect == TRANSITION and e.joint == study.joints[joint]]
-        widths = [1.0 / float(study.robot.sign_smoothing[joint]), *(e.parameters["velocity"] for e in own)]
         measured = [s.measured.qd[:, joint] for s in (study.held if held else study.train)]
-        return [qd[study.decimation.instants(qd.size)] for qd in measured], self.criteria.reversal * max(widths)
+        return [qd[study.decimation.instants(qd.size)] for qd in measured], study.reversing_velocity(joint)
 
     def _of_excess(self, joint: int, excess: Excess) -> ResidualDependence:
         curve = Curve(excess.x, excess.value, excess.noise)

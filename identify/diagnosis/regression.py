@@ -160,11 +160,3 @@ def solved(equations: Equations, noise: Sequence[ArModel], known: IvRegression |
     except np.linalg.LinAlgError as error:
         raise DataError(UNDETERMINED) from error
     return found
-
-
-def relative_fit_errors(fit: IvFit, theta: Array | None = None, *, held: bool) -> tuple[float, Array]:
-    """``|y - X theta| / |y|`` in percent in the band of the comparison, overall and of each joint (n,)."""
-    y = np.concatenate([s.y for s in (fit.study.held if held else fit.study.train)])
-    error = np.concatenate(fit.errors(fit.theta if theta is None else theta, held=held))
-    each = np.linalg.norm(error, axis=0) / np.maximum(np.linalg.norm(y, axis=0), 1e-300)
-    return 100 * float(np.linalg.norm(error) / np.linalg.norm(y)), 100 * each

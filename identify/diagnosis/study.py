@@ -12,6 +12,7 @@ from armident.identify.diagnosis.criteria import Criteria
 from armident.identify.diagnosis.regressor_cache import RegressorCache
 from armident.identify.diagnosis.stretch import KINDS, MotionStretch, at_rows, distances, moving_rows, rows_before
 from armident.identify.effects.drive import Correction
+from armident.identify.effects.friction import TRANSITION
 from armident.identify.effects.recording_corrections import corrected_experiments, of_recording
 from armident.identify.effects.registry import known
 from armident.identify.effects.terms import arm_model, terms_of
@@ -152,6 +153,12 @@ class Study:
     def joints(self) -> list[str]:
         """Names of the joints."""
         return [joint.name for joint in self.robot.joints]
+
+    def reversing_velocity(self, joint: int) -> float:
+        """Return the velocity under which the dry friction of a joint reverses, rad/s or m/s."""
+        own = [e for e in self.robot.effects if e.effect == TRANSITION and e.joint == self.joints[joint]]
+        widths = [1.0 / float(self.robot.sign_smoothing[joint]), *(e.parameters["velocity"] for e in own)]
+        return self.criteria.reversal * max(widths)
 
     def motion(self, stretch: MotionStretch, kind: str, theta: Array | None) -> Motion:
         """Signals (``measured`` or ``simulated``) on which effects depend; ``theta`` (b,) predicts their torques."""

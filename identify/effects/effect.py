@@ -149,6 +149,8 @@ class Effect(ABC):
         Nonlinear parameters.
     settings
         Further parameters of an entry of an effect that adds no torque.
+    at_reversals
+        True if the torque acts about reversals, where no model of dry friction is right: evidence for others is not.
     depends_on_torque
         True if the columns depend on the torque that the model predicts, and so on its parameters.
     scales_torque
@@ -176,6 +178,7 @@ class Effect(ABC):
     linear: tuple[Linear, ...]
     shapes: tuple[Shape, ...] = ()
     settings: tuple[Shape, ...] = ()
+    at_reversals: bool = False
     depends_on_torque: bool = False
     scales_torque: bool = False
     regressor_signals: Signals = "measured"

@@ -56,6 +56,7 @@ class CoulombTransition(Effect):
     reference = "Armstrong-Helouvry, Dupont, Canudas de Wit 1994, Automatica 30(7)"
     required_motion = "reversals"
     excitation = ("reversals",)
+    at_reversals = True
     linear = (
         Linear("fct", TORQUE, "Coulomb friction that reverses as `fct tanh((qd + lead qdd) / velocity)`.", sign=1),
     )
@@ -296,6 +297,7 @@ class PreslidingFriction(Effect):
     reference = "Dahl 1968, A solid friction model; Canudas de Wit et al. 1995, IEEE TAC 40(3)"
     required_motion = "many reversals"
     excitation = ("reversals", "slow")
+    at_reversals = True
     linear = (Linear("fcd", TORQUE, "Coulomb friction that builds up after a reversal, times -1.", sign=-1),)
     shapes = (Shape("displacement", POSITION, "Characteristic displacement of Dahl's model."),)
 

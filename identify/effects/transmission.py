@@ -157,6 +157,7 @@ class Backlash(TorqueDependent):
     required_motion = "many changes of the load's direction"
     direct_evidence = "an encoder on the joint side"
     excitation = ("reversals", "accelerations")
+    at_reversals = True
     linear = (Linear("behind", UNITLESS, "Torque pulses over those of plastic impacts.", sign=1, bounds=(0.1, 1.5)),)
     shapes = (Shape("gap", POSITION, "Width of the gap at the joint, from side to side."), ROTOR)
     regressor_signals = "measured"

@@ -13,6 +13,7 @@ from itertools import pairwise
 import numpy as np
 
 from armident.configs import Trajectory
+from armident.identify.diagnosis.excess import about_reversals
 from armident.identify.diagnosis.model_state import ModelState
 from armident.identify.diagnosis.stretch import moving_rows
 from armident.identify.excitation.point_to_point import sample_trajectory
@@ -113,7 +114,10 @@ def _short(motion: Motion) -> Motion:
 
 
 def _information(state: ModelState, rivals: Sequence[Rival], motions: Sequence[Motion]) -> Floats:
-    """Return the information (c, c) of motions on the parameters of the model and of all rivals."""
+    """Return the information (c, c) of motions on the parameters of the model and of all rivals.
+
+    Times about reversals, where no model of dry friction is right, count only for effects that act there.
+    """
     study = state.study
     slowest, factor = 1.0 / np.asarray(state.robot.sign_smoothing), study.decimation.factor
     total: Floats | float = 0.0
@@ -121,7 +125,11 @@ def _information(state: ModelState, rivals: Sequence[Rival], motions: Sequence[M
         parts = [study.model.rigid_regressor(motion.q, motion.qd, motion.qdd), study.model.term_regressor(motion)]
         parts += [r.columns(motion) for r in rivals if r.term is not None]
         x = study.decimation(np.concatenate(parts, axis=2))
-        moving = moving_rows(motion.qd, slowest, factor, study.decimation.instants(motion.samples))
+        instants = study.decimation.instants(motion.samples)
+        moving = moving_rows(motion.qd, slowest, factor, instants)
+        if not any(r.term.effect.at_reversals for r in rivals if r.term is not None):
+            for j in range(study.robot.n):
+                moving[:, j] &= ~about_reversals(moving[:, j], motion.qd[instants, j], study.reversing_velocity(j))
         rows = whitened([np.ascontiguousarray(x * moving[:, :, None])], state.weights)
         total = total + rows.T @ rows
     return np.asarray(total)

@@ -129,3 +129,22 @@ def test_the_base_fit_decides_a_shift_that_the_check_leaves_open(loop: str, stud
     for shifts in ((), (-LATE, -2 * LATE)):
         assert states[shifts].study.sources[0][0].torque_shift == -LATE
         assert not any("late by" in line for line in states[shifts].study.warnings)
+
+
+def test_each_recording_has_noise_of_its_own_size(experiments: list[Experiment]) -> None:
+    robot = setups.random_arm(3, 4)
+    random = np.random.default_rng(0)
+    base = 0.05 * experiments[0].tau.std(axis=0)
+    noisy = [
+        replace(experiments[0], tau=experiments[0].tau + size * base * random.standard_normal(experiments[0].tau.shape))
+        for size in (1.0, 3.0)
+    ]
+    first = StepwiseSelection(build_study(noisy, [], robot)).start()
+    sizes = np.array([s.noise for s in first.study.train])
+    np.testing.assert_allclose(sizes[1] / sizes[0], 3.0, rtol=0.15)
+    np.testing.assert_allclose(np.prod(sizes, axis=0), 1.0, rtol=1e-6)
+    for stretch in first.study.train:
+        np.testing.assert_allclose(stretch.torques, stretch.y * stretch.noise)
+    # One recording has no other one to be compared with.
+    alone = StepwiseSelection(build_study(noisy[:1], [], robot)).start()
+    assert all((s.noise == 1.0).all() for s in alone.study.train)
