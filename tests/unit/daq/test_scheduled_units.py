@@ -152,6 +152,11 @@ def test_the_cron_line_runs_the_same_command_weekly() -> None:
     accepted(words)
     (unit,) = [words for words in commands(HERE / "systemd" / "armident-reidentify@.service") if "reidentify" in words]
     assert unit == [word.replace("CELL", "cell") for word in words]
+    history = "ARMIDENT_HISTORY=sqlite:////var/lib/armident/CELL/history.sqlite"
+    assert history in CRON.read_text(encoding="utf-8").splitlines()
+    service = HERE / "systemd" / "armident-reidentify@.service"
+    assert history.replace("CELL", "%i") in values(service, "Environment")
+    assert values(service, "EnvironmentFile") == ["-/etc/armident/%i.env"]
 
 
 def test_a_wrong_option_would_be_noticed() -> None:
