@@ -282,6 +282,8 @@ def _disk(session: SessionConfig, robot: RobotConfig) -> Iterator[Check]:
         )
     else:
         yield Check("recordings", "ok", found)
+    if options.copied_to is not None and not options.copied_to.is_dir():
+        yield Check("recordings", "warning", f"copied_to: {options.copied_to}: no such folder: nothing will be deleted")
 
 
 def _write_times(probe: Path, size: int) -> list[float]:

@@ -15,6 +15,7 @@ CHANGEABLE = (
     "recording.rotate_minutes",
     "recording.keep_days",
     "recording.min_free_gb",
+    "recording.copied_to",
     "recording.chunk_ms",
     "recording.drain_ms",
     "recording.trigger.",
