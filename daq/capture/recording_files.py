@@ -11,9 +11,9 @@ from typing import Self
 
 from armident.configs import RobotConfig, SessionConfig
 from armident.configs.schema.session import RecordingOptions, Trigger
-from armident.daq.capture.clock import clock_state
 from armident.daq.matching.streams import CapturedStream
 from armident.daq.recording import QueuedSeries, RecordingSeries, RecordingWriter, TriggeredSeries
+from armident.daq.recording.clock import clock_is_right
 from armident.daq.recording.retention import RetentionThread, identified_in, prune, reason_to_stay, recordings_in
 
 log = logging.getLogger(__name__)
@@ -99,14 +99,6 @@ def next_time(directory: Path, robot: str, now: datetime.datetime) -> datetime.d
     return newest + _STAMP_STEP
 
 
-def _clock_is_right() -> bool:
-    """Return True if the clock is known to be synchronised: one that is ahead makes all recordings old."""
-    try:
-        return clock_state().synchronised
-    except OSError:
-        return False
-
-
 class RecordingRetention:
     """Deletes old recordings of a robot in a ``with`` block; ``options`` may be exchanged at any time."""
 
@@ -121,7 +113,7 @@ class RecordingRetention:
         if options.keep_days is None and options.min_free_gb is None:
             return []
         min_free_bytes = None if options.min_free_gb is None else options.min_free_gb * 1e9
-        now, days = datetime.datetime.now(datetime.UTC), options.keep_days if _clock_is_right() else None
+        now, days = datetime.datetime.now(datetime.UTC), options.keep_days if clock_is_right() else None
         identified = identified_in(self._directory, self._robot)
         stay: Counter[str] = Counter()
 

@@ -21,9 +21,9 @@ import yaml
 from armident.configs import config_path, load_robot
 from armident.configs.units import counts_per_si
 from armident.daq.capture.capture import capture, load_plan
-from armident.daq.capture.clock import clock_state
 from armident.daq.matching.assembler import LATE_S
 from armident.daq.recording import Recording, join_parts, read_recording
+from armident.daq.recording.clock import clock_state
 from armident.drivers.vcan import ensure_vcan, remove_vcan
 from tests.fixtures.processes import ForkedProcess, armident
 

@@ -9,10 +9,9 @@ from pathlib import Path
 import pytest
 
 from armident.configs.schema.session import RecordingOptions
-from armident.daq.capture import recording_files
-from armident.daq.capture.clock import ClockState
 from armident.daq.capture.recording_files import RecordingRetention
-from armident.daq.recording import Mark, write_recording
+from armident.daq.recording import Mark, clock, write_recording
+from armident.daq.recording.clock import ClockState
 from armident.daq.recording.retention import KEEP, LEDGER, identified_in, prune, reason_to_stay
 from armident.identify.monitoring.worker import ledger as ledger_module
 from armident.identify.monitoring.worker.ledger import Ledger
@@ -94,7 +93,7 @@ def test_a_clock_that_is_not_synchronised_makes_no_recording_old(
 ) -> None:
     """Five recordings of the last days, and one that was made after the clock had stepped 40 days ahead."""
     caplog.set_level(logging.INFO, "armident")
-    monkeypatch.setattr(recording_files, "clock_state", lambda: ClockState(0.0, 0.0, 0.0, synchronised))
+    monkeypatch.setattr(clock, "clock_state", lambda: ClockState(0.0, 0.0, 0.0, synchronised))
     now = datetime.datetime.now(datetime.UTC)
     recent = [made(tmp_path, f"{now - datetime.timedelta(days=40 + k):%Y%m%dT%H%M%S}") for k in range(5)]
     made(tmp_path, f"{now - datetime.timedelta(hours=1):%Y%m%dT%H%M%S}")
@@ -107,7 +106,7 @@ def test_a_clock_that_is_not_synchronised_makes_no_recording_old(
 def test_the_reasons_why_recordings_stay_are_logged_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(recording_files, "clock_state", lambda: ClockState(0.0, 0.0, 0.0, True))
+    monkeypatch.setattr(clock, "clock_state", lambda: ClockState(0.0, 0.0, 0.0, True))
     for day in range(1, 4):
         made(tmp_path, f"2026010{day}T000000")
     made(tmp_path, "20260301T000000")
