@@ -105,7 +105,7 @@ class RecordingRetention:
     def __init__(self, options: RecordingOptions, directory: Path, robot: str) -> None:
         self.options = options
         self._directory, self._robot = directory, robot
-        self._said = ""
+        self._said: list[str] = []
         self._thread = RetentionThread(self._prune)
 
     def _prune(self) -> list[Path]:
@@ -127,14 +127,10 @@ class RecordingRetention:
         said = [f"{number} recordings stay that are {reason}" for reason, number in sorted(stay.items())]
         if days != options.keep_days:
             said.append("none is deleted by age, because the clock is not synchronised")
-        self._say("; ".join(said))
+        if said and said != self._said:
+            log.warning("retention: %s", "; ".join(said))
+        self._said = said
         return deleted
-
-    def _say(self, text: str) -> None:
-        """Report what keeps old recordings, once while it stays the same."""
-        if text and text != self._said:
-            log.warning("retention: %s", text)
-        self._said = text
 
     def __enter__(self) -> Self:
         """Return the object; its thread runs already."""

@@ -14,9 +14,6 @@ from armident.identify.documents.files import load_document
 from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.monitoring.change.history import History, HistoryRun, recorded_at
 
-_COPIES = ("backup", "restore")
-"""First words that ask for a copy of the history in a file, or for its way back."""
-
 
 def history_command(
     documents: Sequence[Path],
@@ -35,7 +32,7 @@ def history_command(
     ``robot``: default that of the documents, or the only one. Returns 0 or `FOUND`. Raises ConfigError if an option
     or the database is wrong, DataError if a document is wrong or of another model.
     """
-    if documents and str(documents[0]) in _COPIES:
+    if documents and str(documents[0]) in ("backup", "restore"):
         return _copied(str(documents[0]), documents[1:], database)
     loaded = [(load_document(path, IdentificationDocument), path) for path in documents]
     history = History(database)

@@ -9,7 +9,7 @@ import socket
 import sqlite3
 import time
 from collections.abc import Callable, Generator, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -178,12 +178,11 @@ def _connected(_dialect: Any, _record: Any, words: list[Any], options: dict[str,
             except StopIteration as done:
                 return done.value
 
-    try:
-        hosts = socket.getaddrinfo(options.get("host"), options.get("port"), type=socket.SOCK_STREAM)
-    except OSError:
-        hosts = []
+    addresses: list[Any] = [None]
+    with suppress(OSError):
+        addresses = socket.getaddrinfo(options.get("host"), options.get("port"), type=socket.SOCK_STREAM)
     # Each address of a host is tried for this time.
-    waits = {"connect_timeout": max(int(BUSY_S / max(len(hosts), 1)), 1), "tcp_user_timeout": round(1000 * BUSY_S)}
+    waits = {"connect_timeout": max(int(BUSY_S / len(addresses)), 1), "tcp_user_timeout": round(1000 * BUSY_S)}
     return Impatient.connect(*words, **waits | options)
 
 

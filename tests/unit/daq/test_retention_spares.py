@@ -12,9 +12,10 @@ from armident.configs.schema.session import RecordingOptions
 from armident.daq.capture.recording_files import RecordingRetention
 from armident.daq.recording import Mark, clock, write_recording
 from armident.daq.recording.clock import ClockState
+from armident.daq.recording.model import MarkKind
 from armident.daq.recording.retention import KEEP, LEDGER, identified_in, prune, reason_to_stay
 from armident.identify.monitoring.worker import ledger as ledger_module
-from armident.identify.monitoring.worker.ledger import Ledger
+from armident.identify.monitoring.worker.ledger import Ledger, State
 from tests.unit.daq.test_recording import make_recording
 from tests.unit.daq.test_rotation import NOW, made
 
@@ -31,7 +32,8 @@ def test_a_marked_recording_stays(tmp_path: Path) -> None:
     plain, kept = made(tmp_path, "20261001T000000"), made(tmp_path, "20261002T000000")
     kept.with_name(kept.name + KEEP).touch()
     noted, other = (tmp_path / f"tx40-202610{day}T000000-000Z.mcap" for day in ("03", "04"))
-    for path, kind in ((noted, "note"), (other, "emcy")):
+    kinds: dict[Path, MarkKind] = {noted: "note", other: "emcy"}
+    for path, kind in kinds.items():
         recording = make_recording(300)
         write_recording(replace(recording, marks=(Mark(kind, 5, int(recording.samples.t_ns[0]), "look"),)), path)
     made(tmp_path, "20261119T000000")
@@ -50,11 +52,11 @@ def test_what_a_worker_has_not_identified_stays(tmp_path: Path) -> None:
     damaged = made(tmp_path, "20261007T000000", suffix=".mcap.damaged")
     made(tmp_path, "20261119T000000")
     ledger = Ledger(tmp_path / LEDGER, "worker")
-    for path, state in ((done, "done"), (failed, "failed"), (waiting, None)):
+    states: dict[Path, State] = {done: "done", failed: "failed", waiting: "waiting"}
+    for path, state in states.items():
         ledger.add(path.name, path.stem, [path])
-        if state is not None:
-            assert ledger.claim(path.name) is not None
-            ledger.finish(path.name, state, None, "")
+        assert ledger.claim(path.name) is not None
+        assert ledger.finish(path.name, state, None, "")
     ledger.enter_file(strange, "stamp", None)
     with parts[-1].open("rb") as file:
         # It ends perhaps never; its first parts are not waited for.

@@ -11,8 +11,13 @@ import pytest
 import typer.main
 from typer.core import TyperGroup
 
+from armident.configs import SessionConfig
 from armident.configs.loading import HERE
 from armident.daq.cli import application
+from armident.daq.service import LONGEST_STOP_S
+from armident.identify.monitoring.change.history_schema import BUSY_S
+from armident.identify.monitoring.reidentify.keep import RETRY_S
+from armident.identify.monitoring.reidentify.run import DIAGNOSIS_S
 
 UNITS = sorted((HERE / "systemd").glob("*@.*"))
 SERVICES = [path for path in UNITS if path.suffix == ".service"]
@@ -96,6 +101,36 @@ def test_services_are_bounded_in_memory_system_calls_and_network(path: Path) -> 
     assert values(path, "SystemCallErrorNumber") == ["EPERM"]
     assert values(path, "IPAddressDeny") == ["any"]
     assert values(path, "IPAddressAllow") == ["localhost"]
+
+
+@pytest.mark.parametrize("path", SERVICES, ids=lambda path: path.name)
+def test_a_service_loads_no_code_that_another_one_has_compiled(path: Path) -> None:
+    """The worker reads files of strangers; capture and job have capabilities."""
+    (name,) = re.findall("armident-([a-z]+)@", path.name)
+    assert values(path, "CacheDirectory") == [f"armident/{name}"]
+    assert f"XDG_CACHE_HOME=/var/cache/armident/{name}" in values(path, "Environment")
+
+
+@pytest.mark.parametrize("name", ["capture", "worker"])
+def test_a_service_is_started_again_for_months(name: str) -> None:
+    """A bus that is down at boot ends doctor, and so a start; five in 300 s were the last ones."""
+    unit = Unit(HERE / "systemd" / f"armident-{name}@.service")
+    assert unit["Unit"]["StartLimitIntervalSec"] == "0"
+    assert unit["Service"]["Restart"] == "on-failure"
+    assert unit["Service"]["RestartSec"] == "10"
+
+
+def test_limits_of_time_match_those_of_the_programs() -> None:
+    def longest(name: str) -> float:
+        return float(next(bound.le for bound in SessionConfig.model_fields[name].metadata if hasattr(bound, "le")))
+
+    (start,) = values(HERE / "systemd" / "armident-capture@.service", "TimeoutStartSec")
+    assert float(start) > longest("boot_timeout_s")
+    for path in SERVICES:
+        (stop,) = values(path, "TimeoutStopSec")
+        assert float(stop) < LONGEST_STOP_S
+    (job,) = values(HERE / "systemd" / "armident-reidentify@.service", "TimeoutStartSec")
+    assert 3600.0 * float(job.removesuffix("h")) > DIAGNOSIS_S + RETRY_S + 2 * BUSY_S
 
 
 @pytest.mark.parametrize("path", SERVICES, ids=lambda path: path.name)

@@ -12,6 +12,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import psycopg
@@ -356,6 +357,11 @@ def test_a_server_that_ends_a_connection_is_one_line_and_the_next_attempt_succee
     engine.dispose()
 
 
+def of_psycopg(connection: sa.Connection) -> "psycopg.Connection[object]":
+    """The connection of the driver."""
+    return cast("psycopg.Connection[object]", connection.connection.dbapi_connection)
+
+
 @contextmanager
 def stopped(*processes: int) -> Iterator[None]:
     """Processes of a server that accept connections, which the kernel does, and never answer."""
@@ -378,9 +384,7 @@ def test_a_server_that_hangs_is_left_in_time_whatever_is_waited_for(
     with ExitStack() as stack:
 
         def hang(connection: sa.Connection, *_: object) -> None:
-            backend = connection.connection.dbapi_connection
-            assert isinstance(backend, psycopg.Connection)
-            stack.enter_context(stopped(backend.info.backend_pid))
+            stack.enter_context(stopped(of_psycopg(connection).info.backend_pid))
 
         sa.event.listen(history._engine, moment, hang, once=True)
         with pytest.raises(ConfigError, match=r"the history cannot be written: no connection .*silent for 1 s"):
@@ -397,9 +401,7 @@ def test_a_server_that_does_not_answer_a_new_connection_is_left_in_time(
     monkeypatch.setattr(history_schema, "BUSY_S", 1.0)
     history = History(postgres_url)
     with history._engine.connect() as connection:
-        backend = connection.connection.dbapi_connection
-        assert isinstance(backend, psycopg.Connection)
-        status = Path(f"/proc/{backend.info.backend_pid}/stat").read_text()
+        status = Path(f"/proc/{of_psycopg(connection).info.backend_pid}/stat").read_text()
     postmaster = int(status.rpartition(")")[2].split()[1])
     with stopped(postmaster), pytest.raises(ConfigError, match=r"cannot be read: no connection .*timeout expired"):
         history.runs()
@@ -458,9 +460,7 @@ def test_the_password_comes_from_a_credential_of_systemd(
     (tmp_path / history_schema.CREDENTIAL).write_text("p@ss word\n")
     monkeypatch.setenv("CREDENTIALS_DIRECTORY", str(tmp_path))
     with History(postgres_url)._engine.connect() as connection:
-        backend = connection.connection.dbapi_connection
-        assert isinstance(backend, psycopg.Connection)
-        assert backend.pgconn.password == b"p@ss word"
+        assert of_psycopg(connection).pgconn.password == b"p@ss word"
     # One in the URL counts.
     own = History(postgres_url.replace("armident@", "armident:own@"))
     assert own._engine.url.password == "own"
