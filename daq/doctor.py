@@ -28,9 +28,9 @@ from armident.configs import (
 from armident.configs.blanks import blank_lines, needed, pattern
 from armident.configs.loading import is_session
 from armident.configs.schema.session import Bus
-from armident.daq.capture.clock import clock_state
 from armident.daq.capture.recording_files import chunk_duration_ns
 from armident.daq.matching.streams import captured_streams, unknown_phase
+from armident.daq.recording.clock import clock_state
 from armident.daq.streaming.zenoh_session import configuration, endpoints, unreadable_files
 from armident.drivers.can.interface import SYSFS, is_can, is_up
 from armident.drivers.can.socketcan import RECEIVE_BUFFER, RawSocket
@@ -282,6 +282,8 @@ def _disk(session: SessionConfig, robot: RobotConfig) -> Iterator[Check]:
         )
     else:
         yield Check("recordings", "ok", found)
+    if options.copied_to is not None and not options.copied_to.is_dir():
+        yield Check("recordings", "warning", f"copied_to: {options.copied_to}: no such folder: nothing will be deleted")
 
 
 def _write_times(probe: Path, size: int) -> list[float]:

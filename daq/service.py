@@ -9,12 +9,13 @@ import stat
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from fnmatch import fnmatch
 from functools import partial
 from pathlib import Path
 
-from armident.configs import ArmidentError, ConfigError
+from armident.configs import ArmidentError, ConfigError, load_session
 from armident.configs.loading import HERE as CONFIGS
 
 ACCOUNT = "armident"
@@ -124,6 +125,24 @@ def parts(system: System, cell: str) -> Iterator[InstallStep]:
         yield _file(
             system, UNITS / name, shipped_text(name).replace(SHIPPED_EXECUTABLE, str(system.executable)), "unit"
         )
+    drop_in, text = _drop_in(system, cell)
+    if text:
+        yield _file(system, drop_in, text, "unit")
+
+
+def _drop_in(system: System, cell: str) -> tuple[Path, str]:
+    """Return the file that ties the capture of a cell to its CAN interfaces, and its text; empty without a session."""
+    session, devices = system.root / SETTINGS / f"{cell}.yaml", list[str]()
+    if session.is_file():
+        with suppress(ArmidentError):
+            buses = load_session(session, "").all_buses
+            devices = [bus.channel for bus in buses if bus.interface == "socketcan"]
+    # Characters that systemd.unit(5) wants escaped.
+    devices = [re.sub(r"[^A-Za-z0-9:_.]", lambda found: f"\\x{ord(found[0]):02x}", name) for name in devices]
+    units = " ".join(f"sys-subsystem-net-devices-{name}.device" for name in devices)
+    # Without a device its start job ends after 90 s; the device then starts the unit itself, also later on.
+    text = f"[Unit]\nBindsTo={units}\nAfter={units}\n\n[Install]\nWantedBy={units}\n" if units else ""
+    return UNITS / f"armident-capture@{cell}.service.d/bus.conf", text
 
 
 def _agrees(system: System, path: str, mode: str, owner: str, group: str) -> bool:
@@ -318,17 +337,19 @@ def _removals(system: System, cell: str) -> Iterator[InstallStep]:
             yield step(f"stop {name}", partial(system.run, *words, timeout_s=LONGEST_STOP_S))
     links = [link for name in _instances(cell) for link in _links(system, name)]
     yield from (step(f"disable {link.name} ({link.parent.name})", link.unlink) for link in links)
-    own = system.root / f"etc/tmpfiles.d/armident-{cell}.conf"
+    own = [system.root / path for path in (f"etc/tmpfiles.d/armident-{cell}.conf", _drop_in(system, cell)[0])]
     units = [] if _other_cells(system, cell) else [unit for unit in _units(system) if _is_ours(unit)]
-    files = [own, *([*units, system.root / "etc/tmpfiles.d/armident.conf"] if units else [])]
+    files = [*own, *([*units, system.root / "etc/tmpfiles.d/armident.conf"] if units else [])]
     for file in files:
         if file.is_file():
             kind = "unit" if file in units else "folders"
             yield step(f"remove {kind} /{file.relative_to(system.root)}", file.unlink)
+    if own[1].is_file() and len(list(own[1].parent.iterdir())) == 1:
+        yield step(f"remove folder /{own[1].parent.relative_to(system.root)}", own[1].parent.rmdir)
     cache = system.root / CACHE
     if units and cache.is_dir():
         yield step(f"remove folder /{CACHE} (fonts, compiled kernels)", lambda: shutil.rmtree(cache))
-    if (units or links) and system.has_systemd:
+    if (units or links or own[1].is_file()) and system.has_systemd:
         yield step("units known to systemd", partial(system.run, "systemctl", "daemon-reload"))
 
 

@@ -201,6 +201,10 @@ class RecordingOptions(FrozenModel):
         Size (MB) and duration (min) after which a new file is begun; without both a capture is one file.
     keep_days, min_free_gb
         Age (days) and free space (GB) that delete the oldest files; without both nothing is deleted.
+    copied_to
+        Folder to which files are copied before they may be deleted; ``None``: no copy is waited for.
+    keep_results_days
+        Age (days since the announcement) at which the worker deletes results; ``None``: never.
     preview_hz
         Rate of the preview channels in SI units for viewers, samples/s; 0: none.
     trigger
@@ -214,6 +218,8 @@ class RecordingOptions(FrozenModel):
     rotate_minutes: Annotated[float, Field(gt=0)] | None = None
     keep_days: Annotated[float, Field(gt=0)] | None = None
     min_free_gb: Annotated[float, Field(gt=0)] | None = None
+    copied_to: Path | None = None
+    keep_results_days: Annotated[float, Field(gt=0)] | None = None
     preview_hz: Annotated[float, Field(ge=0, le=1000)] = 50.0
     trigger: Trigger | None = None
 

@@ -8,7 +8,6 @@ from typing import Protocol
 
 from armident.configs import SessionConfig
 from armident.configs.schema.session import MetricsOptions
-from armident.daq.capture.clock import clock_state
 from armident.daq.capture.jitter import SyncJitter, worst
 from armident.daq.capture.metrics import Metrics, Value
 from armident.daq.capture.plan import CapturePlan
@@ -16,6 +15,7 @@ from armident.daq.capture.publisher import Publisher
 from armident.daq.capture.recording_files import free_space
 from armident.daq.capture.sink import Sink
 from armident.daq.matching.assembler import Assembler
+from armident.daq.recording.clock import clock_state
 from armident.drivers.can.receiver import Receiver
 
 WARNED_SHARE = 0.1

@@ -4,6 +4,7 @@ import datetime
 import logging
 import os
 import shutil
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Self
@@ -12,7 +13,8 @@ from armident.configs import RobotConfig, SessionConfig
 from armident.configs.schema.session import RecordingOptions, Trigger
 from armident.daq.matching.streams import CapturedStream
 from armident.daq.recording import QueuedSeries, RecordingSeries, RecordingWriter, TriggeredSeries
-from armident.daq.recording.retention import RetentionThread, prune, recordings_in
+from armident.daq.recording.clock import clock_is_right
+from armident.daq.recording.retention import RetentionThread, identified_in, prune, reason_to_stay, recordings_in
 
 log = logging.getLogger(__name__)
 
@@ -103,6 +105,7 @@ class RecordingRetention:
     def __init__(self, options: RecordingOptions, directory: Path, robot: str) -> None:
         self.options = options
         self._directory, self._robot = directory, robot
+        self._said: list[str] = []
         self._thread = RetentionThread(self._prune)
 
     def _prune(self) -> list[Path]:
@@ -110,9 +113,24 @@ class RecordingRetention:
         if options.keep_days is None and options.min_free_gb is None:
             return []
         min_free_bytes = None if options.min_free_gb is None else options.min_free_gb * 1e9
-        return prune(
-            self._directory, self._robot, datetime.datetime.now(datetime.UTC), options.keep_days, min_free_bytes
-        )
+        now, days = datetime.datetime.now(datetime.UTC), options.keep_days if clock_is_right() else None
+        identified = identified_in(self._directory, self._robot)
+        stay: Counter[str] = Counter()
+
+        def needed(path: Path) -> bool:
+            reason = reason_to_stay(path, identified, options.copied_to)
+            if reason is not None:
+                stay[reason] += 1
+            return reason is not None
+
+        deleted = prune(self._directory, self._robot, now, days, min_free_bytes, needed=needed)
+        said = [f"{number} recordings stay that are {reason}" for reason, number in sorted(stay.items())]
+        if days != options.keep_days:
+            said.append("none is deleted by age, because the clock is not synchronised")
+        if said and said != self._said:
+            log.warning("retention: %s", "; ".join(said))
+        self._said = said
+        return deleted
 
     def __enter__(self) -> Self:
         """Return the object; its thread runs already."""

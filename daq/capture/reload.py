@@ -15,6 +15,8 @@ CHANGEABLE = (
     "recording.rotate_minutes",
     "recording.keep_days",
     "recording.min_free_gb",
+    "recording.copied_to",
+    "recording.keep_results_days",
     "recording.chunk_ms",
     "recording.drain_ms",
     "recording.trigger.",
@@ -24,7 +26,7 @@ CHANGEABLE = (
     "metrics.address",
     "identification",
 )
-"""Keys of a session that may change during its capture; ``identification`` belongs to the worker."""
+"""Keys of a session that may change during its capture; ``identification`` and results belong to the worker."""
 
 Change = Callable[[SessionConfig], None]
 """Applies a changed session to one part of the capture; may raise ConfigError."""

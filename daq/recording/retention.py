@@ -1,18 +1,31 @@
-"""Retention of recordings: deletion by age and by free disk space."""
+"""Retention of recordings: deletion by age and by free disk space, of those that are not needed any more."""
 
 import datetime
+import errno
 import fcntl
+import json
 import logging
 import re
 import shutil
+import sqlite3
 import threading
-from collections.abc import Callable, Iterator
-from contextlib import suppress
+from collections.abc import Callable, Collection, Iterator
+from contextlib import closing, suppress
+from functools import cache
 from pathlib import Path
+
+from mcap.exceptions import McapError
+from mcap.reader import make_reader
+
+from armident.daq.recording.names import MARKS_TOPIC
 
 _NAME = re.compile(r"-(\d{8}T\d{6})-(\d{3})Z(?:\.\d+)?\.mcap(?:\.damaged)?$")
 LONGEST_PAUSE = datetime.timedelta(days=365)
 """Longest time between two recordings of a robot that is a pause: an arm is identified again at least once a year."""
+KEEP = ".keep"
+"""Suffix of a file beside a recording, after its whole name, that marks it as one to keep."""
+LEDGER = "worker.sqlite"
+"""Name of the ledger of the cell's workers in the folder of the recordings."""
 EVERY_S = 60.0
 """Interval between two deletions of old recordings, s."""
 
@@ -26,12 +39,14 @@ def prune(
     keep_days: float | None,
     min_free_bytes: float | None,
     free: Callable[[Path], int] = lambda path: shutil.disk_usage(path).free,
+    needed: Callable[[Path], bool] = lambda _: False,
 ) -> list[Path]:
     """Delete recordings that are too old, then the oldest ones until there is enough space; return them, oldest first.
 
     Only finished captures of this robot are deleted, recognised by their names; subdirectories are not searched.
     ``keep_days`` counts to the newest finished recording not in the future, without pauses of more than a year: a clock
-    that is ahead deletes nothing younger. ``min_free_bytes``, ``free``: wanted and present space, bytes.
+    that is ahead deletes nothing younger. ``min_free_bytes``, ``free``: wanted and present space, bytes. ``needed``:
+    True for recordings that must stay.
     """
     deleted = []
     found = [(path, made, is_being_written(path)) for path, made in recordings_in(directory, robot)]
@@ -42,7 +57,7 @@ def prune(
         old = ages.get(made, datetime.timedelta(0)) > keep
         if not (old or (min_free_bytes is not None and free(directory) < min_free_bytes)):
             break
-        if written:
+        if written or needed(path):
             continue
         path.unlink(missing_ok=True)
         deleted.append(path)
@@ -75,6 +90,60 @@ def recordings_in(directory: Path, robot: str) -> Iterator[tuple[Path, datetime.
                 made = datetime.datetime.strptime(f"{match[1]}.{match[2]}+0000", "%Y%m%dT%H%M%S.%f%z")
                 found.append((path, made))
     yield from sorted(found, key=lambda entry: entry[0].name)
+
+
+def reason_to_stay(path: Path, identified: Collection[str] | None, copied_to: Path | None) -> str | None:
+    """Return why retention spares a recording: marked, not identified, or not copied; ``None`` if it does not.
+
+    ``identified``: names of the captures that need no worker any more (`identified_in`), ``None``: there is none.
+    ``copied_to``: folder in which a file of the same name and size is a copy, ``None``: none is wanted.
+    """
+    # A damaged file is kept beside its repaired one, which is identified.
+    if identified is not None and path.suffix == ".mcap" and capture_of(path) not in identified:
+        return "not identified"
+    if copied_to is not None:
+        copy = copied_to / path.name
+        if not copy.is_file() or copy.stat().st_size != path.stat().st_size:
+            return "not copied"
+    if path.with_name(path.name + KEEP).exists() or _has_note(path, path.stat().st_mtime_ns):
+        return "marked"
+    return None
+
+
+def identified_in(directory: Path, robot: str) -> set[str] | None:
+    """Return the captures that workers have finished, or do not take; ``None`` if the folder has no ledger of workers.
+
+    A capture that is still written counts as one of them: it is identified when it ends, which may be never. Raises
+    OSError if the ledger cannot be read.
+    """
+    ledger = directory / LEDGER
+    if not ledger.is_file():
+        return None
+    try:
+        with closing(sqlite3.connect(f"{ledger.resolve().as_uri()}?mode=ro", uri=True)) as db:
+            names = [path for (path,) in db.execute("SELECT path FROM files WHERE sha256 IS NULL")]
+            for (paths,) in db.execute("SELECT paths FROM experiments WHERE state != 'waiting'"):
+                names += json.loads(paths)
+    except sqlite3.Error as error:
+        raise OSError(errno.EIO, str(error), str(ledger)) from error
+    names += [path for path, _ in recordings_in(directory, robot) if is_being_written(path)]
+    return {capture_of(Path(name)) for name in names}
+
+
+def capture_of(path: Path) -> str:
+    """Return the name of the capture that a file is of: without suffix and number of the part."""
+    return re.sub(r"(\.\d{4,})?\.mcap(\.damaged)?$", "", path.name)
+
+
+@cache
+def _has_note(path: Path, _changed_ns: int) -> bool:
+    """Return True if an operator has set a mark in a recording (``armident command mark``)."""
+    try:
+        with path.open("rb") as file:
+            marks = make_reader(file).iter_messages(topics=[MARKS_TOPIC])
+            return any(json.loads(message.data)["kind"] == "note" for _, _, message in marks)
+    except (OSError, McapError, ValueError, KeyError):
+        return False
 
 
 def is_being_written(path: Path) -> bool:

@@ -173,7 +173,8 @@ def effects(
 
 def history(
     documents: Annotated[
-        list[Path] | None, typer.Argument(help="identification.json files to add. [default: none, only list]")
+        list[Path] | None,
+        typer.Argument(help="identification.json files to add, or backup FILE, or restore FILE. [default: list]"),
     ] = None,
     database: Annotated[
         str, typer.Option(help="SQLAlchemy URL.", envvar="ARMIDENT_HISTORY")
@@ -191,7 +192,8 @@ def history(
 ) -> None:
     """Keep results in a database, list them, and test for a change of the arm since the first one.
 
-    Exit code 4 if the last run differs significantly from the first, in one parameter or in all together.
+    Exit code 4 if the last run differs significantly from the first, in one parameter or in all together. backup FILE
+    writes a copy of the whole database to a file (SQLite); restore FILE adds what a database lacks of such a copy.
 
     Example: armident history recordings/*.identification/identification.json --plot history.png
     """

@@ -12,7 +12,8 @@ from typing import Literal
 import pytest
 
 from armident.configs import SessionConfig
-from armident.daq.recording import read_recording
+from armident.daq.recording import clock, read_recording
+from armident.daq.recording.clock import ClockState
 from armident.daq.streaming import Keys, open_session
 from armident.identify.identification.identify_recording import identify_recording
 from armident.identify.monitoring.worker.announcements import Announcements
@@ -50,7 +51,7 @@ def announce(folder: Path, sha256: str, kind: type[WorkerLink]) -> None:
 @contextmanager
 def linked(session: SessionConfig, kind: type[WorkerLink] = WorkerLink) -> Iterator[WorkerLink]:
     """Yield a link that can announce."""
-    with closing(kind(session, Keys(session.cell, "emps"), nothing, nothing, (0, 0), lambda: None)) as link:
+    with closing(kind(session, Keys(session.cell, "emps"), nothing, nothing, (0, 0), lambda _: b"")) as link:
         link.check()
         while not link.can_announce:
             time.sleep(0.05)
@@ -142,3 +143,17 @@ def test_an_announcement_is_not_repeated_if_the_ledger_refuses_its_entry(
         assert announced(tmp_path, entry.sha256)
         time.sleep(0.5)
         assert audience.results == {entry.sha256: 1}
+
+
+def test_each_announcement_deletes_results_that_are_too_old(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(clock, "clock_state", lambda: ClockState(0.0, 0.0, 0.0, True))
+    ledger, old = Ledger(tmp_path / FILE, "one"), tmp_path / "emps-old.identification"
+    old.mkdir()
+    with monkeypatch.context() as long_ago:
+        long_ago.setattr(time, "time", lambda: 1.0e9)
+        assert ledger.adopt("0" * 64, "emps-old", [tmp_path / "gone.mcap"], old / "identification.json", "usable")
+    entry, session = entered(tmp_path, "failed", lease_s=LONG_S), cell_of(tmp_path)
+    with linked(session) as link:
+        Announcements(Keys(session.cell, "emps"), link, keep_days=365.0).make(ledger, entry.sha256)
+    assert not old.exists()
+    assert [each.sha256 for each in ledger.entries()] == [entry.sha256]

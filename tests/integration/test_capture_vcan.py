@@ -23,6 +23,7 @@ from armident.configs.units import counts_per_si
 from armident.daq.capture.capture import capture, load_plan
 from armident.daq.matching.assembler import LATE_S
 from armident.daq.recording import Recording, join_parts, read_recording
+from armident.daq.recording.clock import clock_state
 from armident.drivers.vcan import ensure_vcan, remove_vcan
 from tests.fixtures.processes import ForkedProcess, armident
 
@@ -144,10 +145,12 @@ def test_no_sample_is_lost_between_files(captured: Captured) -> None:
     assert np.array_equal(sync, np.arange(captured.document["counters"]["sync_sent"]))
 
 
-def test_an_old_recording_is_deleted_meanwhile(captured: Captured) -> None:
-    assert not captured.old.exists()
+def test_an_old_recording_is_deleted_meanwhile_if_the_clock_is_right(captured: Captured) -> None:
+    right = clock_state().synchronised
+    assert captured.old.exists() != right
     assert captured.young.exists()
-    assert f"deleted {captured.old} (retention)" in captured.log
+    assert (f"deleted {captured.old} (retention)" in captured.log) == right
+    assert ("none is deleted by age, because the clock is not synchronised" in captured.log) != right
 
 
 @pytest.mark.nightly

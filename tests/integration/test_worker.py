@@ -133,7 +133,19 @@ def test_an_unusable_result_is_published_with_its_verdict_and_ends_with_exit_cod
     with Worker(session, captured.robot, tmp_path) as worker:
         publish(wrong, session, path=tmp_path / "emps-turned.mcap")
         assert worker.result(LONGEST_S) == 3
-        replies = answers(session, Keys(session.cell, "emps").identification)
+        key = Keys(session.cell, "emps").identification
+        replies = answers(session, key)
+        (away,) = answers(session, f"{key}?since=2020-01-01T00:00:00Z")
+        (heard,) = answers(session, f"{key}?since={wrong.sha256}")
+        (misspelt,) = answers(session, f"{key}?since=yesterday")
+    assert away.ok is not None
+    (missed,) = json.loads(bytes(away.ok.payload))["results"]
+    assert (missed["sha256"], missed["state"], missed["message"]) == (wrong.sha256, "done", "unusable")
+    assert missed["document"]["verdict"] == "unusable"
+    assert heard.ok is not None
+    assert json.loads(bytes(heard.ok.payload)) == {"results": [], "more": False}
+    assert misspelt.err is not None
+    assert b"since=yesterday: expected a time" in bytes(misspelt.err.payload)
     assert replies[0].ok is not None
     published = from_json(bytes(replies[0].ok.payload).decode(), IdentificationDocument, "answer")
     assert published.verdict == "unusable"

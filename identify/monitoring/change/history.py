@@ -1,10 +1,11 @@
 """Database of identifications: a SQLite file, or any other database that SQLAlchemy supports."""
 
-import contextlib
 import datetime
 import hashlib
+import os
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Set
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,8 @@ from armident.identify.monitoring.change.history_schema import (
     recordings,
     repeated,
     runs,
+    runs_as_stored,
+    shown,
     upgrade,
     writing,
 )
@@ -49,14 +52,15 @@ class History:
     """
 
     def __init__(self, url: str = DEFAULT) -> None:
-        self.url = _shown(url)
+        self.url = shown(url)
         try:
             self._engine = engine_for(_driven(url))
             upgrade(self._engine)
         except (sa.exc.SQLAlchemyError, ImportError, OSError, ConfigError) as error:
             missing = getattr(error, "name", None) == "psycopg"
             hint = "; install it with: pip install 'armident[postgresql]'" if missing else ""
-            raise ConfigError(f"{self.url}: cannot be used as history: {reason(error)}{hint}") from error
+            said = reason(error).replace(url, self.url)
+            raise ConfigError(f"{self.url}: cannot be used as history: {said}{hint}") from error
 
     def add(self, document: IdentificationDocument, recorded: datetime.datetime) -> bool:
         """Add an identification; False if its recording is known. Raises ConfigError if it cannot be written."""
@@ -77,7 +81,7 @@ class History:
             "document": text,
         }
         try:
-            with writing(self._engine) as connection:
+            with self._writing() as connection:
                 done = connection.execute(sa.insert(runs).values(row))
                 (number,) = done.inserted_primary_key or (None,)
                 rows = [
@@ -94,8 +98,6 @@ class History:
                 connection.execute(sa.insert(parameters), rows)
         except sa.exc.IntegrityError:
             return False
-        except sa.exc.SQLAlchemyError as error:
-            raise ConfigError(f"{self.url}: the history cannot be written: {reason(error)}") from error
         return True
 
     @staticmethod
@@ -141,13 +143,70 @@ class History:
         self._insert_once(comparisons, row)
 
     def _insert_once(self, table: sa.Table, row: Mapping[str, Any]) -> None:
+        with suppress(sa.exc.IntegrityError), self._writing() as connection:
+            connection.execute(sa.insert(table).values(row))
+
+    @contextmanager
+    def _writing(self) -> Iterator[sa.Connection]:
+        """Yield a connection whose transaction is committed; IntegrityError means that a row is known already."""
         try:
             with writing(self._engine) as connection:
-                connection.execute(sa.insert(table).values(row))
+                yield connection
         except sa.exc.IntegrityError:
-            return
+            raise
         except sa.exc.SQLAlchemyError as error:
             raise ConfigError(f"{self.url}: the history cannot be written: {reason(error)}") from error
+
+    def copy_to(self, other: "History") -> int:
+        """Add the runs that another history lacks, with recordings and comparisons; return their number.
+
+        All are added or none. Raises ConfigError if one cannot be read or the other not be written.
+        """
+        numbers = [number for (number,) in self._rows(sa.select(runs.c.id).order_by(runs.c.id))]
+        try:
+            with other._writing() as target:
+                known = set(target.execute(sa.select(recordings.c.sha256)).scalars())
+                lacking = [dict(row._mapping) for row in self._rows(sa.select(recordings)) if row.sha256 not in known]
+                if lacking:
+                    target.execute(sa.insert(recordings), lacking)
+                digests = set(target.execute(sa.select(runs.c.digest)).scalars())
+                identified = {tuple(row) for row in target.execute(sa.select(runs.c.robot, runs.c.sha256))}
+                return sum(self._copy_run(number, target, digests, identified) for number in numbers)
+        except sa.exc.IntegrityError as error:
+            raise ConfigError(f"{other.url}: another process writes to it; try again") from error
+
+    def _copy_run(
+        self, number: int, target: sa.Connection, digests: Set[str], identified: Set[tuple[str, str]]
+    ) -> bool:
+        """Add one run with its parameters and comparisons unless it or its recording is known already."""
+        ((*values,),) = self._rows(sa.select(runs_as_stored).where(runs_as_stored.c.id == number))
+        run = dict(zip(runs_as_stored.c.keys(), values, strict=True))
+        if run["digest"] in digests or ((run["robot"], run["sha256"]) in identified and not run["repeated"]):
+            return False
+        del run["id"]
+        (new,) = target.execute(sa.insert(runs_as_stored).values(run)).inserted_primary_key or (None,)
+        for table in (parameters, comparisons):
+            rows = self._rows(sa.select(table).where(table.c.identification == number))
+            if rows:
+                target.execute(sa.insert(table), [dict(row._mapping) | {"identification": new} for row in rows])
+        return True
+
+    def save(self, file: Path) -> int:
+        """Write a copy to a file (SQLite), which is replaced as a whole; return the number of its runs.
+
+        Raises ConfigError if the history is empty, or the file is its own.
+        """
+        if self._engine.dialect.name == "sqlite" and Path(self._engine.url.database or "").resolve() == file.resolve():
+            raise ConfigError(f"{file}: the history itself; name another file")
+        temporary = file.with_name(f".{file.name}.{os.getpid()}")
+        try:
+            saved = self.copy_to(History(f"sqlite:///{temporary}"))
+            if not saved:
+                raise ConfigError(f"{file}: not written, because the history is empty")
+            os.replace(temporary, file)
+        finally:
+            temporary.unlink(missing_ok=True)
+        return saved
 
     def first(self, robot: str, cell: str | None = None) -> HistoryRun | None:
         """Oldest converged identification of an arm; runs whose cell the history does not know are included."""
@@ -211,7 +270,7 @@ def recorded_at(document: IdentificationDocument, file: Path) -> datetime.dateti
     found = _STAMP.search(document.recording.path or "")
     if found is not None:
         # A name that only looks like a time is none.
-        with contextlib.suppress(ValueError):
+        with suppress(ValueError):
             return datetime.datetime.strptime(found[1] + "+0000", "%Y%m%dT%H%M%S%z")
     return datetime.datetime.fromtimestamp(file.stat().st_mtime, datetime.UTC)
 
@@ -219,8 +278,3 @@ def recorded_at(document: IdentificationDocument, file: Path) -> datetime.dateti
 def _driven(url: str) -> str:
     """Return the URL with the driver of the extra ``postgresql`` unless it names one."""
     return re.sub(r"^postgres(ql)?://", "postgresql+psycopg://", url)
-
-
-def _shown(url: str) -> str:
-    """Return the URL with its password masked."""
-    return re.sub(r"(://[^:/@]*):[^@]*@", r"\1:***@", url)

@@ -28,9 +28,12 @@ def history_command(
 ) -> int:
     """Carry out ``armident history``: add documents, compare runs with the first one, plot parameters.
 
+    ``documents``: files, or ``backup`` or ``restore`` and one file.
     ``robot``: default that of the documents, or the only one. Returns 0 or `FOUND`. Raises ConfigError if an option
     or the database is wrong, DataError if a document is wrong or of another model.
     """
+    if documents and str(documents[0]) in ("backup", "restore"):
+        return _copied(str(documents[0]), documents[1:], database)
     loaded = [(load_document(path, IdentificationDocument), path) for path in documents]
     history = History(database)
     for document, path in loaded:
@@ -50,6 +53,21 @@ def history_command(
         _table(title, runs, drifts, parameters)
     last = drifts[-1]
     return FOUND if last is not None and last.drifted else 0
+
+
+def _copied(word: str, files: Sequence[Path], database: str) -> int:
+    """Carry out ``armident history backup FILE``, or ``restore FILE``."""
+    if len(files) != 1:
+        raise ConfigError(f"history {word}: expected one file")
+    (file,) = files
+    if word == "backup":
+        print(f"saved {History(database).save(file)} identifications in {file}")
+        return 0
+    if not file.is_file():
+        raise ConfigError(f"{file}: no such file")
+    added = History(f"sqlite:///{file}").copy_to(History(database))
+    print(f"restored {added} identifications; those that the history had already are unchanged")
+    return 0
 
 
 def _compared(first: HistoryRun, run: HistoryRun, false_alarms: float) -> ParameterChangeTest | None:

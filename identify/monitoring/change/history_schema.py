@@ -3,10 +3,14 @@
 The version is ``PRAGMA user_version`` of SQLite, or a row of ``armident_history_version``.
 """
 
+import os
+import re
+import socket
 import sqlite3
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Generator, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
 from typing import Any
 
 import sqlalchemy as sa
@@ -15,7 +19,11 @@ from armident.configs import ConfigError
 from armident.configs.reasons import reason_of
 
 BUSY_S = 15.0
-"""Longest wait for another process that writes to the database, s."""
+"""Longest wait for another process that writes to the database, and for an answer of a server, s."""
+_LOCK_SHARE = 0.9
+"""Part of `BUSY_S` after which a server gives up a lock, so that its reason arrives in time."""
+CREDENTIAL = "history-password"
+"""Name of the systemd credential with the password of the database server."""
 _LOCK = 0x61726D69
 """Number of the advisory lock of an upgrade in PostgreSQL."""
 
@@ -83,6 +91,9 @@ comparisons = sa.Table(
 )
 repeated: sa.ColumnClause[int] = sa.column("repeated", sa.Integer)
 """Column of `runs`: 1 for a further identification of a recording that the history had already."""
+runs_as_stored = runs.to_metadata(sa.MetaData())
+"""Identifications with all columns of the last version."""
+runs_as_stored.append_column(sa.Column("repeated", sa.Integer, nullable=False))
 
 
 def _create_tables(connection: sa.Connection) -> None:
@@ -119,20 +130,60 @@ def engine_for(url: str) -> sa.Engine:
     return engine
 
 
+def shown(url: str) -> str:
+    """Return a URL with its passwords masked, also those of its query and those with characters not quoted."""
+    return re.sub(r"([?&][^=&]*password=)[^&]*", r"\1***", re.sub(r":(?!//).*@", ":***@", url))
+
+
 def _server_engine(url: sa.URL) -> sa.Engine:
     """Return the engine of a database server; on PostgreSQL nothing is waited for longer than `BUSY_S`."""
-    if url.get_backend_name() != "postgresql":
-        return sa.create_engine(url, pool_pre_ping=True)
-    waits = {"connect_timeout": round(BUSY_S) or 1, "tcp_user_timeout": round(1000 * BUSY_S)}
-    own = {key: value for key, value in waits.items() if key not in url.query and url.get_driver_name() == "psycopg"}
-    # A connection that the server has closed since is replaced.
-    engine = sa.create_engine(url, connect_args=own, pool_pre_ping=True)
-    sa.event.listen(engine, "begin", _limit_waits)
+    if "@" in (url.host or ""):
+        raise ConfigError("an @ in user or password of the URL is written %40")
+    credential = Path(os.environ.get("CREDENTIALS_DIRECTORY", "/nowhere"), CREDENTIAL)
+    if url.password is None and "password" not in url.query and credential.is_file():
+        url = url.set(password=credential.read_text(encoding="utf-8").rstrip("\n"))
+    # Transactions are hours apart, so that none begins on a connection that has ended since.
+    engine = sa.create_engine(url, poolclass=sa.NullPool)
+    if url.get_backend_name() == "postgresql":
+        sa.event.listen(engine, "begin", _limit_locks)
+    if url.get_driver_name() == "psycopg":
+        sa.event.listen(engine, "do_connect", _connected)
     return engine
 
 
-def _limit_waits(connection: sa.Connection) -> None:
-    connection.exec_driver_sql(f"SET LOCAL lock_timeout = {round(1000 * BUSY_S)}")
+def _limit_locks(connection: sa.Connection) -> None:
+    connection.exec_driver_sql(f"SET LOCAL lock_timeout = {round(1000 * _LOCK_SHARE * BUSY_S)}")
+
+
+def _connected(_dialect: Any, _record: Any, words: list[Any], options: dict[str, Any]) -> Any:
+    """Return a connection of psycopg that is closed when the server is silent: a stopped one keeps TCP alive."""
+    import psycopg
+
+    class Impatient(psycopg.Connection[Any]):
+        def wait(self, gen: Generator[Any, Any, Any], *args: Any, **kwargs: Any) -> Any:
+            return super().wait(self._limited(gen), *args, **kwargs)
+
+        def _limited(self, gen: Generator[Any, Any, Any]) -> Generator[Any, Any, Any]:
+            """Pass on a generator that waits for the server; psycopg sends 0 every 0.1 s while nothing arrives."""
+            heard, ready = time.monotonic(), None
+            try:
+                while True:
+                    wanted = gen.send(ready)
+                    ready = yield wanted
+                    if ready:
+                        heard = time.monotonic()
+                    elif time.monotonic() - heard > BUSY_S:
+                        self.close()
+                        raise psycopg.OperationalError(f"it has been silent for {BUSY_S:g} s")
+            except StopIteration as done:
+                return done.value
+
+    addresses: list[Any] = [None]
+    with suppress(OSError):
+        addresses = socket.getaddrinfo(options.get("host"), options.get("port"), type=socket.SOCK_STREAM)
+    # Each address of a host is tried for this time.
+    waits = {"connect_timeout": max(int(BUSY_S / len(addresses)), 1), "tcp_user_timeout": round(1000 * BUSY_S)}
+    return Impatient.connect(*words, **waits | options)
 
 
 def _without_own_transactions(connection: sqlite3.Connection, _record: Any) -> None:
@@ -197,7 +248,7 @@ def reason(error: Exception) -> str:
     text = " ".join(str(cause).partition("\n\tIs the server")[0].split())[:200]
     state = getattr(cause, "sqlstate", None)
     if state in _STATES:
-        return _STATES[state].format(busy=BUSY_S, text=text)
+        return _STATES[state].format(busy=_LOCK_SHARE * BUSY_S, text=text)
     if isinstance(error, sa.exc.OperationalError) and not isinstance(cause, sqlite3.Error):
         text = text.removeprefix("connection failed: ")
         return f"no connection to the server ({text}); check that it runs, and host, port, user and database of the URL"

@@ -14,7 +14,7 @@ from armident.identify.monitoring.change.history_schema import wait_and_try
 from armident.identify.monitoring.reidentify.record_run import Say
 
 RETRY_S = 60.0
-"""Time for which a refused entry is tried again after the results are published, s."""
+"""Time for which a refused entry is tried again, s."""
 
 
 def history_or_reason(store: str, needed: bool) -> tuple[History | None, str | None]:
@@ -47,17 +47,12 @@ class HistoryEntry:
         if self.drift is not None and self.baseline is not None:
             history.judge(self.document, self.baseline, self.drift)
 
-    def write_or_say(self, say: Say, seconds: float = 0.0) -> bool:
-        """Write the entry; if the database refuses it for that time, s, say why and return False."""
-        return wait_and_try(self.write, seconds, say)
-
 
 @contextmanager
 def recorded_in_history(entry: HistoryEntry, say: Say) -> Iterator[None]:
-    """Write an entry before the block, and try a refused one again after it, also if it ends with an error."""
-    written = entry.write_or_say(say)
+    """Write an entry after the block, which publishes the results, also if it ends with an error."""
     try:
         yield
     finally:
-        if not written and not entry.write_or_say(say, RETRY_S):
+        if not wait_and_try(entry.write, RETRY_S, say):
             say(f"warning: the history lacks this run; add it with: armident history {entry.path} --database URL")

@@ -34,7 +34,9 @@ class StatusPublisher:
 
     def _answer(self, query: zenoh.Query) -> None:
         with query:
-            if self._last is None:
+            if query.parameters.get("since") is not None:
+                query.reply_err(b"a job knows its own result only; the worker of the cell knows those since a time")
+            elif self._last is None:
                 query.reply_err(b"no identification yet")
             else:
                 query.reply(self._keys.identification, self._last)

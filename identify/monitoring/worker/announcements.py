@@ -1,10 +1,16 @@
 """Announcements of a worker: each result and failure in the ledger is announced once, also if workers are killed."""
 
+import logging
+
+from armident.configs import ArmidentError
 from armident.daq.streaming import Keys
 from armident.identify.monitoring.worker.ledger import Ledger, LedgerEntry
+from armident.identify.monitoring.worker.results import prune_results
 from armident.identify.monitoring.worker.status_messages import failure_status, status_message
 from armident.identify.monitoring.worker.worker_link import LinkDown, WorkerLink
 from armident.identify.monitoring.worker.worker_receiver import content_hash
+
+log = logging.getLogger(__name__)
 
 COMPONENTS = ("worker", "reidentify")
 """Programs that announce the entries of a ledger."""
@@ -14,10 +20,11 @@ class Announcements:
     """Announces the entries of a ledger; an entry and its announcement are one transaction.
 
     A worker killed between both leaves an entry not announced, which others that heard the announcement enter.
+    ``keep_days``: time after which results are deleted; ``None``: never.
     """
 
-    def __init__(self, keys: Keys, link: WorkerLink) -> None:
-        self._keys, self._link = keys, link
+    def __init__(self, keys: Keys, link: WorkerLink, keep_days: float | None = None) -> None:
+        self._keys, self._link, self._keep_days = keys, link, keep_days
         self._heard: set[bytes] = set()
         self._sent: set[str] = set()
 
@@ -43,6 +50,10 @@ class Announcements:
                     self._link.announce((self._keys.identification, document), (self._keys.status, done))
                 self._sent.add(sha256)
         self._sent.discard(sha256)
+        try:
+            prune_results(ledger, self._keep_days)
+        except (ArmidentError, OSError) as error:
+            log.warning("old results stay: %s", error)
         return document if mine else None
 
     def enter_heard(self, ledger: Ledger) -> None:

@@ -87,6 +87,8 @@ class LedgerEntry:
 _COLUMNS = "sha256, name, paths, state, attempts, result, message, announced"
 _LATER = "max(:time, coalesce((SELECT max(finished) FROM experiments), 0) + 0.001)"
 """Time of a result: later than all others, also after a step of the clock back."""
+_TOLD = "max(:ms, (SELECT max(announced) FROM experiments) + 1)"
+"""Time of an announcement, ms UTC, in column ``announced`` (0: none): later than all others."""
 _FREE = "(owner IS NULL OR boot IS NOT :boot OR lease_until < :now OR owner = :owner)"
 
 
@@ -198,9 +200,9 @@ class Ledger:
         """Enter an announcement made inside the block, and end its claim; yield False if it must not be made."""
         with self._transaction() as db:
             done = db.execute(
-                "UPDATE experiments SET announced = 1, owner = NULL "
+                f"UPDATE experiments SET announced = {_TOLD}, owner = NULL "
                 "WHERE sha256 = :sha256 AND owner = :owner AND announced = 0 AND state != 'waiting'",
-                {"sha256": sha256} | self._me(),
+                {"sha256": sha256, "ms": round(time.time() * 1e3)} | self._me(),
             )
             yield bool(done.rowcount)
 
@@ -214,7 +216,9 @@ class Ledger:
         """Enter an announcement that another process has made, and end the claim."""
         with self._transaction() as db:
             db.execute(
-                "UPDATE experiments SET announced = 1, owner = NULL WHERE sha256 = ? AND state != 'waiting'", (sha256,)
+                f"UPDATE experiments SET announced = {_TOLD}, owner = NULL "
+                "WHERE sha256 = :sha256 AND announced = 0 AND state != 'waiting'",
+                {"sha256": sha256, "ms": round(time.time() * 1e3)},
             )
 
     def entry(self, sha256: str) -> LedgerEntry | None:
@@ -246,6 +250,20 @@ class Ledger:
         """Enter a file that was read, and the hash of its recording; ``None`` if it is none of this cell."""
         with self._transaction() as db:
             db.execute("INSERT OR REPLACE INTO files VALUES (?, ?, ?)", (str(path), stamp, sha256))
+
+    def announced(self) -> list[tuple[int, LedgerEntry]]:
+        """Return the announced entries with the times of their announcements, ms UTC, in that order."""
+        # Ledgers of former versions have the time of the result only.
+        told = "max(announced, CAST(1000 * finished AS INTEGER))"
+        query = f"SELECT {told} AS told, {_COLUMNS} FROM experiments WHERE announced ORDER BY told, finished"
+        with self._transaction() as db:
+            return [(row[0], _entry(row[1:])) for row in db.execute(query)]
+
+    def forget(self, hashes: Sequence[str]) -> None:
+        """Remove entries, and their files, which exist no more."""
+        with self._transaction() as db:
+            for table in ("experiments", "files"):
+                db.executemany(f"DELETE FROM {table} WHERE sha256 = ?", [(sha256,) for sha256 in hashes])
 
     def _me(self) -> dict[str, object]:
         now = self._clock()

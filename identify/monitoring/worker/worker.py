@@ -31,6 +31,7 @@ from armident.identify.monitoring.worker.recorded import (
     captured_in,
     result_of,
 )
+from armident.identify.monitoring.worker.results import results_since
 from armident.identify.monitoring.worker.stream_buffer import LARGEST_BLOCK, LARGEST_EVENT, StreamBuffer
 from armident.identify.monitoring.worker.worker_link import LinkDown, WorkerLink
 from armident.identify.report.robot_file import write_identification
@@ -81,8 +82,8 @@ class Worker:
         self._wake, self._closing = threading.Event(), threading.Event()
         self._ledger: Ledger | None = None
         limits = LARGEST_EVENT, LARGEST_BLOCK
-        self._link = WorkerLink(session, self._keys, self._on_event, self._on_block, limits, lambda: self._last)
-        self._announcements = Announcements(self._keys, self._link)
+        self._link = WorkerLink(session, self._keys, self._on_event, self._on_block, limits, self._answer)
+        self._announcements = Announcements(self._keys, self._link, session.recording.keep_results_days)
         self._threads = [
             threading.Thread(target=self._identify_all, name="identify", daemon=True),
             threading.Thread(target=self._keep_alive, name="lease", daemon=True),
@@ -115,6 +116,14 @@ class Worker:
             return self._results.get(timeout=timeout)
         except queue.Empty:
             return None
+
+    def _answer(self, since: str | None) -> bytes:
+        """Return the last result, or all since a time or a recording; ArmidentError if there is none."""
+        if since is not None:
+            return results_since(Ledger(self._out / FILE, self._owner), since)
+        if self._last is None:
+            raise DataError("no identification yet")
+        return self._last
 
     def _on_event(self, data: bytes | None, size: int) -> None:
         with self._lock:

@@ -25,7 +25,8 @@ class WorkerLink:
     """Subscriptions, answers and announcements of a worker, which works on with the files without a session.
 
     The first worker of a cell listens on the port of its role; others take it over when it is free. ``limits``: event
-    and block, bytes; larger ones are ``None``. Raises ConfigError if Zenoh's configuration is wrong.
+    and block, bytes; larger ones are ``None``. ``answer`` takes parameter ``since`` of a query for results if it has
+    one; its ArmidentError or OSError is answered. Raises ConfigError if Zenoh's configuration is wrong.
     """
 
     def __init__(
@@ -35,7 +36,7 @@ class WorkerLink:
         on_event: Take,
         on_block: Take,
         limits: tuple[int, int],
-        answer: Callable[[], bytes | None],
+        answer: Callable[[str | None], bytes],
     ) -> None:
         self._retry_s = longest_retry_s(configuration(session, "worker"))
         self._config, self._keys, self._answer = session, keys, answer
@@ -122,8 +123,7 @@ class WorkerLink:
 
     def _on_query(self, query: zenoh.Query) -> None:
         with query:
-            last = self._answer()
-            if last is None:
-                query.reply_err(b"no identification yet")
-            else:
-                query.reply(self._keys.identification, last)
+            try:
+                query.reply(self._keys.identification, self._answer(query.parameters.get("since")))
+            except (ArmidentError, OSError) as error:
+                query.reply_err(str(error).encode())

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from armident.daq.capture.clock import clock_state
 from armident.daq.capture.journal import journal_entry
+from armident.daq.recording.clock import clock_state
 
 LOG = """
 import logging

@@ -11,8 +11,13 @@ import pytest
 import typer.main
 from typer.core import TyperGroup
 
+from armident.configs import SessionConfig
 from armident.configs.loading import HERE
 from armident.daq.cli import application
+from armident.daq.service import LONGEST_STOP_S
+from armident.identify.monitoring.change.history_schema import BUSY_S
+from armident.identify.monitoring.reidentify.keep import RETRY_S
+from armident.identify.monitoring.reidentify.run import DIAGNOSIS_S
 
 UNITS = sorted((HERE / "systemd").glob("*@.*"))
 SERVICES = [path for path in UNITS if path.suffix == ".service"]
@@ -99,6 +104,36 @@ def test_services_are_bounded_in_memory_system_calls_and_network(path: Path) -> 
 
 
 @pytest.mark.parametrize("path", SERVICES, ids=lambda path: path.name)
+def test_a_service_loads_no_code_that_another_one_has_compiled(path: Path) -> None:
+    """The worker reads files of strangers; capture and job have capabilities."""
+    (name,) = re.findall("armident-([a-z]+)@", path.name)
+    assert values(path, "CacheDirectory") == [f"armident/{name}"]
+    assert f"XDG_CACHE_HOME=/var/cache/armident/{name}" in values(path, "Environment")
+
+
+@pytest.mark.parametrize("name", ["capture", "worker"])
+def test_a_service_is_started_again_for_months(name: str) -> None:
+    """A bus that is down at boot ends doctor, and so a start; five in 300 s were the last ones."""
+    unit = Unit(HERE / "systemd" / f"armident-{name}@.service")
+    assert unit["Unit"]["StartLimitIntervalSec"] == "0"
+    assert unit["Service"]["Restart"] == "on-failure"
+    assert unit["Service"]["RestartSec"] == "10"
+
+
+def test_limits_of_time_match_those_of_the_programs() -> None:
+    def longest(name: str) -> float:
+        return float(next(bound.le for bound in SessionConfig.model_fields[name].metadata if hasattr(bound, "le")))
+
+    (start,) = values(HERE / "systemd" / "armident-capture@.service", "TimeoutStartSec")
+    assert float(start) > longest("boot_timeout_s")
+    for path in SERVICES:
+        (stop,) = values(path, "TimeoutStopSec")
+        assert float(stop) < LONGEST_STOP_S
+    (job,) = values(HERE / "systemd" / "armident-reidentify@.service", "TimeoutStartSec")
+    assert 3600.0 * float(job.removesuffix("h")) > DIAGNOSIS_S + RETRY_S + 2 * BUSY_S
+
+
+@pytest.mark.parametrize("path", SERVICES, ids=lambda path: path.name)
 def test_who_has_a_watchdog_notifies_it(path: Path) -> None:
     notifies = values(path, "Type") == ["notify"]
     assert notifies == (path.name != "armident-reidentify@.service")
@@ -106,12 +141,13 @@ def test_who_has_a_watchdog_notifies_it(path: Path) -> None:
     assert values(path, "NotifyAccess") == (["main"] if notifies else [])
 
 
-@pytest.mark.parametrize("name", ["capture", "reidentify"])
-def test_a_capture_may_read_the_state_of_the_clock_and_not_set_it(name: str) -> None:
-    """``ProtectClock=`` and ``@system-service`` alone forbid adjtimex(2), by which health reports the clock."""
+@pytest.mark.parametrize("name", ["capture", "reidentify", "worker"])
+def test_a_service_may_read_the_state_of_the_clock_and_not_set_it(name: str) -> None:
+    """``ProtectClock=`` and ``@system-service`` alone forbid adjtimex(2), which health and retention need."""
     path = HERE / "systemd" / f"armident-{name}@.service"
     assert values(path, "ProtectClock") == []
-    assert values(path, "SystemCallFilter") == ["@system-service adjtimex clock_adjtime"]
+    # A later line adds to an earlier one, or takes away from it.
+    assert values(path, "SystemCallFilter")[-1].endswith("adjtimex clock_adjtime")
     assert "CAP_SYS_TIME" not in values(path, "CapabilityBoundingSet")[0]
 
 
@@ -152,6 +188,11 @@ def test_the_cron_line_runs_the_same_command_weekly() -> None:
     accepted(words)
     (unit,) = [words for words in commands(HERE / "systemd" / "armident-reidentify@.service") if "reidentify" in words]
     assert unit == [word.replace("CELL", "cell") for word in words]
+    history = "ARMIDENT_HISTORY=sqlite:////var/lib/armident/CELL/history.sqlite"
+    assert history in CRON.read_text(encoding="utf-8").splitlines()
+    service = HERE / "systemd" / "armident-reidentify@.service"
+    assert history.replace("CELL", "%i") in values(service, "Environment")
+    assert values(service, "EnvironmentFile") == ["-/etc/armident/%i.env"]
 
 
 def test_a_wrong_option_would_be_noticed() -> None:

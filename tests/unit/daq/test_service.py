@@ -1,7 +1,9 @@
 """``armident service``: user, folders, permissions and units of a cell in a system image, and their removal."""
 
 import os
+import re
 import stat
+import subprocess
 import sys
 from collections.abc import Iterator
 from configparser import ConfigParser
@@ -176,7 +178,7 @@ def test_the_units_agree_with_the_account_and_the_folders(image: Path) -> None:
         assert (keys["User"], keys["Group"]) == (ACCOUNT, ACCOUNT)
         assert keys["StateDirectory"] == "armident/%i"
         assert keys["WorkingDirectory"] == f"/{STATE}/%i"
-        assert keys["CacheDirectory"] == "armident"
+        assert keys["CacheDirectory"].rpartition("/")[0] == str(CACHE.relative_to("var/cache"))
         assert keys.get("StateDirectoryMode", "0755") == "0755"
     names = [step.name for step in steps(System(image, Path("/x")), "%i")]
     assert any("/var/lib/armident/%i (armident:armident, 0755)" in name for name in names)
@@ -233,6 +235,35 @@ def test_a_removed_cell_keeps_its_recordings_and_its_configuration(image: Path) 
     assert session.read_text() == "schema: armident/session/1\n"
     assert "recordings and results: /var/lib/armident/line3 (1 files, 2.0 MB); never deleted" in done
     assert uninstall("line3", image)[0] == "nothing to do: the service of cell line3 is not installed"
+
+
+@needs_root
+def test_a_capture_is_tied_to_the_can_interfaces_of_its_session(image: Path) -> None:
+    """Without its session there is nothing to tie it to; a second run does it, and a removal undoes it."""
+    drop_in = image / UNITS / "armident-capture@line3.service.d" / "bus.conf"
+    install("line3", image)
+    assert not drop_in.parent.exists()
+    cell = (HERE / "cells" / "emps_cell.yaml").read_text()
+    for line, devices in (
+        ("bus: {interface: udp_multicast, channel: 239.74.163.2}", None),
+        ("bus: {channel: can-0}", [r"sys-subsystem-net-devices-can\x2d0.device"]),
+    ):
+        (image / SETTINGS / "line3.yaml").write_text(re.sub("(?m)^bus: .*", line, cell))
+        install("line3", image)
+        assert drop_in.exists() == (devices is not None)
+    unit = ConfigParser(interpolation=None)
+    unit.optionxform = str  # type: ignore[assignment, method-assign]
+    unit.read_string(drop_in.read_text())
+    found = [unit["Unit"]["BindsTo"], unit["Unit"]["After"], unit["Install"]["WantedBy"]]
+    assert [value.split() for value in found] == 3 * [devices]
+    assert install("line3", image)[0] == "nothing to do: the service of cell line3 is installed"
+    system = ["systemctl", f"--root={image}", "enable", "armident-capture@line3"]
+    subprocess.run(system, check=True, capture_output=True)
+    wanted = image / UNITS / f"{found[0]}.wants" / "armident-capture@line3.service"
+    assert wanted.is_symlink()
+    uninstall("line3", image)
+    assert not wanted.is_symlink()
+    assert not drop_in.parent.exists()
 
 
 @needs_root

@@ -1,5 +1,7 @@
 """Result documents: schema files, round trips, messages about broken files."""
 
+import os
+import stat
 from pathlib import Path
 
 import numpy as np
@@ -12,12 +14,14 @@ from armident.configs.schema.robot import RobotConfig
 from armident.configs.schema.scenario import Scenario
 from armident.configs.schema.session import SessionConfig
 from armident.configs.schema.trajectory import Trajectory
+from armident.daq.recording import write_recording
 from armident.identify.documents.base import plain
 from armident.identify.documents.diagnosis import BeforeAfter, DiagnosisDocument, Gap, Gaps
 from armident.identify.documents.files import from_json, load_document, to_json, write_atomically
 from armident.identify.documents.identification import IdentificationDocument, parameter
 from armident.identify.documents.schemas import SCHEMA_FILES, schema_text
 from tests.evaluation.schema import SuiteConfig
+from tests.unit.daq.test_recording import make_recording
 
 
 def diagnosis() -> DiagnosisDocument:
@@ -82,6 +86,17 @@ def test_a_document_survives_being_written_and_read(tmp_path: Path) -> None:
     write_atomically(path, to_json(diagnosis()))
     assert load_document(path, DiagnosisDocument) == diagnosis()
     assert [p.name for p in path.parent.iterdir()] == ["diagnosis.json"]
+
+
+@pytest.mark.parametrize(("umask", "mode"), [(0o022, 0o644), (0o027, 0o640)])
+def test_the_umask_decides_who_may_read_a_result_as_with_recordings(tmp_path: Path, umask: int, mode: int) -> None:
+    before = os.umask(umask)
+    try:
+        write_atomically(tmp_path / "diagnosis.json", to_json(diagnosis()))
+        write_recording(make_recording(10), tmp_path / "arm.mcap")
+    finally:
+        os.umask(before)
+    assert {stat.S_IMODE(path.stat().st_mode) for path in tmp_path.iterdir()} == {mode}
 
 
 def test_the_schema_key_is_first_and_versioned() -> None:

@@ -5,18 +5,24 @@ import hashlib
 import itertools
 import json
 import multiprocessing
+import os
+import signal
 import sqlite3
 import sys
 from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from typing import cast
 
 import numpy as np
+import psycopg
 import pytest
 import sqlalchemy as sa
 from typer.testing import CliRunner
 
 from armident.configs import ConfigError
 from armident.daq.cli import application
+from armident.identify.diagnosis.change_test import compare
 from armident.identify.documents.files import to_json
 from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.monitoring.change import history_schema
@@ -322,7 +328,7 @@ def test_a_locked_table_on_a_server_is_one_line_and_is_not_waited_for_longer(
         other.execute(sa.text("LOCK TABLE identifications"))
         code, _, err = call(document, "--database", postgres_url)
         assert (code, len(err.strip().splitlines())) == (2, 1)
-        assert "the history cannot be written: locked by another process for more than 0.2 s; try again" in err
+        assert "the history cannot be written: locked by another process for more than 0.18 s; try again" in err
         with pytest.raises(ConfigError, match="the history cannot be read: locked by another process"):
             history.runs()
     engine.dispose()
@@ -351,6 +357,57 @@ def test_a_server_that_ends_a_connection_is_one_line_and_the_next_attempt_succee
     engine.dispose()
 
 
+def of_psycopg(connection: sa.Connection) -> "psycopg.Connection[object]":
+    """The connection of the driver."""
+    return cast("psycopg.Connection[object]", connection.connection.dbapi_connection)
+
+
+@contextmanager
+def stopped(*processes: int) -> Iterator[None]:
+    """Processes of a server that accept connections, which the kernel does, and never answer."""
+    for process in processes:
+        os.kill(process, signal.SIGSTOP)
+    try:
+        yield
+    finally:
+        for process in processes:
+            os.kill(process, signal.SIGCONT)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("moment", ["before_cursor_execute", "commit"])
+def test_a_server_that_hangs_is_left_in_time_whatever_is_waited_for(
+    postgres_url: str, moment: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(history_schema, "BUSY_S", 1.0)
+    history = History(postgres_url)
+    with ExitStack() as stack:
+
+        def hang(connection: sa.Connection, *_: object) -> None:
+            stack.enter_context(stopped(of_psycopg(connection).info.backend_pid))
+
+        sa.event.listen(history._engine, moment, hang, once=True)
+        with pytest.raises(ConfigError, match=r"the history cannot be written: no connection .*silent for 1 s"):
+            history.add(result(0, TRUTH), START)
+    # A server that was only slow may have committed.
+    history.add(result(0, TRUTH), START)
+    assert len(history.runs()) == 1
+
+
+@pytest.mark.slow
+def test_a_server_that_does_not_answer_a_new_connection_is_left_in_time(
+    postgres_url: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(history_schema, "BUSY_S", 1.0)
+    history = History(postgres_url)
+    with history._engine.connect() as connection:
+        status = Path(f"/proc/{of_psycopg(connection).info.backend_pid}/stat").read_text()
+    postmaster = int(status.rpartition(")")[2].split()[1])
+    with stopped(postmaster), pytest.raises(ConfigError, match=r"cannot be read: no connection .*timeout expired"):
+        history.runs()
+    assert history.runs() == []
+
+
 @pytest.mark.slow
 def test_a_reader_without_rights_and_a_server_that_is_not_there_are_one_line(postgres_url: str, server: str) -> None:
     History(postgres_url)
@@ -374,3 +431,120 @@ def test_a_reader_without_rights_and_a_server_that_is_not_there_are_one_line(pos
         with pytest.raises(ConfigError, match=words) as caught:
             History(wrong)
         assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "url",
+    [
+        "postgresql://me:secret@127.0.0.1:1/x",
+        "postgresql://me@127.0.0.1:1/x?password=secret",
+        "postgresql://me@127.0.0.1:1/x?connect_timeout=2&sslpassword=secret&password=secret",
+        "postgresql://me:se@secret@127.0.0.1:1/x",
+        "postgresql//me:secret@127.0.0.1/x",
+        "me:secret@127.0.0.1/x",
+        "postgresql+pg8000://me:secret@127.0.0.1/x",
+    ],
+)
+def test_a_password_is_never_printed(url: str) -> None:
+    code, out, err = call("--database", url)
+    assert code == 2
+    assert "cannot be used as history" in err
+    assert "secret" not in out + err
+
+
+@pytest.mark.slow
+def test_the_password_comes_from_a_credential_of_systemd(
+    postgres_url: str, server: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    history = History(postgres_url)
+    (tmp_path / history_schema.CREDENTIAL).write_text("p@ss word\n")
+    monkeypatch.setenv("CREDENTIALS_DIRECTORY", str(tmp_path))
+    with History(postgres_url)._engine.connect() as connection:
+        assert of_psycopg(connection).pgconn.password == b"p@ss word"
+    # One in the URL counts.
+    own = History(postgres_url.replace("armident@", "armident:own@"))
+    assert own._engine.url.password == "own"
+    assert history._engine.url.password is None
+
+
+def filled(url: str, tmp_path: Path) -> tuple[History, list[IdentificationDocument]]:
+    """A history of three runs, the last one with its comparison, and one recording that was identified twice."""
+    documents = [result(0, TRUTH), result(0, TRUTH + 0.1), result(1, TRUTH), result(2, TRUTH, "other")]
+    former(url, documents)
+    history = History(url)
+    for document, cell in ((documents[0], "left"), (documents[3], None)):
+        history.describe(facts(document, cell))
+    history.judge(documents[2], documents[0], compare(documents[0], documents[2], 1e-4))
+    return history, documents
+
+
+def contents(url: str) -> list[list[tuple[object, ...]]]:
+    """All rows of the tables, without the numbers of the runs."""
+    engine = sa.create_engine(driven(url))
+    with engine.connect() as connection:
+        found = [
+            [tuple(row) for row in connection.execute(query)]
+            for query in (
+                sa.select(*[c for c in history_schema.runs_as_stored.c if c.name != "id"]).order_by(sa.text("digest")),
+                sa.select(history_schema.recordings).order_by(sa.text("sha256")),
+                sa.select(history_schema.runs.c.digest, *history_schema.parameters.c[1:])
+                .join_from(history_schema.runs, history_schema.parameters)
+                .order_by(history_schema.runs.c.digest, history_schema.parameters.c.name),
+                sa.select(history_schema.runs.c.digest, *history_schema.comparisons.c[1:]).join_from(
+                    history_schema.runs, history_schema.comparisons
+                ),
+            )
+        ]
+    engine.dispose()
+    return found
+
+
+@pytest.mark.slow
+def test_a_backup_restores_all_that_the_history_had(url: str, tmp_path: Path) -> None:
+    history, documents = filled(url, tmp_path)
+    added = result(3, TRUTH)
+    assert history.add(added, START + 3 * WEEK)
+    copy = tmp_path / "copy"
+    code, out, err = call("backup", str(copy), "--database", url)
+    assert (code, out) == (0, f"saved 5 identifications in {copy}\n"), err
+    assert contents(f"sqlite:///{copy}") == contents(url)
+    fresh = f"sqlite:///{tmp_path}/fresh.sqlite"
+    # A history that has begun again keeps its own runs; their numbers differ from those of the copy.
+    later = result(4, TRUTH)
+    assert History(fresh).add(later, START + 4 * WEEK)
+    for number in (5, 0):
+        code, out, err = call("restore", str(copy), "--database", fresh)
+        assert (code, out.startswith(f"restored {number} identifications")) == (0, True), err
+    restored = History(fresh)
+    assert [run.document for run in restored.runs("arm")] == [documents[0], documents[2], added, later]
+    assert all(row in now for was, now in zip(contents(url), contents(fresh), strict=True) for row in was)
+    assert restored.cell(documents[0]) == "left"
+
+
+@pytest.mark.slow
+def test_a_backup_goes_back_to_a_server_which_then_takes_new_runs(postgres_url: str, tmp_path: Path) -> None:
+    url = f"sqlite:///{tmp_path}/h.sqlite"
+    filled(url, tmp_path)
+    copy = tmp_path / "copy"
+    assert call("backup", str(copy), "--database", url)[0] == 0
+    code, _, err = call("restore", str(copy), "--database", postgres_url)
+    assert code == 0, err
+    assert contents(postgres_url) == contents(url)
+    assert History(postgres_url).add(result(5, TRUTH), START)
+
+
+def test_a_backup_is_not_replaced_by_an_empty_one_nor_by_itself(tmp_path: Path) -> None:
+    url, copy = f"sqlite:///{tmp_path}/h.sqlite", tmp_path / "copy"
+    copy.write_text("the last backup")
+    for words, reason in (
+        (["backup", str(copy)], "not written, because the history is empty"),
+        (["backup", str(tmp_path / "h.sqlite")], "the history itself"),
+        (["restore", str(tmp_path / "gone")], "no such file"),
+        (["restore", str(copy)], "cannot be used as history: damaged"),
+        (["backup"], "expected one file"),
+    ):
+        code, _, err = call(*words, "--database", url)
+        assert code == 2
+        assert reason in err
+    assert copy.read_text() == "the last backup"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["copy", "h.sqlite"]

@@ -98,6 +98,21 @@ def test_a_locked_history_is_reported_and_the_verdict_is_published(tmp_path: Pat
 
 
 @pytest.mark.usefixtures("quickly")
+def test_the_history_is_written_after_the_verdict_is_published(tmp_path: Path) -> None:
+    work = job(tmp_path)
+    history = History(work.store)
+    known: dict[str, int] = {}
+
+    class Listener(Published):
+        def status(self, state: str, **more: Any) -> None:
+            known[state] = len(history.runs())
+
+    carry_out(work, cast(StatusPublisher, Listener()), lambda _: None)
+    assert known["done"] == 0
+    assert len(history.runs()) == 1
+
+
+@pytest.mark.usefixtures("quickly")
 def test_a_result_that_zenoh_has_not_taken_is_left_to_a_worker(tmp_path: Path, recorded: Recording) -> None:
     work = job(tmp_path)
     carry_out(work, cast(StatusPublisher, Published(reachable=False)), lambda _: None)

@@ -44,3 +44,11 @@ def clock_state() -> ClockState:
     unit = 1e-3 if timex.status & _NANOSECONDS else 1.0
     synchronised = state != _TIME_ERROR and not timex.status & _UNSYNCHRONISED
     return ClockState(timex.offset * unit, float(timex.esterror), float(timex.maxerror), synchronised)
+
+
+def clock_is_right() -> bool:
+    """Return True if the clock is known to be synchronised: one that is ahead makes everything old."""
+    try:
+        return clock_state().synchronised
+    except OSError:
+        return False
