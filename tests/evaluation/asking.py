@@ -35,7 +35,6 @@ from armident.identify.documents.diagnosis import Explanation
 from armident.identify.documents.investigation import MotionChoice
 from armident.identify.effects.unnamed import NAME as UNNAMED
 from armident.identify.excitation.collision import CollisionModel
-from armident.identify.excitation.design import design_trajectory
 from armident.identify.investigation import choice as choices
 from armident.identify.investigation.choice import Chosen
 from armident.identify.investigation.folder import Progress
@@ -77,15 +76,13 @@ class Asking(Investigating):
 
 
 class Excited(Asking):
-    """Asks for exciting trajectories, each with another seed."""
+    """Asks for exciting trajectories (D-optimal) within the same limits, each with another seed."""
 
     def choose(self, state: ModelState, explanations: Sequence[Explanation], done: Sequence[MotionChoice]) -> Chosen:
         """Return another exciting trajectory."""
-        made = design_trajectory(
-            state.robot, choices.EXCITATION_S, seed=len(done), evaluations=choices.EVALUATIONS, theta=state.fit.theta
-        )
-        motion = MotionChoice(motion="excitation", words="excitation", duration_s=made.trajectory.duration)
-        return Chosen("", (motion,), motion, made.trajectory)
+        reach = choices.reach_of_recordings(state)
+        motion, made = choices.excitation_of(state.robot, reach, state.fit.theta, self.collision, seed=len(done))
+        return Chosen("", (motion,), None if made is None else motion, made)
 
 
 class Drawn(Asking):
