@@ -94,6 +94,9 @@ def design_trajectory(
     """
     robot.check_movable()
     model = arm_model(robot)
+    if any(term.depends_on_torque for term in model.terms):
+        # Without parameters, the torques on which these terms depend are not known.
+        model = model.without_terms() if theta is None else model.anchored(theta)
     limits = [joint.limits for joint in robot.joints]
     sigma = np.array([limit.torque for limit in limits]) if noise is None else np.asarray(noise, dtype=np.float64)
     if sigma.shape != (robot.n,) or not (sigma > 0.0).all():

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from armident.configs import ConfigError, load_robot, load_trajectory
+from armident.configs.schema.robot import Effect
 from armident.identify.effects.terms import arm_model
 from armident.identify.excitation.design import design_trajectory, predict_precision
 from armident.identify.robot.arm import ArmModel
@@ -83,3 +84,13 @@ def test_one_prismatic_axis_is_excited_too() -> None:
 def test_noise_of_the_wrong_length_is_refused(tx40: ArmModel) -> None:
     with pytest.raises(ConfigError, match="expected 6 positive numbers"):
         design_trajectory(tx40.robot, 5.0, noise=[1.0])
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_an_effect_of_predicted_torques_does_not_hinder_a_design(tx40: ArmModel, known: bool) -> None:
+    entry = Effect(effect="encoder_eccentricity", joint=tx40.robot.joints[1].name, parameters={"harmonic": 1.0})
+    robot = tx40.robot.model_copy(update={"effects": (entry,)})
+    model = arm_model(robot)
+    rigid = [TABLE_B4[name][0] if name in TABLE_B4 else 0.0 for name in tx40.base.names]
+    theta = [*rigid, *np.zeros(model.e)] if known else None
+    design_trajectory(robot, 2.0, evaluations=3, theta=theta).trajectory.check(robot, "design")
