@@ -10,6 +10,8 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
 
+from armident.daq.recording.names import in_order
+
 _NAME = re.compile(r"-(\d{8}T\d{6})-(\d{3})Z(?:\.\d+)?\.mcap(?:\.damaged)?$")
 LONGEST_PAUSE = datetime.timedelta(days=365)
 """Longest time between two recordings of a robot that is a pause: an arm is identified again at least once a year."""
@@ -74,7 +76,7 @@ def recordings_in(directory: Path, robot: str) -> Iterator[tuple[Path, datetime.
             with suppress(ValueError):
                 made = datetime.datetime.strptime(f"{match[1]}.{match[2]}+0000", "%Y%m%dT%H%M%S.%f%z")
                 found.append((path, made))
-    yield from sorted(found, key=lambda entry: entry[0].name)
+    yield from sorted(found, key=lambda entry: in_order(entry[0]))
 
 
 def is_being_written(path: Path) -> bool:

@@ -1,16 +1,24 @@
 """Recordings of a cell in folders: the files of each capture, whether they are finished, and earlier results."""
 
 import glob
+import os
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 
 from armident.configs import ArmidentError, DataError
-from armident.daq.recording import Recording, is_recording, join_parts, read_recording
+from armident.daq.recording import Recording, is_recording, join_parts, read_recording, unpacked_bytes
+from armident.daq.recording.names import in_order
 from armident.daq.recording.retention import is_being_written
 from armident.identify.documents.files import load_document
 from armident.identify.documents.identification import IdentificationDocument
+from armident.identify.monitoring.worker.ledger import FoundFiles
+
+MOST_BYTES = 3_500_000_000
+"""Largest size of a recording that is read, bytes of its unpacked records: an hour of six axes at 5 kHz (190 bytes a
+row), which is identified in less than 4 GB."""
 
 _PART = re.compile(r"(?P<name>.+?)(?:\.\d{4,})?\.mcap")
 
@@ -33,47 +41,74 @@ class Captured:
         return {name for name in names if _PART.fullmatch(name)} <= {path.name for path in self.paths}
 
     @property
-    def stamp(self) -> str:
+    def stamps(self) -> tuple[str, ...]:
         """Sizes and times of change of the files, to notice a change; raises OSError if a file has vanished."""
-        stats = [path.stat() for path in self.paths]
-        return ";".join(f"{path.name}:{s.st_size}:{s.st_mtime_ns}" for path, s in zip(self.paths, stats, strict=True))
+        return tuple(f"{path.name}:{s.st_size}:{s.st_mtime_ns}" for path in self.paths for s in [path.stat()])
+
+    def found(self, *, any_cell: bool = False) -> FoundFiles:
+        """Return the files as the ledger takes them; raises OSError if a file has vanished."""
+        made = max(path.stat().st_mtime for path in self.paths)
+        return FoundFiles(self.name, self.paths, self.stamps, made, any_cell)
+
+    def parts(self) -> "list[Captured]":
+        """Return each file as a capture of its own."""
+        return [Captured(path.name.removesuffix(".mcap"), (path,)) for path in self.paths]
+
+    @property
+    def nbytes(self) -> int:
+        """Size of the unpacked records of its files, bytes; raises OSError if one cannot be read."""
+        return sum(map(_unpacked_bytes, self.paths, self.stamps))
+
+    def check_size(self) -> None:
+        """Raise DataError if the recording is larger than `MOST_BYTES`, OSError if a file cannot be read."""
+        size = self.nbytes
+        if size > MOST_BYTES:
+            raise DataError(
+                f"{self.paths[0]}: it unpacks to {size / 1e9:.1f} GB, a worker reads {MOST_BYTES / 1e9:.1f} GB; "
+                "let captures begin new files (recording.rotate_minutes), or run armident identify on this one"
+            )
 
     def read(self) -> Recording:
         """Return the recording, joined of its files. Raises ArmidentError if a file cannot be read."""
         return join_parts([read_recording(path) for path in self.paths])
 
 
+@lru_cache(maxsize=1000)
+def _unpacked_bytes(path: Path, _stamp: str) -> int:
+    return unpacked_bytes(path)
+
+
 def captured_in(folders: Sequence[Path], robot: str) -> list[Captured]:
     """Captures of a robot in existing folders, without their subfolders, in the order of their names."""
     found: dict[tuple[Path, str], list[Path]] = {}
     for folder in {folder.resolve(): None for folder in folders}:
-        for path in folder.glob(f"{robot}-*.mcap") if folder.is_dir() else ():
+        for path in map(Path, glob.iglob(f"{glob.escape(os.fspath(folder))}/{glob.escape(robot)}-*.mcap")):
             match = _PART.fullmatch(path.name)
-            if match is not None and is_recording(path):
+            if match is not None:
                 found.setdefault((folder, match["name"]), []).append(path)
     ordered = sorted(found.items(), key=lambda each: each[0][1])
-    return [Captured(name, tuple(sorted(paths))) for (_, name), paths in ordered]
+    return [Captured(name, tuple(sorted(paths, key=in_order))) for (_, name), paths in ordered]
 
 
-def captured_as(paths: Sequence[Path]) -> list[Captured]:
+def captured_as(paths: Iterable[Path]) -> list[Captured]:
     """Return the captures of these files, which are parts of one capture or of one event each."""
     found: dict[str, list[Path]] = {}
     for path in paths:
         match = _PART.fullmatch(path.name)
         if match is not None and is_recording(path):
             found.setdefault(match["name"], []).append(path.resolve())
-    return [Captured(name, tuple(sorted(files))) for name, files in found.items()]
+    return [Captured(name, tuple(sorted(files, key=in_order))) for name, files in found.items()]
 
 
-def is_of(recording: Recording, cell: str | None, robot: str) -> bool:
-    """True if a recording is of a robot in a cell (``None``: any); raises DataError if it is, and empty."""
+def foreign(recording: Recording, cell: str | None, robot: str) -> str | None:
+    """Return why a recording is none of a robot in a cell (``None``: any cell), or ``None``."""
     session = None if recording.session is None else recording.session.cell
     found = recording.metadata.get("cell", session)
-    if recording.robot.name != robot or (cell is not None and found != cell):
-        return False
-    if recording.samples.sync.size == 0:
-        raise DataError(f"{recording.path}: it holds no samples")
-    return True
+    if recording.robot.name != robot:
+        return f"of robot {recording.robot.name}, not {robot}"
+    if cell is not None and found != cell:
+        return f"it names no cell, the worker's is {cell}" if found is None else f"of cell {found}, not {cell}"
+    return None if recording.samples.sync.size else "it holds no samples"
 
 
 def result_of(sha256: str, folder: Path) -> tuple[Path, IdentificationDocument] | None:

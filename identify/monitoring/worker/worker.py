@@ -12,6 +12,7 @@ from typing import TypeVar
 
 from armident.configs import ArmidentError, DataError, RobotConfig, SessionConfig, load_robot, load_session
 from armident.configs.reasons import reason_of
+from armident.daq.recording import Recording
 from armident.daq.streaming import Keys
 from armident.identify.identification.identify_recording import identify_recording
 from armident.identify.identification.options import options_of
@@ -26,11 +27,7 @@ from armident.identify.monitoring.worker.ledger import (
     State,
     unique_owner,
 )
-from armident.identify.monitoring.worker.recorded import (
-    Captured,
-    captured_in,
-    result_of,
-)
+from armident.identify.monitoring.worker.recorded import result_of
 from armident.identify.monitoring.worker.stream_buffer import LARGEST_BLOCK, LARGEST_EVENT, StreamBuffer
 from armident.identify.monitoring.worker.worker_link import LinkDown, WorkerLink
 from armident.identify.report.robot_file import write_identification
@@ -73,7 +70,7 @@ class Worker:
         self._results: queue.Queue[int] = queue.Queue()
         self._buffer = StreamBuffer()
         self._lock = threading.Lock()
-        self._intake = Intake(session.cell, robot.name, self._folder, self._buffer, self._lock, self._refuse)
+        self._intake = Intake(session.cell, robot.name, self._folder_of, self._buffer, self._lock, self._refuse)
         self._last: bytes | None = None
         self._problem: str | None = None
         self._progress = progress
@@ -158,7 +155,7 @@ class Worker:
                 for assembly in ended:
                     self._intake.take_stream(ledger, assembly)
                 if time.monotonic() - scanned >= SCAN_S:
-                    self._intake.add_files(ledger, captured_in(self._folders, self._robot.name))
+                    self._intake.scan(ledger, self._folders)
                     scanned = time.monotonic()
                 entry = ledger.claim(held=tuple(self._intake.streams), announce=self._link.can_announce)
                 self._problem = None
@@ -177,8 +174,10 @@ class Worker:
 
     def _opened(self) -> Ledger:
         if self._ledger is None:
-            self._ledger = Ledger(self._out / FILE, self._owner)
-            last = self._ledger.last_result()
+            ledger = Ledger(self._out / FILE, self._owner)
+            self._intake.begin(ledger)
+            self._ledger = ledger
+            last = ledger.last_result()
             if last is not None and last.is_file():
                 self._last = last.read_bytes()
         return self._ledger
@@ -194,14 +193,11 @@ class Worker:
         self._link.status("failed", capture=capture, message=message)
         self._results.put(code)
 
-    def _folder(self, name: str) -> Path:
-        return self._out / f"{name}.identification"
-
     def _folder_of(self, entry: LedgerEntry) -> Path:
         """Return the folder of a result; another one if a recording of the same name has a result there."""
-        plain = self._folder(entry.name)
+        plain = self._out / f"{entry.name}.identification"
         taken = (plain / "identification.json").is_file() and result_of(entry.sha256, plain) is None
-        return self._folder(f"{entry.name}.{entry.sha256[:8]}") if taken else plain
+        return self._out / f"{entry.name}.{entry.sha256[:8]}.identification" if taken else plain
 
     def _process(self, ledger: Ledger, entry: LedgerEntry) -> None:
         """Identify a recording, enter and announce the result; what was done before is not repeated."""
@@ -209,8 +205,13 @@ class Worker:
         if entry.state == "waiting":
             try:
                 if entry.attempts > MOST_ATTEMPTS:
-                    raise DataError(f"{entry.name}: {MOST_ATTEMPTS} workers have ended while they identified it")
-                path, verdict = self._identify(entry)
+                    raise DataError(f"{entry.name}: {MOST_ATTEMPTS} workers have ended while they worked on it")
+                self._advance(f"reading {entry.name}")
+                found = self._intake.read(ledger, entry)
+                if found is None:
+                    return
+                entry, recording = found
+                path, verdict = self._identify(entry, recording)
             except _Closing:
                 raise
             except ArmidentError as error:
@@ -240,13 +241,12 @@ class Worker:
             log.warning("%s: lease expired: the result of the other worker is used", entry.name)
         return mine
 
-    def _identify(self, entry: LedgerEntry) -> tuple[Path, str]:
+    def _identify(self, entry: LedgerEntry, recording: Recording) -> tuple[Path, str]:
         """Return the file of the result and its verdict; a result that a killed worker has written is used."""
         folder = self._folder_of(entry)
         found = result_of(entry.sha256, folder)
         if found is not None:
             return found[0], found[1].verdict or ""
-        recording = Captured(entry.name, entry.paths).read() if entry.paths else self._intake.streams[entry.sha256]
         source = "file" if entry.paths else "stream"
         self._advance(f"identifying {entry.name}")
         print(f"worker: {recording.samples.sync.size} samples from the {source}, identifying", flush=True)

@@ -96,7 +96,9 @@ def test_the_newest_result_is_the_last_one_also_after_a_step_of_the_clock_back(
         with one.announcement(digest) as mine:
             assert mine
     assert one.last_result() == Path("second.json")
-    assert one.adopt("c" * 64, "z", [Path("z.mcap")], Path("third.json"), "trustworthy")
+    one.add("c" * 64, "z", [Path("z.mcap")])
+    assert one.claim() is not None
+    assert one.finish("c" * 64, "done", Path("third.json"), "trustworthy", announced=True)
     assert one.last_result() == Path("third.json")
 
 
@@ -145,7 +147,7 @@ def test_a_ledger_that_is_locked_damaged_or_newer_is_one_line(tmp_path: Path, mo
             Ledger(path, "two").add(A, "x", [])
     db.execute("PRAGMA user_version = 99")
     db.close()
-    with pytest.raises(ArmidentError, match="ledger of version 99, this program knows 1"):
+    with pytest.raises(ArmidentError, match="ledger of version 99, this program knows 2"):
         Ledger(path, "one")
     path.write_bytes(b"x" * 5000)
     with pytest.raises(ArmidentError, match="the ledger is damaged"):
