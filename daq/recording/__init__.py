@@ -2,7 +2,7 @@
 
 from armident.daq.recording.layout import StreamLayout
 from armident.daq.recording.model import Field, Gap, Mark, Recording, Stream, join_parts
-from armident.daq.recording.reader import has_end, is_recording, read_recording, unpacked_bytes
+from armident.daq.recording.reader import is_recording, read_recording
 from armident.daq.recording.recovery import Recovered, recover_recording
 from armident.daq.recording.ring_buffer import TriggeredSeries
 from armident.daq.recording.rotation import RecordingSeries
@@ -21,11 +21,9 @@ __all__ = [
     "Stream",
     "StreamLayout",
     "TriggeredSeries",
-    "has_end",
     "is_recording",
     "join_parts",
     "read_recording",
     "recover_recording",
-    "unpacked_bytes",
     "write_recording",
 ]

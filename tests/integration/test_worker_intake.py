@@ -21,9 +21,9 @@ from armident.daq.recording import (
     StreamLayout,
     mcap_records,
     read_recording,
-    unpacked_bytes,
     write_recording,
 )
+from armident.daq.recording.reader import unpacked_bytes
 from armident.identify.documents.files import load_document
 from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.monitoring.worker import intake
@@ -69,7 +69,7 @@ def work_until_poisoned(folder: Path) -> None:
             os.kill(os.getpid(), signal.SIGKILL)
         return read(captured)
 
-    Captured.read = poisoned  # type: ignore[method-assign]
+    Captured.read = poisoned  # type: ignore[method-assign, assignment]
     with Worker(cell_of(folder), ROBOT, folder) as worker:
         worker.result()
         worker.result()
@@ -92,7 +92,7 @@ def test_a_file_that_ends_its_workers_is_counted_before_it_is_read_and_holds_up_
     with Ledger(tmp_path / FILE, "killed")._transaction() as db:
         db.execute("UPDATE experiments SET owner = NULL")
     with closing(Audience(session, "emps")), Worker(session, ROBOT, tmp_path) as worker:
-        assert worker.result(LONGEST_S) == 3
+        assert worker.result(LONGEST_S) == 1
     failed = entries(tmp_path)["emps-poison"]
     assert (failed.state, failed.announced, failed.digest) == ("failed", True, None)
     assert f"{MOST_ATTEMPTS} workers have ended" in (failed.message or "")
@@ -265,7 +265,6 @@ def test_a_torn_file_that_no_longer_changes_is_identified(
 def test_a_file_that_changes_while_it_is_read_is_read_again(
     session: SessionConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(intake, "AGAIN_S", 0.5)
     recorded(session, "a", 1)
     ledger = Ledger(tmp_path / FILE, "one")
     reader = intake.Intake(session.cell, "emps", lambda _: tmp_path, StreamBuffer(), threading.Lock(), print)
@@ -281,10 +280,14 @@ def test_a_file_that_changes_while_it_is_read_is_read_again(
 
     monkeypatch.setattr(Captured, "read", while_replaced)
     assert reader.read(ledger, entry) is None
-    assert "emps-a.mcap: it changed while it was read; trying again" in caplog.text
+    assert "emps-a: it changed while it was read; trying again" in caplog.text
     monkeypatch.setattr(Captured, "read", read)
-    wait_for(lambda: (again := ledger.claim()) is not None and reader.read(ledger, again) is not None)
-    (entry,) = ledger.entries()
+    assert ledger.claim() is None
+    reader.scan(ledger, [tmp_path])
+    again = ledger.claim()
+    assert again is not None
+    assert reader.read(ledger, again) is not None
+    entry = ledger.entries()[-1]
     assert entry.digest == read_recording(tmp_path / "emps-a.mcap").sha256
 
 
@@ -301,7 +304,7 @@ def test_a_file_that_is_deleted_is_passed_over_and_found_again_under_another_nam
     (tmp_path / "emps-a.mcap").rename(tmp_path / "away")
     with Worker(session, ROBOT, tmp_path) as worker:
         wait_for(lambda: entries(tmp_path)["emps-a"].state == "passed")
-        assert "emps-a.mcap: deleted before it was identified; passed over" in caplog.text
+        assert "emps-a.mcap: no such recording; trying again" in caplog.text
         (tmp_path / "away").rename(tmp_path / "emps-b.mcap")
         assert worker.result(LONGEST_S) == 0
     assert {name: entry.state for name, entry in entries(tmp_path).items()} == {"emps-b": "done"}

@@ -4,13 +4,14 @@ import logging
 import math
 import threading
 import time
-from collections.abc import Callable, Sequence, Set
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
 
-from armident.configs import ArmidentError, DataError
+from armident.configs import ConfigError, DataError
 from armident.configs.reasons import reason_of
-from armident.daq.recording import Recording, has_end
+from armident.daq.recording import Recording
+from armident.daq.recording.reader import has_end
 from armident.daq.recording.retention import is_being_written
 from armident.identify.monitoring.worker.ledger import Ledger, LedgerEntry
 from armident.identify.monitoring.worker.recorded import (
@@ -18,8 +19,9 @@ from armident.identify.monitoring.worker.recorded import (
     Captured,
     captured_as,
     captured_in,
-    foreign,
+    check_origin,
     result_of,
+    stamp_of,
 )
 from armident.identify.monitoring.worker.stream_buffer import MOST_NAMES, Assembly, StreamBuffer, drop_oldest
 
@@ -27,8 +29,6 @@ log = logging.getLogger(__name__)
 
 STILL_S = 60.0
 """Time without a change after which a file without an end counts as torn, not as one that is being copied, s."""
-AGAIN_S = 60.0
-"""Time after which a file that could not be read, or that changed meanwhile, is tried again, s."""
 
 
 class Intake:
@@ -72,8 +72,8 @@ class Intake:
             streamed = None
             if not found or (assembly.complete and not assembly.too_long and not assembly.triggered):
                 streamed = assembly.recording()
-                if not found and (reason := foreign(streamed, None, self._robot)) is not None:
-                    raise DataError(f"capture {assembly.capture}: {reason}")
+                if not found:
+                    check_origin(streamed, None, self._robot)
         except DataError as error:
             if not found:
                 self._refuse(assembly, error)
@@ -101,34 +101,25 @@ class Intake:
         self._enter(ledger, found, None)
 
     def read(self, ledger: Ledger, entry: LedgerEntry) -> tuple[LedgerEntry, Recording] | None:
-        """Return a claimed recording with its hash; ``None`` if it is passed over, known, or read again later.
-
-        Raises DataError if it is too large.
-        """
+        """Return a claimed recording with its hash; ``None`` if it is passed over, known, or read again later."""
         if not entry.paths:
             return entry, self.streams[entry.sha256]
         captured = Captured(entry.name, entry.paths)
-        try:
-            before = captured.stamps
-            captured.check_size()
-        except OSError as error:
-            return self._not_read(ledger, entry, reason_of(error))
+        before = captured.stamps
         try:
             recording = captured.read()
-            reason = foreign(recording, None if entry.any_cell else self._cell, self._robot)
+            check_origin(recording, None if entry.any_cell else self._cell, self._robot)
+            if captured.stamps != before:
+                raise ConfigError("it changed while it was read")
+        except (ConfigError, OSError) as error:
+            # It may be deleted, or on a disk that is mounted again later.
+            reason = reason_of(error) if isinstance(error, OSError) else str(error)
+            self._pass_over(ledger, entry, f"{entry.name}: {reason}", again=True)
         except DataError as error:
-            reason = str(error)
-        except (ArmidentError, OSError) as error:
-            return self._not_read(ledger, entry, reason_of(error) if isinstance(error, OSError) else str(error))
-        try:
-            changed = captured.stamps != before
-        except OSError:
-            changed = True
-        if changed:
-            return self._not_read(ledger, entry, "it changed while it was read")
-        if reason is not None:
-            return self._pass_over(ledger, entry, reason)
-        return self._settled(ledger, entry, recording)
+            self._pass_over(ledger, entry, str(error))
+        else:
+            return self._settled(ledger, entry, recording)
+        return None
 
     def _settled(
         self, ledger: Ledger, entry: LedgerEntry, recording: Recording
@@ -139,44 +130,40 @@ class Intake:
             return None
         settled = ledger.entry(digest)
         assert settled is not None
-        found = result_of(digest, self._folder_of(settled)) if entry.unread else None
+        found = result_of(digest, self._folder_of(settled)) if entry.digest is None else None
         if found is not None:
             # It was announced before this ledger existed.
-            ledger.finish(digest, "done", found[0], found[1].verdict or "", announced=True)
+            ledger.finish(digest, "done", found[0], found[1].verdict or "")
+            ledger.enter_announced(digest)
             return None
         return settled, recording
 
-    def _not_read(self, ledger: Ledger, entry: LedgerEntry, reason: str) -> None:
-        if not all(path.exists() for path in entry.paths):
-            self._pass_over(ledger, entry, "deleted before it was identified")
+    def _pass_over(self, ledger: Ledger, entry: LedgerEntry, reason: str, *, again: bool = False) -> None:
+        """Enter why a recording is none; ``again``: the next search takes its files for new ones."""
+        ledger.finish(entry.sha256, "passed", None, reason)
+        if not again:
+            log.warning("%s; passed over", reason)
             return
+        ledger.forget(entry.paths)
+        for path in entry.paths:
+            self._known.pop(path, None)
         with self._lock:
-            self._buffer.refuse("files", f"{_named(entry, reason)}; trying again")
-        ledger.postpone(entry.sha256, AGAIN_S)
+            self._buffer.refuse("files", f"{reason}; trying again")
 
-    def _pass_over(self, ledger: Ledger, entry: LedgerEntry, reason: str) -> None:
-        log.warning("%s; passed over", _named(entry, reason))
-        ledger.finish(entry.sha256, "passed", None, reason, announced=True)
-
-    def _stretches(self, ledger: Ledger, captured: Captured, unfinished: Set[Path], *, growing: bool) -> list[Captured]:
+    def _stretches(self, ledger: Ledger, captured: Captured, unfinished: set[Path], *, growing: bool) -> list[Captured]:
         """Return what is identified as one recording: a finished capture, or each finished file of a long one.
 
         A capture whose files were entered one by one stays so: when old ones are deleted, the rest is not joined.
         """
         finished = Captured(captured.name, tuple(path for path in captured.paths if path not in unfinished))
         with suppress(FileNotFoundError):
-            if len(captured.paths) > 1 and (finished.nbytes > MOST_BYTES or ledger.alone(captured.paths)):
+            if len(captured.paths) > 1 and (ledger.alone(captured.paths) or finished.nbytes > MOST_BYTES):
                 return [part for part in finished.parts() if self._is_new(part)]
         return [] if growing or unfinished.intersection(captured.paths) else [captured]
 
     def _is_new(self, captured: Captured) -> bool:
         """Return True if a file is not known with its present stamp."""
-        try:
-            return any(
-                self._known.get(path) != stamp for path, stamp in zip(captured.paths, captured.stamps, strict=True)
-            )
-        except OSError:
-            return False
+        return any(self._known.get(path) != stamp_of(path) for path in captured.paths)
 
     def _is_finished(self, path: Path) -> bool:
         """Return True if nobody writes a file any more; otherwise the reason is reported once."""
@@ -194,42 +181,37 @@ class Intake:
 
     def _not_finished(self, path: Path) -> str | None:
         if not path.is_file():
-            return "no file: a link that leads nowhere, a folder or a pipe"
+            return "no file, but a link that leads nowhere, a folder or a pipe"
         if is_being_written(path):
             return "a capture writes it"
         if has_end(path):
             return None
-        (stamp,) = Captured("", (path,)).stamps
-        seen, since = self._changed.get(path, ("", 0.0))
-        if seen != stamp:
-            since = time.monotonic()
-            self._changed[path] = stamp, since
-        still = time.monotonic() - since >= STILL_S
+        stamp, now = stamp_of(path), time.monotonic()
+        if self._changed.setdefault(path, (stamp, now))[0] != stamp:
+            self._changed[path] = stamp, now
+        still = now - self._changed[path][1] >= STILL_S
         return None if still else f"it has no end, and did not stay the same for {STILL_S:g} s"
 
     def _enter(
         self, ledger: Ledger, captures: Sequence[Captured], streamed: str | None, *, announced: bool = False
     ) -> None:
         """Enter finished captures; ``streamed``: hash of their stream."""
-        entered = []
+        found = []
         for captured in captures:
-            try:
-                entered.append(captured.found(any_cell=announced))
-            except OSError:
-                continue
+            with suppress(OSError):
+                found.append(captured.found(any_cell=announced))
+        entered = [each for each in found if announced or each.made >= self._since]
+        if len(entered) < len(found):
+            log.info("%d recordings from before --since are passed over", len(found) - len(entered))
         ledger.enter(entered)
-        for each in entered:
+        for each in found:
             self._known.update(zip(each.paths, each.stamps, strict=True))
-            key = None if streamed is None else ledger.key_of(each.paths[0])
-            if len(entered) > 1:
-                # Each is a part of the stream only.
-                continue
-            if streamed is not None and key == each.key:
-                self._streamed[key] = streamed
-                while len(self._streamed) > MOST_NAMES:
-                    del self._streamed[next(iter(self._streamed))]
-            elif streamed is not None and key is not None:
-                _compare(each.paths[0], streamed, key)
+        if streamed is not None and len(entered) == 1:
+            key = ledger.key_of(entered[0].paths[0])
+            if key == entered[0].key:
+                self._streamed = dict([*self._streamed.items(), (key, streamed)][-MOST_NAMES:])
+            else:
+                _compare(entered[0].paths[0], streamed, key)
 
     def _refuse(self, assembly: Assembly, error: DataError) -> None:
         paths = [str(path) for path in (assembly.end or {}).get("paths", ())]
@@ -242,8 +224,3 @@ class Intake:
 def _compare(path: Path, streamed: str, digest: str) -> None:
     if streamed != digest:
         log.warning("%s: the stream has other samples than the file, which counts", path)
-
-
-def _named(entry: LedgerEntry, reason: str) -> str:
-    path = str(entry.paths[0])
-    return reason if path in reason else f"{path}: {reason}"

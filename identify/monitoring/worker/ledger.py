@@ -6,21 +6,25 @@ written, then entered, then announced. The announcement and its entry are one tr
 entered is entered by the others, which have heard it.
 """
 
+import fcntl
 import hashlib
 import json
+import logging
 import os
 import secrets
 import socket
 import sqlite3
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 from armident.configs import ArmidentError
 from armident.configs.reasons import reason_of
+
+log = logging.getLogger(__name__)
 
 FILE = "worker.sqlite"
 """Name of the ledger in the folder of the results."""
@@ -32,7 +36,7 @@ MOST_ATTEMPTS = 12
 """Number of workers that may end while they read or identify a recording before it is given up. If every second worker
 ends for another reason, such as a restart, a good recording is given up once in 4000."""
 
-State = Literal["waiting", "done", "failed", "passed"]
+State = Literal["waiting", "done", "failed", "passed", "ignored"]
 
 _MIGRATIONS = (
     """
@@ -60,6 +64,7 @@ _MIGRATIONS = (
     """
     ALTER TABLE experiments ADD COLUMN made REAL NOT NULL DEFAULT 0;
     ALTER TABLE experiments ADD COLUMN any_cell INTEGER NOT NULL DEFAULT 0;
+    ALTER TABLE experiments ADD COLUMN version TEXT;
     UPDATE experiments SET made = added;
     DELETE FROM files WHERE sha256 IS NULL;
     """,
@@ -72,7 +77,11 @@ class LedgerError(ArmidentError):
 
 
 class LedgerUnusable(ArmidentError):
-    """The ledger is damaged, or of a newer version."""
+    """The ledger is damaged, deleted, or of a newer version."""
+
+
+class LedgerLost(LedgerUnusable):
+    """The ledger is damaged or was deleted: a new one finds the results."""
 
 
 _UNREAD = "file:"
@@ -101,10 +110,11 @@ class FoundFiles:
 
 @dataclass(frozen=True)
 class LedgerEntry:
-    """Recording in the ledger: ``waiting``, ``done``, ``failed``, or ``passed`` over: not one of this cell.
+    """Recording: ``waiting``, ``done``, ``failed``, ``passed`` over (none of this cell), or ``ignored`` by a user.
 
     ``sha256``: of its samples, or the key of files that were not read; ``paths``: none if it exists in the stream only.
     ``attempts``: claims, this one included; ``message``: verdict, or reason of a failure or of passing over.
+    ``version``: of the program, if the failure may be its fault.
     """
 
     sha256: str
@@ -116,21 +126,23 @@ class LedgerEntry:
     message: str | None
     announced: bool
     any_cell: bool
-
-    @property
-    def unread(self) -> bool:
-        """True if its files were not read yet."""
-        return self.sha256.startswith(_UNREAD)
+    version: str | None
 
     @property
     def digest(self) -> str | None:
         """SHA-256 of its samples, hexadecimal; ``None`` if its files were not read yet."""
-        return None if self.unread else self.sha256
+        return None if self.sha256.startswith(_UNREAD) else self.sha256
 
 
-_COLUMNS = "sha256, name, paths, state, attempts, result, message, announced, any_cell"
+_COLUMNS = "sha256, name, paths, state, attempts, result, message, announced, any_cell, version"
 _LATER = "max(:time, coalesce((SELECT max(finished) FROM experiments), 0) + 0.001)"
 """Time of a result: later than all others, also after a step of the clock back."""
+ACTIONS = {"retry": {"state": "waiting", "announced": 0}, "ignore": {"state": "ignored", "announced": 1}}
+"""What a user can do with recordings without a result, and their state afterwards."""
+_RESET = (
+    "UPDATE experiments SET state = :state, announced = :announced, attempts = 0, owner = NULL, message = NULL, "
+    "version = NULL"
+)
 _REVIVE = (
     "UPDATE experiments SET name = :name, paths = :paths, state = 'waiting', announced = 0 "
     "WHERE sha256 = :sha256 AND (state = 'passed' OR (state = 'waiting' AND :paths != '[]'))"
@@ -143,7 +155,7 @@ class Ledger:
     """Ledger in a file, shared by all processes that work on the recordings of a folder.
 
     It is on a local disk (SQLite's write-ahead log). ``lease_s``: end of a claim that is not renewed, s. ``clock``: one
-    that nobody sets. Raises LedgerError if locked or full, LedgerUnusable if damaged or newer.
+    that nobody sets. Raises LedgerError if locked or full, LedgerUnusable if damaged, deleted meanwhile, or newer.
     """
 
     def __init__(
@@ -154,7 +166,9 @@ class Ledger:
         self._boot = _boot_id()
         with self._errors():
             path.parent.mkdir(parents=True, exist_ok=True)
-        with self._transaction() as db:
+        with self._transaction("rwc") as db:
+            if (found := db.execute("PRAGMA integrity_check(1)").fetchone()[0]) != "ok":
+                raise sqlite3.DatabaseError(found)
             version = int(db.execute("PRAGMA user_version").fetchone()[0])
             if version > len(_MIGRATIONS):
                 raise LedgerUnusable(
@@ -213,10 +227,15 @@ class Ledger:
         with self._transaction() as db:
             return {Path(path): stamp for path, stamp in db.execute("SELECT path, stamp FROM files")}
 
-    def key_of(self, path: Path) -> str | None:
-        """Return the hash of the recording of a file, or its key if it was not read; ``None`` if it is unknown."""
+    def key_of(self, path: Path) -> str:
+        """Return the hash of the recording of a file that was entered, or its key if it was not read."""
         with self._transaction() as db:
-            return _file(db, str(path))[1]
+            return str(_file(db, str(path))[1])
+
+    def forget(self, paths: Sequence[Path]) -> None:
+        """Forget files: the next search enters them again if they are there."""
+        with self._transaction() as db:
+            db.executemany("DELETE FROM files WHERE path = ?", [(str(path),) for path in paths])
 
     def alone(self, paths: Sequence[Path]) -> bool:
         """Return True if one of these files was entered as a recording of its own."""
@@ -278,26 +297,18 @@ class Ledger:
         with self._transaction() as db:
             db.execute("UPDATE experiments SET owner = NULL WHERE owner = :owner", self._me())
 
-    def postpone(self, sha256: str, seconds: float) -> None:
-        """End a claim without an attempt; the recording can be claimed after a time, s."""
-        with self._transaction() as db:
-            db.execute(
-                "UPDATE experiments SET owner = '', lease_until = :now + :seconds, attempts = attempts - 1 "
-                "WHERE sha256 = :sha256 AND owner = :owner",
-                self._me() | {"sha256": sha256, "seconds": seconds},
-            )
-
-    def finish(self, sha256: str, state: State, result: Path | None, message: str, *, announced: bool = False) -> bool:
+    def finish(self, sha256: str, state: State, result: Path | None, message: str, version: str | None = None) -> bool:
         """Enter a result or failure; False if the claim was lost to another worker, whose result counts.
 
-        ``announced``: it needs no announcement.
+        ``version``: of the program, if the failure may be its fault. ``passed`` needs no announcement.
         """
         values = {"sha256": sha256, "state": state, "result": None if result is None else str(result)}
         with self._transaction() as db:
             done = db.execute(
                 f"UPDATE experiments SET state = :state, result = :result, message = :message, finished = {_LATER}, "
-                "announced = :announced WHERE sha256 = :sha256 AND owner = :owner AND state = 'waiting'",
-                values | {"message": message, "time": time.time(), "announced": announced} | self._me(),
+                "version = :version, announced = :state = 'passed' "
+                "WHERE sha256 = :sha256 AND owner = :owner AND state = 'waiting'",
+                values | {"message": message, "version": version, "time": time.time()} | self._me(),
             )
             return bool(done.rowcount)
 
@@ -349,15 +360,34 @@ class Ledger:
         with self._transaction() as db:
             return int(db.execute("SELECT count(*) FROM experiments WHERE state = 'waiting'").fetchone()[0])
 
+    def retry_after_upgrade(self, version: str) -> None:
+        """Let recordings wait again that failed under another version of the program."""
+        with self._transaction() as db:
+            db.execute(
+                f"{_RESET} WHERE state = 'failed' AND version != :version", {"version": version, **ACTIONS["retry"]}
+            )
+
+    def change(self, action: str, patterns: Sequence[str]) -> list[str]:
+        """Retry or ignore recordings without a result whose names match patterns (GLOB); return the names."""
+        changed = []
+        with self._transaction() as db:
+            for pattern in patterns:
+                row = {"pattern": pattern, **ACTIONS[action]}
+                where = " WHERE name GLOB :pattern AND state NOT IN ('done', :state)"
+                changed += [name for (name,) in db.execute(f"SELECT name FROM experiments{where} ORDER BY name", row)]
+                db.execute(_RESET + where, row)
+        return changed
+
     def _me(self) -> dict[str, object]:
         now = self._clock()
         return {"owner": self.owner, "boot": self._boot, "now": now, "until": now + self._lease_s}
 
     @contextmanager
-    def _transaction(self) -> Iterator[sqlite3.Connection]:
+    def _transaction(self, mode: str = "rw") -> Iterator[sqlite3.Connection]:
         """Yield a connection in a transaction that excludes other writers; it is committed at the end of the block."""
         with self._errors():
-            db = sqlite3.connect(self.path, timeout=BUSY_S, isolation_level=None)
+            uri = f"{self.path.absolute().as_uri()}?mode={mode}"
+            db = sqlite3.connect(uri, timeout=BUSY_S, isolation_level=None, uri=True)
             try:
                 _use_write_ahead_log(db)
                 db.execute("BEGIN IMMEDIATE")
@@ -376,11 +406,31 @@ class Ledger:
         try:
             yield
         except (sqlite3.OperationalError, OSError) as error:
+            if self.path.parent.is_dir() and not self.path.exists():
+                raise LedgerLost(f"{self.path}: the ledger was deleted") from error
             raise LedgerError(f"{self.path}: {reason_of(error, BUSY_S, named=False)}") from error
         except sqlite3.DatabaseError as error:
-            raise LedgerUnusable(
-                f"{self.path}: the ledger is damaged ({error}); move it away and start again, results are found"
+            reason = " ".join(str(error).split())
+            raise LedgerLost(
+                f"{self.path}: the ledger is damaged ({reason}); restart a worker, which begins a new one"
             ) from error
+
+
+def open_ledger(path: Path, owner: str) -> Ledger:
+    """Return a ledger; a damaged one is moved aside and a new one is begun. Raises as `Ledger`."""
+    with suppress(LedgerLost):
+        return Ledger(path, owner)
+    with path.with_name(f"{path.name}.lock").open("w") as lock:
+        # Of several workers that start at once the first moves it.
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        with suppress(LedgerLost):
+            return Ledger(path, owner)
+        aside = path.with_name(f"{path.name}.damaged-{time.strftime('%Y%m%dT%H%M%SZ', time.gmtime())}")
+        for suffix in ("", "-wal", "-shm"):
+            with suppress(FileNotFoundError):
+                path.with_name(path.name + suffix).rename(aside.with_name(aside.name + suffix))
+        log.warning("%s: the ledger was damaged, and is now %s; a new one finds the results", path, aside.name)
+        return Ledger(path, owner)
 
 
 def unique_owner() -> str:
@@ -409,11 +459,11 @@ def _file(db: sqlite3.Connection, path: str) -> tuple[str | None, str | None]:
     return (None, None) if row is None else (row[0], row[1])
 
 
-def _entry(row: tuple[str, str, str, State, int, str | None, str | None, int, int]) -> LedgerEntry:
-    sha256, name, paths, state, attempts, result, message, announced, any_cell = row
+def _entry(row: tuple[str, str, str, State, int, str | None, str | None, int, int, str | None]) -> LedgerEntry:
+    sha256, name, paths, state, attempts, result, message, announced, any_cell, version = row
     files = tuple(Path(path) for path in json.loads(paths))
     found = None if result is None else Path(result)
-    return LedgerEntry(sha256, name, files, state, attempts, found, message, bool(announced), bool(any_cell))
+    return LedgerEntry(sha256, name, files, state, attempts, found, message, bool(announced), bool(any_cell), version)
 
 
 def _texts(paths: Sequence[Path]) -> str:

@@ -1,16 +1,16 @@
 """Recordings of a cell in folders: the files of each capture, whether they are finished, and earlier results."""
 
 import glob
-import os
 import re
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 
 from armident.configs import ArmidentError, DataError
-from armident.daq.recording import Recording, is_recording, join_parts, read_recording, unpacked_bytes
+from armident.daq.recording import Recording, is_recording, join_parts, read_recording
 from armident.daq.recording.names import in_order
+from armident.daq.recording.reader import unpacked_bytes
 from armident.daq.recording.retention import is_being_written
 from armident.identify.documents.files import load_document
 from armident.identify.documents.identification import IdentificationDocument
@@ -42,8 +42,8 @@ class Captured:
 
     @property
     def stamps(self) -> tuple[str, ...]:
-        """Sizes and times of change of the files, to notice a change; raises OSError if a file has vanished."""
-        return tuple(f"{path.name}:{s.st_size}:{s.st_mtime_ns}" for path in self.paths for s in [path.stat()])
+        """Sizes and times of change of the files, to notice a change."""
+        return tuple(map(stamp_of, self.paths))
 
     def found(self, *, any_cell: bool = False) -> FoundFiles:
         """Return the files as the ledger takes them; raises OSError if a file has vanished."""
@@ -57,11 +57,14 @@ class Captured:
     @property
     def nbytes(self) -> int:
         """Size of the unpacked records of its files, bytes; raises OSError if one cannot be read."""
-        return sum(map(_unpacked_bytes, self.paths, self.stamps))
+        return sum(map(unpacked_bytes, self.paths))
 
     def check_size(self) -> None:
-        """Raise DataError if the recording is larger than `MOST_BYTES`, OSError if a file cannot be read."""
-        size = self.nbytes
+        """Raise DataError if the recording is larger than `MOST_BYTES`."""
+        size = 0
+        with suppress(OSError):
+            # Reading it says why.
+            size = self.nbytes
         if size > MOST_BYTES:
             raise DataError(
                 f"{self.paths[0]}: it unpacks to {size / 1e9:.1f} GB, a worker reads {MOST_BYTES / 1e9:.1f} GB; "
@@ -73,16 +76,20 @@ class Captured:
         return join_parts([read_recording(path) for path in self.paths])
 
 
-@lru_cache(maxsize=1000)
-def _unpacked_bytes(path: Path, _stamp: str) -> int:
-    return unpacked_bytes(path)
+def stamp_of(path: Path) -> str:
+    """Return size and time of change of a file; an empty text if it has vanished."""
+    try:
+        found = path.stat()
+    except OSError:
+        return ""
+    return f"{path.name}:{found.st_size}:{found.st_mtime_ns}"
 
 
 def captured_in(folders: Sequence[Path], robot: str) -> list[Captured]:
     """Captures of a robot in existing folders, without their subfolders, in the order of their names."""
     found: dict[tuple[Path, str], list[Path]] = {}
     for folder in {folder.resolve(): None for folder in folders}:
-        for path in map(Path, glob.iglob(f"{glob.escape(os.fspath(folder))}/{glob.escape(robot)}-*.mcap")):
+        for path in folder.glob(f"{robot}-*.mcap") if folder.is_dir() else ():
             match = _PART.fullmatch(path.name)
             if match is not None:
                 found.setdefault((folder, match["name"]), []).append(path)
@@ -100,15 +107,17 @@ def captured_as(paths: Iterable[Path]) -> list[Captured]:
     return [Captured(name, tuple(sorted(files, key=in_order))) for name, files in found.items()]
 
 
-def foreign(recording: Recording, cell: str | None, robot: str) -> str | None:
-    """Return why a recording is none of a robot in a cell (``None``: any cell), or ``None``."""
+def check_origin(recording: Recording, cell: str | None, robot: str) -> None:
+    """Raise DataError if a recording is none of a robot in a cell (``None``: any cell), or is empty."""
     session = None if recording.session is None else recording.session.cell
     found = recording.metadata.get("cell", session)
+    where = recording.path or "the stream"
     if recording.robot.name != robot:
-        return f"of robot {recording.robot.name}, not {robot}"
+        raise DataError(f"{where}: of robot {recording.robot.name}, not {robot}")
     if cell is not None and found != cell:
-        return f"it names no cell, the worker's is {cell}" if found is None else f"of cell {found}, not {cell}"
-    return None if recording.samples.sync.size else "it holds no samples"
+        raise DataError(f"{where}: of {'no cell' if found is None else f'cell {found}'}, not {cell}")
+    if recording.samples.sync.size == 0:
+        raise DataError(f"{where}: it holds no samples")
 
 
 def result_of(sha256: str, folder: Path) -> tuple[Path, IdentificationDocument] | None:

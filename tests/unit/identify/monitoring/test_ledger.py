@@ -98,7 +98,8 @@ def test_the_newest_result_is_the_last_one_also_after_a_step_of_the_clock_back(
     assert one.last_result() == Path("second.json")
     one.add("c" * 64, "z", [Path("z.mcap")])
     assert one.claim() is not None
-    assert one.finish("c" * 64, "done", Path("third.json"), "trustworthy", announced=True)
+    assert one.finish("c" * 64, "done", Path("third.json"), "trustworthy")
+    one.enter_announced("c" * 64)
     assert one.last_result() == Path("third.json")
 
 
