@@ -11,8 +11,10 @@ import time
 from pathlib import Path
 
 import pytest
+import yaml
 
 from armident.configs import SessionConfig
+from armident.configs.loading import HERE
 from armident.daq.streaming import Keys, open_session
 from armident.identify.identification.identify_recording import identify_recording
 from armident.identify.monitoring.worker import worker as module
@@ -232,3 +234,15 @@ def test_a_ledger_of_the_former_version_keeps_its_results_and_looks_again_at_wha
     with Worker(session, ROBOT, tmp_path) as worker:
         assert worker.result(6.0) is None
     assert [(entry.name, entry.state) for entry in ledger.entries()] == [("emps-a", "done")]
+
+
+def test_a_relative_folder_of_results_is_kept_as_an_absolute_one(session: SessionConfig, tmp_path: Path) -> None:
+    recorded(session, "a")
+    data = yaml.safe_load((HERE / "cells" / "emps_cell.yaml").read_text(encoding="utf-8"))
+    data |= {"cell": session.cell, "robot": "emps.yaml", "recording": {"directory": str(tmp_path)}}
+    (tmp_path / "cell.yaml").write_text(yaml.safe_dump(data | {"identification": {"method": "idim-ls"}}))
+    words = ("worker", "--config", tmp_path / "cell.yaml", "--once", "--out", "results")
+    code, _, err = call(*words, cwd=tmp_path)
+    assert code == 0, err
+    result = Ledger(tmp_path / "results" / FILE, "test").last_result()
+    assert result == tmp_path / "results" / "emps-a.identification" / "identification.json"

@@ -302,7 +302,7 @@ class Ledger:
 
         ``version``: of the program, if the failure may be its fault. ``passed`` needs no announcement.
         """
-        values = {"sha256": sha256, "state": state, "result": None if result is None else str(result)}
+        values = {"sha256": sha256, "state": state, "result": None if result is None else str(result.absolute())}
         with self._transaction() as db:
             done = db.execute(
                 f"UPDATE experiments SET state = :state, result = :result, message = :message, finished = {_LATER}, "
