@@ -198,7 +198,7 @@ class RecordingOptions(FrozenModel):
     drain_ms
         Interval at which received frames are read, ms.
     rotate_mb, rotate_minutes
-        Size (MB) and duration (min) after which a new file is begun; without both a capture is one file.
+        Size (MB) and duration (min) after which a new file is begun; a capture without both (null) is one file.
     keep_days, min_free_gb
         Age (days) and free space (GB) that delete the oldest files; without both nothing is deleted.
     copied_to
@@ -215,7 +215,7 @@ class RecordingOptions(FrozenModel):
     chunk_ms: Annotated[int, Field(ge=10, le=1000)] = 100
     drain_ms: Annotated[int, Field(ge=1, le=100)] = 20
     rotate_mb: Annotated[float, Field(ge=1)] | None = None
-    rotate_minutes: Annotated[float, Field(gt=0)] | None = None
+    rotate_minutes: Annotated[float, Field(gt=0)] | None = 30.0
     keep_days: Annotated[float, Field(gt=0)] | None = None
     min_free_gb: Annotated[float, Field(gt=0)] | None = None
     copied_to: Path | None = None

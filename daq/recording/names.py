@@ -1,4 +1,6 @@
-"""Names of the topics and metadata records of a recording."""
+"""Names of recordings, and of the topics and metadata records in them."""
+
+from pathlib import Path
 
 SCHEMA = "armident/recording/1"
 """Version of the file's content, in the metadata record ``RECORDING``."""
@@ -26,3 +28,8 @@ ROWS_OF = "rows "
 
 RECOVERED = "armident.recovered"
 """Metadata of a recovered file: a description of the missing parts."""
+
+
+def in_order(path: Path) -> str:
+    """Key by which files sort in the order of their parts: ``NAME.mcap`` comes before ``NAME.0002.mcap``."""
+    return path.name.replace(".mcap", "", 1)

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
+from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from pydantic import ValidationError
 
@@ -29,7 +30,7 @@ from armident.daq.recording.names import (
     SCHEMA,
     SESSION,
 )
-from armident.daq.recording.scan import ChunkItem, RecordingScan
+from armident.daq.recording.scan import LARGEST_CHUNK, ChunkItem, RecordingScan
 
 _LEAST_ROW, _MOST_RESERVED = 2, 1 << 25
 """Least share of a compressed file that a row takes, bytes, and largest number of rows for which memory is reserved."""
@@ -88,6 +89,35 @@ def is_recording(path: Path) -> bool:
             return RECORDING.encode() in head or (head.startswith(mcap.MAGIC) and _is_listed(file))
     except OSError:
         return False
+
+
+def unpacked_bytes(path: Path) -> int:
+    """Return the bytes of a recording's records if its chunks were unpacked; a damaged chunk counts nothing.
+
+    The arrays of `read_recording` are smaller. Raises OSError if the file cannot be read.
+    """
+    with path.open("rb") as file:
+        if path.stat().st_size == 0:
+            return 0
+        data = memoryview(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))
+        return sum(_unpacked(opcode, body) for opcode, _, body in mcap.records(data, len(mcap.MAGIC)))
+
+
+def has_end(path: Path) -> bool:
+    """Return True if a file ends like a finished MCAP file; raises OSError if it cannot be read."""
+    with path.open("rb") as file:
+        file.seek(max(0, path.stat().st_size - len(mcap.MAGIC)))
+        return file.read() == mcap.MAGIC
+
+
+def _unpacked(opcode: int, body: memoryview) -> int:
+    if opcode != Opcode.CHUNK:
+        return len(body)
+    try:
+        size = mcap.read_chunk(body).size
+    except mcap.MalformedRecord:
+        return 0
+    return size if size <= LARGEST_CHUNK else 0
 
 
 def _is_listed(file: BinaryIO) -> bool:

@@ -17,7 +17,7 @@ from pathlib import Path
 from mcap.exceptions import McapError
 from mcap.reader import make_reader
 
-from armident.daq.recording.names import MARKS_TOPIC
+from armident.daq.recording.names import MARKS_TOPIC, in_order
 
 _NAME = re.compile(r"-(\d{8}T\d{6})-(\d{3})Z(?:\.\d+)?\.mcap(?:\.damaged)?$")
 LONGEST_PAUSE = datetime.timedelta(days=365)
@@ -89,7 +89,7 @@ def recordings_in(directory: Path, robot: str) -> Iterator[tuple[Path, datetime.
             with suppress(ValueError):
                 made = datetime.datetime.strptime(f"{match[1]}.{match[2]}+0000", "%Y%m%dT%H%M%S.%f%z")
                 found.append((path, made))
-    yield from sorted(found, key=lambda entry: entry[0].name)
+    yield from sorted(found, key=lambda entry: in_order(entry[0]))
 
 
 def reason_to_stay(path: Path, identified: Collection[str] | None, copied_to: Path | None) -> str | None:

@@ -23,8 +23,7 @@ class RecordingSeries:
 
     A file is closed, with its index, after the next one has been created. If that fails (disk full, directory removed),
     rows continue in the old file, :attr:`problem` describes the error, and the next attempt follows after ``RETRY_NS``.
-    ``begin``: creates part k, from 1, at a path. Files are ``NAME.mcap``, or ``NAME.0001.mcap`` and so on where a limit
-    of bytes or ns is set.
+    ``begin``: creates part k, from 1, at a path. Files are ``NAME.mcap``, ``NAME.0002.mcap`` and so on.
     """
 
     def __init__(
@@ -134,7 +133,7 @@ class RecordingSeries:
 
     def _next(self) -> RecordingWriter:
         number = len(self.paths) + 1
-        part = "" if self._max_bytes is None and self._max_ns is None else f".{number:04d}"
+        part = "" if number == 1 else f".{number:04d}"
         writer = self._begin(self._directory / f"{self._name}{part}.mcap", number)
         self.paths.append(writer.path)
         return writer

@@ -17,7 +17,7 @@ from armident.daq.recording import mcap_records as mcap
 from armident.daq.recording.layout import StreamLayout
 from armident.daq.recording.names import CHECK, COUNTERS, LAYOUT_KEY, RECOVERED, ROWS_OF
 
-_LARGEST_CHUNK = 1 << 28
+LARGEST_CHUNK = 1 << 28
 """Largest uncompressed chunk that is read, bytes."""
 _PIECE = 1 << 20
 """Bytes that are decompressed at a time where the size is not known beforehand."""
@@ -319,7 +319,7 @@ def _uncompressed(body: memoryview, checked: bool) -> bytes | None:
         chunk = mcap.read_chunk(body)
     except mcap.MalformedRecord:
         return None
-    if chunk.size > _LARGEST_CHUNK:
+    if chunk.size > LARGEST_CHUNK:
         return None
     raw = _decompressed(chunk)
     if raw is None:

@@ -1,5 +1,6 @@
 """Commands of this package: identification, checks, diagnosis, use of models, history, trajectories."""
 
+from datetime import datetime
 from pathlib import Path
 from typing import Annotated
 
@@ -65,16 +66,39 @@ def worker(
     out: Annotated[
         Path | None, typer.Option("--out", help="Folder for the results. [default: the session's recording directory]")
     ] = None,
+    since: Annotated[datetime | None, typer.Option(help="Pass over files that were changed before.")] = None,
 ) -> None:
     """Identify every experiment of a cell when its recording ends, and publish the results.
+
+    The newest recording comes first. `armident queue` lists what waits, failed, or was passed over.
 
     Example: armident worker --config configs/tx40_cell.yaml
     """
     from armident.identify.monitoring.worker.worker import run_worker
 
-    code = run_worker(config, once=once, out=out)
+    code = run_worker(config, once=once, out=out, since=since)
     if code:
         raise typer.Exit(code)
+
+
+def queue(
+    action: Annotated[str, typer.Argument(help="list, retry or ignore.")],
+    names: Annotated[
+        list[str] | None, typer.Argument(help="Recordings without .mcap, or patterns such as 'tx40-2025*'.")
+    ] = None,
+    config: Annotated[Path | None, typer.Option("--config", help="Session of the worker.")] = None,
+    out: Annotated[Path | None, typer.Option("--out", help="Folder of its results, instead of --config.")] = None,
+    json: Json = False,
+) -> None:
+    """List the recordings of a worker with their states, try those again that have no result, or leave them out.
+
+    States: waiting, done, failed, passed (over, with the reason), ignored. A running worker takes changes over.
+
+    Example: armident queue retry tx40-20261101T101500-000Z --config cell.yaml
+    """
+    from armident.identify.monitoring.worker.queue_command import queue_command
+
+    queue_command(action, names or [], config, out, as_json=json)
 
 
 @with_options

@@ -24,6 +24,7 @@ import armident.drivers.can.filtered_socket
 from armident.configs import ArmidentError
 from armident.configs.schema.session import Bus
 from armident.daq.capture.plan import load_plan
+from armident.daq.recording.names import in_order
 from armident.drivers.can.frames import Frames, frames
 from armident.drivers.canopen.objects import COB_SYNC
 from tests.faults.bus import session_file
@@ -124,7 +125,7 @@ def watched(plan: armident.daq.capture.capture.CapturePlan, bus: GeneratedBus, c
         while not ended.wait(0.05):
             if bus.sent >= len(memory) * step:
                 memory.append((bus.sent / RATE_HZ / 60, memory_mb(os.getpid())))
-            files = sorted((folder / "out").glob("*.mcap"))
+            files = sorted((folder / "out").glob("*.mcap"), key=in_order)
             for path in files[:-2]:
                 with suppress(OSError):
                     path.unlink()

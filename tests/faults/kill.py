@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 
 from armident.daq.recording import read_recording, recover_recording
 from armident.daq.recording.model import join_parts
+from armident.daq.recording.names import in_order
 from armident.drivers.can.frames import STANDARD_ID_MASK
 from armident.drivers.can.socketcan import RawSocket
 from armident.drivers.canopen.objects import COB_SYNC
@@ -97,7 +98,7 @@ class Worker:
             received = read_syncs(witness)
         received = received[received[:, 0] <= at_ns, 0]
         wrong = [] if capture.returncode == -signal.SIGKILL else [f"ended with {capture.returncode}: {log_text(log)}"]
-        files, kept = sorted(out.glob("*.mcap")), 0
+        files, kept = sorted(out.glob("*.mcap"), key=in_order), 0
         try:
             kept = self._checked(files, received, wrong)
         except Exception as error:

@@ -3,7 +3,6 @@
 import errno
 import json
 import os
-import shutil
 import threading
 import time
 from dataclasses import replace
@@ -63,7 +62,8 @@ def test_recordings_of_the_time_without_a_worker_are_identified_once(session: Se
     recorded(session.model_copy(update={"cell": "other"}), "c", 3)
     with Worker(session, first.robot, tmp_path) as worker:
         assert [worker.result(LONGEST_S), worker.result(LONGEST_S)] == [0, 0]
-    assert states(tmp_path) == {"emps-a": ("done", True), "emps-b": ("done", True)}
+    expected = {"emps-a": ("done", True), "emps-b": ("done", True), "emps-c": ("passed", True)}
+    assert states(tmp_path) == expected
     written = tmp_path / "emps-b.identification" / "identification.json"
     assert load_document(written, IdentificationDocument).recording.sha256 == second.sha256
     before = written.stat().st_mtime_ns
@@ -75,15 +75,15 @@ def test_recordings_of_the_time_without_a_worker_are_identified_once(session: Se
         path.unlink()
     with Worker(session, first.robot, tmp_path) as worker:
         assert worker.result(8.0) is None
-    assert states(tmp_path) == {"emps-a": ("done", True), "emps-b": ("done", True)}
+    assert states(tmp_path) == expected
 
 
 def test_files_that_cannot_be_read_do_not_hold_up_others(
     session: SessionConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    made = recorded(session, "c")
-    for name in ("a", "b"):
-        shutil.copy(tmp_path / "emps-c.mcap", tmp_path / f"emps-{name}.mcap")
+    made = recorded(session, "a", 1)
+    for seed, name in enumerate("bc", start=2):
+        recorded(session, name, seed)
     read = Captured.read
     errors = {"emps-a": OSError(errno.EIO, os.strerror(errno.EIO)), "emps-b": RuntimeError("unforeseen")}
 
@@ -94,10 +94,12 @@ def test_files_that_cannot_be_read_do_not_hold_up_others(
 
     monkeypatch.setattr(Captured, "read", refused)
     with Worker(session, made.robot, tmp_path) as worker:
-        assert worker.result(LONGEST_S) == 0
-    assert states(tmp_path) == {"emps-c": ("done", True)}
-    assert "emps-a.mcap: cannot be read: Input/output error; trying again" in caplog.text
-    assert "emps-b.mcap: internal error (RuntimeError); it is not identified" in caplog.text
+        assert {worker.result(LONGEST_S), worker.result(LONGEST_S)} == {0, 1}
+    found = states(tmp_path)
+    assert found.pop("emps-a") in {("passed", True), ("waiting", False)}
+    assert found == {"emps-b": ("failed", True), "emps-c": ("done", True)}
+    assert "emps-a: Input/output error; trying again" in caplog.text
+    assert f"emps-b: internal error of armident {module.VERSION} (RuntimeError: unforeseen)" in caplog.text
 
 
 def test_two_workers_share_the_recordings(session: SessionConfig, tmp_path: Path) -> None:

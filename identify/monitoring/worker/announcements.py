@@ -42,7 +42,8 @@ class Announcements:
         with ledger.announcement(sha256) as mine:
             if mine and sha256 not in self._sent:
                 if document is None:
-                    self._link.announce((self._keys.status, failure_status("worker", message, entry.name, sha256)))
+                    failed = failure_status("worker", message, entry.name, entry.digest)
+                    self._link.announce((self._keys.status, failed))
                 else:
                     done = status_message(
                         "worker", "done", result=str(entry.result), verdict=message, capture=entry.name, sha256=sha256
@@ -82,4 +83,4 @@ def _contents(entry: LedgerEntry) -> list[bytes]:
     document, message = _outcome(entry)
     if document is not None:
         return [document]
-    return [failure_status(component, message, entry.name, entry.sha256) for component in COMPONENTS]
+    return [failure_status(component, message, entry.name, entry.digest) for component in COMPONENTS]

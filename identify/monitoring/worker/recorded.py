@@ -2,15 +2,23 @@
 
 import glob
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 from armident.configs import ArmidentError, DataError
 from armident.daq.recording import Recording, is_recording, join_parts, read_recording
+from armident.daq.recording.names import in_order
+from armident.daq.recording.reader import unpacked_bytes
 from armident.daq.recording.retention import is_being_written
 from armident.identify.documents.files import load_document
 from armident.identify.documents.identification import IdentificationDocument
+from armident.identify.monitoring.worker.ledger import FoundFiles
+
+MOST_BYTES = 3_500_000_000
+"""Largest size of a recording that is read, bytes of its unpacked records: an hour of six axes at 5 kHz (190 bytes a
+row), which is identified in less than 4 GB."""
 
 _PART = re.compile(r"(?P<name>.+?)(?:\.\d{4,})?\.mcap")
 
@@ -33,14 +41,48 @@ class Captured:
         return {name for name in names if _PART.fullmatch(name)} <= {path.name for path in self.paths}
 
     @property
-    def stamp(self) -> str:
-        """Sizes and times of change of the files, to notice a change; raises OSError if a file has vanished."""
-        stats = [path.stat() for path in self.paths]
-        return ";".join(f"{path.name}:{s.st_size}:{s.st_mtime_ns}" for path, s in zip(self.paths, stats, strict=True))
+    def stamps(self) -> tuple[str, ...]:
+        """Sizes and times of change of the files, to notice a change."""
+        return tuple(map(stamp_of, self.paths))
+
+    def found(self, *, any_cell: bool = False) -> FoundFiles:
+        """Return the files as the ledger takes them; raises OSError if a file has vanished."""
+        made = max(path.stat().st_mtime for path in self.paths)
+        return FoundFiles(self.name, self.paths, self.stamps, made, any_cell)
+
+    def parts(self) -> "list[Captured]":
+        """Return each file as a capture of its own."""
+        return [Captured(path.name.removesuffix(".mcap"), (path,)) for path in self.paths]
+
+    @property
+    def nbytes(self) -> int:
+        """Size of the unpacked records of its files, bytes; raises OSError if one cannot be read."""
+        return sum(map(unpacked_bytes, self.paths))
+
+    def check_size(self) -> None:
+        """Raise DataError if the recording is larger than `MOST_BYTES`."""
+        size = 0
+        with suppress(OSError):
+            # Reading it says why.
+            size = self.nbytes
+        if size > MOST_BYTES:
+            raise DataError(
+                f"{self.paths[0]}: it unpacks to {size / 1e9:.1f} GB, a worker reads {MOST_BYTES / 1e9:.1f} GB; "
+                "let captures begin new files (recording.rotate_minutes), or run armident identify on this one"
+            )
 
     def read(self) -> Recording:
         """Return the recording, joined of its files. Raises ArmidentError if a file cannot be read."""
         return join_parts([read_recording(path) for path in self.paths])
+
+
+def stamp_of(path: Path) -> str:
+    """Return size and time of change of a file; an empty text if it has vanished."""
+    try:
+        found = path.stat()
+    except OSError:
+        return ""
+    return f"{path.name}:{found.st_size}:{found.st_mtime_ns}"
 
 
 def captured_in(folders: Sequence[Path], robot: str) -> list[Captured]:
@@ -49,31 +91,33 @@ def captured_in(folders: Sequence[Path], robot: str) -> list[Captured]:
     for folder in {folder.resolve(): None for folder in folders}:
         for path in folder.glob(f"{robot}-*.mcap") if folder.is_dir() else ():
             match = _PART.fullmatch(path.name)
-            if match is not None and is_recording(path):
+            if match is not None:
                 found.setdefault((folder, match["name"]), []).append(path)
     ordered = sorted(found.items(), key=lambda each: each[0][1])
-    return [Captured(name, tuple(sorted(paths))) for (_, name), paths in ordered]
+    return [Captured(name, tuple(sorted(paths, key=in_order))) for (_, name), paths in ordered]
 
 
-def captured_as(paths: Sequence[Path]) -> list[Captured]:
+def captured_as(paths: Iterable[Path]) -> list[Captured]:
     """Return the captures of these files, which are parts of one capture or of one event each."""
     found: dict[str, list[Path]] = {}
     for path in paths:
         match = _PART.fullmatch(path.name)
         if match is not None and is_recording(path):
             found.setdefault(match["name"], []).append(path.resolve())
-    return [Captured(name, tuple(sorted(files))) for name, files in found.items()]
+    return [Captured(name, tuple(sorted(files, key=in_order))) for name, files in found.items()]
 
 
-def is_of(recording: Recording, cell: str | None, robot: str) -> bool:
-    """True if a recording is of a robot in a cell (``None``: any); raises DataError if it is, and empty."""
+def check_origin(recording: Recording, cell: str | None, robot: str) -> None:
+    """Raise DataError if a recording is none of a robot in a cell (``None``: any cell), or is empty."""
     session = None if recording.session is None else recording.session.cell
     found = recording.metadata.get("cell", session)
-    if recording.robot.name != robot or (cell is not None and found != cell):
-        return False
+    where = recording.path or "the stream"
+    if recording.robot.name != robot:
+        raise DataError(f"{where}: of robot {recording.robot.name}, not {robot}")
+    if cell is not None and found != cell:
+        raise DataError(f"{where}: of {'no cell' if found is None else f'cell {found}'}, not {cell}")
     if recording.samples.sync.size == 0:
-        raise DataError(f"{recording.path}: it holds no samples")
-    return True
+        raise DataError(f"{where}: it holds no samples")
 
 
 def result_of(sha256: str, folder: Path) -> tuple[Path, IdentificationDocument] | None:

@@ -64,4 +64,4 @@ def prune_results(ledger: Ledger, days: float | None) -> None:
                 shutil.rmtree(folder)
         if not any(path.exists() for path in entry.paths):
             forgotten.append(entry.sha256)
-    ledger.forget(forgotten)
+    ledger.remove(forgotten)

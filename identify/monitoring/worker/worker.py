@@ -1,6 +1,9 @@
 """Identification worker: identifies every recording of a cell once, and announces the results on Zenoh."""
 
+import datetime
+import importlib.metadata
 import logging
+import math
 import queue
 import signal
 import threading
@@ -8,10 +11,11 @@ import time
 from collections.abc import Callable
 from contextlib import closing, suppress
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from armident.configs import ArmidentError, DataError, RobotConfig, SessionConfig, load_robot, load_session
 from armident.configs.reasons import reason_of
+from armident.daq.recording import Recording
 from armident.daq.streaming import Keys
 from armident.identify.identification.identify_recording import identify_recording
 from armident.identify.identification.options import options_of
@@ -23,14 +27,13 @@ from armident.identify.monitoring.worker.ledger import (
     Ledger,
     LedgerEntry,
     LedgerError,
+    LedgerLost,
+    LedgerUnusable,
     State,
+    open_ledger,
     unique_owner,
 )
-from armident.identify.monitoring.worker.recorded import (
-    Captured,
-    captured_in,
-    result_of,
-)
+from armident.identify.monitoring.worker.recorded import Captured, result_of
 from armident.identify.monitoring.worker.results import results_since
 from armident.identify.monitoring.worker.stream_buffer import LARGEST_BLOCK, LARGEST_EVENT, StreamBuffer
 from armident.identify.monitoring.worker.worker_link import LinkDown, WorkerLink
@@ -48,6 +51,8 @@ RETRY_S, LONGEST_RETRY_S = 1.0, 30.0
 LONGEST_STAGE_S = 7200.0
 """Time after which an identification that reports no further stage counts as hung, s."""
 
+VERSION = importlib.metadata.version("armident")
+
 T = TypeVar("T")
 
 
@@ -59,11 +64,17 @@ class Worker:
     """Identifies every recording of one robot in one cell, found by Zenoh's events and in the folders of the cell.
 
     The ledger in the folder of results lets several workers share the work, also after a crash. ``progress`` is called
-    every second while the work advances, for a watchdog. Raises ConfigError if Zenoh's configuration is wrong.
+    every second while the work advances, for a watchdog. ``since``: older files are passed over, s since 1970. Raises
+    ConfigError if Zenoh's configuration is wrong.
     """
 
     def __init__(
-        self, session: SessionConfig, robot: RobotConfig, out: Path, progress: Callable[[str], None] | None = None
+        self,
+        session: SessionConfig,
+        robot: RobotConfig,
+        out: Path,
+        progress: Callable[[str], None] | None = None,
+        since: float = -math.inf,
     ) -> None:
         self._robot, self._cell, self._out = robot, session.cell, out
         self._folders = (session.recording.directory, out)
@@ -74,9 +85,10 @@ class Worker:
         self._results: queue.Queue[int] = queue.Queue()
         self._buffer = StreamBuffer()
         self._lock = threading.Lock()
-        self._intake = Intake(session.cell, robot.name, self._folder, self._buffer, self._lock, self._refuse)
+        self._intake = Intake(session.cell, robot.name, self._folder_of, self._buffer, self._lock, self._refuse, since)
         self._last: bytes | None = None
         self._problem: str | None = None
+        self._digits = 1
         self._progress = progress
         self._state, self._advanced = "waiting", time.monotonic()
         self._wake, self._closing = threading.Event(), threading.Event()
@@ -167,15 +179,19 @@ class Worker:
                 for assembly in ended:
                     self._intake.take_stream(ledger, assembly)
                 if time.monotonic() - scanned >= SCAN_S:
-                    self._intake.add_files(ledger, captured_in(self._folders, self._robot.name))
+                    self._intake.scan(ledger, self._folders)
                     scanned = time.monotonic()
                 entry = ledger.claim(held=tuple(self._intake.streams), announce=self._link.can_announce)
                 self._problem = None
+                self._note_backlog(ledger.backlog())
                 if entry is not None:
                     self._process(ledger, entry)
                     continue
             except _Closing:
                 return
+            except LedgerLost as error:
+                log.warning("%s; a new one is begun: results in the folder are found and not announced again", error)
+                self._ledger, scanned = None, -SCAN_S
             except (ArmidentError, OSError) as error:
                 self._say_problem(str(error) if isinstance(error, ArmidentError) else reason_of(error))
             except Exception as error:
@@ -186,11 +202,21 @@ class Worker:
 
     def _opened(self) -> Ledger:
         if self._ledger is None:
-            self._ledger = Ledger(self._out / FILE, self._owner)
-            last = self._ledger.last_result()
+            ledger = open_ledger(self._out / FILE, self._owner)
+            ledger.retry_after_upgrade(VERSION)
+            self._intake.begin(ledger)
+            self._ledger = ledger
+            last = ledger.last_result()
             if last is not None and last.is_file():
                 self._last = last.read_bytes()
         return self._ledger
+
+    def _note_backlog(self, backlog: int) -> None:
+        """Publish the backlog, and warn at 10, 100, 1000 and so on."""
+        self._link.backlog = backlog
+        if len(str(backlog)) > self._digits:
+            log.warning("%d recordings wait; armident queue lists them, and leaves out those that you name", backlog)
+        self._digits = max(self._digits, len(str(backlog))) if backlog else 1
 
     def _say_problem(self, text: str) -> None:
         """Report a problem once while it lasts; the work is tried again."""
@@ -203,32 +229,38 @@ class Worker:
         self._link.status("failed", capture=capture, message=message)
         self._results.put(code)
 
-    def _folder(self, name: str) -> Path:
-        return self._out / f"{name}.identification"
-
     def _folder_of(self, entry: LedgerEntry) -> Path:
         """Return the folder of a result; another one if a recording of the same name has a result there."""
-        plain = self._folder(entry.name)
+        plain = self._out / f"{entry.name}.identification"
         taken = (plain / "identification.json").is_file() and result_of(entry.sha256, plain) is None
-        return self._folder(f"{entry.name}.{entry.sha256[:8]}") if taken else plain
+        return self._out / f"{entry.name}.{entry.sha256[:8]}.identification" if taken else plain
 
     def _process(self, ledger: Ledger, entry: LedgerEntry) -> None:
         """Identify a recording, enter and announce the result; what was done before is not repeated."""
-        code = _exit_code(entry.state, entry.message)
+        code = _exit_code(entry.state, entry.message) if entry.version is None else ArmidentError.exit_code
         if entry.state == "waiting":
             try:
                 if entry.attempts > MOST_ATTEMPTS:
-                    raise DataError(f"{entry.name}: {MOST_ATTEMPTS} workers have ended while they identified it")
-                path, verdict = self._identify(entry)
-            except _Closing:
+                    raise RuntimeError(f"{MOST_ATTEMPTS} workers have ended while they worked on it")
+                self._advance(f"reading {entry.name}")
+                Captured(entry.name, entry.paths).check_size()
+                found = self._intake.read(ledger, entry)
+                if found is None:
+                    return
+                entry, recording = found
+                path, verdict = self._identify(entry, recording)
+            except (_Closing, LedgerError, LedgerUnusable):
                 raise
             except ArmidentError as error:
                 self._fail(ledger, entry, str(error))
                 code = error.exit_code
             except Exception as error:
-                self._fail(ledger, entry, f"{entry.name}: internal error ({type(error).__name__})")
+                reason = " ".join(f"{type(error).__name__}: {error}".split())[:200]
+                step = f"another version tries again, or: armident queue retry {entry.name}"
+                message = f"{entry.name}: internal error of armident {VERSION} ({reason}); {step}"
+                self._fail(ledger, entry, message, VERSION)
                 log.debug("internal error", exc_info=True)
-                code = 1
+                code = ArmidentError.exit_code
             else:
                 if not self._enter(ledger, entry, "done", path, verdict):
                     return
@@ -239,23 +271,22 @@ class Worker:
             self._until_possible("announcement", lambda: self._announce(ledger, entry.sha256))
             self._results.put(code)
 
-    def _fail(self, ledger: Ledger, entry: LedgerEntry, message: str) -> None:
+    def _fail(self, ledger: Ledger, entry: LedgerEntry, message: str, version: str | None = None) -> None:
         log.error("%s", message)
-        self._enter(ledger, entry, "failed", None, message)
+        self._enter(ledger, entry, "failed", None, message, version)
 
-    def _enter(self, ledger: Ledger, entry: LedgerEntry, state: State, path: Path | None, message: str) -> bool:
-        mine = self._until_possible("ledger", lambda: ledger.finish(entry.sha256, state, path, message))
+    def _enter(self, ledger: Ledger, entry: LedgerEntry, state: State, *more: Any) -> bool:
+        mine = self._until_possible("ledger", lambda: ledger.finish(entry.sha256, state, *more))
         if not mine:
             log.warning("%s: lease expired: the result of the other worker is used", entry.name)
         return mine
 
-    def _identify(self, entry: LedgerEntry) -> tuple[Path, str]:
+    def _identify(self, entry: LedgerEntry, recording: Recording) -> tuple[Path, str]:
         """Return the file of the result and its verdict; a result that a killed worker has written is used."""
         folder = self._folder_of(entry)
         found = result_of(entry.sha256, folder)
         if found is not None:
             return found[0], found[1].verdict or ""
-        recording = Captured(entry.name, entry.paths).read() if entry.paths else self._intake.streams[entry.sha256]
         source = "file" if entry.paths else "stream"
         self._advance(f"identifying {entry.name}")
         print(f"worker: {recording.samples.sync.size} samples from the {source}, identifying", flush=True)
@@ -309,7 +340,7 @@ def _exit_code(state: State, message: str | None) -> int:
     return DataError.exit_code if state == "failed" or message == "unusable" else 0
 
 
-def run_worker(config: Path, *, once: bool, out: Path | None) -> int:
+def run_worker(config: Path, *, once: bool, out: Path | None, since: datetime.datetime | None) -> int:
     """Carry out ``armident worker`` until SIGTERM or SIGINT, or ``once``; return the exit code."""
     session = load_session(config, "identify")
     robot = load_robot(session.robot, "identify")
@@ -317,7 +348,8 @@ def run_worker(config: Path, *, once: bool, out: Path | None) -> int:
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: stopped.set())
     folder = out or session.recording.directory
-    with closing(Notifier()) as notifier, Worker(session, robot, folder, notifier.progress) as worker:
+    begin = -math.inf if since is None else since.timestamp()
+    with closing(Notifier()) as notifier, Worker(session, robot, folder, notifier.progress, begin) as worker:
         print("worker: ready", flush=True)
         notifier.ready(f"{session.cell}: waiting")
         while not stopped.is_set():

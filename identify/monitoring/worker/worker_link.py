@@ -42,6 +42,7 @@ class WorkerLink:
         self._config, self._keys, self._answer = session, keys, answer
         self.receiver = WorkerReceiver(session, keys, on_event, on_block, limits)
         """Subscriptions, in a session of their own."""
+        self.backlog = 0
         self._session: zenoh.Session | None = None
         self._announcer: Announcer | None = None
         self._shared = False
@@ -86,8 +87,8 @@ class WorkerLink:
                 raise LinkDown("zenoh: the session failed") from error
 
     def status(self, state: str, **more: Any) -> None:
-        """Publish the state of the worker if there is a session. ``more``: further entries."""
-        content = status_message("worker", state, **more)
+        """Publish the state of the worker and its backlog if there is a session. ``more``: further entries."""
+        content = status_message("worker", state, backlog=self.backlog, **more)
         with self._lock:
             if self._session is None:
                 return

@@ -23,6 +23,7 @@ from armident.daq.recording import (
     read_recording,
     recover_recording,
 )
+from armident.daq.recording.names import in_order
 from armident.daq.recording.retention import RetentionThread, prune
 from tests.unit.daq.test_recording import make_recording
 
@@ -65,10 +66,13 @@ def test_every_row_is_in_exactly_one_complete_file(tmp_path: Path, limits: dict[
     with RecordingSeries(beginner(recording), tmp_path, NAME, **limits) as series:
         finished = write(series, recording)
         series.close({"frames": 7})
-    assert [p.name for p in series.paths] == [f"{NAME}.{k:04d}.mcap" for k in range(1, len(series.paths) + 1)]
+    assert [p.name for p in series.paths] == [
+        f"{NAME}.mcap",
+        *(f"{NAME}.{k:04d}.mcap" for k in range(2, len(series.paths) + 1)),
+    ]
     assert len(series.paths) > 3
     assert finished == series.paths[:-1]
-    assert sorted(tmp_path.iterdir()) == series.paths
+    assert sorted(tmp_path.iterdir(), key=in_order) == series.paths
     parts = [read_recording(path) for path in series.paths]
     for number, part in enumerate(parts, start=1):
         assert part.missing is None

@@ -81,7 +81,7 @@ def test_a_result_is_announced_once_and_again_only_if_the_announcement_failed(tw
         with each.announcement(A) as mine:
             assert not mine
     assert one.claim() is other.claim() is None
-    assert one.last_result() == Path("r.json")
+    assert one.last_result() == Path.cwd() / "r.json"
 
 
 def test_the_newest_result_is_the_last_one_also_after_a_step_of_the_clock_back(
@@ -95,9 +95,12 @@ def test_the_newest_result_is_the_last_one_also_after_a_step_of_the_clock_back(
         assert one.finish(digest, "done", Path(result), "trustworthy")
         with one.announcement(digest) as mine:
             assert mine
-    assert one.last_result() == Path("second.json")
-    assert one.adopt("c" * 64, "z", [Path("z.mcap")], Path("third.json"), "trustworthy")
-    assert one.last_result() == Path("third.json")
+    assert one.last_result() == Path.cwd() / "second.json"
+    one.add("c" * 64, "z", [Path("z.mcap")])
+    assert one.claim() is not None
+    assert one.finish("c" * 64, "done", Path("third.json"), "trustworthy")
+    one.enter_announced("c" * 64)
+    assert one.last_result() == Path.cwd() / "third.json"
 
 
 def test_a_worker_that_ends_in_order_frees_its_recordings_at_once(two: tuple[Ledger, Ledger]) -> None:
@@ -145,7 +148,7 @@ def test_a_ledger_that_is_locked_damaged_or_newer_is_one_line(tmp_path: Path, mo
             Ledger(path, "two").add(A, "x", [])
     db.execute("PRAGMA user_version = 99")
     db.close()
-    with pytest.raises(ArmidentError, match="ledger of version 99, this program knows 1"):
+    with pytest.raises(ArmidentError, match="ledger of version 99, this program knows 2"):
         Ledger(path, "one")
     path.write_bytes(b"x" * 5000)
     with pytest.raises(ArmidentError, match="the ledger is damaged"):
