@@ -121,11 +121,10 @@ def identified_in(directory: Path, robot: str) -> set[str] | None:
         return None
     try:
         with closing(sqlite3.connect(f"{ledger.resolve().as_uri()}?mode=ro", uri=True)) as db:
-            names = [path for (path,) in db.execute("SELECT path FROM files WHERE sha256 IS NULL")]
-            for (paths,) in db.execute("SELECT paths FROM experiments WHERE state != 'waiting'"):
-                names += json.loads(paths)
+            ended = db.execute("SELECT paths FROM experiments WHERE state != 'waiting'").fetchall()
     except sqlite3.Error as error:
         raise OSError(errno.EIO, str(error), str(ledger)) from error
+    names = [name for (paths,) in ended for name in json.loads(paths)]
     names += [path for path, _ in recordings_in(directory, robot) if is_being_written(path)]
     return {capture_of(Path(name)) for name in names}
 

@@ -161,14 +161,14 @@ def _noise_level(f: Array, power: Array, used: NDArray[np.int64], dt: float) -> 
 
 def away_from_reversals(series: Sequence[Array], velocities: Sequence[Array], slow: float) -> list[Array]:
     """Residuals (M,) of one joint, zero about reversals and under ``slow``, where dry friction has no model."""
-    return [np.where(about_reversals(e, qd, slow), 0.0, e) for e, qd in zip(series, velocities, strict=True)]
+    return [np.where(about_reversals(e != 0.0, qd, slow), 0.0, e) for e, qd in zip(series, velocities, strict=True)]
 
 
-def about_reversals(e: Array, qd: Array, slow: float) -> NDArray[np.bool_]:
-    """Return true for samples about a reversal, rest (``e`` is zero) or motion under ``slow``, (M,)."""
-    turns = np.append(False, np.sign(qd[1:]) != np.sign(qd[:-1])) | (e == 0.0) | (np.abs(qd) < slow)
+def about_reversals(moving: NDArray[np.bool_], qd: Array, slow: float) -> NDArray[np.bool_]:
+    """Return true for samples about a reversal, rest or motion under ``slow``, (M,)."""
+    turns = np.append(False, np.sign(qd[1:]) != np.sign(qd[:-1])) | ~moving | (np.abs(qd) < slow)
     begin = WINDOW // 2
-    return np.asarray(np.convolve(turns, np.ones(WINDOW + 1))[begin : begin + e.size] > 0.0)
+    return np.asarray(np.convolve(turns, np.ones(WINDOW + 1))[begin : begin + qd.size] > 0.0)
 
 
 def bursts(
@@ -181,7 +181,7 @@ def bursts(
     powers, moments = [], []
     for e, t, qd in zip(series, times, velocities, strict=True):
         count = e.size // WINDOW
-        used = ~about_reversals(e, qd, slow)[: count * WINDOW].reshape(count, WINDOW).any(axis=1)
+        used = ~about_reversals(e != 0.0, qd, slow)[: count * WINDOW].reshape(count, WINDOW).any(axis=1)
         powers.append(np.mean(e[: count * WINDOW].reshape(count, WINDOW) ** 2, axis=1)[used])
         moments.append(t[: count * WINDOW : WINDOW][used])
     power, moment = np.concatenate(powers), np.concatenate(moments)

@@ -151,7 +151,11 @@ def test_each_announcement_deletes_results_that_are_too_old(tmp_path: Path, monk
     old.mkdir()
     with monkeypatch.context() as long_ago:
         long_ago.setattr(time, "time", lambda: 1.0e9)
-        assert ledger.adopt("0" * 64, "emps-old", [tmp_path / "gone.mcap"], old / "identification.json", "usable")
+        ledger.add("0" * 64, "emps-old", [tmp_path / "gone.mcap"])
+        assert ledger.claim("0" * 64) is not None
+        assert ledger.finish("0" * 64, "done", old / "identification.json", "usable")
+        with ledger.announcement("0" * 64) as mine:
+            assert mine
     entry, session = entered(tmp_path, "failed", lease_s=LONG_S), cell_of(tmp_path)
     with linked(session) as link:
         Announcements(Keys(session.cell, "emps"), link, keep_days=365.0).make(ledger, entry.sha256)

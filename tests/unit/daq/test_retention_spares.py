@@ -15,7 +15,7 @@ from armident.daq.recording.clock import ClockState
 from armident.daq.recording.model import MarkKind
 from armident.daq.recording.retention import KEEP, LEDGER, identified_in, prune, reason_to_stay
 from armident.identify.monitoring.worker import ledger as ledger_module
-from armident.identify.monitoring.worker.ledger import Ledger, State
+from armident.identify.monitoring.worker.ledger import FoundFiles, Ledger, State
 from tests.unit.daq.test_recording import make_recording
 from tests.unit.daq.test_rotation import NOW, made
 
@@ -57,7 +57,7 @@ def test_what_a_worker_has_not_identified_stays(tmp_path: Path) -> None:
         ledger.add(path.name, path.stem, [path])
         assert ledger.claim(path.name) is not None
         assert ledger.finish(path.name, state, None, "")
-    ledger.enter_file(strange, "stamp", None)
+    ledger.enter([FoundFiles(strange.stem, (strange,), ("stamp",), 0.0)], "of another cell")
     with parts[-1].open("rb") as file:
         # It ends perhaps never; its first parts are not waited for.
         fcntl.flock(file, fcntl.LOCK_EX)

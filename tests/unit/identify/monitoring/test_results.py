@@ -14,7 +14,7 @@ from armident.configs import ConfigError
 from armident.daq.recording import clock
 from armident.daq.recording.clock import ClockState
 from armident.daq.recording.retention import KEEP
-from armident.identify.monitoring.worker.ledger import FILE, Ledger
+from armident.identify.monitoring.worker.ledger import FILE, FoundFiles, Ledger
 from armident.identify.monitoring.worker.results import prune_results, results_since
 
 A, B, C, D = (letter * 64 for letter in "abcd")
@@ -43,9 +43,11 @@ class Cell:
         path, folder = self.folder / f"{name}.mcap", self.folder / f"{name}.identification"
         if recorded:
             path.touch()
-        self.ledger.add(digest, name, [path])
-        self.ledger.enter_file(path, "stamp", digest)
-        assert self.ledger.claim(digest) is not None
+        files = FoundFiles(name, (path,), ("stamp",), self.now)
+        self.ledger.enter([files])
+        entry = self.ledger.claim(files.key)
+        assert entry is not None
+        assert self.ledger.settle(entry, digest)
         if failed:
             assert self.ledger.finish(digest, "failed", None, "too short")
             return folder
@@ -161,8 +163,8 @@ def test_old_results_go_with_their_entries_when_their_recordings_have_gone(cell:
         assert [folder.exists() for folder in (gone, kept, marked, waiting, last)] == [False, False, True, True, False]
         # The recording of B is there: without its entry it would be identified again.
         assert cell.known == [B, C, D, "e" * 64]
-    assert cell.ledger.file_hash(cell.folder / "arm-a.mcap", "stamp") is None
-    assert cell.ledger.file_hash(cell.folder / "arm-b.mcap", "stamp") == (B,)
+    assert cell.folder / "arm-a.mcap" not in cell.ledger.files()
+    assert cell.ledger.key_of(cell.folder / "arm-b.mcap") == B
     os.unlink(cell.folder / "arm-b.mcap")
     prune_results(cell.ledger, 99.0)
     assert cell.known == [C, D, "e" * 64]
