@@ -6,7 +6,7 @@ Atkinson, Fedorov 1975, Biometrika 62(1)). The expected fall of the entropy foll
 Tracey 2017, Entropy 19(7), equation 10).
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -26,6 +26,8 @@ from armident.identify.signals.experiments import Experiment
 
 SINGULAR = 1e-10
 """Eigenvalue of normalised information over the largest below which a direction is not determined."""
+SAMPLES = 20_000
+"""Most samples of a motion whose columns are computed at a time: 0.1 GB for seven axes and eighty columns."""
 MOST = 50.0
 """Log Bayes factor, nats, that counts as certain: no model of an arm is right to more."""
 
@@ -113,6 +115,14 @@ def _short(motion: Motion) -> Motion:
     return replace(motion, q=motion.q[few], qd=motion.qd[few], qdd=motion.qdd[few])
 
 
+def _pieces(motion: Motion) -> Iterator[Motion]:
+    """Yield parts of a motion of at most `SAMPLES` samples."""
+    edges = np.linspace(0, motion.samples, -(-motion.samples // SAMPLES) + 1).astype(int)
+    for begin, end in pairwise(edges):
+        q, qd, qdd = (x[begin:end] for x in (motion.q, motion.qd, motion.qdd))
+        yield replace(motion, q=q, qd=qd, qdd=qdd, start=motion.start + motion.dt * float(begin))
+
+
 def _information(state: ModelState, rivals: Sequence[Rival], motions: Sequence[Motion]) -> Floats:
     """Return the information (c, c) of motions on the parameters of the model and of all rivals.
 
@@ -121,7 +131,7 @@ def _information(state: ModelState, rivals: Sequence[Rival], motions: Sequence[M
     study = state.study
     slowest, factor = 1.0 / np.asarray(state.robot.sign_smoothing), study.decimation.factor
     total: Floats | float = 0.0
-    for motion in motions:
+    for motion in (piece for whole in motions for piece in _pieces(whole)):
         parts = [study.model.rigid_regressor(motion.q, motion.qd, motion.qdd), study.model.term_regressor(motion)]
         parts += [r.columns(motion) for r in rivals if r.term is not None]
         x = study.decimation(np.concatenate(parts, axis=2))
