@@ -142,14 +142,15 @@ def gain(with_it: ModelState, without: ModelState) -> float:
 
 
 def materiality(without: ModelState, with_it: ModelState) -> tuple[float, float]:
-    """Return the largest share of a joint's error power that an effect removes, and its torque in percent there.
+    """Return the share of the error power that an effect removes, and its torque in percent of that of the joint.
 
-    Joints on which the effect does not act change with the other parameters, and do not count.
+    Both are of the joint and the recording in which the share is largest: motions that do not show an effect say
+    nothing of its size. Joints on which it does not act change with the other parameters, and do not count.
     """
-    before, after = without.score.rms, with_it.score.rms
-    removed = np.where(acted_on(with_it, without), np.maximum(before**2 - after**2, 0.0), 0.0)
-    joint = int(np.argmax(removed / np.maximum(before**2, 1e-300)))
-    torque = np.concatenate([s.y[:, joint] for s in without.study.train])
+    before, after = without.score.rms_of_recordings, with_it.score.rms_of_recordings
+    removed = np.where(acted_on(with_it, without)[:, None], np.maximum(before**2 - after**2, 0.0), 0.0)
+    shares = removed / np.maximum(before**2, 1e-300)
+    joint, recording = np.unravel_index(int(np.argmax(shares)), shares.shape)
+    torque = np.concatenate([s.torques[:, joint] for s in without.study.train])
     size = float(np.sqrt(np.mean(torque**2)))
-    share = float(removed[joint] / max(before[joint] ** 2, 1e-300))
-    return share, 100 * float(np.sqrt(removed[joint])) / max(size, 1e-300)
+    return float(shares[joint, recording]), 100 * float(np.sqrt(removed[joint, recording])) / max(size, 1e-300)

@@ -8,7 +8,7 @@ from scipy.special import stdtr
 
 from armident.identify.diagnosis.criteria import Criteria
 from armident.identify.diagnosis.model_state import ModelState, acted_on
-from armident.identify.diagnosis.predictive_score import SUMS
+from armident.identify.diagnosis.predictive_score import SUMS, block_sums
 from armident.identify.effects.effect import SIGN_TOLERANCE
 from armident.identify.regression.equations import applied
 
@@ -22,6 +22,7 @@ class Confirmation:
     ``noiseless``: errors with the torque of the effect at the simulated motion. Measured positions, differentiated
     twice, may add more noise than the effect has torque. ``acts``: joints on whose torques it acts. ``whole_before``,
     ``whole_after``: errors of all joints together. ``scale``: best factor of the effect's torque, 1 as in training.
+    ``recordings`` (S, 3, n): the first three of each recording, over the torques of all.
     """
 
     p_value: float
@@ -33,6 +34,7 @@ class Confirmation:
     whole_after: float
     scale: float
     scale_std: float
+    recordings: Array
 
     @property
     def absent(self) -> bool:
@@ -43,6 +45,18 @@ class Confirmation:
     def share(self) -> Array:
         """Share of the power of the errors of each joint that the effect removes, (n,)."""
         return np.asarray(1.0 - (self.best / np.maximum(self.before, 1e-300)) ** 2)
+
+    @property
+    def fall(self) -> Array:
+        """Logarithm of the factor by which the error of each joint falls in the recording that shows it most, (n,)."""
+        before, best = self._errors_of_recordings
+        most = np.argmax(before**2 - best**2, axis=0), np.arange(before.shape[1])
+        return np.asarray(np.log(np.maximum(before[most], 1e-300) / np.maximum(best[most], 1e-300)))
+
+    @property
+    def _errors_of_recordings(self) -> tuple[Array, Array]:
+        """Errors of each recording without and with the effect, (S, n), as `before` and `best`."""
+        return self.recordings[:, 0], self.recordings[:, 2 if self.best is self.noiseless else 1]
 
     @property
     def best(self) -> Array:
@@ -71,10 +85,13 @@ class Confirmation:
     def is_material(self, criteria: Criteria, *, named: bool) -> bool:
         """True if the errors of one joint on which it acts fall by enough, relative to them and to its torque.
 
-        A term without a name is lack of fit, and judged as that: the error itself falls by `material_pct`.
+        Motions that do not show an effect say nothing of its size: one recording is enough. A term without a name is
+        lack of fit, and judged as that: the error itself falls by `material_pct`.
         """
-        size = self.change if named else self.before - self.best
-        enough = (self.share >= criteria.least_share) & (size >= criteria.material_pct)
+        before, best = self._errors_of_recordings
+        fall = np.maximum(before**2 - best**2, 0.0)
+        size = np.sqrt(fall) if named else before - best
+        enough = (fall >= criteria.least_share * before**2) & (size >= criteria.material_pct)
         return bool((enough & self.acts).any())
 
 
@@ -91,11 +108,15 @@ def confirmed(with_it: ModelState, without: ModelState) -> Confirmation:
     else:
         change = [b - a for b, a in zip(before, after, strict=True)]
     noiseless = [b - c for b, c in zip(before, change, strict=True)]
-    # In units of the errors of each joint, as the errors themselves are compared.
-    errors, along = (np.concatenate([x / with_it.score.rms for x in parts]) for parts in (before, change))
+    # In units of the errors of each joint and recording, as the errors themselves are compared.
+    sizes = {s.experiment: s.noise for s in with_it.study.train}
+    units = [with_it.score.rms * sizes.get(s.experiment, 1.0) for s in with_it.study.held]
+    errors, along = (
+        np.concatenate([x / unit for x, unit in zip(parts, units, strict=True)]) for parts in (before, change)
+    )
     coefficient = float(np.sum(along * errors)) / max(float(np.sum(along**2)), 1e-300)
     products = np.sum(along * (errors - coefficient * along), axis=1)
-    sums = np.array([part.sum() for part in np.array_split(products, SUMS)])
+    sums = block_sums(products)
     spread = float(sums.std(ddof=1)) * np.sqrt(SUMS) / max(float(np.sum(along**2)), 1e-300)
     torque = np.concatenate([s.y for s in with_it.study.held])
     return Confirmation(
@@ -108,6 +129,7 @@ def confirmed(with_it: ModelState, without: ModelState) -> Confirmation:
         _whole(after, torque),
         coefficient,
         spread,
+        np.array([[_share_of(e, torque) for e in own] for own in zip(before, after, noiseless, strict=True)]),
     )
 
 
@@ -115,6 +137,12 @@ def _relative(errors: list[Array], torque: Array) -> Array:
     """Norm of the errors of each joint over that of its torque, percent, (n,)."""
     size = np.linalg.norm(np.concatenate(errors), axis=0)
     return np.asarray(100 * size / np.maximum(np.linalg.norm(torque, axis=0), 1e-300))
+
+
+def _share_of(errors: Array, torque: Array) -> Array:
+    """Root mean square of the errors of each joint in one recording over that of its torque in all, percent, (n,)."""
+    size, whole = (np.sqrt(np.mean(x**2, axis=0)) for x in (errors, torque))
+    return np.asarray(100 * size / np.maximum(whole, 1e-300))
 
 
 def _whole(errors: list[Array], torque: Array) -> float:

@@ -79,6 +79,7 @@ def _finding(
             "tests": one.step.tests,
             "share_of_residual": float(report.share[joint]),
             "change_of_torque_pct": addition.material_pct,
+            "fall": float(report.fall[joint]),
             "std": std,
             "units": _units(effect, final.robot.joints[place.joint].type == "prismatic"),
             # Of the error that is known not to be noise; what is left may be the rest of another effect.

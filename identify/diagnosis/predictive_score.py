@@ -54,8 +54,8 @@ class PredictiveScore:
         regression = self.fit.regression
         b = self.fit.theta.size
         zx, zy = np.zeros((FOLDS, b, b)), np.zeros((FOLDS, b))
-        for joint, rows in zip(self.fit.equations.joints, regression.rows, strict=True):
-            for k, own in folds_of(rows.shape[0]):
+        for joint, rows, ar in zip(self.fit.equations.joints, regression.rows, regression.noise, strict=True):
+            for k, own in folds_of([max(len(part) - ar.order, 0) for part in joint.parts]):
                 sums = joint.products([rows[own]])
                 zx[k][np.ix_(joint.z, joint.x)] += sums[:, : joint.x.size]
                 zy[k][joint.z] += sums[:, -1]
@@ -92,18 +92,15 @@ class PredictiveScore:
         found = []
         for joint, change in zip(self.fit.equations.joints, self._changes, strict=True):
             width = joint.x.size
-            total = sum(len(part) for part in joint.parts)
             rows = joint.parts[0][:] if len(joint.parts) == 1 else np.concatenate([part[:] for part in joint.parts])
             errors = rows[:, -1].copy()
-            for k, own in folds_of(total):
+            for k, own in folds_of([len(part) for part in joint.parts]):
                 errors[own] -= rows[own, :width] @ self.folds[k, joint.x]
             parts = np.split(errors, np.cumsum([len(part) for part in joint.parts])[:-1])
             if change is not None:
-                fold, begin = fold_of(total), 0
                 for part, left in zip(joint.parts, parts, strict=True):
-                    number = fold[begin : begin + len(part)]
-                    left += noise_of_motion(joint, part[:], change)[np.arange(number.size), number]
-                    begin += len(part)
+                    rows_of_part = np.arange(len(part))
+                    left += noise_of_motion(joint, part[:], change)[rows_of_part, fold_of(len(part))]
             found.append(tuple(parts))
         return tuple(found)
 
@@ -138,6 +135,12 @@ class PredictiveScore:
     def rms(self) -> Array:
         """Root mean square of the predicted errors of each joint, N m or N, (n,)."""
         return np.array([float(np.sqrt(np.mean(errors**2))) for errors in self.errors])
+
+    @cached_property
+    def rms_of_recordings(self) -> Array:
+        """Root mean square of the predicted errors of each joint and stretch, N m or N, (n, S)."""
+        noise = np.transpose([s.noise for s in self.fit.study.train])
+        return noise * np.sqrt([[_mean_square(part) for part in parts] for parts in self._parts])
 
     @cached_property
     def own_noise(self) -> tuple[ArModel, ...]:
@@ -184,7 +187,7 @@ class PredictiveScore:
             sizes = [_size(part) for part in white]
             e1 = np.concatenate([part / size for part, size in zip(white, sizes, strict=True)])
             change = np.concatenate([ar.whiten(part) / size for part, size in zip(less, sizes, strict=True)]) - e1
-            sums = np.array([part.sum() for part in np.array_split(change * e1, SUMS)])
+            sums = block_sums(change * e1)
             naive = float(np.mean(e1**2) * (change @ change))
             found.append(max(1.0, float(np.sum((sums - sums.mean()) ** 2)) * SUMS / (SUMS - 1) / max(naive, 1e-300)))
         return np.array(found)
@@ -217,15 +220,28 @@ def _solved(a: Array, c: Array) -> Array:
 
 
 def fold_of(rows: int) -> NDArray[np.int64]:
-    """Return the fold of each row, (R,)."""
+    """Return the fold of each row of a stretch, (R,)."""
     return np.arange(rows) * BLOCKS // max(rows, 1) % FOLDS
 
 
-def folds_of(rows: int) -> Iterator[tuple[int, slice]]:
-    """Fold and rows of each block."""
-    edges = [-(-block * rows // BLOCKS) for block in range(BLOCKS + 1)]
-    for block, span in enumerate(pairwise(edges)):
-        yield block % FOLDS, slice(*span)
+def folds_of(lengths: Sequence[int]) -> Iterator[tuple[int, slice]]:
+    """Fold and rows of each block of stretches one after the other: no fold lacks a whole motion."""
+    for begin, rows in zip(np.cumsum([0, *lengths]), lengths, strict=False):
+        edges = [int(begin) - (-block * rows // BLOCKS) for block in range(BLOCKS + 1)]
+        for block, span in enumerate(pairwise(edges)):
+            yield block % FOLDS, slice(*span)
+
+
+def block_edges(used: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Return the edges of `SUMS` blocks with equal numbers of used rows, (SUMS + 1,): a joint may rest for long."""
+    rows = np.flatnonzero(used)
+    inner = rows[np.arange(1, SUMS) * rows.size // SUMS] if rows.size else np.zeros(SUMS - 1, np.int64)
+    return np.concatenate([[0], inner, [used.size]])
+
+
+def block_sums(values: Array) -> Array:
+    """Return the sums of values (R,) over `SUMS` blocks with equal numbers of those that are not zero."""
+    return np.array([values[begin:end].sum() for begin, end in pairwise(block_edges(values != 0.0))])
 
 
 def references_of(fit: IvFit) -> tuple[Array | None, ...]:

@@ -71,14 +71,15 @@ def calibration(*, several: bool = False) -> Calibration:
 def features(finding: Finding) -> dict[str, float]:
     """Return the figures of a finding that its probability rises with, each of order 1.
 
-    ``margin``: evidence over the next name. ``confirmed``: significance on the report part. ``fall``: of its error.
+    ``margin``: evidence over the next name. ``confirmed``: significance on the report part. ``fall``: of its error, in
+    the recording that shows it most.
     ``explained``: share of the error that is known not to be noise.
     """
     evidence = finding.evidence
     return {
         "margin": float(np.log1p(np.clip(evidence["margin"], 0.0, MOST_EVIDENCE))),
         "confirmed": float(np.log1p(min(-np.log(max(evidence["p_value"], 1e-300)), MOST_EVIDENCE))),
-        "fall": float(np.log(max(finding.gap_before, 1e-300) / max(finding.gap_after, 1e-300))),
+        "fall": evidence["fall"],
         "explained": evidence["share_explained"],
     }
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy import special
 
 from armident.identify.diagnosis.free_functions import FreeFunction
-from armident.identify.diagnosis.predictive_score import SUMS
+from armident.identify.diagnosis.predictive_score import SUMS, block_edges
 
 Array = NDArray[np.float64]
 
@@ -180,9 +180,8 @@ def significance(u: Array, e: Array, estimate: Array) -> tuple[float, float]:
 
     Correlated power as a chi-square scaled by block sums (Box 1954, Annals of Mathematical Statistics 25(2)).
     """
-    edges = np.arange(SUMS + 1) * e.size // SUMS
     sums, white = [], 0.0
-    for begin, end in pairwise(edges):
+    for begin, end in pairwise(block_edges(e != 0.0)):
         part = u[begin:end]
         gram = part.T @ part
         sums.append(part.T @ e[begin:end] - gram @ estimate)
@@ -200,8 +199,8 @@ def significance(u: Array, e: Array, estimate: Array) -> tuple[float, float]:
 
 def inflation_of_sums(change: Array, e: Array) -> float:
     """Variance of block sums of ``change * e`` over that of white noise; ``e`` (R,) orthogonal to ``change`` (R,)."""
-    edges = np.arange(SUMS) * e.size // SUMS
-    sums, weights = np.add.reduceat(change * e, edges), np.add.reduceat(change**2, edges)
+    blocks = [slice(begin, end) for begin, end in pairwise(block_edges(e != 0.0))]
+    sums, weights = (np.array([x[own].sum() for own in blocks]) for x in (change * e, change**2))
     total = float(weights.sum())
     white = _mean_square(e) * (total - float(weights @ weights) / max(total, 1e-300))
     return float(sums @ sums) / max(white, 1e-300)

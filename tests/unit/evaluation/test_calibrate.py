@@ -14,7 +14,7 @@ HIDDEN = {"family": "effect", "accepted": ["joint_spring"], "joints": ["axis_2"]
 
 
 def finding(effect: str, joint: str, **evidence: Any) -> Finding:
-    known = {"margin": 3.0, "odds": {}, "p_value": 1e-5, "share_explained": 1.0}
+    known = {"margin": 3.0, "odds": {}, "p_value": 1e-5, "fall": 0.7, "share_explained": 1.0}
     return Finding(
         effect=effect, joint=joint, kind="structure", parameters={}, confidence=0.0, alternatives=[],
         gap_before=10.0, gap_after=5.0, evidence=known | evidence,

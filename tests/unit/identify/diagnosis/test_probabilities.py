@@ -24,7 +24,7 @@ KNOWN = Calibration(
     temper=1.0,
     level=0.9,
 )
-EVIDENCE: dict[str, Any] = {"margin": 5.0, "odds": {}, "p_value": 1e-6, "share_explained": 1.0}
+EVIDENCE: dict[str, Any] = {"margin": 5.0, "odds": {}, "p_value": 1e-6, "fall": 0.2, "share_explained": 1.0}
 
 
 def finding(effect: str = "stribeck_friction", joint: str = "joint_1", **evidence: Any) -> Finding:
@@ -50,7 +50,7 @@ def test_more_evidence_is_never_less_probable(more: dict[str, float]) -> None:
 
 def test_the_shipped_map_is_sure_of_strong_evidence_only() -> None:
     known = calibration()
-    strong = finding(margin=100.0, p_value=1e-20).model_copy(update={"gap_after": 0.3})
+    strong = finding(margin=100.0, p_value=1e-20, fall=2.8)
     weak = finding(margin=0.1, p_value=5e-3, share_explained=0.1)
     assert known.probability(features(strong)) > 0.9
     assert known.probability(features(weak)) < 0.5
