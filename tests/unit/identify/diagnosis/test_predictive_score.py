@@ -5,7 +5,15 @@ import pytest
 
 from armident.configs.schema.robot import Effect
 from armident.identify.diagnosis.candidate_comparison import gain
-from armident.identify.diagnosis.predictive_score import BLOCKS, FOLDS, fold_of
+from armident.identify.diagnosis.predictive_score import (
+    BLOCKS,
+    FOLDS,
+    SUMS,
+    block_edges,
+    block_sums,
+    fold_of,
+    folds_of,
+)
 from tests.fixtures.diagnoses import SPRING, selection, with_effects
 
 pytestmark = pytest.mark.slow
@@ -19,6 +27,27 @@ def test_folds_are_blocks_of_equal_length_that_cover_all_rows() -> None:
     assert set(fold) == set(range(FOLDS))
     assert np.count_nonzero(np.diff(fold)) == BLOCKS - 1
     assert np.ptp(np.bincount(fold)) <= 1
+
+
+def test_no_fold_lacks_a_whole_recording() -> None:
+    of_row = np.full(1230, -1)
+    for fold, rows in folds_of([1000, 0, 200, 30]):
+        of_row[rows] = fold
+    assert (of_row[:1000] == fold_of(1000)).all()
+    for recording in (of_row[:1000], of_row[1000:1200], of_row[1200:]):
+        assert np.ptp(np.bincount(recording, minlength=FOLDS)) <= 1
+
+
+def test_blocks_of_sums_have_as_many_rows_in_which_the_joint_moves() -> None:
+    used = np.zeros(5000, np.bool_)
+    used[300:1300:2] = True
+    counts = np.add.reduceat(used, block_edges(used)[:-1])
+    assert counts.size == SUMS
+    assert np.ptp(counts) <= 1
+    values = np.where(used, np.random.default_rng(0).standard_normal(used.size), 0.0)
+    # White values: the sums have the variance of white values, however long the joint rests.
+    assert np.var(block_sums(values), ddof=1) == pytest.approx(used.sum() / SUMS, rel=0.7)
+    assert block_sums(np.zeros(5000)).tolist() == [0.0] * SUMS
 
 
 def test_the_log_likelihood_favours_the_true_model() -> None:
