@@ -69,6 +69,7 @@ def work_until_poisoned(folder: Path) -> None:
             os.kill(os.getpid(), signal.SIGKILL)
         return read(captured)
 
+    # In a process of its own, which ends as if for want of memory: types forbid to replace a method.
     Captured.read = poisoned  # type: ignore[method-assign, assignment]
     with Worker(cell_of(folder), ROBOT, folder) as worker:
         worker.result()
@@ -201,16 +202,21 @@ def test_a_file_that_is_replaced_under_its_name_gets_a_result_of_its_new_content
     assert results == {first.sha256, second.sha256}
 
 
+def read_and_killed(session: SessionConfig, folder: Path) -> None:
+    """Read the only recording as a worker that is killed before it has a result."""
+    ledger = Ledger(folder / FILE, "killed", lease_s=0.0)
+    reader = intake.Intake(session.cell, "emps", lambda _: folder, StreamBuffer(), threading.Lock(), print)
+    reader.scan(ledger, [folder])
+    entry = ledger.claim()
+    assert entry is not None
+    assert reader.read(ledger, entry) is not None
+
+
 def test_a_file_that_is_replaced_before_it_is_identified_has_one_result_with_the_hash_of_its_samples(
     session: SessionConfig, tmp_path: Path
 ) -> None:
     recorded(session, "a", 1)
-    ledger = Ledger(tmp_path / FILE, "killed", lease_s=0.0)
-    scanned = intake.Intake(session.cell, "emps", lambda _: tmp_path, StreamBuffer(), threading.Lock(), print)
-    scanned.scan(ledger, [tmp_path])
-    entry = ledger.claim()
-    assert entry is not None
-    assert scanned.read(ledger, entry) is not None  # the worker is killed before the result
+    read_and_killed(session, tmp_path)
     second = recorded(session, "a", 2)
     with Worker(session, ROBOT, tmp_path) as worker:
         assert worker.result(LONGEST_S) == 0
@@ -295,12 +301,7 @@ def test_a_file_that_is_deleted_is_passed_over_and_found_again_under_another_nam
     session: SessionConfig, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     recorded(session, "a", 1)
-    ledger = Ledger(tmp_path / FILE, "killed", lease_s=0.0)
-    reader = intake.Intake(session.cell, "emps", lambda _: tmp_path, StreamBuffer(), threading.Lock(), print)
-    reader.scan(ledger, [tmp_path])
-    entry = ledger.claim()
-    assert entry is not None
-    assert reader.read(ledger, entry) is not None
+    read_and_killed(session, tmp_path)
     (tmp_path / "emps-a.mcap").rename(tmp_path / "away")
     with Worker(session, ROBOT, tmp_path) as worker:
         wait_for(lambda: entries(tmp_path)["emps-a"].state == "passed")

@@ -140,7 +140,7 @@ _LATER = "max(:time, coalesce((SELECT max(finished) FROM experiments), 0) + 0.00
 _TOLD = "max(:ms, (SELECT max(announced) FROM experiments) + 1)"
 """Time of an announcement, ms UTC, in column ``announced`` (0: none): later than all others."""
 ACTIONS = {"retry": {"state": "waiting", "announced": 0}, "ignore": {"state": "ignored", "announced": 1}}
-"""What a user can do with recordings without a result, and their state afterwards."""
+"""Columns of a recording without a result after each action of a user on it."""
 _RESET = (
     "UPDATE experiments SET state = :state, announced = :announced, attempts = 0, owner = NULL, message = NULL, "
     "version = NULL"

@@ -21,7 +21,7 @@ from tests.unit.daq.test_rotation import NOW, made
 
 
 def deleted(folder: Path, copied_to: Path | None = None) -> list[Path]:
-    """What is deleted of recordings of ages above 30 days."""
+    """Delete recordings older than 30 days, and return those that are gone."""
     identified = identified_in(folder, "tx40")
     return prune(
         folder, "tx40", NOW, 30.0, None, needed=lambda path: reason_to_stay(path, identified, copied_to) is not None

@@ -237,6 +237,14 @@ def test_a_removed_cell_keeps_its_recordings_and_its_configuration(image: Path) 
     assert uninstall("line3", image)[0] == "nothing to do: the service of cell line3 is not installed"
 
 
+class Unit(ConfigParser):
+    """Unit of systemd, whose keys have capitals."""
+
+    def optionxform(self, optionstr: str) -> str:
+        """Return a key as it is."""
+        return optionstr
+
+
 @needs_root
 def test_a_capture_is_tied_to_the_can_interfaces_of_its_session(image: Path) -> None:
     """Without its session there is nothing to tie it to; a second run does it, and a removal undoes it."""
@@ -251,8 +259,7 @@ def test_a_capture_is_tied_to_the_can_interfaces_of_its_session(image: Path) -> 
         (image / SETTINGS / "line3.yaml").write_text(re.sub("(?m)^bus: .*", line, cell))
         install("line3", image)
         assert drop_in.exists() == (devices is not None)
-    unit = ConfigParser(interpolation=None)
-    unit.optionxform = str  # type: ignore[assignment, method-assign]
+    unit = Unit(interpolation=None)
     unit.read_string(drop_in.read_text())
     found = [unit["Unit"]["BindsTo"], unit["Unit"]["After"], unit["Install"]["WantedBy"]]
     assert [value.split() for value in found] == 3 * [devices]

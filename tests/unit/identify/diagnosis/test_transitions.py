@@ -67,8 +67,10 @@ def test_the_velocity_of_a_smooth_reversal_is_found_between_the_values_of_the_gr
     entries = {e.joint: e.parameters for e in state.robot.effects if e.effect == "coulomb_transition"}
     assert set(entries) == set(study.joints)
     found = np.array([entries[joint]["velocity"] for joint in study.joints])
-    # Of the joints together: at 0.004 of the top speed, that of one joint scatters by 12 % with the noise.
-    assert np.sqrt(np.mean((found / (share * speeds[0]) - 1.0) ** 2)) < 0.1
+    errors = np.abs(found / (share * speeds[0]) - 1.0)
+    assert np.sqrt(np.mean(errors**2)) < 0.1
+    # At 0.4 % of the top speed the velocity of one joint scatters by 12 % with the noise.
+    assert share == 0.004 or errors.max() < 0.1
     assert all(entries[joint]["lead"] < 0.3 * study.dt for joint in study.joints)
 
 
