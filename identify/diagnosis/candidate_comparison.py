@@ -10,6 +10,7 @@ from armident.configs.schema.robot import Effect as Entry
 from armident.identify.diagnosis.candidates import Candidate, Key, Shapes
 from armident.identify.diagnosis.model_state import ModelState, acted_on
 from armident.identify.diagnosis.precision import p_value_of_effect
+from armident.identify.diagnosis.predictive_score import mean_square
 from armident.identify.effects.unnamed import NAME as UNNAMED
 from armident.identify.regression.ar_noise import ArModel
 
@@ -152,5 +153,5 @@ def materiality(without: ModelState, with_it: ModelState) -> tuple[float, float]
     shares = removed / np.maximum(before**2, 1e-300)
     joint, recording = np.unravel_index(int(np.argmax(shares)), shares.shape)
     torque = np.concatenate([s.torques[:, joint] for s in without.study.train])
-    size = float(np.sqrt(np.mean(torque**2)))
+    size = float(np.sqrt(mean_square(torque)))
     return float(shares[joint, recording]), 100 * float(np.sqrt(removed[joint, recording])) / max(size, 1e-300)

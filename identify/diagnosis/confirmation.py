@@ -8,7 +8,7 @@ from scipy.special import stdtr
 
 from armident.identify.diagnosis.criteria import Criteria
 from armident.identify.diagnosis.model_state import ModelState, acted_on
-from armident.identify.diagnosis.predictive_score import SUMS, block_sums
+from armident.identify.diagnosis.predictive_score import SUMS, block_sums, mean_square
 from armident.identify.effects.effect import SIGN_TOLERANCE
 from armident.identify.regression.equations import applied
 
@@ -141,7 +141,7 @@ def _relative(errors: list[Array], torque: Array) -> Array:
 
 def _share_of(errors: Array, torque: Array) -> Array:
     """Root mean square of the errors of each joint in one recording over that of its torque in all, percent, (n,)."""
-    size, whole = (np.sqrt(np.mean(x**2, axis=0)) for x in (errors, torque))
+    size, whole = (np.sqrt([mean_square(own) for own in x.T]) for x in (errors, torque))
     return np.asarray(100 * size / np.maximum(whole, 1e-300))
 
 

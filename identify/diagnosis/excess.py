@@ -5,7 +5,7 @@ slow signal or a contact for noise: here the spectrum is compared with that of d
 that of other moments.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -80,12 +80,28 @@ class Excess:
 def spectral_excess(
     series: Sequence[Array], velocities: Sequence[Array], dt: float, slow: float = 0.0
 ) -> Excess | None:
-    """Band of frequencies with most power over what noise of drives and encoders has there; the longest series counts.
+    """Band of frequencies with most power over what noise of drives and encoders has there; each series is evidence.
 
     ``series``: residuals (M,) of one joint in the band of the comparison, zero at rest. Times about reversals and under
-    the velocity ``slow``, where dry friction has no model, are left out.
+    the velocity ``slow``, where dry friction has no model, are left out. The band is that of the series with most power
+    beyond noise: a signal need not be in every recording.
     """
-    e, qd = max(zip(series, velocities, strict=True), key=lambda pair: pair[0].size)
+    each = [_in_series(e, qd, dt, slow) for e, qd in zip(series, velocities, strict=True)]
+    found = [one for one in each if one is not None]
+    if not found:
+        return None
+    strongest = max(found, key=lambda one: one.share * one.error**2)
+    return replace(strongest, p_value=fisher(one.p_value for one in found))
+
+
+def fisher(p_values: Iterable[float]) -> float:
+    """Return the probability of so small p-values of independent tests together (Fisher's method)."""
+    logarithms = [float(np.log(max(p, 1e-300))) for p in p_values]
+    return float(chdtrc(2 * len(logarithms), -2.0 * sum(logarithms)))
+
+
+def _in_series(e: Array, qd: Array, dt: float, slow: float) -> Excess | None:
+    """Return the excess of one series (M,); ``None`` if it is short or at rest."""
     (away,) = away_from_reversals([e], [qd], slow)
     power = periodogram(hann_window(e.size) * away)
     f = np.arange(power.size) / (e.size * dt)
@@ -134,8 +150,7 @@ def together(one: Excess | None, other: Excess | None) -> tuple[Excess | None, E
     step = max(float(part.x[1] - part.x[0]) for part in (one, other))
     if abs(one.where[0] - other.where[0]) > PER_FREQUENCY * step:
         return one, other
-    product = sum(float(np.log(max(part.p_value, 1e-300))) for part in (one, other))
-    p_value = float(chdtrc(4, -2.0 * product))
+    p_value = fisher(part.p_value for part in (one, other))
     line = min(one.narrow, other.narrow) > 0.5
     first, second = (replace(p, p_value=p_value, kind="frequency" if line else p.kind) for p in (one, other))
     return first, second

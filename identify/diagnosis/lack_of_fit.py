@@ -24,6 +24,7 @@ from armident.identify.diagnosis.excess import (
 )
 from armident.identify.diagnosis.free_functions import FINE, FreeFunction, free_functions, in_band
 from armident.identify.diagnosis.noise_beyond import noise_beyond
+from armident.identify.diagnosis.predictive_score import mean_square
 from armident.identify.diagnosis.projection import JointResidual, Projection
 from armident.identify.diagnosis.regression import IvFit
 from armident.identify.diagnosis.spectral_lines import SpectralLine, bandwidth_of_motion, lines_of_joints
@@ -179,21 +180,22 @@ class LackOfFit:
         return large and self._significant(test)
 
     def _fall(self, test: Projection | SpectralLine | Excess, joint: int) -> float:
-        """By how much the error of a joint falls without a dependence, percent of its torque."""
+        """By how much the error of a joint falls without a dependence, percent of its torque.
+
+        It is that of the recording that shows it most: others need not move as it needs.
+        """
         torque = np.concatenate([s.torques[:, joint] for s in self.fit.study.train])
-        left = 1.0 - np.sqrt(max(1.0 - test.share, 0.0))
         if isinstance(test, SpectralLine):
             fall = test.size
         elif isinstance(test, Excess):
-            fall = test.error * left
+            fall = test.error * (1.0 - np.sqrt(max(1.0 - test.share, 0.0)))
         else:
+            errors = [e[:, joint] for e in self.fit.errors(self.fit.theta, held=True)]
             # Times about reversals, where dry friction has no model, are no evidence.
-            error = np.concatenate([e[:, joint] for e in self.fit.errors(self.fit.theta, held=True)])
-            speeds, slow = self._speeds(joint, held=True)
-            (away,) = away_from_reversals([error], [np.concatenate(speeds)], slow)
-            removed, power = (error**2 - (error - test.change) ** 2)[away != 0.0].sum(), np.sum(error**2)
-            fall = float(np.sqrt(power) - np.sqrt(np.clip(power - removed, 0.0, power))) / np.sqrt(error.size)
-        return float(100.0 * fall / max(float(np.sqrt(np.mean(torque**2))), 1e-300))
+            away = away_from_reversals(errors, *self._speeds(joint, held=True))
+            changes = np.split(test.change, np.cumsum([e.size for e in errors])[:-1])
+            fall = max(map(_fall_of_error, errors, changes, away))
+        return float(100.0 * fall / max(np.sqrt(mean_square(torque)), 1e-300))
 
     def _dependence(self, p: Projection, own: JointResidual) -> ResidualDependence:
         """Dependence with its curve."""
@@ -406,6 +408,14 @@ class LackOfFit:
                 chosen.append(own)
                 left -= own.size
         return np.concatenate(chosen) if chosen else np.arange(0)
+
+
+def _fall_of_error(error: Array, change: Array, away: Array) -> float:
+    """Return by how much the root mean square of errors (M,) falls with a change (M,) where ``away`` is not zero."""
+    removed, power = (error**2 - (error - change) ** 2)[away != 0.0].sum(), np.sum(error**2)
+    return float(np.sqrt(power) - np.sqrt(np.clip(power - removed, 0.0, power))) / np.sqrt(
+        max(np.count_nonzero(error), 1)
+    )
 
 
 def _refitted(errors: Sequence[Array], regressors: Sequence[Array]) -> list[Array]:

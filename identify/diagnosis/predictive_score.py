@@ -121,7 +121,7 @@ class PredictiveScore:
     def innovations(self, noise: Sequence[ArModel]) -> Array:
         """Mean squares of the innovations of each joint and stretch under noise models, (N m)^2 or N^2, (n, S)."""
         found = [
-            [ar.variance * _mean_square(ar.whiten(part)) for part in parts]
+            [ar.variance * float(np.mean(ar.whiten(part) ** 2)) for part in parts]
             for ar, parts in zip(noise, self._parts, strict=True)
         ]
         return np.maximum(found, 1e-300)
@@ -140,7 +140,7 @@ class PredictiveScore:
     def rms_of_recordings(self) -> Array:
         """Root mean square of the predicted errors of each joint and stretch, N m or N, (n, S)."""
         noise = np.transpose([s.noise for s in self.fit.study.train])
-        return noise * np.sqrt([[_mean_square(part) for part in parts] for parts in self._parts])
+        return noise * np.sqrt([[mean_square(part) for part in parts] for parts in self._parts])
 
     @cached_property
     def own_noise(self) -> tuple[ArModel, ...]:
@@ -202,13 +202,14 @@ class PredictiveScore:
         return float(np.sum(each / self.inflation_over(other, noise)))
 
 
-def _mean_square(errors: Array) -> float:
-    return float(np.mean(errors**2)) if errors.size else 0.0
+def mean_square(x: Array) -> float:
+    """Return the mean square of the values that are not zero: a joint at rest has none."""
+    return float(x @ x) / max(int(np.count_nonzero(x)), 1)
 
 
 def _size(errors: Array) -> float:
     """Return the root mean square of errors, or 1 if all are zero."""
-    return float(np.sqrt(_mean_square(errors))) or 1.0
+    return float(np.sqrt(np.mean(errors**2))) or 1.0 if errors.size else 1.0
 
 
 def _solved(a: Array, c: Array) -> Array:

@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
+from armident.identify.diagnosis.excess import fisher
 from armident.identify.diagnosis.free_functions import FreeFunction
-from armident.identify.diagnosis.predictive_score import SUMS, block_edges
+from armident.identify.diagnosis.predictive_score import SUMS, block_edges, mean_square
 
 Array = NDArray[np.float64]
 
@@ -48,9 +49,8 @@ class Projection:
 
     @property
     def p_value(self) -> float:
-        """Both parts combined (Fisher's method)."""
-        product = np.log(max(self.p_train, 1e-300)) + np.log(max(self.p_held, 1e-300))
-        return float(special.chdtrc(4, -2.0 * product))
+        """Both parts combined."""
+        return fisher((self.p_train, self.p_held))
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,7 +161,7 @@ class JointResidual:
         here, e = change[self.held_rows], self.held_e[self.held_rows]
         after = e - here * (here @ e) / max(float(here @ here), 1e-300)
         variance = sum(
-            _mean_square(self.held_e[rows] - change[rows]) * float(change[rows] @ change[rows])
+            mean_square(self.held_e[rows] - change[rows]) * float(change[rows] @ change[rows])
             for rows in self.held_joints
         )
         through = self.regressor.T @ change
@@ -202,13 +202,8 @@ def inflation_of_sums(change: Array, e: Array) -> float:
     blocks = [slice(begin, end) for begin, end in pairwise(block_edges(e != 0.0))]
     sums, weights = (np.array([x[own].sum() for own in blocks]) for x in (change * e, change**2))
     total = float(weights.sum())
-    white = _mean_square(e) * (total - float(weights @ weights) / max(total, 1e-300))
+    white = mean_square(e) * (total - float(weights @ weights) / max(total, 1e-300))
     return float(sums @ sums) / max(white, 1e-300)
-
-
-def _mean_square(e: Array) -> float:
-    """Mean square of the values that are not zero: a joint at rest has none."""
-    return float(e @ e) / max(int(np.count_nonzero(e)), 1)
 
 
 def smoothing(estimate: Array, through: Array, power: Array, function: FreeFunction | None) -> tuple[Array, Array]:

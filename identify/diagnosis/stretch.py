@@ -10,6 +10,8 @@ from armident.identify.signals.differentiate import Derivatives
 
 Array = NDArray[np.float64]
 
+USUAL = 0.95
+"""Quantile of the velocity of a joint that counts as its speed in a recording."""
 KINDS = ("measured", "simulated")
 """Kinds of motion of a stretch."""
 
@@ -86,6 +88,22 @@ def distances(stretches: Sequence[MotionStretch]) -> Array:
     apart = sum(np.sum((s.simulated.qd - s.measured.qd) ** 2, axis=0) for s in stretches)
     size = sum(np.sum(s.measured.qd**2, axis=0) for s in stretches)
     return np.asarray(apart / np.maximum(size, 1e-300))
+
+
+def usual_speeds(qd: Array) -> Array:
+    """Return the speed of each joint in a recording, (n,), without the short push of a loop that is switched on."""
+    return np.asarray(np.quantile(np.abs(qd), USUAL, axis=0))
+
+
+def dragged_joints(speeds: Array, fastest: Array, slow: float) -> NDArray[np.bool_]:
+    """Return true for joints that the others only drag in a recording, (n,): their equations are no evidence.
+
+    Dry friction holds such a joint; how it creeps depends on more than a model knows. ``speeds`` (n,): in the
+    recording; ``fastest`` (n,): in the recording where the joint moves most. Below the share ``slow`` of that, a joint
+    is dragged if another one moves twice as much.
+    """
+    share = speeds / np.maximum(fastest, 1e-300)
+    return np.asarray(share < min(slow, 0.5 * float(share.max())))
 
 
 def moving_rows(qd: Array, slowest: Array, width: int, instants: NDArray[np.int64]) -> NDArray[np.bool_]:

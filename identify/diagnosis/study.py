@@ -10,7 +10,16 @@ from armident.configs import DataError, RobotConfig
 from armident.configs.schema.robot import Effect as Entry
 from armident.identify.diagnosis.criteria import Criteria
 from armident.identify.diagnosis.regressor_cache import RegressorCache
-from armident.identify.diagnosis.stretch import KINDS, MotionStretch, at_rows, distances, moving_rows, rows_before
+from armident.identify.diagnosis.stretch import (
+    KINDS,
+    MotionStretch,
+    at_rows,
+    distances,
+    dragged_joints,
+    moving_rows,
+    rows_before,
+    usual_speeds,
+)
 from armident.identify.effects.drive import Correction
 from armident.identify.effects.friction import TRANSITION
 from armident.identify.effects.recording_corrections import corrected_experiments, of_recording
@@ -160,6 +169,11 @@ class Study:
         widths = [1.0 / float(self.robot.sign_smoothing[joint]), *(e.parameters["velocity"] for e in own)]
         return self.criteria.reversal * max(widths)
 
+    def dragged(self, qd: Array) -> NDArray[np.bool_]:
+        """Return true for joints that a motion with velocities ``qd`` (N, n) only drags, (n,)."""
+        fastest = np.max([usual_speeds(s.qd) for s in self.signals], axis=0)
+        return dragged_joints(usual_speeds(qd), fastest, self.criteria.dragged_speed)
+
     def motion(self, stretch: MotionStretch, kind: str, theta: Array | None) -> Motion:
         """Signals (``measured`` or ``simulated``) on which effects depend; ``theta`` (b,) predicts their torques."""
         parts: list[Derivatives] = [getattr(stretch, kind)]
@@ -274,6 +288,7 @@ def build_study(
     simulated, loop, auxiliary, warnings = _simulated(model, experiments, signals, bandwidth)
     warnings += unsaturated_joints(given, robot, speeds)
     slowest = 1.0 / np.asarray(robot.sign_smoothing)
+    usual = np.array([usual_speeds(s.qd) for s in signals])
     train: list[MotionStretch] = []
     held: list[MotionStretch] = []
     for k, (e, s, z) in enumerate(zip(experiments, signals, simulated, strict=True)):
@@ -292,6 +307,7 @@ def build_study(
             measured, noiseless = at_rows(s, rows, dt, factor), at_rows(z, rows, dt, factor)
             at = second.instants(rows.size)
             moving = moving_rows(measured.qd, slowest, second.factor, at)
+            moving &= ~dragged_joints(usual[k], usual.max(axis=0), criteria.dragged_speed)
             y = np.where(moving, y, 0.0)
             even = np.ones(robot.n)
             into.append(MotionStretch(measured, noiseless, y, torque[span], t, k, rows, span, moving, even, before))

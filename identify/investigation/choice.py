@@ -77,11 +77,16 @@ def _alone(asked: str, choice: MotionChoice, trajectory: Trajectory | None) -> C
 
 
 def next_motion(
-    state: ModelState, explanations: Sequence[Explanation], collision: CollisionModel, done: Sequence[MotionChoice]
+    state: ModelState,
+    explanations: Sequence[Explanation],
+    collision: CollisionModel,
+    done: Sequence[MotionChoice],
+    left_s: float,
 ) -> Chosen:
     """Return the motion that tells the explanations apart most per second of robot time, among those not done yet.
 
-    ``state``: model as configured, fitted to all recordings so far. ``explanations``: of its joints.
+    ``state``: model as configured, fitted to all recordings so far. ``explanations``: of its joints. ``left_s``: time
+    of motion that is left, s.
     """
     reach, past = reach_of_recordings(state), {_key(one) for one in done}
     open_questions, asked = _questions(state, explanations)
@@ -97,7 +102,9 @@ def next_motion(
     made.sort(key=lambda each: ((each[1].expected_gain or 0.0) < LEAST_GAIN, -each[0]))
     considered: list[MotionChoice] = []
     for _, choice, trajectory in made:
-        reason = excluded(state.robot, trajectory, state.fit.theta, collision, state.fit.covariance)
+        reason = too_long(choice, left_s) or excluded(
+            state.robot, trajectory, state.fit.theta, collision, state.fit.covariance
+        )
         considered.append(choice.model_copy(update={"excluded": reason}))
         if reason is None:
             enough = not open_questions or (choice.expected_gain or 0.0) >= LEAST_GAIN
@@ -137,6 +144,13 @@ def _questions(
     posed = [(one, question(state, rivals)) for one in doubtful if len(rivals := rivals_of(state, one)) > 1]
     words = "; ".join(f"{one.joint}: {_or([r.name for r in each.rivals])}?" for one, each in posed)
     return posed, words or "what do other recordings show?"
+
+
+def too_long(choice: MotionChoice, left_s: float) -> str | None:
+    """Return the reason if a motion takes longer than the time that is left, s."""
+    if choice.duration_s <= left_s:
+        return None
+    return f"takes {choice.duration_s:.0f} s, and {left_s:.0f} s of motion are left; allow more with --minutes"
 
 
 def excluded(

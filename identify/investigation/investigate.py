@@ -33,6 +33,7 @@ from armident.identify.investigation.choice import (
     first_motion,
     next_motion,
     next_recording,
+    too_long,
 )
 from armident.identify.investigation.folder import Ask, Progress, answer_of, keep_motion, read_again
 from armident.identify.investigation.rivals import uncertain, with_decided
@@ -71,6 +72,11 @@ class Investigating:
         """True if the recording of the last motion is missing."""
         last = self.document.rounds[-1] if self.document.rounds else None
         return last is not None and last.recording is None and last.refused is None
+
+    @property
+    def left_s(self) -> float:
+        """Time of motion that is left, s."""
+        return 60.0 * self.document.minutes - self.document.motion_s
 
     @property
     def model(self) -> RobotConfig:
@@ -123,18 +129,15 @@ class Investigating:
             return next_recording(state, explanations, self.offered, done)
         if not uncertain(explanations):
             return confirming_motion(state, self.collision, done)
-        return next_motion(state, explanations, self.collision, done)
+        return next_motion(state, explanations, self.collision, done, self.left_s)
 
     def _affordable(self, chosen: Chosen) -> None:
         """Enter a motion if there is one and the budget allows it; else stop."""
-        used, allowed, choice = self.document.motion_s, self.document.minutes, chosen.choice
+        choice = chosen.choice
         if choice is None:
             self._stop(_no_motion(chosen, uncertain(self.document.explanations)))
-        elif used + choice.duration_s > 60.0 * allowed:
-            self._stop(
-                f"{choice.words} takes {choice.duration_s:.0f} s, and {used:.0f} s of {allowed:g} min have been used; "
-                "allow more with --minutes"
-            )
+        elif (reason := too_long(choice, self.left_s)) is not None:
+            self._stop(f"{choice.words} {reason}")
         else:
             self._enter(chosen)
 

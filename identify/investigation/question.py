@@ -131,12 +131,13 @@ def _information(state: ModelState, rivals: Sequence[Rival], motions: Sequence[M
     study = state.study
     slowest, factor = 1.0 / np.asarray(state.robot.sign_smoothing), study.decimation.factor
     total: Floats | float = 0.0
-    for motion in (piece for whole in motions for piece in _pieces(whole)):
+    pieces = [(piece, ~study.dragged(whole.qd)) for whole in motions for piece in _pieces(whole)]
+    for motion, asked in pieces:
         parts = [study.model.rigid_regressor(motion.q, motion.qd, motion.qdd), study.model.term_regressor(motion)]
         parts += [r.columns(motion) for r in rivals if r.term is not None]
         x = study.decimation(np.concatenate(parts, axis=2))
         instants = study.decimation.instants(motion.samples)
-        moving = moving_rows(motion.qd, slowest, factor, instants)
+        moving = moving_rows(motion.qd, slowest, factor, instants) & asked
         if not any(r.term.effect.at_reversals for r in rivals if r.term is not None):
             for j in range(study.robot.n):
                 moving[:, j] &= ~about_reversals(moving[:, j], motion.qd[instants, j], study.reversing_velocity(j))

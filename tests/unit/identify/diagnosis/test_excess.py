@@ -65,6 +65,19 @@ def test_a_weak_signal_at_one_frequency_of_both_parts_is_more_evidence_than_eith
         assert joint.p_value < 0.1 * part.p_value
 
 
+def test_a_signal_need_not_be_in_every_recording() -> None:
+    quiet, other = noise(5), noise(6) + 0.55 * np.where(T > 7.0, 1.0, -1.0)
+    found = spectral_excess([quiet, other], [SPEED, SPEED], DT)
+    alone = spectral_excess([other], [SPEED], DT)
+    assert found is not None
+    assert alone is not None
+    assert (found.where, found.share) == (alone.where, alone.share)
+    assert found.p_value < 1e-3
+    both = spectral_excess([other, other], [SPEED, SPEED], DT)
+    assert both is not None
+    assert both.p_value < 0.1 * alone.p_value
+
+
 def test_errors_that_are_larger_in_the_report_part_count_beyond_twice_the_expected() -> None:
     usual = [noise(0)]
     assert larger_errors(usual, [1.8 * noise(1)], 0.0, [T], 2.0) is None

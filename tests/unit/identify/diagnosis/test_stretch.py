@@ -7,9 +7,14 @@ import pytest
 
 from armident.configs import load_robot
 from armident.configs.schema.robot import Effect
+from armident.identify.diagnosis.criteria import Criteria
+from armident.identify.diagnosis.stretch import dragged_joints
 from armident.identify.diagnosis.study import Study, build_study
 from armident.identify.identification.from_recording import experiments_from_recording
+from armident.identify.signals.experiments import Experiment
+from tests.fixtures import setups
 from tests.fixtures.arms import recording
+from tests.fixtures.setups import random_arm
 
 
 @pytest.fixture(scope="module")
@@ -62,3 +67,34 @@ def test_a_new_simulation_replaces_the_past_too(study: Study) -> None:
     np.testing.assert_array_equal(again.simulated.q, held.measured.q)
     np.testing.assert_array_equal(again.before[1].q, held.before[0].q)
     assert again.before[1].start == held.before[1].start
+
+
+@pytest.mark.parametrize(
+    ("speeds", "dragged"),
+    [
+        ((1.0, 2.0, 3.0), (False, False, False)),
+        ((0.5, 0.1, 0.3), (False, True, True)),
+        ((0.15, 0.02, 0.01), (False, True, True)),
+        # All are slow, or nothing moves: that is the motion.
+        ((0.1, 0.15, 0.2), (False, False, False)),
+        ((0.0, 0.0, 0.0), (False, False, False)),
+    ],
+)
+def test_a_slow_joint_beside_one_that_moves_is_dragged(speeds: tuple[float, ...], dragged: tuple[bool, ...]) -> None:
+    found = dragged_joints(np.array(speeds), np.array([1.0, 2.0, 3.0]), Criteria().dragged_speed)
+    assert tuple(found) == dragged
+
+
+def test_equations_of_joints_that_others_drag_do_not_count() -> None:
+    robot = random_arm(3, 3)
+    (fast, *_) = setups.record(robot, 0)
+    slow = fast.q.copy()
+    # The second and the third joint creep in the other recording.
+    slow[:, 1:] = slow[:1, 1:] + 0.05 * (slow[:, 1:] - slow[:1, 1:])
+    other = Experiment(slow, fast.tau, None, fast.dt)
+    made = build_study([fast, other], [], robot)
+    for stretches in (made.train, made.held):
+        first, second = stretches
+        assert first.moving.any(axis=0).all()
+        assert second.moving.any(axis=0).tolist() == [True, False, False]
+        assert not second.y[:, 1:].any()
