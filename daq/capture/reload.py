@@ -23,10 +23,12 @@ CHANGEABLE = (
     "zenoh.queue_blocks",
     "zenoh.commands",
     "metrics.port",
+    "metrics.worker_port",
     "metrics.address",
     "identification",
 )
-"""Keys of a session that may change during its capture; ``identification`` and results belong to the worker."""
+"""Keys of a session that may change during its capture; ``identification``, results and ``worker_port`` belong to
+the worker."""
 
 Change = Callable[[SessionConfig], None]
 """Applies a changed session to one part of the capture; may raise ConfigError."""
