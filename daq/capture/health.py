@@ -8,6 +8,7 @@ from contextlib import ExitStack
 from typing import Protocol
 
 from armident.configs import SessionConfig
+from armident.configs.schema.session import MetricsOptions
 from armident.daq.capture.capture_metrics import CAPTURE
 from armident.daq.capture.jitter import SyncJitter, worst
 from armident.daq.capture.plan import CapturePlan
@@ -18,10 +19,7 @@ from armident.daq.matching.assembler import Assembler
 from armident.daq.recording.clock import clock_state
 from armident.drivers.can.receiver import Receiver
 from armident.drivers.canopen.bus_load import busy_seconds, worst_load
-from armident.metrics import MetricsEndpoint, Value
-
-_LATE = "sync_late_"
-"""Begin of the counters of the punctuality of SYNC."""
+from armident.metrics import MetricsExporter, Value
 
 WARNED_SHARE = 0.1
 """Share of the memory for waiting rows from which a warning is logged; nothing is lost before the memory is full.
@@ -91,8 +89,8 @@ class Health:
     ) -> None:
         self._plan, self._assembler, self._receiver, self._jitters = plan, assembler, receiver, jitters
         self._sink, self._publisher = sink, publisher
-        self._metrics: MetricsEndpoint | None = None
-        self._place = _place(plan.session)
+        self._metrics: MetricsExporter | None = None
+        self._options = plan.session.metrics
         self.temperatures: Callable[[], dict[str, float]] = dict
         """Returns the temperature of each joint's drive (degrees Celsius) where it is known."""
         self.punctuality: Callable[[], dict[str, int]] = dict
@@ -104,22 +102,22 @@ class Health:
     def serve(self, stack: ExitStack) -> None:
         """Serve metrics if the session configures a port, until the stack unwinds."""
         stack.callback(self._exchange, None)
-        self._exchange(self._opened(*self._place))
+        self._exchange(self._opened(self._options))
 
     def change(self, session: SessionConfig) -> None:
         """Apply port and address of a reloaded session; if the port cannot be opened, the former one stays."""
-        place = _place(session)
-        if place != self._place:
-            fresh = self._opened(*place)
+        options, before = session.metrics, self._options
+        if (options.address, options.port) != (before.address, before.port):
+            fresh = self._opened(options)
             # Not here: closing the former server waits for its thread.
             threading.Thread(target=self._exchange, args=(fresh,), name="metrics", daemon=True).start()
-            self._place = place
+        self._options = options
 
-    def _opened(self, address: str, port: int | None) -> MetricsEndpoint | None:
-        common = self._plan.session.cell, self._plan.robot.name
-        return None if port is None else MetricsEndpoint(CAPTURE, common, address, port)
+    def _opened(self, options: MetricsOptions) -> MetricsExporter | None:
+        exporter = MetricsExporter(CAPTURE, (self._plan.session.cell, self._plan.robot.name))
+        return None if options.port is None else exporter.serve(options.address, options.port)
 
-    def _exchange(self, fresh: MetricsEndpoint | None) -> None:
+    def _exchange(self, fresh: MetricsExporter | None) -> None:
         old, self._metrics = self._metrics, fresh
         if old is not None:
             old.close()
@@ -160,7 +158,7 @@ class Health:
         self._publisher.health(health)
         metrics = self._metrics
         if metrics is not None:
-            metrics.update(health | self._measured(events))
+            metrics.values = health | self._measured(events)
         self._publisher.status({"state": "recording", "sync": self._assembler.last_sync})
 
     def _measured(self, events: dict[str, int]) -> dict[str, Value]:
@@ -184,18 +182,8 @@ class Health:
                 for bus, jitter in zip(received, self._jitters, strict=True)
                 for statistic, value in jitter.statistics().items()
             },
-            "late_of": {
-                (name.removeprefix(_LATE).removesuffix("_us"),): value
-                for name, value in self.punctuality().items()
-                if name.startswith(_LATE)
-            },
             "celsius_of": {(joint,): celsius for joint, celsius in self.temperatures().items()},
         }
-
-
-def _place(session: SessionConfig) -> tuple[str, int | None]:
-    """Return the address and the port of the metrics of a capture."""
-    return session.metrics.address, session.metrics.port
 
 
 def _clock() -> dict[str, float | str | None]:

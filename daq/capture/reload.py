@@ -27,8 +27,7 @@ CHANGEABLE = (
     "metrics.address",
     "identification",
 )
-"""Keys of a session that may change during its capture; ``identification``, results and ``worker_port`` belong to
-the worker."""
+"""Keys of a session that may change during its capture; the worker takes some of them at its next start."""
 
 Change = Callable[[SessionConfig], None]
 """Applies a changed session to one part of the capture; may raise ConfigError."""

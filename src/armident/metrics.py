@@ -7,7 +7,7 @@ import os
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, Self
 
 from prometheus_client import CollectorRegistry, start_http_server, write_to_textfile
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
@@ -19,8 +19,6 @@ log = logging.getLogger(__name__)
 
 Value = float | str | Mapping[tuple[str, ...], float] | None
 """Number of a metric, or numbers by the values of labels; texts, ``None`` and NaN are left out."""
-Values = Mapping[str, Value]
-"""Values by the keys of the families."""
 COMMON = ("cell", "robot")
 """Labels of every metric."""
 
@@ -48,70 +46,56 @@ _VERSION: Value = {(importlib.metadata.version("armident"),): 1.0}
 
 @dataclass(frozen=True)
 class Metrics:
-    """Metrics of a program."""
+    """Metrics of a program, as ``capture``."""
 
     program: str
     families: tuple[Family, ...]
 
-    def filled(self, common: tuple[str, str], values: Values) -> Iterator[Metric]:
-        """Yield the metrics that have values; ``common``: those of the labels `COMMON`."""
-        for family in self.families:
-            value = _VERSION if family is INFO else values.get(family.key)
-            series = {(): value} if isinstance(value, int | float) else value
-            if not isinstance(series, Mapping):
-                continue
-            kind = CounterMetricFamily if family.kind == "counter" else GaugeMetricFamily
-            name, labels = f"armident_{self.program}_{family.name}", [*COMMON, *family.labels]
-            metric = kind(name, family.help, labels=labels)
-            for of, number in series.items():
-                if math.isfinite(number):
-                    metric.add_metric([*common, *of], number * family.scale)
-            if metric.samples:
-                yield metric
 
-    def write(self, path: Path, common: tuple[str, str], values: Values) -> None:
-        """Replace a file as a whole by the metrics; raises OSError if it cannot be written."""
-        write_to_textfile(str(path), _Served(self, common, values).registry)
+class MetricsExporter(Collector):
+    """Exports ``values``, which may be replaced at any time, to be read only; ``common``: those of `COMMON`."""
 
-
-class _Served(Collector):
-    """Metrics with their last values, in a registry of their own."""
-
-    def __init__(self, metrics: Metrics, common: tuple[str, str], values: Values | None = None) -> None:
-        self.values = values or {}
+    def __init__(self, metrics: Metrics, common: tuple[str, str]) -> None:
+        self.values: Mapping[str, Value] = {}
         self._metrics, self._common = metrics, common
-        self.registry = CollectorRegistry()
-        self.registry.register(self)
+        self._registry = CollectorRegistry()
+        self._registry.register(self)
 
     def collect(self) -> Iterator[Metric]:
-        return self._metrics.filled(self._common, self.values)
+        """Yield the metrics that have values."""
+        values = self.values
+        for family in self._metrics.families:
+            value = _VERSION if family is INFO else values.get(family.key)
+            series = {(): value} if isinstance(value, int | float) else value
+            if isinstance(series, Mapping):
+                kind = CounterMetricFamily if family.kind == "counter" else GaugeMetricFamily
+                name = f"armident_{self._metrics.program}_{family.name}"
+                metric = kind(name, family.help, labels=[*COMMON, *family.labels])
+                for labels, number in series.items():
+                    if math.isfinite(number):
+                        metric.add_metric([*self._common, *labels], number * family.scale)
+                if metric.samples:
+                    yield metric
 
-
-class MetricsEndpoint:
-    """Serves the last values of the metrics of a program over HTTP, to be read only; port 0 takes a free one.
-
-    Raises ConfigError if it cannot listen.
-    """
-
-    def __init__(self, metrics: Metrics, common: tuple[str, str], address: str, port: int) -> None:
-        self._served = _Served(metrics, common)
+    def serve(self, address: str, port: int) -> Self:
+        """Serve the metrics over HTTP; port 0 takes a free one. Raises ConfigError if it cannot listen."""
         try:
-            self._server, self._thread = start_http_server(port, address, self._served.registry)
+            self._server, self._thread = start_http_server(port, address, self._registry)
         except OSError as error:
             raise ConfigError(f"metrics: cannot listen on {address}:{port}: {error.strerror}") from error
         self.url = f"http://{address}:{int(self._server.server_port)}/metrics"
-        """Address of the metrics."""
         log.info("metrics on %s", self.url)
-
-    def update(self, values: Values) -> None:
-        """Replace the served values."""
-        self._served.values = values
+        return self
 
     def close(self) -> None:
-        """Stop the server."""
+        """Stop serving."""
         self._server.shutdown()
         self._server.server_close()
         self._thread.join()
+
+    def write(self, path: Path) -> None:
+        """Replace a file as a whole by the metrics; raises OSError if it cannot be written."""
+        write_to_textfile(str(path), self._registry)
 
 
 def check_file(path: Path) -> None:

@@ -11,7 +11,7 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from armident.configs import ConfigError, SessionConfig
 from armident.configs.loading import load_session
-from armident.metrics import INFO, Family, Metrics, MetricsEndpoint, Value, check_file
+from armident.metrics import INFO, Family, Metrics, MetricsExporter, Value, check_file
 
 METRICS = Metrics(
     "test",
@@ -35,20 +35,20 @@ def parsed(text: str) -> Found:
     }
 
 
-def scraped(endpoint: MetricsEndpoint) -> Found:
+def scraped(exporter: MetricsExporter) -> Found:
     directly = urllib.request.build_opener(urllib.request.ProxyHandler({}))
-    with directly.open(endpoint.url, timeout=10) as answer:
+    with directly.open(exporter.url, timeout=10) as answer:
         return parsed(answer.read().decode())
 
 
 def test_values_are_served_in_base_units_with_the_labels_of_the_cell() -> None:
-    with closing(MetricsEndpoint(METRICS, COMMON, "127.0.0.1", 0)) as endpoint:
-        before = scraped(endpoint)
+    with closing(MetricsExporter(METRICS, COMMON).serve("127.0.0.1", 0)) as exporter:
+        before = scraped(exporter)
         loads: Value = {("can0",): 0.25, ("can1",): 0.5, ("vcan0",): float("nan")}
-        endpoint.update({"frames": 12, "error_us": 3.0, "load_of": loads, "file": "a.mcap"})
-        found = scraped(endpoint)
-        endpoint.update({"frames": 15, "error_us": None})
-        after = scraped(endpoint)
+        exporter.values = {"frames": 12, "error_us": 3.0, "load_of": loads, "file": "a.mcap"}
+        found = scraped(exporter)
+        exporter.values = {"frames": 15, "error_us": None}
+        after = scraped(exporter)
     assert set(before) == {("armident_test_info", "")}
     assert found == {
         **before,
@@ -64,21 +64,21 @@ def test_an_occupied_port_is_a_configuration_error() -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         with pytest.raises(ConfigError, match=rf"metrics: cannot listen on 127\.0\.0\.1:{port}: Address already"):
-            MetricsEndpoint(METRICS, COMMON, "127.0.0.1", port)
+            MetricsExporter(METRICS, COMMON).serve("127.0.0.1", port)
 
 
 def test_the_port_is_free_again_afterwards() -> None:
-    with closing(MetricsEndpoint(METRICS, COMMON, "127.0.0.1", 0)) as first:
+    with closing(MetricsExporter(METRICS, COMMON).serve("127.0.0.1", 0)) as first:
         url = first.url
     port = int(url.split(":")[2].split("/")[0])
-    with closing(MetricsEndpoint(METRICS, COMMON, "127.0.0.1", port)) as second:
+    with closing(MetricsExporter(METRICS, COMMON).serve("127.0.0.1", port)) as second:
         assert second.url == url
 
 
 def test_metrics_can_be_read_and_nothing_else() -> None:
-    with closing(MetricsEndpoint(METRICS, COMMON, "127.0.0.1", 0)) as endpoint:
+    with closing(MetricsExporter(METRICS, COMMON).serve("127.0.0.1", 0)) as exporter:
         for method in ("POST", "PUT", "DELETE"):
-            request = urllib.request.Request(endpoint.url, b"armident_test_frames_total 1", method=method)
+            request = urllib.request.Request(exporter.url, b"armident_test_frames_total 1", method=method)
             with pytest.raises(urllib.error.HTTPError, match=r"405|501"):
                 urllib.request.build_opener(urllib.request.ProxyHandler({})).open(request, timeout=10)
 
@@ -86,7 +86,9 @@ def test_metrics_can_be_read_and_nothing_else() -> None:
 def test_a_file_is_replaced_as_a_whole(tmp_path: Path) -> None:
     path = tmp_path / "a.prom"
     path.write_text("old")
-    METRICS.write(path, COMMON, {"frames": 7})
+    exporter = MetricsExporter(METRICS, COMMON)
+    exporter.values = {"frames": 7}
+    exporter.write(path)
     assert parsed(path.read_text())["armident_test_frames_total", ""] == ("counter", LABELS, 7)
     assert list(tmp_path.iterdir()) == [path]
 

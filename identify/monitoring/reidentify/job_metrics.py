@@ -10,17 +10,12 @@ from armident.configs.reasons import reason_of
 from armident.identify.diagnosis.change_test import ParameterChangeTest
 from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.monitoring.change.comparison import joint_of, places_of
-from armident.identify.monitoring.identification_metrics import (
-    IDENTIFICATION,
-    VERDICTS,
-    identification_values,
-    one_of,
-)
+from armident.identify.monitoring.model_metrics import IDENTIFICATION, VERDICTS, identification_values, one_of
 from armident.identify.monitoring.reidentify.record_run import Say
-from armident.metrics import INFO, Family, Metrics, Value, check_file
+from armident.metrics import INFO, Family, Metrics, MetricsExporter, Value, check_file
 
 INTERRUPTED = 130
-"""Exit code after Ctrl-C or SIGTERM: that of the command line."""
+"""Exit code after Ctrl-C, as that of the command line."""
 
 JOB = Metrics(
     "reidentify",
@@ -52,20 +47,19 @@ def reported(path: Path | None, config: Path, say: Say) -> Iterator[dict[str, Va
         return
     check_file(path)
     session = load_session(config, "identify")
-    common, began, code = (session.cell, load_robot(session.robot, "identify").name), time.monotonic(), 1
+    exporter = MetricsExporter(JOB, (session.cell, load_robot(session.robot, "identify").name))
+    began, code = time.monotonic(), INTERRUPTED
     try:
         yield values
         code = 0
-    except ArmidentError as error:
-        code = error.exit_code
-        raise
-    except KeyboardInterrupt:
-        code = INTERRUPTED
+    except Exception as error:
+        code = getattr(error, "exit_code", ArmidentError.exit_code)
         raise
     finally:
         ended = {"ended_s": time.time(), "duration_s": time.monotonic() - began}
+        exporter.values = {"exit_code": code, **values, **ended}
         try:
-            JOB.write(path, common, {"exit_code": code, **values, **ended})
+            exporter.write(path)
         except OSError as error:
             say(f"warning: no metrics: {reason_of(error)}")
 

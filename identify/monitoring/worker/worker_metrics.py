@@ -8,14 +8,9 @@ from pathlib import Path
 from armident.configs import ArmidentError, ConfigError, SessionConfig
 from armident.identify.documents.files import load_document
 from armident.identify.documents.identification import IdentificationDocument
-from armident.identify.monitoring.identification_metrics import (
-    IDENTIFICATION,
-    VERDICTS,
-    identification_values,
-    one_of,
-)
+from armident.identify.monitoring.model_metrics import IDENTIFICATION, VERDICTS, identification_values, one_of
 from armident.identify.monitoring.worker.ledger import Ledger
-from armident.metrics import INFO, UPDATED, Family, Metrics, MetricsEndpoint, Value
+from armident.metrics import INFO, UPDATED, Family, Metrics, MetricsExporter, Value
 
 log = logging.getLogger(__name__)
 
@@ -42,16 +37,17 @@ class WorkerMetrics:
 
     def __init__(self, session: SessionConfig, robot: str) -> None:
         self._options, self._common = session.metrics, (session.cell, robot)
-        self._endpoint: MetricsEndpoint | None = None
+        self._exporter: MetricsExporter | None = None
         self._refused = False
         self._read: tuple[Path | None, dict[str, Value]] = None, {}
 
     def open(self) -> None:
         """Take the port of the session, if there is one and it is free."""
-        if self._options.worker_port is None or self._endpoint is not None:
+        if self._options.worker_port is None or self._exporter is not None:
             return
         try:
-            self._endpoint = MetricsEndpoint(WORKER, self._common, self._options.address, self._options.worker_port)
+            exporter = MetricsExporter(WORKER, self._common)
+            self._exporter = exporter.serve(self._options.address, self._options.worker_port)
         except ConfigError as error:
             if not self._refused:
                 log.warning("%s; trying again, another worker of the cell may serve them", error)
@@ -59,7 +55,7 @@ class WorkerMetrics:
 
     def update(self, ledger: Ledger, counters: dict[str, Value]) -> None:
         """Serve the present state; ``counters``: values that the ledger has not. Raises ArmidentError as the ledger."""
-        if self._endpoint is None:
+        if self._exporter is None:
             return
         found, now = ledger.summary(), time.time()
         if found.result is not None and found.result != self._read[0]:
@@ -73,9 +69,9 @@ class WorkerMetrics:
             "ended_s": found.ended,
             "verdict": one_of(found.verdict, (*VERDICTS, "failed")),
         }
-        self._endpoint.update({**values, **self._read[1], **counters})
+        self._exporter.values = {**values, **self._read[1], **counters}
 
     def close(self) -> None:
         """Stop the server."""
-        if self._endpoint is not None:
-            self._endpoint.close()
+        if self._exporter is not None:
+            self._exporter.close()
