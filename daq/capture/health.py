@@ -96,6 +96,8 @@ class Health:
         self.punctuality: Callable[[], dict[str, int]] = dict
         """Returns the counters of the own SYNC producer, if there is one."""
         self._frames_before = 0
+        # Not every second: the bits of all SYNCs are counted.
+        self._planned = {(bus.channel,): worst_load(plan.session, bus) for bus in plan.session.all_buses if bus.bitrate}
         self._busy: tuple[float, dict[str, float]] = time.monotonic(), {}
         self._disk = DiskCheck(sink)
 
@@ -163,19 +165,15 @@ class Health:
 
     def _measured(self, events: dict[str, int]) -> dict[str, Value]:
         """Return the values of metrics with labels of their own, which the health message has not."""
-        session, received = (
-            self._plan.session,
-            dict(zip(self._plan.session.all_buses, self._receiver.traffic, strict=True)),
-        )
+        received = dict(zip(self._plan.session.all_buses, self._receiver.traffic, strict=True))
         busy = {bus.channel: busy_seconds(bus, frames) for bus, frames in received.items()}
-        (since, before), self._busy = self._busy, (time.monotonic(), busy)
-        seconds = self._busy[0] - since
+        (since, before), self._busy = self._busy, (now := time.monotonic(), busy)
         return {
             "time_s": time.time(),
             "buffer_share": self._sink.waiting_share,
             "frames_of": {(bus.channel,): float(frames.sum()) for bus, frames in received.items()},
-            "load_of": {(bus,): (now - before.get(bus, 0.0)) / seconds for bus, now in busy.items()},
-            "plan_of": {(bus.channel,): worst_load(session, bus) for bus in received},
+            "load_of": {(bus,): (value - before.get(bus, 0.0)) / (now - since) for bus, value in busy.items()},
+            "plan_of": self._planned,
             "events_of": {(kind,): number for kind, number in events.items()},
             "jitter_of": {
                 (bus.channel, statistic): value

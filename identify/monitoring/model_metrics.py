@@ -8,11 +8,11 @@ _PARAMETER = ("joint", "parameter", "unit")
 VERDICTS = ("trustworthy", "doubtful", "unusable")
 
 IDENTIFICATION = (
-    Family("parameters", "parameter_value", "Estimate of a parameter, in its unit.", _PARAMETER),
-    Family("deviations", "parameter_std", "Standard deviation of the estimate, in its unit.", _PARAMETER),
-    Family("error", "torque_error_ratio", "Norm of the torque error over that of the torque."),
-    Family("error_of", "joint_torque_error_ratio", "The same of a joint.", ("joint",)),
-    Family("identified_s", "identification_seconds", "Duration of the identification."),
+    Family("parameters", "parameter_value", "Estimate of a parameter in its unit.", _PARAMETER),
+    Family("deviations", "parameter_std", "Standard deviation of the estimate in its unit.", _PARAMETER),
+    Family("error", "torque_error_ratio", "Torque error of all joints over the torque (norms)."),
+    Family("error_of", "joint_torque_error_ratio", "Torque error of a joint over its torque (norms).", ("joint",)),
+    Family("identified_s", "identification_seconds", "Time that the identification took."),
 )
 """Metrics of an identification. Each parameter has two, and each joint one."""
 

@@ -7,7 +7,7 @@ import os
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, Self
+from typing import Self
 
 from prometheus_client import CollectorRegistry, start_http_server, write_to_textfile
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
@@ -25,7 +25,7 @@ COMMON = ("cell", "robot")
 
 @dataclass(frozen=True)
 class Family:
-    """A metric without ``armident_PROGRAM_`` and, of a counter, ``_total``; ``labels``: those beside `COMMON`.
+    """A metric: name without ``armident_PROGRAM_``, and its ``labels`` beside `COMMON`. ``_total`` makes it a counter.
 
     ``key``: of its values; ``scale``: factor from their unit to that of the metric.
     """
@@ -34,12 +34,11 @@ class Family:
     name: str
     help: str
     labels: tuple[str, ...] = ()
-    kind: Literal["counter", "gauge"] = "gauge"
     scale: float = 1.0
 
 
 INFO = Family("version", "info", "Always 1, with the version of armident.", ("version",))
-UPDATED = Family("time_s", "updated_timestamp_seconds", "Time of these values.")
+UPDATED = Family("time_s", "updated_timestamp_seconds", "Time at which the values were read.")
 """Families of every program; `INFO` has its value by itself."""
 _VERSION: Value = {(importlib.metadata.version("armident"),): 1.0}
 
@@ -68,7 +67,7 @@ class MetricsExporter(Collector):
             value = _VERSION if family is INFO else values.get(family.key)
             series = {(): value} if isinstance(value, int | float) else value
             if isinstance(series, Mapping):
-                kind = CounterMetricFamily if family.kind == "counter" else GaugeMetricFamily
+                kind = CounterMetricFamily if family.name.endswith("_total") else GaugeMetricFamily
                 name = f"armident_{self._metrics.program}_{family.name}"
                 metric = kind(name, family.help, labels=[*COMMON, *family.labels])
                 for labels, number in series.items():

@@ -36,6 +36,7 @@ from armident.identify.monitoring.reidentify import run
 from armident.identify.monitoring.reidentify.job_metrics import JOB, drift_values
 from armident.identify.monitoring.reidentify.reidentify_options import ReidentifyOptions
 from armident.identify.monitoring.reidentify.run import reidentify_command
+from armident.identify.monitoring.worker.ledger import FILE, Ledger
 from armident.identify.monitoring.worker.worker import Worker
 from armident.identify.monitoring.worker.worker_metrics import WORKER
 from armident.metrics import COMMON, Metrics
@@ -57,11 +58,12 @@ def exported(metrics: Metrics, text: str) -> Exported:
     declared = {f"armident_{metrics.program}_{each.name}": each for each in metrics.families}
     found: Exported = {}
     for family in text_string_to_metric_families(text):
-        each = declared[family.name]
-        assert (family.type, family.documentation) == (each.kind, each.help)
         for sample in family.samples:
+            each = declared[sample.name]
+            assert family.type == ("counter" if sample.name.endswith("_total") else "gauge")
+            assert family.documentation == each.help
             assert set(sample.labels) == {*COMMON, *each.labels}
-            found.setdefault(family.name, {})[tuple(sample.labels[name] for name in each.labels)] = sample.value
+            found.setdefault(sample.name, {})[tuple(sample.labels[name] for name in each.labels)] = sample.value
     if shutil.which("promtool"):
         done = subprocess.run(
             ["promtool", "check", "metrics"], input=text, capture_output=True, text=True, check=False, timeout=60
@@ -122,7 +124,7 @@ def test_a_capture_exports_what_it_declares(udp_bus: Bus, tmp_path: Path, caplog
         found = scraped(
             CAPTURE,
             caplog,
-            lambda each: "drive_temperature_celsius" in each and each["rows"][()] > 100 and not stop.is_set(),
+            lambda each: "drive_temperature_celsius" in each and each["rows_total"][()] > 100 and not stop.is_set(),
         )
         stop.set()
         thread.join()
@@ -137,7 +139,7 @@ def test_a_capture_exports_what_it_declares(udp_bus: Bus, tmp_path: Path, caplog
         without = {name for name in names(CAPTURE) if name.startswith("clock_")}
     assert set(found) == names(CAPTURE) - without
     (result,) = results
-    assert found["rows"][()] <= result.counters["samples.rows"]
+    assert found["rows_total"][()] <= result.counters["samples.rows"]
     assert found["drive_temperature_celsius"] == {("joint_1",): 40.0}
     bus = (udp_bus.channel,)
     # 50 SYNCs and TPDOs a second, a fifth more of the slow stream; bits without stuff bits of CiA 301 at 1 Mbit/s.
@@ -147,7 +149,7 @@ def test_a_capture_exports_what_it_declares(udp_bus: Bus, tmp_path: Path, caplog
     assert set(found["sync_jitter_seconds"]) == {(*bus, each) for each in ("std", "p50", "p99", "p99.9", "max")}
     assert 0 < found["sync_jitter_seconds"][*bus, "max"] < 10
     assert abs(found["updated_timestamp_seconds"][()] - time.time()) < LONGEST_S
-    assert found["events"]["heartbeat_lost",] == result.counters["heartbeat_lost"]
+    assert found["events_total"]["heartbeat_lost",] == result.counters["heartbeat_lost"]
     with pytest.raises(OSError):  # noqa: PT011 the endpoint has ended with the capture
         scraped(CAPTURE, caplog, lambda _: True)
 
@@ -163,23 +165,24 @@ def test_a_worker_exports_what_it_declares(tmp_path: Path, caplog: pytest.LogCap
         found = scraped(
             WORKER, caplog, lambda each: each.get("recordings", {}).get(("done",)) == 1 and "parameter_std" in each
         )
+        # A recording that another worker holds.
+        other = Ledger(tmp_path / FILE, "other", lease_s=1000.0)
+        other.add("f" * 64, "emps-b", [tmp_path / "emps-b.mcap"])
+        assert other.claim("f" * 64) is not None
+        waits = scraped(WORKER, caplog, lambda each: each["oldest_waiting_seconds"][()] >= 1.0)
     assert set(found) == names(WORKER)
     states = {"waiting": 0, "done": 1, "failed": 0, "passed": 1, "ignored": 0}
     assert found["recordings"] == {(state,): number for state, number in states.items()}
     assert found["oldest_waiting_seconds"] == {(): 0.0}
-    assert found["attempts"][()] == 2
+    assert found["attempts_total"][()] == 2
     document = load_document(tmp_path / "emps-a.identification" / "identification.json", IdentificationDocument)
     assert [verdict for (verdict,), value in found["last_verdict"].items() if value] == [document.verdict]
     assert found["parameter_value"] == {("joint_1", p.name, p.unit): p.value for p in document.parameters}
     assert found["parameter_std"] == {("joint_1", p.name, p.unit): p.std for p in document.parameters}
     assert found["torque_error_ratio"][()] == pytest.approx(document.relative_error_pct / 100)
-    # The recording that waits: another worker has the same ledger, and none of the results of its own.
-    recorded(session, "b", 2)
-    with Worker(session, made.robot, tmp_path) as worker:
-        waiting = scraped(WORKER, caplog, lambda each: each.get("recordings", {}).get(("waiting",)) == 1)
-        assert worker.result(LONGEST_S) == 0
-    assert waiting["oldest_waiting_seconds"][()] < LONGEST_S
-    assert waiting["parameter_value"] == found["parameter_value"]
+    assert waits["recordings"] == found["recordings"] | {("waiting",): 1}
+    assert waits["oldest_waiting_seconds"][()] < LONGEST_S
+    assert waits["parameter_value"] == found["parameter_value"]
 
 
 def test_a_second_worker_serves_the_metrics_when_the_first_has_ended(

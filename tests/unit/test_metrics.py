@@ -17,7 +17,7 @@ METRICS = Metrics(
     "test",
     (
         INFO,
-        Family("frames", "frames", "Frames.", kind="counter"),
+        Family("frames", "frames_total", "Frames."),
         Family("error_us", "clock_error_seconds", "Error.", scale=1e-6),
         Family("load_of", "load_ratio", "Load.", ("bus",)),
     ),
