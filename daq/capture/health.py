@@ -97,7 +97,9 @@ class Health:
         """Returns the counters of the own SYNC producer, if there is one."""
         self._frames_before = 0
         # Not every second: the bits of all SYNCs are counted.
-        self._planned = {(bus.channel,): worst_load(plan.session, bus) for bus in plan.session.all_buses if bus.bitrate}
+        self._planned: Value = {
+            (bus.channel,): worst_load(plan.session, bus) for bus in plan.session.all_buses if bus.bitrate
+        }
         self._busy: tuple[float, dict[str, float]] = time.monotonic(), {}
         self._disk = DiskCheck(sink)
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from armident.configs.errors import ArmidentError
 from armident.drivers.can.error_frames import summarise
-from armident.drivers.can.frames import ERROR_FLAG, FD_FLAG, FD_LENGTHS, BusDown, FrameBus, Frames, frames
+from armident.drivers.can.frames import ERROR_FLAG, BusDown, FrameBus, Frames, counts_by_length, frames
 
 BATCH = 4096
 """Maximum number of frames per batch."""
@@ -47,13 +47,7 @@ class _BusState:
         self.errors: list[Frames] = []
         self.error_count = 0
         self.reported = 0.0
-        self.traffic = np.zeros((2, FD_LENGTHS[-1] + 1), np.int64)
-
-    def count(self, received: Frames) -> None:
-        """Add frames to the traffic of the bus."""
-        width = self.traffic.shape[1]
-        kinds = received["length"] + width * ((received["flags"] & FD_FLAG) != 0)
-        self.traffic += np.bincount(kinds, minlength=2 * width).reshape(2, width)
+        self.traffic = counts_by_length(self.batch[:0])
 
 
 class Receiver:
@@ -100,7 +94,7 @@ class Receiver:
 
     @property
     def traffic(self) -> tuple[NDArray[np.int64], ...]:
-        """Number of frames of each bus, (2, 65): classic and CAN FD, by their number of data bytes."""
+        """Number of frames of each bus, as `counts_by_length`."""
         return tuple(entry.traffic for entry in self._buses)
 
     @property
@@ -131,7 +125,7 @@ class Receiver:
                 more |= got == BATCH
                 if got:
                     batch = self._without_errors(entry, entry.batch[:got])
-                    entry.count(batch)
+                    entry.traffic += counts_by_length(batch)
                     yield k, batch, entry.bus.dropped > before
             if not more:
                 return

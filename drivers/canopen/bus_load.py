@@ -96,10 +96,7 @@ def frame_seconds(bus: Bus, data_bytes: int, *, fd: bool) -> tuple[float, float]
 
 
 def busy_seconds(bus: Bus, traffic: NDArray[np.int64]) -> float:
-    """Least time for which frames have occupied a bus, s: without stuff bits; ``nan`` without bit rate.
-
-    ``traffic`` (2, 65): numbers of classic and of CAN FD frames by their number of data bytes.
-    """
+    """Least time for which frames (`counts_by_length`) have occupied a bus, s: no stuff bits; ``nan`` if virtual."""
     frames = ((traffic[fd, size], frame_seconds(bus, int(size), fd=bool(fd))[0]) for fd, size in np.argwhere(traffic))
     return float(sum(number * seconds for number, seconds in frames))
 

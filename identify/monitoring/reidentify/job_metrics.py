@@ -14,9 +14,6 @@ from armident.identify.monitoring.model_metrics import IDENTIFICATION, VERDICTS,
 from armident.identify.monitoring.reidentify.record_run import Say
 from armident.metrics import INFO, Family, Metrics, MetricsExporter, Value, check_file
 
-INTERRUPTED = 130
-"""Exit code after Ctrl-C, as that of the command line."""
-
 JOB = Metrics(
     "reidentify",
     (
@@ -48,7 +45,8 @@ def reported(path: Path | None, config: Path, say: Say) -> Iterator[dict[str, Va
     check_file(path)
     session = load_session(config, "identify")
     exporter = MetricsExporter(JOB, (session.cell, load_robot(session.robot, "identify").name))
-    began, code = time.monotonic(), INTERRUPTED
+    # 130 after Ctrl-C, as the command line has it.
+    began, code = time.monotonic(), 130
     try:
         yield values
         code = 0
