@@ -378,13 +378,8 @@ class Ledger:
             ).fetchone()
         return None if row is None else Path(row[0])
 
-    def backlog(self) -> int:
-        """Return the number of recordings that wait for their identification, those under way included."""
-        with self._transaction() as db:
-            return int(db.execute("SELECT count(*) FROM experiments WHERE state = 'waiting'").fetchone()[0])
-
     def summary(self) -> LedgerSummary:
-        """Return what the ledger has, for metrics."""
+        """Return what the ledger has; those under way are among the waiting ones."""
         newest = "SELECT CASE state WHEN 'done' THEN message ELSE state END, finished, result FROM experiments WHERE "
         order = " AND finished ORDER BY finished DESC LIMIT 1"
         with self._transaction() as db:

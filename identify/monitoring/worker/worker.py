@@ -190,7 +190,7 @@ class Worker:
                     scanned = time.monotonic()
                 entry = ledger.claim(held=tuple(self._intake.streams), announce=self._link.can_announce)
                 self._problem = None
-                self._note_backlog(ledger.backlog())
+                self._note_backlog(ledger.summary().states["waiting"])
                 if entry is not None:
                     self._process(ledger, entry)
                     continue
