@@ -159,11 +159,12 @@ class Worker:
         while not self._closing.wait(POLL_S):
             self._metrics.open()
             try:
-                if self._ledger is not None:
-                    self._ledger.renew()
-                    self._announcements.enter_heard(self._ledger)
+                # The other thread leaves a ledger that is lost.
+                if (ledger := self._ledger) is not None:
+                    ledger.renew()
+                    self._announcements.enter_heard(ledger)
                     counters = {"attempts": self._attempts, "failures": self._failures}
-                    self._metrics.update(self._ledger, {**counters, "zenoh_open": self._link.can_announce})
+                    self._metrics.update(ledger, {**counters, "zenoh_open": self._link.can_announce})
             except (ArmidentError, OSError) as error:
                 log.debug("lease or metrics not renewed: %s", error)
             self._link.check()
