@@ -250,18 +250,25 @@ class ZenohOptions(FrozenModel):
 
 
 class MetricsOptions(FrozenModel):
-    """Endpoint for Prometheus.
+    """Endpoints for Prometheus, which anybody who reaches them can read.
 
     Parameters
     ----------
-    port
-        TCP port; ``None``: no endpoint.
+    port, worker_port
+        TCP port of the capture, and of the worker; ``None``: no endpoint.
     address
         Address to listen on; loopback by default.
     """
 
     port: Annotated[int, Field(ge=0, le=65_535)] | None = None
+    worker_port: Annotated[int, Field(ge=0, le=65_535)] | None = None
     address: str = "127.0.0.1"
+
+    @model_validator(mode="after")
+    def _different(self) -> Self:
+        if self.port and self.port == self.worker_port:
+            raise ValueError(f"port and worker_port: capture and worker cannot both listen on {self.port}")
+        return self
 
 
 class SessionConfig(WithBlanks):

@@ -2,14 +2,15 @@
 
 import logging
 import threading
+import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from typing import Protocol
 
 from armident.configs import SessionConfig
 from armident.configs.schema.session import MetricsOptions
+from armident.daq.capture.capture_metrics import CAPTURE
 from armident.daq.capture.jitter import SyncJitter, worst
-from armident.daq.capture.metrics import Metrics, Value
 from armident.daq.capture.plan import CapturePlan
 from armident.daq.capture.publisher import Publisher
 from armident.daq.capture.recording_files import free_space
@@ -17,6 +18,8 @@ from armident.daq.capture.sink import Sink
 from armident.daq.matching.assembler import Assembler
 from armident.daq.recording.clock import clock_state
 from armident.drivers.can.receiver import Receiver
+from armident.drivers.canopen.bus_load import busy_seconds, worst_load
+from armident.metrics import MetricsExporter, Value
 
 WARNED_SHARE = 0.1
 """Share of the memory for waiting rows from which a warning is logged; nothing is lost before the memory is full.
@@ -86,11 +89,18 @@ class Health:
     ) -> None:
         self._plan, self._assembler, self._receiver, self._jitters = plan, assembler, receiver, jitters
         self._sink, self._publisher = sink, publisher
-        self._metrics: Metrics | None = None
+        self._metrics: MetricsExporter | None = None
         self._options = plan.session.metrics
         self.temperatures: Callable[[], dict[str, float]] = dict
         """Returns the temperature of each joint's drive (degrees Celsius) where it is known."""
+        self.punctuality: Callable[[], dict[str, int]] = dict
+        """Returns the counters of the own SYNC producer, if there is one."""
         self._frames_before = 0
+        # Not every second: the bits of all SYNCs are counted.
+        self._planned: Value = {
+            (bus.channel,): worst_load(plan.session, bus) for bus in plan.session.all_buses if bus.bitrate
+        }
+        self._busy: tuple[float, dict[str, float]] = time.monotonic(), {}
         self._disk = DiskCheck(sink)
 
     def serve(self, stack: ExitStack) -> None:
@@ -99,22 +109,19 @@ class Health:
         self._exchange(self._opened(self._options))
 
     def change(self, session: SessionConfig) -> None:
-        """Apply the ``metrics`` options of a reloaded session; if the port cannot be opened, the former one stays."""
-        if session.metrics != self._options:
-            fresh = self._opened(session.metrics)
+        """Apply port and address of a reloaded session; if the port cannot be opened, the former one stays."""
+        options, before = session.metrics, self._options
+        if (options.address, options.port) != (before.address, before.port):
+            fresh = self._opened(options)
             # Not here: closing the former server waits for its thread.
             threading.Thread(target=self._exchange, args=(fresh,), name="metrics", daemon=True).start()
-            self._options = session.metrics
+        self._options = options
 
-    def _opened(self, options: MetricsOptions) -> Metrics | None:
-        if options.port is None:
-            return None
-        labels = {"cell": self._plan.session.cell, "robot": self._plan.robot.name}
-        metrics = Metrics(options.address, options.port, labels)
-        log.info("metrics on http://%s:%d/metrics", options.address, metrics.port)
-        return metrics
+    def _opened(self, options: MetricsOptions) -> MetricsExporter | None:
+        exporter = MetricsExporter(CAPTURE, (self._plan.session.cell, self._plan.robot.name))
+        return None if options.port is None else exporter.serve(options.address, options.port)
 
-    def _exchange(self, fresh: Metrics | None) -> None:
+    def _exchange(self, fresh: MetricsExporter | None) -> None:
         old, self._metrics = self._metrics, fresh
         if old is not None:
             old.close()
@@ -125,7 +132,7 @@ class Health:
         rate = (counters["frames"] - self._frames_before) / seconds
         self._frames_before = counters["frames"]
         self._disk.update()
-        health: dict[str, Value] = {
+        health: dict[str, float | str | None] = {
             "file": None if self._sink.path is None else self._sink.path.name,
             "rows_not_written": self._sink.lost_rows,
             "rows_waiting": self._sink.waiting_rows,
@@ -137,6 +144,7 @@ class Health:
             "kernel_drops": self._receiver.dropped,
             "error_frames": self._receiver.error_frames,
             "buses_down": sum(self._receiver.down),
+            "tpdo_late": counters["tpdo_late"],
             "answers_owed": self._assembler.outstanding,
             "queue_depth": self._publisher.depth,
             "disk_free_bytes": free_space(self._plan.directory),
@@ -146,6 +154,7 @@ class Health:
             "zenoh_problem": self._publisher.problem,
             **_clock(),
             **{f"temperature_{joint}_c": round(celsius, 2) for joint, celsius in self.temperatures().items()},
+            **self.punctuality(),
             **events,
         }
         for name, value in worst(self._jitters).items():
@@ -153,11 +162,31 @@ class Health:
         self._publisher.health(health)
         metrics = self._metrics
         if metrics is not None:
-            metrics.update(health)
+            metrics.values = health | self._measured(events)
         self._publisher.status({"state": "recording", "sync": self._assembler.last_sync})
 
+    def _measured(self, events: dict[str, int]) -> dict[str, Value]:
+        """Return the values of metrics with labels of their own, which the health message has not."""
+        received = dict(zip(self._plan.session.all_buses, self._receiver.traffic, strict=True))
+        busy = {bus.channel: busy_seconds(bus, frames) for bus, frames in received.items()}
+        (since, before), self._busy = self._busy, (now := time.monotonic(), busy)
+        return {
+            "time_s": time.time(),
+            "buffer_share": self._sink.waiting_share,
+            "frames_of": {(bus.channel,): float(frames.sum()) for bus, frames in received.items()},
+            "load_of": {(bus,): (value - before.get(bus, 0.0)) / (now - since) for bus, value in busy.items()},
+            "plan_of": self._planned,
+            "events_of": {(kind,): number for kind, number in events.items()},
+            "jitter_of": {
+                (bus.channel, statistic): value
+                for bus, jitter in zip(received, self._jitters, strict=True)
+                for statistic, value in jitter.statistics().items()
+            },
+            "celsius_of": {(joint,): celsius for joint, celsius in self.temperatures().items()},
+        }
 
-def _clock() -> dict[str, Value]:
+
+def _clock() -> dict[str, float | str | None]:
     """Return the state of the system clock, which stamps the frames where the hardware does not."""
     try:
         state = clock_state()

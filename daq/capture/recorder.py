@@ -90,6 +90,7 @@ class Recorder:
         self._jitters = [SyncJitter(period_ns, overflow) for _ in receiver.channels]
         self._events = EventHandler(plan, self._assembler, sink)
         self.health = Health(plan, self._assembler, receiver, self._jitters, sink, outputs.publisher)
+        self.health.punctuality = self._punctuality
         self._producer: SyncProducer | KernelSync | None = None
         self._master: DriveMaster | None = None
         self._reports: DriveMaster | EmcyListener | None = listener
@@ -167,17 +168,21 @@ class Recorder:
         counters["sync_unseen"] = self._syncs_unreceived
         for name, value in worst(self._jitters).items():
             counters[f"sync_jitter_{name.replace('.', '_')}_us"] = round(value)
-        if isinstance(self._producer, SyncProducer):
-            stats = self._producer.stats()
-            counters |= {
-                "sync_sent": stats.sent,
-                "sync_not_sent": sum(stats.unsent),
-                "sync_late_p99_us": round(stats.late_p99_us),
-                "sync_late_max_us": round(stats.late_max_us),
-                "sync_overruns": stats.overruns,
-                "sync_skipped_periods": stats.skipped,
-            }
-        return counters
+        return counters | self._punctuality()
+
+    def _punctuality(self) -> dict[str, int]:
+        """Return the counters of the own SYNC producer, if it is the loop."""
+        if not isinstance(self._producer, SyncProducer):
+            return {}
+        stats = self._producer.stats()
+        return {
+            "sync_sent": stats.sent,
+            "sync_not_sent": sum(stats.unsent),
+            "sync_late_p99_us": round(stats.late_p99_us),
+            "sync_late_max_us": round(stats.late_max_us),
+            "sync_overruns": stats.overruns,
+            "sync_skipped_periods": stats.skipped,
+        }
 
     def _start_motion(self) -> None:
         if isinstance(self._producer, SyncProducer) and self._motion is not None:

@@ -23,10 +23,11 @@ CHANGEABLE = (
     "zenoh.queue_blocks",
     "zenoh.commands",
     "metrics.port",
+    "metrics.worker_port",
     "metrics.address",
     "identification",
 )
-"""Keys of a session that may change during its capture; ``identification`` and results belong to the worker."""
+"""Keys of a session that may change during its capture; the worker takes some of them at its next start."""
 
 Change = Callable[[SessionConfig], None]
 """Applies a changed session to one part of the capture; may raise ConfigError."""

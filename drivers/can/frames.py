@@ -97,6 +97,13 @@ def frames(n: int, fd: bool = False) -> Frames:
     return np.zeros(n, dtype=FD_FRAME if fd else FRAME)
 
 
+def counts_by_length(received: Frames) -> NDArray[np.int64]:
+    """Numbers of classic and of CAN FD frames by their number of data bytes, shape (2, 65)."""
+    width = FD_LENGTHS[-1] + 1
+    kinds = received["length"] + width * ((received["flags"] & FD_FLAG) != 0)
+    return np.bincount(kinds, minlength=2 * width).reshape(2, width)
+
+
 def fd_length(size: int) -> int:
     """Number of data bytes of the smallest CAN FD frame that carries a payload; ValueError if none does."""
     if size > FD_LENGTHS[-1]:

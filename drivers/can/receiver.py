@@ -7,10 +7,11 @@ from dataclasses import dataclass
 from typing import Literal, Self
 
 import numpy as np
+from numpy.typing import NDArray
 
 from armident.configs.errors import ArmidentError
 from armident.drivers.can.error_frames import summarise
-from armident.drivers.can.frames import ERROR_FLAG, BusDown, FrameBus, Frames, frames
+from armident.drivers.can.frames import ERROR_FLAG, BusDown, FrameBus, Frames, counts_by_length, frames
 
 BATCH = 4096
 """Maximum number of frames per batch."""
@@ -46,6 +47,7 @@ class _BusState:
         self.errors: list[Frames] = []
         self.error_count = 0
         self.reported = 0.0
+        self.traffic = counts_by_length(self.batch[:0])
 
 
 class Receiver:
@@ -91,6 +93,11 @@ class Receiver:
         return sum(entry.error_count for entry in self._buses)
 
     @property
+    def traffic(self) -> tuple[NDArray[np.int64], ...]:
+        """Number of frames of each bus, as `counts_by_length`."""
+        return tuple(entry.traffic for entry in self._buses)
+
+    @property
     def down(self) -> tuple[bool, ...]:
         """``True`` for each bus that is down."""
         return tuple(entry.down_since is not None for entry in self._buses)
@@ -118,6 +125,7 @@ class Receiver:
                 more |= got == BATCH
                 if got:
                     batch = self._without_errors(entry, entry.batch[:got])
+                    entry.traffic += counts_by_length(batch)
                     yield k, batch, entry.bus.dropped > before
             if not more:
                 return

@@ -7,6 +7,9 @@ bit rate from bit rate switch to CRC delimiter.
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+import numpy as np
+from numpy.typing import NDArray
+
 from armident.configs import ConfigError, SessionConfig
 from armident.configs.schema.session import Bus
 from armident.drivers.can.frames import fd_length
@@ -82,6 +85,22 @@ class Load:
     bus: str = ""
 
 
+def frame_seconds(bus: Bus, data_bytes: int, *, fd: bool) -> tuple[float, float]:
+    """Minimum and maximum time of a frame on a bus, s; ``nan`` without bit rate."""
+    bitrate, data_bitrate = bus.bitrate or float("nan"), bus.data_bitrate or float("nan")
+    if fd:
+        low, high = (nominal / bitrate + data / data_bitrate for nominal, data in fd_frame_bits(fd_length(data_bytes)))
+        return low, high
+    low, high = (bits / bitrate for bits in frame_bits(data_bytes))
+    return low, high
+
+
+def busy_seconds(bus: Bus, traffic: NDArray[np.int64]) -> float:
+    """Least time for which frames (`counts_by_length`) have occupied a bus, s: no stuff bits; ``nan`` if virtual."""
+    frames = ((traffic[fd, size], frame_seconds(bus, int(size), fd=bool(fd))[0]) for fd, size in np.argwhere(traffic))
+    return float(sum(number * seconds for number, seconds in frames))
+
+
 def loads(session: SessionConfig, period_us: int | None = None) -> list[Load]:
     """Load of a session by bus and kind of message; ``nan`` on a bus without bit rate."""
     return [row for bus in session.all_buses for row in bus_loads(session, bus, period_us)]
@@ -90,21 +109,15 @@ def loads(session: SessionConfig, period_us: int | None = None) -> list[Load]:
 def bus_loads(session: SessionConfig, bus: Bus, period_us: int | None = None) -> list[Load]:
     """Load of one bus by kind of message; ``nan`` on a bus without bit rate."""
     period = (session.sync.period_us if period_us is None else period_us) * 1e-6
-    bitrate, data_bitrate = bus.bitrate or float("nan"), bus.data_bitrate or float("nan")
     nodes = len(session.drives_on(bus))
 
     def load(message: str, data_bytes: int, rate: float, fd: bool = False) -> Load:
-        if fd:
-            low, high = (
-                nominal / bitrate + data / data_bitrate for nominal, data in fd_frame_bits(fd_length(data_bytes))
-            )
-        else:
-            low, high = (bits / bitrate for bits in frame_bits(data_bytes))
+        low, high = frame_seconds(bus, data_bytes, fd=fd)
         return Load(message, rate, low * rate, high * rate, bus.channel)
 
     contents = [bytes([k]) for k in range(1, session.sync.counter + 1)] or [b""]
-    sync = [exact_bits(COB_SYNC, data) for data in contents]
-    shares = sum(sync) / len(sync) / period / bitrate, max(sync) / period / bitrate
+    sync = [exact_bits(COB_SYNC, data) / (bus.bitrate or float("nan")) for data in contents]
+    shares = sum(sync) / len(sync) / period, max(sync) / period
     rows = [Load("SYNC", 1 / period, *shares, bus.channel)]
     for name, stream in session.streams.items():
         size = TpdoLayout.of(stream.objects, f"streams.{name}", stream.pack, bus.fd).frame_size

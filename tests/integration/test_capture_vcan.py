@@ -229,7 +229,7 @@ def test_a_trigger_writes_only_the_time_around_events(vcan_bus: str, tmp_path: P
     time.sleep(5.0)
     (address,) = (word for word in log.split() if word.startswith("http://127.0.0.1:"))
     with urllib.request.build_opener(urllib.request.ProxyHandler({})).open(address, timeout=10) as answer:
-        assert 'armident_frames_total{cell="events",robot="tx40"}' in answer.read().decode()
+        assert 'armident_capture_rows_total{cell="events",robot="tx40"}' in answer.read().decode()
     for words in (["mark", "gripper changed"], ["save"]):
         command = armident("command", *words, "--config", session)
         out, err = command.communicate(timeout=60)

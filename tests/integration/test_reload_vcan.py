@@ -58,11 +58,12 @@ def test_no_sync_is_lost_during_a_reload(vcan_bus: str, tmp_path: Path) -> None:
     wait_for_file(tmp_path / "out", 50_000, process)
     directly = urllib.request.build_opener(urllib.request.ProxyHandler({}))
     deadline = 100
-    while deadline and b"temperature_joint_6_c" not in (page := directly.open(address, timeout=10).read()):
+    while deadline and b'joint="joint_6"' not in (page := directly.open(address, timeout=10).read()):
         deadline -= 1
         time.sleep(0.1)
-    assert b'armident_temperature_joint_1_c{cell="reloaded",robot="tx40"} 40.0' in page
-    assert b"armident_clock_synchronised" in page
+    labels = b'{cell="reloaded",joint="joint_1",robot="tx40"}'
+    assert b"armident_capture_drive_temperature_celsius%s 40.0" % labels in page
+    assert b"armident_capture_clock_synchronised" in page
     process.send_signal(signal.SIGTERM)
     out, err = process.communicate(timeout=200)
     assert process.returncode == 0, err

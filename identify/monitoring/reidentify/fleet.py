@@ -60,8 +60,10 @@ def fleet_command(pattern: str, asked: ReidentifyOptions, *, as_json: bool) -> i
     """Carry out ``armident reidentify --recordings``; a failed recording does not stop the others.
 
     Each is compared with the baseline, or the first run of the arm (robot and cell). Returns 0, `FOUND` or 1.
-    Raises ConfigError if nothing matches, or there are no workers.
+    Raises ConfigError if nothing matches, there are no workers, or metrics are asked for.
     """
+    if asked.metrics is not None:
+        raise ConfigError("--metrics: not with --recordings; the results of a fleet are in the history (--store)")
     paths = [Path(name).resolve() for name in sorted(glob.glob(pattern, recursive=True))]
     if not paths:
         raise ConfigError(f"--recordings {pattern}: no such file")

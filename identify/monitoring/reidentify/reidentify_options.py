@@ -34,6 +34,9 @@ class ReidentifyOptions:
         flag=_DIAGNOSIS["time_limit_s"]["flag"],
         **_DIAGNOSIS["time_limit_s"]["typer"],
     )
+    metrics: Path | None = option(
+        "File of metrics (NAME.prom) for the textfile collector of Prometheus' node_exporter.", None
+    )
     investigate: bool = option(
         "If the arm has changed, move it along further motions that tell what has changed, without asking.", False
     )

@@ -34,11 +34,13 @@ from armident.identify.identification.options import options_of
 from armident.identify.monitoring.reidentify.baseline import Baseline, baseline_of
 from armident.identify.monitoring.reidentify.cell import load_moving_session
 from armident.identify.monitoring.reidentify.identify_once import identify_once
+from armident.identify.monitoring.reidentify.job_metrics import drift_values, identified_values, reported
 from armident.identify.monitoring.reidentify.keep import HistoryEntry, history_or_reason, recorded_in_history
 from armident.identify.monitoring.reidentify.publish import StatusPublisher
 from armident.identify.monitoring.reidentify.record_run import POLL_S, Say, record_run, running
 from armident.identify.monitoring.reidentify.reidentify_options import ReidentifyOptions
 from armident.identify.monitoring.reidentify.summary import change_lines, finding_lines
+from armident.metrics import Value
 
 CHECK_PERIOD = 1e-3
 """Sampling period of predicted torques, s."""
@@ -97,16 +99,19 @@ def reidentify_command(asked: ReidentifyOptions, *, as_json: bool) -> int:
             raise ConfigError(f"{option}: needs --recordings")
     if asked.config is None:
         raise ConfigError("--config: give the session of the cell, or --recordings")
-    job = prepare(asked.config, asked.baseline, asked.store, asked.out, asked.false_alarms)
-    job = replace(job, material=asked.material, time_limit_s=asked.time_limit_s)
-    if asked.investigate:
-        job = replace(job, experiments=asked.experiments, minutes=asked.minutes)
 
     def say(line: str) -> None:
         print(f"reidentify: {line}", file=sys.stderr, flush=True)
 
-    with StatusPublisher(job.session, job.robot) as announcer:
-        outcome = carry_out(job, announcer, say)
+    with reported(asked.metrics, asked.config, say) as values:
+        job = prepare(asked.config, asked.baseline, asked.store, asked.out, asked.false_alarms)
+        job = replace(job, material=asked.material, time_limit_s=asked.time_limit_s)
+        if asked.investigate:
+            job = replace(job, experiments=asked.experiments, minutes=asked.minutes)
+        with StatusPublisher(job.session, job.robot) as announcer:
+            outcome = carry_out(job, announcer, say, values)
+        values |= {"changed": outcome.changed, "exit_code": FOUND if outcome.changed else 0}
+        values["investigated"] = outcome.investigation is not None
     if as_json:
         print(json.dumps(entry(job, outcome), indent=1))
     else:
@@ -149,8 +154,12 @@ def check_trajectory(session: SessionConfig, robot: RobotConfig, baseline: Basel
             )
 
 
-def carry_out(job: Job, announcer: StatusPublisher, say: Say) -> Outcome:
-    """Carry out a job, store its result in the history, and publish it; raises ArmidentError if it fails."""
+def carry_out(job: Job, announcer: StatusPublisher, say: Say, values: dict[str, Value] | None = None) -> Outcome:
+    """Carry out a job, store its result in the history, and publish it; raises ArmidentError if it fails.
+
+    ``values``: takes those of the metrics of the job.
+    """
+    values = {} if values is None else values
     say(f"{job.robot.name} in cell {job.session.cell}; baseline: {job.baseline.name}")
     if job.warning is not None:
         say(f"warning: {job.warning}; the run goes on with the baseline that is given")
@@ -162,6 +171,7 @@ def carry_out(job: Job, announcer: StatusPublisher, say: Say) -> Outcome:
     options = options_of(job.session)
     done = identify_once(recording, job.robot, options, job.out, announcer, say)
     document, path = done.document, done.path
+    values |= identified_values(document)
     for reason in document.reasons:
         say(f"{reason.level}: {reason.message}. Next: {reason.next_step}")
     for warning in document.warnings:
@@ -180,6 +190,7 @@ def carry_out(job: Job, announcer: StatusPublisher, say: Say) -> Outcome:
         )
     except Inconclusive as error:
         return _unexpected(job, recording, document, path, str(error), announcer, say)
+    values |= {} if drift is None else drift_values(drift, document)
     with recorded_in_history(HistoryEntry(job.store, recording, document, path, job.baseline.document, drift), say):
         return _concluded(job, recording, document, path, drift, announcer, say)
 

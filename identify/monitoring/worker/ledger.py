@@ -19,7 +19,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 from armident.configs import ArmidentError
 from armident.configs.reasons import reason_of
@@ -132,6 +132,20 @@ class LedgerEntry:
     def digest(self) -> str | None:
         """SHA-256 of its samples, hexadecimal; ``None`` if its files were not read yet."""
         return None if self.sha256.startswith(_UNREAD) else self.sha256
+
+
+@dataclass(frozen=True)
+class LedgerSummary:
+    """Numbers of recordings by state, entry time of the oldest that waits, and the newest end; times in s since 1970.
+
+    ``verdict``: of the newest result, or ``failed``; ``ended``: its time; ``result``: file of the newest result.
+    """
+
+    states: dict[str, int]
+    waits_since: float | None
+    verdict: str | None
+    ended: float | None
+    result: Path | None
 
 
 _COLUMNS = "sha256, name, paths, state, attempts, result, message, announced, any_cell, version"
@@ -364,10 +378,18 @@ class Ledger:
             ).fetchone()
         return None if row is None else Path(row[0])
 
-    def backlog(self) -> int:
-        """Return the number of recordings that wait for their identification, those under way included."""
+    def summary(self) -> LedgerSummary:
+        """Return what the ledger has; those under way are among the waiting ones."""
+        newest = "SELECT CASE state WHEN 'done' THEN message ELSE state END, finished, result FROM experiments WHERE "
+        order = " AND finished ORDER BY finished DESC LIMIT 1"
         with self._transaction() as db:
-            return int(db.execute("SELECT count(*) FROM experiments WHERE state = 'waiting'").fetchone()[0])
+            rows = db.execute("SELECT state, count(*), min(added) FROM experiments GROUP BY state").fetchall()
+            ended = db.execute(f"{newest} state IN ('done', 'failed') {order}").fetchone()
+            result = db.execute(f"{newest} result IS NOT NULL {order}").fetchone()
+        numbers = dict.fromkeys(get_args(State), 0) | {state: number for state, number, _ in rows}
+        since = next((added for state, _, added in rows if state == "waiting"), None)
+        verdict, moment, _ = ended or (None, None, None)
+        return LedgerSummary(numbers, since, verdict, moment, Path(result[2]) if result else None)
 
     def retry_after_upgrade(self, version: str) -> None:
         """Let recordings wait again that failed under another version of the program."""

@@ -37,6 +37,7 @@ from armident.identify.monitoring.worker.recorded import Captured, result_of
 from armident.identify.monitoring.worker.results import results_since
 from armident.identify.monitoring.worker.stream_buffer import LARGEST_BLOCK, LARGEST_EVENT, StreamBuffer
 from armident.identify.monitoring.worker.worker_link import LinkDown, WorkerLink
+from armident.identify.monitoring.worker.worker_metrics import WorkerMetrics
 from armident.identify.report.robot_file import write_identification
 from armident.systemd import Notifier
 
@@ -95,6 +96,8 @@ class Worker:
         self._ledger: Ledger | None = None
         limits = LARGEST_EVENT, LARGEST_BLOCK
         self._link = WorkerLink(session, self._keys, self._on_event, self._on_block, limits, self._answer)
+        self._metrics = WorkerMetrics(session, robot.name)
+        self._attempts = self._failures = 0
         self._announcements = Announcements(self._keys, self._link, session.recording.keep_results_days)
         self._threads = [
             threading.Thread(target=self._identify_all, name="identify", daemon=True),
@@ -116,6 +119,7 @@ class Worker:
         self._threads[1].join()
         self._threads[0].join(POLL_S)
         self._link.close()
+        self._metrics.close()
         if self._ledger is not None:
             try:
                 self._ledger.release()
@@ -153,12 +157,16 @@ class Worker:
     def _keep_alive(self) -> None:
         """Renew the leases, enter what others announced, and keep the Zenoh session open; in a thread of its own."""
         while not self._closing.wait(POLL_S):
+            self._metrics.open()
             try:
-                if self._ledger is not None:
-                    self._ledger.renew()
-                    self._announcements.enter_heard(self._ledger)
+                # The other thread leaves a ledger that is lost.
+                if (ledger := self._ledger) is not None:
+                    ledger.renew()
+                    self._announcements.enter_heard(ledger)
+                    counters = {"attempts": self._attempts, "failures": self._failures}
+                    self._metrics.update(ledger, {**counters, "zenoh_open": self._link.can_announce})
             except (ArmidentError, OSError) as error:
-                log.debug("lease not renewed: %s", error)
+                log.debug("lease or metrics not renewed: %s", error)
             self._link.check()
             if self._progress is not None and time.monotonic() - self._advanced < LONGEST_STAGE_S:
                 self._progress(self._state)
@@ -183,7 +191,7 @@ class Worker:
                     scanned = time.monotonic()
                 entry = ledger.claim(held=tuple(self._intake.streams), announce=self._link.can_announce)
                 self._problem = None
-                self._note_backlog(ledger.backlog())
+                self._note_backlog(ledger.summary().states["waiting"])
                 if entry is not None:
                     self._process(ledger, entry)
                     continue
@@ -239,6 +247,7 @@ class Worker:
         """Identify a recording, enter and announce the result; what was done before is not repeated."""
         code = _exit_code(entry.state, entry.message) if entry.version is None else ArmidentError.exit_code
         if entry.state == "waiting":
+            self._attempts += 1
             try:
                 if entry.attempts > MOST_ATTEMPTS:
                     raise RuntimeError(f"{MOST_ATTEMPTS} workers have ended while they worked on it")
@@ -273,6 +282,7 @@ class Worker:
 
     def _fail(self, ledger: Ledger, entry: LedgerEntry, message: str, version: str | None = None) -> None:
         log.error("%s", message)
+        self._failures += 1
         self._enter(ledger, entry, "failed", None, message, version)
 
     def _enter(self, ledger: Ledger, entry: LedgerEntry, state: State, *more: Any) -> bool:

@@ -1,5 +1,6 @@
 """Bus load against the figures of can-utils and of Davis et al. 2007."""
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -7,9 +8,11 @@ from typer.testing import CliRunner
 
 from armident.configs import ConfigError, SessionConfig, load_session
 from armident.daq.cli import application
-from armident.drivers.can.frames import FD_LENGTHS
+from armident.drivers.can.frames import FD_FLAG, FD_LENGTHS, counts_by_length, frames
 from armident.drivers.canopen.bus_load import (
     alternatives,
+    bus_loads,
+    busy_seconds,
     check_fits,
     exact_bits,
     fd_frame_bits,
@@ -18,6 +21,7 @@ from armident.drivers.canopen.bus_load import (
     frame_bits,
     loads,
 )
+from armident.drivers.canopen.objects import TpdoLayout
 
 
 def on_a_physical_bus(period_us: int, drives: int = 6) -> SessionConfig:
@@ -126,6 +130,25 @@ def test_each_bus_carries_its_own_drives_and_every_sync() -> None:
     assert len(per_bus) == 6
     assert sum(row.frames_per_s for row in rows if row.message.startswith("TPDO1")) == pytest.approx(30_000)
     assert sum(row.frames_per_s for row in rows if row.message == "SYNC") == pytest.approx(30_000)
+
+
+@pytest.mark.parametrize(("name", "data_bitrate"), [("tx40_six_buses", None), ("tx40_one_fd", 5_000_000)])
+def test_frames_of_a_second_take_the_time_that_is_planned_without_stuff_bits(
+    name: str, data_bitrate: int | None
+) -> None:
+    session = physical(name, data_bitrate)
+    bus = session.all_buses[0]
+    stream = session.streams["samples"]
+    received = frames(100, fd=bus.fd)
+    received["length"] = TpdoLayout.of(stream.objects, "samples", stream.pack, bus.fd).frame_size
+    received["flags"] = FD_FLAG if bus.fd else 0
+    planned = next(row for row in bus_loads(session, bus) if row.message.startswith("TPDO1"))
+    assert busy_seconds(bus, counts_by_length(received)) == pytest.approx(100 * planned.typical / planned.frames_per_s)
+    assert counts_by_length(received)[int(bus.fd)].sum() == counts_by_length(received).sum() == 100
+
+
+def test_frames_on_a_virtual_bus_take_no_known_time() -> None:
+    assert np.isnan(busy_seconds(load_session("tx40_cell").all_buses[0], counts_by_length(frames(1))))
 
 
 def table(*options: str) -> str:
