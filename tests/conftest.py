@@ -3,6 +3,7 @@
 import gc
 import itertools
 import os
+import tempfile
 from collections.abc import Generator, Iterator
 from pathlib import Path
 
@@ -13,6 +14,11 @@ import pytest
 # Set before numpy is imported; child processes inherit it. There is one test process per processor, so that more
 # threads of OpenBLAS only wait for each other.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+# The keys of the tests, which their child processes inherit: not those of this user or of a plant.
+_state = tempfile.TemporaryDirectory(prefix="armident-state-")
+os.environ["XDG_STATE_HOME"] = _state.name
+os.environ.pop("ARMIDENT_KEYS", None)
 
 from armident.configs.schema.session import Bus
 from armident.drivers.can.udp import open_python_can

@@ -58,7 +58,7 @@ class KeyFolder:
                     self._make_authority()
                     of, name = (ANY_CELL, "local") if role in ("operator", "viewer") else (cell, cell)
                     addresses = ("localhost", "127.0.0.1", "::1")
-                    found = read_authority(self.path).issue(role, of, f"{role}.{name}", addresses, _DAYS, _FROM)
+                    found = read_authority(self.path).issue(role, of, f"{role}.{name}"[:64], addresses, _DAYS, _FROM)
                     write_identity(self.path, found)
         if found is None:
             raise ConfigError(
@@ -76,6 +76,16 @@ class KeyFolder:
         if not path.is_file():
             raise ConfigError(f"{path}: no such file; copy it from the machine on which armident keys init ran")
         return read_certificates(path)
+
+    def stamp(self, name: str) -> tuple[int, ...]:
+        """Return the times of change of the folder and of a file in it, by which a renewal is noticed."""
+        found = []
+        for path in (self.path, self.path / name):
+            try:
+                found.append(path.stat().st_mtime_ns)
+            except OSError:
+                found.append(0)
+        return tuple(found)
 
     def _find(self, role: Role, cell: str) -> Identity | None:
         """Return the identity whose certificate ends last, rather of the cell than of the plant."""

@@ -13,8 +13,8 @@ Action = Literal["publish", "answer", "ask", "read"]
 class Permission:
     """Keys below ``armident/CELL/ROBOT/`` for each action; ``*`` stands for one or more parts of a key.
 
-    ``publish``: messages and liveliness tokens. ``answer``: replies to queries. ``ask``: queries. ``read``: subscriptions,
-    also of liveliness. Who reads samples and events asks their publisher for those that it missed, below ``@adv``.
+    ``publish``: messages and liveliness tokens. ``answer``: replies to queries. ``ask``: queries. ``read``:
+    subscriptions, also of liveliness. A reader of samples and events asks for those that it missed below ``@adv``.
     """
 
     publish: tuple[str, ...] = ()

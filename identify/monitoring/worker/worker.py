@@ -177,7 +177,7 @@ class Worker:
                 with self._lock:
                     ended = self._buffer.take_ended()
                 for assembly in ended:
-                    self._intake.take_stream(ledger, assembly)
+                    self._intake.take_stream(ledger, assembly, self._folders)
                 if time.monotonic() - scanned >= SCAN_S:
                     self._intake.scan(ledger, self._folders)
                     scanned = time.monotonic()

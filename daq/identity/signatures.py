@@ -1,0 +1,198 @@
+"""Signatures of messages on Zenoh, in the attachment of a sample, a query or a reply; payloads stay as they are.
+
+An attachment is ``ARMS``, version (u8), time (i64, ns UTC), lengths of nonce (u8) and certificate (u16), little endian;
+then nonce, certificate (DER) and signature (ECDSA, P-256, SHA-256). Signed is all before the signature, followed by the
+key expression, a zero byte, and the SHA-256 of the payload.
+"""
+
+import hashlib
+import secrets
+import struct
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from datetime import UTC, datetime
+
+import zenoh
+from cryptography import x509
+from cryptography.exceptions import InvalidSignature
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.hazmat.primitives.hashes import SHA256
+from cryptography.hazmat.primitives.serialization import Encoding
+
+from armident.configs import ConfigError, DataError, SessionConfig
+from armident.daq.identity.certificates import (
+    ANY_CELL,
+    Role,
+    check_dates,
+    identity_of,
+    trusted_certificate,
+)
+from armident.daq.identity.folder import KeyFolder, key_folder
+from armident.daq.identity.permissions import Action, may
+
+VERSION = 1
+LARGEST = 4096
+"""Largest attachment that is read, bytes; usual are 600."""
+NONCE_BYTES = 16
+MOST_CERTIFICATES = 256
+"""Number of checked certificates that are remembered."""
+_MAGIC = b"ARMS"
+_HEAD = struct.Struct("<4sBqBH")
+
+
+@dataclass(frozen=True)
+class Attachment:
+    """Content of an attachment; ``signed``: the bytes before the signature, ``time_ns`` in UTC."""
+
+    time_ns: int
+    nonce: bytes
+    certificate: bytes
+    signed: bytes
+    signature: bytes
+
+
+@dataclass(frozen=True)
+class Signed:
+    """Signer of a message that was found right, time of its signature, ns UTC, and its nonce."""
+
+    role: Role
+    cell: str
+    name: str
+    time_ns: int
+    nonce: bytes
+
+
+def parse(data: bytes) -> Attachment:
+    """Return the content of an attachment; DataError if it is none."""
+    if len(data) < _HEAD.size or not data.startswith(_MAGIC):
+        raise DataError("the attachment is no signature")
+    _, version, time_ns, of_nonce, of_certificate = _HEAD.unpack_from(data)
+    if version != VERSION:
+        raise DataError(f"a signature of version {version}, this program reads {VERSION}")
+    begin = _HEAD.size + of_nonce
+    end = begin + of_certificate
+    if end >= len(data):
+        raise DataError("a signature shorter than its head states")
+    return Attachment(time_ns, data[_HEAD.size : begin], data[begin:end], data[:end], data[end:])
+
+
+class Signer:
+    """Signs messages as a role in a cell; a renewed certificate is used without a restart."""
+
+    def __init__(self, folder: KeyFolder, role: Role, cell: str, clock: Callable[[], int] = time.time_ns) -> None:
+        self._folder, self._role, self._cell, self._clock = folder, role, cell, clock
+        self._load()
+
+    def attachment(self, key: str, payload: bytes, nonce: bytes = b"") -> bytes:
+        """Return the attachment that signs a payload on a key expression."""
+        if self._folder.stamp(self._file) != self._stamp:
+            # While a renewal is under way, the present certificate is used.
+            with suppress(ConfigError):
+                self._load()
+        head = _HEAD.pack(_MAGIC, VERSION, self._clock(), len(nonce), len(self._certificate))
+        signed = head + nonce + self._certificate
+        return signed + self._identity.sign(_covered(signed, key, payload))
+
+    def reply(self, query: zenoh.Query, key: str, payload: bytes) -> None:
+        """Answer a query, and sign its attachment with the answer if it is a nonce."""
+        asked = query.attachment
+        nonce = bytes(asked) if asked is not None and len(asked) == NONCE_BYTES else b""
+        query.reply(key, payload, attachment=self.attachment(key, payload, nonce))
+
+    def _load(self) -> None:
+        self._identity = self._folder.identity(self._role, self._cell)
+        self._certificate = self._identity.certificate.public_bytes(Encoding.DER)
+        self._file = f"{self._identity.name}.pem"
+        self._stamp = self._folder.stamp(self._file)
+
+
+class Trust:
+    """Checks messages of one robot, below ``base`` (``armident/CELL/ROBOT``), against the authority of the plant."""
+
+    def __init__(self, folder: KeyFolder, base: str, clock: Callable[[], int] = time.time_ns) -> None:
+        self._folder, self._base, self._clock = folder, f"{base}/", clock
+        self._cell = base.split("/")[1]
+        self._checked: dict[bytes, x509.Certificate] = {}
+        self._load()
+
+    def check(
+        self,
+        action: Action,
+        key: zenoh.KeyExpr | str,
+        payload: bytes,
+        attachment: zenoh.ZBytes | bytes | None,
+        *,
+        nonce: bytes | None = None,
+        after_ns: int | None = None,
+    ) -> Signed:
+        """Return the signer of a message who may do this with its key; DataError otherwise, with the reason.
+
+        ``nonce``: that of the query which this answers. ``after_ns``: latest time of a message known so far, ns UTC.
+        """
+        key = str(key)
+        if attachment is None:
+            raise DataError(f"{key}: a message without signature, as of a former version; update its sender")
+        if len(attachment) > LARGEST:
+            raise DataError(f"{key}: an attachment of {len(attachment)} bytes")
+        if not key.startswith(self._base):
+            raise DataError(f"{key}: not below {self._base}")
+        found = parse(bytes(attachment))
+        certificate = self._certificate(found.certificate)
+        role, cell, name = identity_of(certificate)
+        if cell not in (self._cell, ANY_CELL):
+            raise DataError(f"{key}: signed by {name} of cell {cell}")
+        if not may(role, action, key.removeprefix(self._base)):
+            raise DataError(f"{key}: signed by {name}; a {role} may not {action} it")
+        public = certificate.public_key()
+        assert isinstance(public, ec.EllipticCurvePublicKey)
+        try:
+            public.verify(found.signature, _covered(found.signed, key, payload), ec.ECDSA(SHA256()))
+        except InvalidSignature as error:
+            raise DataError(f"{key}: the signature of {name} is not that of this message") from error
+        if nonce is not None and found.nonce != nonce:
+            raise DataError(f"{key}: an answer of {name} to another query")
+        if after_ns is not None and found.time_ns <= after_ns:
+            raise DataError(f"{key}: an old message of {name}, repeated")
+        return Signed(role, cell, name, found.time_ns, found.nonce)
+
+    def _certificate(self, data: bytes) -> x509.Certificate:
+        """Return a certificate that is valid now; its chain is checked once."""
+        at = datetime.fromtimestamp(self._clock() / 1e9, UTC)
+        if self._folder.stamp("authority.pem") != self._stamp:
+            # While the file is replaced, the known authorities count.
+            with suppress(ConfigError):
+                self._load()
+        certificate = self._checked.get(data)
+        if certificate is None:
+            certificate = trusted_certificate(data, self._authorities, at)
+            if len(self._checked) >= MOST_CERTIFICATES:
+                self._checked.clear()
+            self._checked[data] = certificate
+        check_dates(certificate, at, identity_of(certificate)[2])
+        return certificate
+
+    def _load(self) -> None:
+        self._authorities = self._folder.authority_certificates()
+        self._stamp = self._folder.stamp("authority.pem")
+        self._checked.clear()
+
+
+def signer_for(session: SessionConfig, role: Role) -> Signer:
+    """Return the signer of a role in the cell of a session; ConfigError if there is no key."""
+    return Signer(key_folder(session.zenoh.keys), role, session.cell)
+
+
+def trust_for(session: SessionConfig, base: str) -> Trust:
+    """Return the check of messages below ``base`` for a session; ConfigError if there is no authority."""
+    return Trust(key_folder(session.zenoh.keys), base)
+
+
+def new_nonce() -> bytes:
+    """Return a nonce for a query."""
+    return secrets.token_bytes(NONCE_BYTES)
+
+
+def _covered(signed: bytes, key: str, payload: bytes) -> bytes:
+    return b"".join((signed, key.encode(), b"\0", hashlib.sha256(payload).digest()))
