@@ -217,7 +217,7 @@ def _capture_runs(session: SessionConfig, keys: Keys) -> bool:
     """Return True if the token of another capture of this robot is found."""
     until = time.monotonic() + FIND_S
     try:
-        with open_session(session, "observer") as observer:
+        with open_session(session, "observer", identity="capture") as observer:
             while time.monotonic() < until:
                 if any(reply.ok is not None for reply in observer.liveliness().get(keys.alive("capture"), timeout=0.3)):
                     return True

@@ -108,7 +108,7 @@ def send_command(session: SessionConfig, robot: str, command: Command, answer_s:
     """Send a command and wait until a capture accepts it; ConfigError if none answers, DataError if it refuses."""
     keys, nonce, content = Keys(session.cell, robot), new_nonce(), command.text.encode()
     signer, trust = signer_for(session, "operator"), trust_for(session, keys.base)
-    with open_session(session, "observer") as zenoh_session:
+    with open_session(session, "observer", identity="operator") as zenoh_session:
         key = keys.command(command.name)
         try:
             querier = zenoh_session.declare_querier(key, timeout=answer_s)

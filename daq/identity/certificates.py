@@ -25,10 +25,10 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 from armident.configs import ConfigError, DataError
 from armident.configs.reasons import reason_of
 
-Role = Literal["capture", "worker", "operator", "viewer"]
+Role = Literal["capture", "worker", "operator", "viewer", "router"]
 ROLES: tuple[Role, ...] = get_args(Role)
 ANY_CELL = "*"
-"""Cell of an operator or viewer of the whole plant."""
+"""Cell of a router, and of an operator or viewer of the whole plant."""
 TOLERANCE = timedelta(minutes=5)
 """Difference of the clocks of two hosts that a new certificate allows for."""
 PRIVATE, OF_GROUP = 0o600, 0o640
@@ -69,7 +69,7 @@ class Authority:
         """
         if role not in ROLES:
             raise ConfigError(f"role {role!r}: expected {', '.join(ROLES)}")
-        if cell == ANY_CELL and role not in ("operator", "viewer"):
+        if cell == ANY_CELL and role not in ("operator", "viewer", "router"):
             raise ConfigError(f"role {role}: needs a cell; only operator and viewer may be of all cells ({ANY_CELL})")
         key = ec.generate_private_key(ec.SECP256R1())
         subject = _name((NameOID.COMMON_NAME, name), (NameOID.ORGANIZATIONAL_UNIT_NAME, role),

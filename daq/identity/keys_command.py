@@ -102,7 +102,7 @@ def keys(
     for each in made:
         files = f"{path}/{each.name}.pem, {each.name}.key and authority.pem"
         print(f"{each.name}: valid until {each.certificate.not_valid_after_utc:%Y-%m-%d}")
-        print(f"  copy {files} to {OF_PLANT} on its host, and restart what uses them")
+        print(f"  copy {files} to {OF_PLANT} on its host")
     if action == "enrol":
         print(f"copy {path / of_plant.ROUTER_FILE} to the host of the router, and restart the router")
 

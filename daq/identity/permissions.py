@@ -41,6 +41,7 @@ PERMISSIONS: dict[Role, Permission] = {
     ),
     "operator": Permission(ask=("command/*", "result/*", *_STREAMS, "alive/*"), read=_ALL),
     "viewer": Permission(ask=("result/*", *_STREAMS, "alive/*"), read=_ALL),
+    "router": Permission(),
 }
 """Permissions by role; an operator or viewer of all cells has them in each cell. All else is forbidden.
 

@@ -67,7 +67,7 @@ class LiveWatch:
         self._received = self._taken = 0
         self.estimator = estimator
         self._rate = 1.0 / session.sync_period
-        self._session = open_session(session, "observer")
+        self._session = open_session(session, "observer", identity="worker")
 
     def __enter__(self) -> Self:
         """Subscribe, answer queries, and declare the liveliness token."""

@@ -46,7 +46,7 @@ class WorkerReceiver:
         if self._session is not None:
             return
         try:
-            session = open_session(self._config, "observer", any_port=True)
+            session = open_session(self._config, "observer", any_port=True, identity="worker")
             try:
                 self._declared = self._subscribed(session)
             except BaseException:
