@@ -26,6 +26,7 @@ from armident.identify.monitoring.recursive.saved_state import state_of
 from armident.identify.monitoring.recursive.watch import WatchOptions, watch_cell, watch_recordings
 from armident.identify.monitoring.worker.stream_buffer import LARGEST_BLOCK
 from tests.fixtures import arms
+from tests.fixtures.signed import put_signed
 from tests.integration.test_worker import blocks_of as published_blocks
 
 pytestmark = pytest.mark.slow
@@ -162,7 +163,7 @@ def test_blocks_of_strangers_end_no_watch(session: SessionConfig) -> None:
         for message in (b"no block", encode_block(replace(block, layout=others)), bytes(LARGEST_BLOCK + 1)):
             before, end = watch.refusals.total, time.monotonic() + 60.0
             while watch.refusals.total == before and time.monotonic() < end:
-                stranger.put(key, message)
+                put_signed(stranger, session, key, message)
                 time.sleep(0.2)
             assert watch.refusals.total > before
     assert estimator.result().sync == -1
