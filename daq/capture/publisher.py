@@ -13,6 +13,7 @@ import zenoh.ext
 
 from armident.configs import ConfigError, SessionConfig
 from armident.daq.capture.remote_commands import Commands
+from armident.daq.identity.plant import Countdown
 from armident.daq.identity.signatures import signer_for, trust_for
 from armident.daq.streaming import Block, Keys, encode_block, open_session
 from armident.daq.streaming.zenoh_session import configuration
@@ -164,7 +165,9 @@ class Publisher:
             self._ready.notify()
 
     def _run(self) -> None:
+        countdown = Countdown(self._config)
         while True:
+            countdown.check()
             if self._session is None and not self._try_open():
                 if self._over.wait(RETRY_S):
                     return

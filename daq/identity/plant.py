@@ -1,6 +1,8 @@
 """Authority of a plant: enrols roles, renews and revokes their certificates, and checks a folder of keys."""
 
+import logging
 import re
+import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
@@ -30,6 +32,9 @@ from armident.daq.identity.certificates import (
     write_key,
     write_whole,
 )
+from armident.daq.identity.folder import key_folder
+
+log = logging.getLogger(__name__)
 
 AUTHORITY = "authority"
 """Name of the authority among those of its folder."""
@@ -195,7 +200,7 @@ def write_router(folder: Path) -> None:
 
 
 def findings(folder: Path, now: datetime, session: SessionConfig | None = None) -> Iterator[Finding]:
-    """Check everything in a folder of keys that would fail later; ``session``: the cell that uses it."""
+    """Check everything in a folder of keys that would fail later; ``session``: only what its cell uses."""
     is_plant = (folder / "authority.key").exists()
     try:
         authorities = read_certificates(folder / "authority.pem")
@@ -209,10 +214,12 @@ def findings(folder: Path, now: datetime, session: SessionConfig | None = None) 
         if path.stem == AUTHORITY:
             continue
         try:
+            certificate = read_certificates(path)[0]
+            _, cell, name = identity_of(certificate)
+            if session is not None and cell != session.cell:
+                continue
             if not (is_plant and not path.with_suffix(".key").exists()):  # The key was handed over.
                 read_identity(path)
-            certificate = read_certificates(path)[0]
-            name = identity_of(certificate)[2]
             if name != path.stem:
                 raise ConfigError(f"{path}: is the certificate of {name}; expected the name {name}.pem")
             trusted_certificate(certificate.public_bytes(Encoding.DER), authorities, now)
@@ -220,10 +227,36 @@ def findings(folder: Path, now: datetime, session: SessionConfig | None = None) 
             yield Finding("failed", str(error))
         else:
             yield _ending(name, certificate, now)
-    if is_plant:
+    if is_plant and session is None:
         yield _router(folder)
     if session is not None:
-        yield from _of_session(folder, session)
+        yield from _endpoints_of(folder, session)
+
+
+def of_session(session: SessionConfig, now: datetime) -> Iterator[Finding]:
+    """Check the keys of the plant that a session uses; those of this machine alone need no check."""
+    try:
+        folder = key_folder(session.zenoh.keys)
+    except ConfigError as error:
+        yield Finding("failed", str(error))
+    else:
+        if not folder.local:
+            yield from findings(folder.path, now, session)
+
+
+class Countdown:
+    """Logs once a day which certificates of a session end soon or fail."""
+
+    def __init__(self, session: SessionConfig) -> None:
+        self._session, self._due = session, time.monotonic()
+
+    def check(self) -> None:
+        """Log what is found if a day has passed since the last time."""
+        if time.monotonic() >= self._due:
+            self._due = time.monotonic() + 86_400
+            for each in of_session(self._session, datetime.now(UTC)):
+                if each.verdict != "ok":
+                    log.log(logging.ERROR if each.verdict == "failed" else logging.WARNING, "keys: %s", each.message)
 
 
 def _router(folder: Path) -> Finding:
@@ -240,7 +273,7 @@ def _router(folder: Path) -> Finding:
     return Finding("failed", f"{path}: {reason}; run: armident keys router, and copy it to the host of the router")
 
 
-def _of_session(folder: Path, session: SessionConfig) -> Iterator[Finding]:
+def _endpoints_of(folder: Path, session: SessionConfig) -> Iterator[Finding]:
     """Check the certificates that the endpoints of a session need."""
     try:
         of_cell = [each for each in enrolled(folder) if each.cell in (session.cell, ANY_CELL)]

@@ -8,6 +8,7 @@ from typing import Any
 import zenoh
 
 from armident.configs import ArmidentError, ConfigError, SessionConfig
+from armident.daq.identity.plant import Countdown
 from armident.daq.identity.signatures import signer_for
 from armident.daq.streaming import Announcer, Keys, open_session
 from armident.daq.streaming.announcer import longest_retry_s
@@ -46,6 +47,7 @@ class WorkerLink:
         self.receiver = WorkerReceiver(session, keys, on_event, on_block, limits)
         """Subscriptions, in a session of their own."""
         self.backlog = 0
+        self._countdown = Countdown(session)
         self._session: zenoh.Session | None = None
         self._announcer: Announcer | None = None
         self._shared = False
@@ -60,6 +62,7 @@ class WorkerLink:
 
     def check(self) -> None:
         """Open sessions that are missing, and take the port of the role if another worker has left it."""
+        self._countdown.check()
         self.receiver.check()
         if self._session is not None and not self._shared:
             return
