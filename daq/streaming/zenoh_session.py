@@ -21,7 +21,7 @@ ANY_PORT = "tcp/127.0.0.1:0"
 """Endpoint that listens on a free loopback port."""
 LARGEST_MESSAGE = 32 << 20
 """Largest message that a session accepts, bytes; Zenoh drops larger ones (its own limit is 1 GiB)."""
-CONNECT_MS = 1000
+CONNECT_MS = 2000
 """Longest wait of a client for its router, ms; the caller tries again, and Zenoh does after a lost connection."""
 _FIRST_PORT = 17_000
 _CELLS = 5_000
@@ -75,14 +75,14 @@ def configuration(
     if role == "worker":
         for key, value in SENT_IN_ORDER.items():
             config.insert_json5(key, json.dumps(value))
-    if options.listen and role != "observer" and not any_port:
-        config.insert_json5("listen/endpoints", json.dumps(options.listen))
-    if options.connect:
+    listen = options.listen if role != "observer" and not any_port else ()
+    by_tls = options.config is None and any(place.startswith(_ENCRYPTED) for place in (*listen, *options.connect))
+    if listen or by_tls:
+        config.insert_json5("listen/endpoints", json.dumps(listen))
+    if options.connect or by_tls:
         config.insert_json5("connect/endpoints", json.dumps(options.connect))
-        listens = options.listen and role != "observer" and not any_port
-        if options.config is None and not listens and any(place.startswith(_ENCRYPTED) for place in options.connect):
-            config.insert_json5("mode", '"client"')
-            config.insert_json5("listen/endpoints", "[]")
+    if by_tls and not listen:
+        config.insert_json5("mode", '"client"')
     if _mode(config) == "client":
         config.insert_json5("connect/timeout_ms", str(CONNECT_MS))
     _protect(config, session, identity or ("viewer" if role == "observer" else role))

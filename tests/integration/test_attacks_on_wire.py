@@ -82,7 +82,7 @@ def raw(place: str, tls: dict[str, Any] | None, **more: Any) -> zenoh.Config:
     """A client of Zenoh without our program: no access control, nothing signed."""
     config = zenoh.Config()
     entries: dict[str, Any] = {
-        "mode": "client", "connect/endpoints": [place], "connect/timeout_ms": 600, "connect/exit_on_failure": False,
+        "mode": "client", "connect/endpoints": [place], "connect/timeout_ms": 2000, "connect/exit_on_failure": False,
         "scouting/multicast/enabled": False, "timestamping/enabled": True, **more,
     }  # fmt: skip
     if tls is not None:
@@ -569,11 +569,12 @@ def test_a_late_worker_gets_history_and_recovers_what_it_missed(plant: Plant) ->
                 lambda data, _: taken.append(data or b""),
                 (1 << 20, 1 << 20),
             )
-            receiver.check()
             stack.callback(receiver.close)
-            assert wait_for(lambda: len(taken) == 4), "no history"
+            assert wait_for(lambda: receiver.check() or len(taken) == 4, 20), (
+                f"{len(taken)} of 4 blocks of history, {capture.problem}"
+            )
             capture.offer(made[4])
-            assert wait_for(lambda: len(taken) == 5), "nothing live"
+            assert wait_for(lambda: len(taken) == 5, 20), "nothing live"
         for block in made[5:8]:
             capture.offer(block)
         time.sleep(0.3)
