@@ -118,9 +118,10 @@ def send_command(session: SessionConfig, robot: str, command: Command, answer_s:
             raise ArmidentError(f"zenoh: {error}") from error
     problem: ArmidentError = ConfigError(f"no capture of cell {session.cell}, robot {robot}, answers")
     for reply in replies:
-        if reply.ok is None:
+        if reply.err is not None:
             problem = DataError(f"the capture refuses: {bytes(reply.err.payload).decode(errors='replace')}")
             continue
+        assert reply.ok is not None
         try:
             trust.check("answer", key, bytes(reply.ok.payload), reply.ok.attachment, nonce=nonce)
         except DataError as error:

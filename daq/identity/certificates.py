@@ -67,37 +67,25 @@ class Authority:
 
         The certificate has the role as organisational unit and the cell as organisation. ConfigError if one is invalid.
         """
-        if role not in ROLES:
-            raise ConfigError(f"role {role!r}: expected {', '.join(ROLES)}")
-        if cell == ANY_CELL and role not in ("operator", "viewer", "router"):
-            raise ConfigError(f"role {role}: needs a cell; only operator and viewer may be of all cells ({ANY_CELL})")
-        key = ec.generate_private_key(ec.SECP256R1())
-        subject = _name((NameOID.COMMON_NAME, name), (NameOID.ORGANIZATIONAL_UNIT_NAME, role),
-                        (NameOID.ORGANIZATION_NAME, cell))  # fmt: skip
-        purposes = [ExtendedKeyUsageOID.CLIENT_AUTH, ExtendedKeyUsageOID.SERVER_AUTH]
-        builder = (
-            _builder(subject, self.certificate.subject, key, days, now)
-            .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
-            .add_extension(_usage(digital_signature=True), critical=True)
-            .add_extension(x509.ExtendedKeyUsage(purposes), critical=False)
-            .add_extension(x509.AuthorityKeyIdentifier.from_issuer_public_key(self.key.public_key()), critical=False)
-        )
-        if addresses:
-            names = x509.SubjectAlternativeName([_address(address) for address in addresses])
-            builder = builder.add_extension(names, critical=False)
+        if role not in ROLES or (cell == ANY_CELL and role not in ("operator", "viewer", "router")):
+            of_all = "only operator, viewer and router may be of all cells"
+            raise ConfigError(f"role {role!r} in cell {cell!r}: expected one of {', '.join(ROLES)}; {of_all}")
+        key, addressed = ec.generate_private_key(ec.SECP256R1()), [_address(address) for address in addresses]
+        more: list[tuple[x509.ExtensionType, bool]] = [
+            (x509.ExtendedKeyUsage([ExtendedKeyUsageOID.CLIENT_AUTH, ExtendedKeyUsageOID.SERVER_AUTH]), False),
+            (x509.AuthorityKeyIdentifier.from_issuer_public_key(self.key.public_key()), False),
+            *([(x509.SubjectAlternativeName(addressed), False)] if addressed else []),
+        ]
+        subject = {NameOID.COMMON_NAME: name, NameOID.ORGANIZATIONAL_UNIT_NAME: role, NameOID.ORGANIZATION_NAME: cell}
+        builder = _builder(subject, key, days, now, None, more).issuer_name(self.certificate.subject)
         return Identity(role, cell, name, key, builder.sign(self.key, SHA256()))
 
 
 def new_authority(plant: str, days: int, now: datetime | None = None) -> Authority:
     """Return a new authority of a plant; its certificate signs itself, and no other authority."""
     key = ec.generate_private_key(ec.SECP256R1())
-    name = _name((NameOID.COMMON_NAME, plant))
-    builder = (
-        _builder(name, name, key, days, now)
-        .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
-        .add_extension(_usage(key_cert_sign=True, crl_sign=True), critical=True)
-    )
-    return Authority(key, builder.sign(key, SHA256()))
+    builder = _builder({NameOID.COMMON_NAME: plant}, key, days, now, 0, [])
+    return Authority(key, builder.issuer_name(_name({NameOID.COMMON_NAME: plant})).sign(key, SHA256()))
 
 
 def identity_of(certificate: x509.Certificate) -> tuple[Role, str, str]:
@@ -232,11 +220,34 @@ def read_authority(folder: Path) -> Authority:
     raise ConfigError(f"{folder / 'authority.pem'}: no certificate belongs to authority.key")
 
 
-def _name(*attributes: tuple[x509.ObjectIdentifier, str]) -> x509.Name:
+def _builder(
+    subject: dict[x509.ObjectIdentifier, str],
+    key: ec.EllipticCurvePrivateKey,
+    days: int,
+    now: datetime | None,
+    path_length: int | None,
+    more: list[tuple[x509.ExtensionType, bool]],
+) -> x509.CertificateBuilder:
+    """Return a certificate without issuer; ``path_length``: of an authority, ``None`` of a role."""
+    begin, ca = now or datetime.now(UTC), path_length is not None
+    builder = (
+        x509.CertificateBuilder(subject_name=_name(subject), public_key=key.public_key())
+        .serial_number(x509.random_serial_number())
+        .not_valid_before(begin - TOLERANCE)
+        .not_valid_after(begin + timedelta(days=days))
+    )
+    usage = x509.KeyUsage(not ca, False, False, False, False, ca, ca, False, False)
+    own = [(x509.BasicConstraints(ca, path_length), True), (usage, True)]
+    for extension, critical in (*own, (x509.SubjectKeyIdentifier.from_public_key(key.public_key()), False), *more):
+        builder = builder.add_extension(extension, critical)
+    return builder
+
+
+def _name(attributes: dict[x509.ObjectIdentifier, str]) -> x509.Name:
     try:
-        return x509.Name([x509.NameAttribute(oid, value) for oid, value in attributes])
+        return x509.Name([x509.NameAttribute(oid, value) for oid, value in attributes.items()])
     except ValueError as error:
-        values = ", ".join(repr(value) for _, value in attributes)
+        values = ", ".join(map(repr, attributes.values()))
         raise ConfigError(f"{values}: names in certificates have 1 to 64 characters") from error
 
 
@@ -247,23 +258,3 @@ def _address(text: str) -> x509.GeneralName:
         return x509.DNSName(text)
     except ValueError as error:
         raise ConfigError(f"address {text!r}: expected an IP address or a DNS name in ASCII") from error
-
-
-def _builder(
-    subject: x509.Name, issuer: x509.Name, key: ec.EllipticCurvePrivateKey, days: int, now: datetime | None
-) -> x509.CertificateBuilder:
-    begin = now or datetime.now(UTC)
-    return (
-        x509.CertificateBuilder()
-        .subject_name(subject)
-        .issuer_name(issuer)
-        .public_key(key.public_key())
-        .serial_number(x509.random_serial_number())
-        .not_valid_before(begin - TOLERANCE)
-        .not_valid_after(begin + timedelta(days=days))
-        .add_extension(x509.SubjectKeyIdentifier.from_public_key(key.public_key()), critical=False)
-    )
-
-
-def _usage(*, digital_signature: bool = False, key_cert_sign: bool = False, crl_sign: bool = False) -> x509.KeyUsage:
-    return x509.KeyUsage(digital_signature, False, False, False, False, key_cert_sign, crl_sign, False, False)

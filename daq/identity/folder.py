@@ -13,6 +13,7 @@ from cryptography import x509
 
 from armident.configs import ConfigError
 from armident.configs.reasons import reason_of
+from armident.daq.identity import OF_PLANT, VARIABLE
 from armident.daq.identity.certificates import (
     ANY_CELL,
     Identity,
@@ -27,10 +28,6 @@ from armident.daq.identity.certificates import (
     write_whole,
 )
 
-VARIABLE = "ARMIDENT_KEYS"
-"""Environment variable that names the folder of a plant's keys."""
-OF_PLANT = Path("/etc/armident/keys")
-"""Folder of a plant's keys, where it exists."""
 OF_SERVICES = Path("/var/lib/armident/keys")
 """Local folder that the services of a machine share."""
 _FROM, _DAYS = datetime(1970, 1, 2, tzinfo=UTC), 47_481
@@ -48,7 +45,7 @@ class KeyFolder:
     local: bool = False
 
     def identity(self, role: Role, cell: str) -> Identity:
-        """Return the identity of a role for a cell; a folder of a plant that lacks it is a ConfigError."""
+        """Return the identity of a role for a cell, or of any (`ANY_CELL`); ConfigError if the plant has none here."""
         found = self._find(role, cell)
         if found is None and self.local:
             with self._locked():
@@ -96,7 +93,7 @@ class KeyFolder:
             except ConfigError as error:
                 refused = error
                 continue
-            if identity.role == role and identity.cell in (cell, ANY_CELL):
+            if identity.role == role and (cell == ANY_CELL or identity.cell in (cell, ANY_CELL)):
                 found.append(identity)
         if not found and refused is not None:
             raise refused

@@ -53,8 +53,9 @@ def keys(
     Example: armident keys enrol viewer --name anna --cell press_7
     """
     from armident.configs import ArmidentError, ConfigError, load_session
+    from armident.daq.identity import OF_PLANT, VARIABLE
     from armident.daq.identity import plant as of_plant
-    from armident.daq.identity.folder import OF_PLANT, VARIABLE, key_folder
+    from armident.daq.identity.folder import key_folder
 
     addresses, now = address or [], datetime.now(UTC)
     if action == "init":

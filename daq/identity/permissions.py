@@ -6,7 +6,7 @@ from typing import Literal
 
 from armident.daq.identity.certificates import Role
 
-Action = Literal["publish", "answer", "ask", "read"]
+Action = Literal["publish", "answer", "ask", "read", "sign"]
 
 
 @dataclass(frozen=True)
@@ -15,12 +15,14 @@ class Permission:
 
     ``publish``: messages and liveliness tokens. ``answer``: replies to queries. ``ask``: queries. ``read``:
     subscriptions, also of liveliness. A reader of samples and events asks for those that it missed below ``@adv``.
+    ``sign``: ``documents``, which are files.
     """
 
     publish: tuple[str, ...] = ()
     answer: tuple[str, ...] = ()
     ask: tuple[str, ...] = ()
     read: tuple[str, ...] = ()
+    sign: tuple[str, ...] = ()
 
 
 _STREAMS = ("samples", "events", "samples/@adv/*", "events/@adv/*")
@@ -38,8 +40,9 @@ PERMISSIONS: dict[Role, Permission] = {
         answer=("result/*",),
         ask=(*_STREAMS, "result/*", "alive/*"),
         read=(*_STREAMS, "result/*", "status", "sent", "alive/*"),
+        sign=("documents",),
     ),
-    "operator": Permission(ask=("command/*", "result/*", *_STREAMS, "alive/*"), read=_ALL),
+    "operator": Permission(ask=("command/*", "result/*", *_STREAMS, "alive/*"), read=_ALL, sign=("documents",)),
     "viewer": Permission(ask=("result/*", *_STREAMS, "alive/*"), read=_ALL),
     "router": Permission(),
 }

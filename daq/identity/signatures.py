@@ -24,6 +24,7 @@ from cryptography.hazmat.primitives.serialization import Encoding
 from armident.configs import ConfigError, DataError, SessionConfig
 from armident.daq.identity.certificates import (
     ANY_CELL,
+    Identity,
     Role,
     check_dates,
     identity_of,
@@ -85,15 +86,21 @@ class Signer:
         self._folder, self._role, self._cell, self._clock = folder, role, cell, clock
         self._load()
 
-    def attachment(self, key: str, payload: bytes, nonce: bytes = b"") -> bytes:
-        """Return the attachment that signs a payload on a key expression."""
-        if self._folder.stamp(self._file) != self._stamp:
+    @property
+    def identity(self) -> Identity:
+        """Identity that signs."""
+        if self._folder.stamp(f"{self._identity.name}.pem") != self._stamp:
             # While a renewal is under way, the present certificate is used.
             with suppress(ConfigError):
                 self._load()
-        head = _HEAD.pack(_MAGIC, VERSION, self._clock(), len(nonce), len(self._certificate))
-        signed = head + nonce + self._certificate
-        return signed + self._identity.sign(_covered(signed, key, payload))
+        return self._identity
+
+    def attachment(self, key: str, payload: bytes, nonce: bytes = b"") -> bytes:
+        """Return the attachment that signs a payload on a key expression."""
+        identity = self.identity
+        certificate = identity.certificate.public_bytes(Encoding.DER)
+        signed = _HEAD.pack(_MAGIC, VERSION, self._clock(), len(nonce), len(certificate)) + nonce + certificate
+        return signed + identity.sign(_covered(signed, key, payload))
 
     def reply(self, query: zenoh.Query, key: str, payload: bytes) -> None:
         """Answer a query, and sign its attachment with the answer if it is a nonce."""
@@ -103,9 +110,7 @@ class Signer:
 
     def _load(self) -> None:
         self._identity = self._folder.identity(self._role, self._cell)
-        self._certificate = self._identity.certificate.public_bytes(Encoding.DER)
-        self._file = f"{self._identity.name}.pem"
-        self._stamp = self._folder.stamp(self._file)
+        self._stamp = self._folder.stamp(f"{self._identity.name}.pem")
 
 
 class Trust:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydantic import ConfigDict
+from pydantic import ConfigDict, Field
 
 from armident.configs.schema.base import DescribedModel
 from armident.daq.recording import Recording
@@ -20,6 +20,53 @@ class Document(DescribedModel):
     """Part of a result document, without unknown keys and without NaN."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, populate_by_name=True)
+
+
+class Provenance(Document):
+    """Origin of a signed document.
+
+    Parameters
+    ----------
+    armident
+        Version of armident.
+    host, user
+        Machine and account.
+    time
+        Time of the signature, ISO 8601, UTC.
+    """
+
+    armident: str
+    host: str
+    user: str
+    time: str
+
+
+class Signature(Document):
+    """Signature of a document, over its JSON without ``signature``: keys sorted, no blanks, ASCII.
+
+    Parameters
+    ----------
+    certificate
+        Certificate of the signer (DER, base64), with his role and cell.
+    value
+        Signature (ECDSA, P-256, SHA-256; base64).
+    """
+
+    certificate: str
+    value: str
+
+
+class SignedDocument(Document):
+    """Document of a file that may be signed.
+
+    Parameters
+    ----------
+    provenance, signature
+        Origin and signature, of the file that was read; a file that is written anew has its own, or none.
+    """
+
+    provenance: Provenance | None = Field(None, exclude=True, description="Origin of a signed document.")
+    signature: Signature | None = Field(None, exclude=True, description="Signature; armident verify checks it.")
 
 
 class RecordingReference(Document):

@@ -88,7 +88,7 @@ def test_a_plant_is_made_by_the_commands_and_says_who_may_do_what(tmp_path: Path
         (["enrol"], "expected a role"),
         (["enrol", "vewer"], "no role 'vewer'; expected capture, worker"),
         (["enrol", "capture"], "--cell is missing"),
-        (["enrol", "capture", "--name", "x"], "needs a cell"),
+        (["enrol", "capture", "--name", "x"], "only operator, viewer and router may be of all cells"),
         (["enrol", "viewer"], "--cell is missing, or --name"),
         (["enrol", "viewer", "--cell", "a/**"], "expected the name of a cell"),
         (["enrol", "viewer", "--name", "../x"], "--name '../x'"),
