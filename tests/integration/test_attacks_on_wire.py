@@ -197,7 +197,7 @@ def plant(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Plant]:
     make_authority(plant.folder, "werk")
     enrol(plant.folder, "router", None, None, ["localhost"], 365)
     for role, cell, name in ENROLLED:
-        enrol(plant.folder, role, cell, name, [], 365)
+        enrol(plant.folder, role, cell, name, ["localhost"] if (role, cell) == ("capture", "a") else [], 365)
     plant.host.mkdir()
     plant.stolen.mkdir()
     for path in [*plant.folder.glob("*.pem"), *plant.folder.glob("*.*.key")]:
@@ -583,6 +583,36 @@ def test_a_late_worker_gets_history_and_recovers_what_it_missed(plant: Plant) ->
             capture.offer(made[8])
             assert wait_for(lambda: len(taken) == 9, 20), f"{len(taken)} of 9 blocks"
     assert len(set(taken)) == 9
+
+
+def test_a_capture_that_listens_itself_denies_as_the_router_does(plant: Plant) -> None:
+    alone = Plant(plant.folder)
+    heard: list[bytes] = []
+    session = alone.session("a", connect=(), listen=(alone.place,), keys=plant.folder)
+    with open_session(session, "capture") as capture:
+        kept = [
+            capture.declare_queryable(f"{A}/command/*", lambda query: query.reply(query.key_expr, b"accepted")),
+            capture.declare_subscriber(f"{A}/status", lambda sample: heard.append(bytes(sample.payload))),
+        ]
+        with pytest.raises(zenoh.ZError):
+            zenoh.open(raw(alone.place.replace("tls", "tcp"), None))
+        read: dict[str, list[bytes]] = {"viewer.anna": [], "capture.b": []}
+        for name, got in read.items():
+            with alone.attacker(name) as attacker:
+                readers = attacker.declare_subscriber(
+                    f"{A}/samples", lambda sample, got=got: got.append(bytes(sample.payload))
+                )
+                attacker.put(f"{A}/status", FORGED)
+                assert ask(attacker, f"{A}/command/stop") == []
+                for _ in range(20):
+                    capture.put(f"{A}/samples", b"block")
+                    time.sleep(0.02)
+                del readers
+        with alone.attacker("operator.bert") as operator:
+            assert wait_for(lambda: ask(operator, f"{A}/command/stop"))
+        del kept
+    assert heard == []
+    assert [bool(got) for got in read.values()] == [True, False]
 
 
 def test_a_second_authority_is_not_trusted_beside_that_of_the_plant(plant: Plant) -> None:

@@ -286,7 +286,7 @@ CLIENT = f'mode: "client", {QUIET}, connect: {{endpoints: ["tls/192.0.2.1:7447"]
         ({"connect": ("tls/192.0.2.1:7447#enable_mtls=false",)}, "expected no options of certificates"),
         ({"connect": ("tls/192.0.2.1:7447#verify_name_on_connect=false",)}, "expected no options of certificates"),
         ({"listen": ("tls/0.0.0.0:7447",)}, "router.json5: no such file; who listens for other hosts needs it"),
-        ({"connect": ("tls/192.0.2.1:7447",), "cell": "b"}, "no key of a capture of cell b; run where the authority is"),
+        ({"connect": ("tls/192.0.2.1:7447",), "cell": "b"}, "no key of a capture of cell b; run where the authority"),
         ("{}", "multicast finds other hosts"),
         (f"{{{QUIET}}}", rf"tcp/\[::\]:0: {FAR}"),
         ('{scouting: {multicast: {enabled: true}}, listen: {endpoints: ["tcp/127.0.0.1:1"]}}', "multicast finds"),
