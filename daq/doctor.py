@@ -314,13 +314,16 @@ def _speed(times: list[float], span_s: float) -> Check:
 def _zenoh(session: SessionConfig) -> Check:
     """Check the configuration of Zenoh, and that the port of the capture is free."""
     try:
-        unreadable = unreadable_files(configuration(session, "capture"))
+        config = configuration(session, "capture")
+        unreadable = unreadable_files(config)
     except ConfigError as error:
         return Check("zenoh", "failed", str(error))
     if unreadable:
-        return Check("zenoh", "failed", f"{session.zenoh.config}: cannot be read: {', '.join(unreadable)}")
+        return Check("zenoh", "failed", f"{session.zenoh.config or 'keys'}: cannot be read: {', '.join(unreadable)}")
     if session.zenoh.config is not None or session.zenoh.listen:
         return Check("zenoh", "ok", "configured by the session")
+    if config.get_json("mode") == '"client"':
+        return Check("zenoh", "ok", f"client of {', '.join(session.zenoh.connect)} by mutual TLS")
     host, _, port = endpoints(session)["capture"].removeprefix("tcp/").rpartition(":")
     with socket.socket() as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)

@@ -75,7 +75,11 @@ def keys(
     if action == "enrol":
         made.append(of_plant.enrol(path, str(subject), cell, name, addresses, days))
     elif action == "renew" and every:
-        ending = [each for each in of_plant.enrolled(path) if within is None or each.days_left(now) <= within]
+        ending = [
+            each
+            for each in of_plant.enrolled(path)
+            if within is None or of_plant.days_left(each.certificate, now) <= within
+        ]
         made += [of_plant.renew(path, each.name, (), days) for each in ending]
         print(f"{len(made)} of {len(of_plant.enrolled(path))} certificates renewed")
     elif action == "renew" and subject == of_plant.AUTHORITY:
@@ -95,6 +99,7 @@ def keys(
     elif action == "check":
         session = None if config is None else load_session(config, "")
         results = list(of_plant.findings(path, now, session))
+        results += [] if session is None else of_plant.missing(path, session)
         _print_check(results, of_plant.explanations(path), as_json=as_json)
         if any(each.verdict == "failed" for each in results):
             raise ArmidentError(f"{path}: connections would fail")

@@ -72,21 +72,14 @@ class Enrolled:
             names = self.certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
         except x509.ExtensionNotFound:
             return []
-        return [
-            *names.get_values_for_type(x509.DNSName),
-            *(str(address) for address in names.get_values_for_type(x509.IPAddress)),
-        ]
-
-    def days_left(self, now: datetime) -> int:
-        """Return the whole days until the certificate ends; negative if it has ended."""
-        return days_left(self.certificate, now)
+        return [str(name.value) for name in names]
 
     def row(self, now: datetime) -> dict[str, Any]:
         """Return what is shown of it, by column."""
         return {
             "name": self.name, "role": self.role, "cell": self.cell,
-            "valid_until": f"{self.certificate.not_valid_after_utc:%Y-%m-%d}", "days_left": self.days_left(now),
-            "addresses": self.addresses,
+            "valid_until": f"{self.certificate.not_valid_after_utc:%Y-%m-%d}",
+            "days_left": days_left(self.certificate, now), "addresses": self.addresses,
         }  # fmt: skip
 
 
@@ -118,19 +111,7 @@ def plant_of(folder: Path) -> str:
 
 def enrolled(folder: Path) -> list[Enrolled]:
     """Return the certificates of roles in a folder, by name; ConfigError names a file that is none."""
-    found = []
-    for path in sorted(folder.glob("*.pem")):
-        if path.stem == AUTHORITY:
-            continue
-        certificate = read_certificates(path)[0]
-        try:
-            each = Enrolled(*identity_of(certificate), certificate)
-        except DataError as error:
-            raise ConfigError(f"{path}: {error}") from error
-        if each.name != path.stem:
-            raise ConfigError(f"{path}: is the certificate of {each.name}; expected the name {each.name}.pem")
-        found.append(each)
-    return found
+    return [_read(path) for path in _files(folder)]
 
 
 def enrol(folder: Path, role: str, cell: str | None, name: str | None, addresses: Sequence[str], days: int) -> Identity:
@@ -146,9 +127,7 @@ def enrol(folder: Path, role: str, cell: str | None, name: str | None, addresses
         if cell is not None or name is not None:
             raise ConfigError("a router has neither --cell nor --name: all routers of a plant have one certificate")
         if not addresses:
-            raise ConfigError(
-                "a router needs --address, once for each DNS name or IP address under which it is reached"
-            )
+            raise ConfigError("a router needs --address, once for each DNS name or IP address to reach it")
         full = router_name(plant_of(folder))
     else:
         if cell is not None and not _CELL.fullmatch(cell):
@@ -166,9 +145,7 @@ def enrol(folder: Path, role: str, cell: str | None, name: str | None, addresses
 
 def renew(folder: Path, name: str, addresses: Sequence[str], days: int) -> Identity:
     """Replace certificate and key of a name; role and cell stay, and the addresses unless others are given."""
-    old = next((each for each in enrolled(folder) if each.name == name), None)
-    if old is None:
-        raise ConfigError(f"{folder}: no {name}.pem; armident keys show lists all names")
+    old = _known(folder, name)
     return _issue(folder, old.role, old.cell, name, addresses or old.addresses, days)
 
 
@@ -185,18 +162,15 @@ def renew_authority(folder: Path) -> None:
 def revoke(folder: Path, name: str) -> None:
     """Remove a name from the access control of the router, and keep it from being enrolled again."""
     read_authority(folder)
-    try:
-        (folder / f"{name}.pem").rename(_revoked(folder, name))
-        (folder / f"{name}.key").unlink(missing_ok=True)
-    except FileNotFoundError as error:
-        raise ConfigError(f"{folder}: no {name}.pem; armident keys show lists all names") from error
+    _known(folder, name)
+    (folder / f"{name}.pem").rename(_revoked(folder, name))
+    (folder / f"{name}.key").unlink(missing_ok=True)
     write_router(folder)
 
 
 def write_router(folder: Path) -> None:
     """Write the configuration of the router from the certificates in the folder of the authority."""
-    text = _router_text(folder)
-    write_whole(folder / ROUTER_FILE, text.encode(), 0o644)
+    write_whole(folder / ROUTER_FILE, _router_text(folder).encode(), 0o644)
 
 
 def findings(folder: Path, now: datetime, session: SessionConfig | None = None) -> Iterator[Finding]:
@@ -210,27 +184,20 @@ def findings(folder: Path, now: datetime, session: SessionConfig | None = None) 
         yield Finding("failed", str(error))
         return
     yield _ending(AUTHORITY, authorities[0], now)
-    for path in sorted(folder.glob("*.pem")):
-        if path.stem == AUTHORITY:
-            continue
+    for path in _files(folder):
         try:
-            certificate = read_certificates(path)[0]
-            _, cell, name = identity_of(certificate)
-            if session is not None and cell != session.cell:
+            each = _read(path)
+            if session is not None and each.cell != session.cell:
                 continue
-            if not (is_plant and not path.with_suffix(".key").exists()):  # The key was handed over.
+            if path.with_suffix(".key").exists() or not is_plant:  # There the key may have been handed over.
                 read_identity(path)
-            if name != path.stem:
-                raise ConfigError(f"{path}: is the certificate of {name}; expected the name {name}.pem")
-            trusted_certificate(certificate.public_bytes(Encoding.DER), authorities, now)
+            trusted_certificate(each.certificate.public_bytes(Encoding.DER), authorities, now)
         except (ConfigError, DataError) as error:
             yield Finding("failed", str(error))
         else:
-            yield _ending(name, certificate, now)
+            yield _ending(each.name, each.certificate, now)
     if is_plant and session is None:
         yield _router(folder)
-    if session is not None:
-        yield from _endpoints_of(folder, session)
 
 
 def of_session(session: SessionConfig, now: datetime) -> Iterator[Finding]:
@@ -259,6 +226,22 @@ class Countdown:
                     log.log(logging.ERROR if each.verdict == "failed" else logging.WARNING, "keys: %s", each.message)
 
 
+def missing(folder: Path, session: SessionConfig) -> Iterator[Finding]:
+    """Check that a folder has what the endpoints of a session need: roles, and addresses in their certificates."""
+    of_cell = [each for each in enrolled(folder) if each.cell == session.cell]
+    for role in ("capture", "worker"):
+        own = [each for each in of_cell if each.role == role]
+        if not own:
+            command = f"armident keys enrol {role} --cell {session.cell}"
+            reason = f"{folder}: no certificate of a {role} of cell {session.cell}, which it needs to run here"
+            yield Finding("warning" if of_cell else "failed", f"{reason}; run: {command}")
+        for host in (host_of(place) for place in session.zenoh.listen if not is_loopback(place)):
+            for each in own:
+                if host not in (*each.addresses, "0.0.0.0", "::"):
+                    command = f"armident keys renew {each.name} --address {host}"
+                    yield Finding("failed", f"{each.name}: its certificate is not for {host}; run: {command}")
+
+
 def _router(folder: Path) -> Finding:
     """Check that the configuration of the router is that of the enrolled names."""
     path = folder / ROUTER_FILE
@@ -273,27 +256,6 @@ def _router(folder: Path) -> Finding:
     return Finding("failed", f"{path}: {reason}; run: armident keys router, and copy it to the host of the router")
 
 
-def _endpoints_of(folder: Path, session: SessionConfig) -> Iterator[Finding]:
-    """Check the certificates that the endpoints of a session need."""
-    try:
-        of_cell = [each for each in enrolled(folder) if each.cell in (session.cell, ANY_CELL)]
-    except ConfigError:
-        return  # It is among the findings already.
-    for role in ("capture", "worker"):
-        own = [each for each in of_cell if each.role == role]
-        if not own:
-            command = f"armident keys enrol {role} --cell {session.cell}"
-            yield Finding("failed", f"{folder}: no certificate of a {role} of cell {session.cell}; run: {command}")
-        for endpoint in session.zenoh.listen:
-            host = host_of(endpoint)
-            if is_loopback(endpoint) or host in ("0.0.0.0", "::"):
-                continue
-            for each in own:
-                if host not in each.addresses:
-                    command = f"armident keys renew {each.name} --address {host}"
-                    yield Finding("failed", f"{each.name}: its certificate is not for {host}; run: {command}")
-
-
 def explanations(folder: Path) -> list[str]:
     """Return what each enrolled name may do, in words; nothing if a file in the folder is none of these."""
     try:
@@ -305,13 +267,11 @@ def explanations(folder: Path) -> list[str]:
 def _ending(name: str, certificate: x509.Certificate, now: datetime) -> Finding:
     """Check the time until a certificate ends."""
     days = days_left(certificate, now)
-    end = f"{name}: valid until {certificate.not_valid_after_utc:%Y-%m-%d}"
-    if days < 0:
-        end = f"{name}: expired on {certificate.not_valid_after_utc:%Y-%m-%d}"
-    verdict: Verdict = "ok" if days >= WARN_DAYS else "warning" if days >= FAIL_DAYS else "failed"
-    if verdict == "ok":
+    end = f"{name}: {'expired on' if days < 0 else 'valid until'} {certificate.not_valid_after_utc:%Y-%m-%d}"
+    if days >= WARN_DAYS:
         return Finding("ok", f"{end}, {days} days")
     left = "" if days < 0 else f", in {days} days"
+    verdict: Verdict = "warning" if days >= FAIL_DAYS else "failed"
     return Finding(verdict, f"{end}{left}; run where the authority is: armident keys renew {name}")
 
 
@@ -327,6 +287,28 @@ def _issue(folder: Path, role: Role, cell: str, name: str, addresses: Sequence[s
     return identity
 
 
+def _files(folder: Path) -> list[Path]:
+    return [path for path in sorted(folder.glob("*.pem")) if path.stem != AUTHORITY]
+
+
+def _read(path: Path) -> Enrolled:
+    certificate = read_certificates(path)[0]
+    try:
+        each = Enrolled(*identity_of(certificate), certificate)
+    except DataError as error:
+        raise ConfigError(f"{path}: {error}") from error
+    if each.name != path.stem:
+        raise ConfigError(f"{path}: is the certificate of {each.name}; expected the name {each.name}.pem")
+    return each
+
+
+def _known(folder: Path, name: str) -> Enrolled:
+    for each in enrolled(folder):
+        if each.name == name:
+            return each
+    raise ConfigError(f"{folder}: no {name}.pem; armident keys show lists all names")
+
+
 def _router_text(folder: Path) -> str:
     return router_file(((each.role, each.cell, each.name) for each in enrolled(folder)), plant_of(folder))
 
@@ -337,5 +319,5 @@ def _revoked(folder: Path, name: str) -> Path:
 
 def _check_name(name: str, option: str) -> str:
     if not _NAME.fullmatch(name):
-        raise ConfigError(f"{option} {name!r}: expected letters, digits, '.', '-' and '_', such as anna")
+        raise ConfigError(f"{option} {name!r}: expected letters, digits, '.', '-' and '_', at most 50, such as anna")
     return name

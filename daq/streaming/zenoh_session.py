@@ -105,7 +105,7 @@ def open_session(
             router = ", ".join(_places(config, "connect"))
             raise ConfigError(
                 f"zenoh: cannot connect to {router} as {identity or role} of cell {session.cell}: does the router run, "
-                f"and is armident keys check content here and there? ({_short(error)})"
+                f"and does armident keys check find no fault here and there? ({_short(error)})"
             ) from error
         place = ", ".join(session.zenoh.listen) or endpoints(session).get(role, "")
         raise ConfigError(

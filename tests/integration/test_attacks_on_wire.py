@@ -259,7 +259,7 @@ def test_without_a_certificate_no_connection_opens(plant: Plant) -> None:
 
 def test_a_client_refuses_a_router_of_another_host_name(plant: Plant) -> None:
     session = plant.session("a", connect=(f"tls/127.0.0.1:{plant.port}",))
-    with pytest.raises(ConfigError, match="does the router run, and is armident keys check content"):
+    with pytest.raises(ConfigError, match="does the router run, and does armident keys check find no fault"):
         open_session(session, "observer")
 
 

@@ -107,7 +107,8 @@ def test_the_end_of_certificates_is_counted_down_and_does_not_stop_a_capture(tmp
     make_authority(tmp_path / "keys", "plant")
     for role, days in (("capture", 5), ("worker", 20), ("viewer", 1)):
         enrol(tmp_path / "keys", role, "other" if role == "viewer" else "doctor", None, [], days)
-    path = cell(tmp_path, cell="doctor", zenoh={"keys": "keys"})
+    path = cell(tmp_path, cell="doctor", zenoh={"keys": "keys", "connect": ["tls/192.0.2.1:7447"]})
+    assert checks_of(path)["zenoh"] == Check("zenoh", "ok", "client of tls/192.0.2.1:7447 by mutual TLS")
     found = [check for check in run_checks(path) if check.name == "keys"]
     assert [check.verdict for check in found] == ["ok", "warning", "warning"]
     assert found[1].message.endswith(", in 4 days; run where the authority is: armident keys renew capture.doctor")

@@ -24,7 +24,7 @@ from armident.daq.identity.certificates import (
     write_key,
     write_whole,
 )
-from armident.daq.identity.plant import Countdown, enrol, enrolled, findings, make_authority, renew, revoke
+from armident.daq.identity.plant import Countdown, enrol, enrolled, findings, make_authority, missing, renew, revoke
 from armident.daq.streaming.zenoh_session import configuration
 from tests.unit.daq.test_identity import der
 from tests.unit.daq.test_streaming import cell
@@ -99,6 +99,7 @@ def test_a_plant_is_made_by_the_commands_and_says_who_may_do_what(tmp_path: Path
         (["renew"], "expected a name, or --all"),
         (["renew", "viewer.otto"], "no viewer.otto.pem; armident keys show lists"),
         (["revoke", "viewer.otto"], "no viewer.otto.pem"),
+        (["revoke", "authority"], "no authority.pem; armident keys show"),
         (["list"], "no action 'list'; expected init, enrol"),
         (["show", "--folder", "nowhere"], "no such folder"),
     ],
@@ -197,17 +198,22 @@ def test_the_end_of_a_certificate_is_counted_down(tmp_path: Path, days: int, ver
 
 def test_check_with_a_session_names_missing_roles_and_addresses(plant: Path) -> None:
     session = cell("press_7", listen=("tls/192.0.2.7:7447", "tls/0.0.0.0:7448", "tcp/127.0.0.1:1"))
-    assert problems(plant, session=session) == [
+    assert [each.message for each in missing(plant, session)] == [
         f"{name}: its certificate is not for 192.0.2.7; run: armident keys renew {name} --address 192.0.2.7"
         for name in ("capture.press_7", "worker.press_7")
     ]
     for role in ("capture", "worker"):
         renew(plant, f"{role}.press_7", ["192.0.2.7"], 365)
-    assert problems(plant, session=session) == []
-    assert [message.split("; run: ")[1] for message in problems(plant, session=cell("b"))] == [
-        "armident keys enrol capture --cell b",
-        "armident keys enrol worker --cell b",
+    assert list(missing(plant, session)) == []
+    assert [(each.verdict, each.message.split("; run: ")[1]) for each in missing(plant, cell("b"))] == [
+        ("failed", "armident keys enrol capture --cell b"),
+        ("failed", "armident keys enrol worker --cell b"),
     ]
+    (plant / "worker.press_7.pem").unlink()
+    assert [each.verdict for each in missing(plant, session)] == ["warning"]
+    code, said, _ = run("check", "--config", "tx40_cell.yaml", "--folder", plant)
+    assert code == 1
+    assert "no certificate of a capture of cell demo" in said
 
 
 def test_a_renewal_keeps_name_role_cell_and_addresses_with_a_new_key(plant: Path) -> None:
