@@ -55,6 +55,7 @@ def keys(
     from armident.configs import ArmidentError, ConfigError, load_session
     from armident.daq.identity import OF_PLANT, VARIABLE
     from armident.daq.identity import plant as of_plant
+    from armident.daq.identity.access import ROUTER_FILE
     from armident.daq.identity.folder import key_folder
 
     addresses, now = address or [], datetime.now(UTC)
@@ -90,10 +91,10 @@ def keys(
         made.append(of_plant.renew(path, str(subject), addresses, days))
     elif action == "revoke":
         of_plant.revoke(path, str(subject))
-        print(f"{subject}: revoked once the router has started again with {path / of_plant.ROUTER_FILE}")
+        print(f"{subject}: revoked once the router has started again with {path / ROUTER_FILE}")
     elif action == "router":
         of_plant.write_router(path)
-        print(path / of_plant.ROUTER_FILE)
+        print(path / ROUTER_FILE)
     elif action == "show":
         _show([each.row(now) for each in of_plant.enrolled(path)], as_json=as_json)
     elif action == "check":
@@ -110,7 +111,7 @@ def keys(
         print(f"{each.name}: valid until {each.certificate.not_valid_after_utc:%Y-%m-%d}")
         print(f"  copy {files} to {OF_PLANT} on its host")
     if action == "enrol":
-        print(f"copy {path / of_plant.ROUTER_FILE} to the host of the router, and restart the router")
+        print(f"copy {path / ROUTER_FILE} to the host of the router, and restart the router")
 
 
 def _show(rows: list[dict[str, Any]], *, as_json: bool) -> None:

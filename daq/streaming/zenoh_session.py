@@ -75,13 +75,13 @@ def configuration(
     if role == "worker":
         for key, value in SENT_IN_ORDER.items():
             config.insert_json5(key, json.dumps(value))
-    listen = options.listen if role != "observer" and not any_port else ()
-    by_tls = options.config is None and any(place.startswith(_ENCRYPTED) for place in (*listen, *options.connect))
-    if listen or by_tls:
-        config.insert_json5("listen/endpoints", json.dumps(listen))
+    listens = options.listen if role != "observer" and not any_port else ()
+    by_tls = options.config is None and any(place.startswith(_ENCRYPTED) for place in (*listens, *options.connect))
+    if listens or by_tls:
+        config.insert_json5("listen/endpoints", json.dumps(listens))
     if options.connect or by_tls:
         config.insert_json5("connect/endpoints", json.dumps(options.connect))
-    if by_tls and not listen:
+    if by_tls and not listens:
         config.insert_json5("mode", '"client"')
     if _mode(config) == "client":
         config.insert_json5("connect/timeout_ms", str(CONNECT_MS))
