@@ -132,6 +132,18 @@ def trusted_certificate(
     raise DataError(f"{identity[2]}: its certificate was issued by another authority")
 
 
+def verify(certificate: x509.Certificate, signature: bytes, data: bytes) -> None:
+    """Check the signature of data by the holder of a trusted certificate; DataError if it is wrong."""
+    key = certificate.public_key()
+    assert isinstance(key, ec.EllipticCurvePublicKey)
+    try:
+        key.verify(signature, data, ec.ECDSA(SHA256()))
+    except InvalidSignature as error:
+        raise DataError(
+            f"the signature of {identity_of(certificate)[2]} does not fit: changed or forged"
+        ) from error
+
+
 def check_dates(certificate: x509.Certificate, at: datetime, name: str) -> None:
     """Check that a certificate is valid at a time; DataError with its ``name`` and the date if not."""
     if at > certificate.not_valid_after_utc:
