@@ -112,7 +112,7 @@ def _operator() -> "Identity | None":
     """Return the identity of a person who has one in the folder of the plant; cryptography is loaded only then."""
     from armident.daq.identity import OF_PLANT, VARIABLE
 
-    if not (os.environ.get(VARIABLE) or OF_PLANT.is_dir()):
+    if not (os.environ.get(VARIABLE) or os.path.isdir(OF_PLANT)):
         return None
     from armident.daq.identity.certificates import ANY_CELL
     from armident.daq.identity.folder import key_folder
