@@ -117,19 +117,30 @@ def trusted_certificate(
     """Return a certificate from its bytes, checked as by `signer_of`."""
     try:
         certificate = x509.load_der_x509_certificate(certificate_der)
-        identity = identity_of(certificate)
-        is_of_curve = isinstance(certificate.public_key(), ec.EllipticCurvePublicKey)
     except (ValueError, TypeError, UnsupportedAlgorithm) as error:
         raise DataError("not a certificate (X.509, DER)") from error
-    if not is_of_curve:
-        raise DataError(f"{identity[2]}: the certificate has no key of an elliptic curve")
-    check_dates(certificate, at, identity[2])
+    name = identity_of(certificate)[2]
     for authority in authority_certificates:
-        with suppress(InvalidSignature, ValueError, TypeError):
+        with suppress(InvalidSignature, ValueError, TypeError, UnsupportedAlgorithm):
             certificate.verify_directly_issued_by(authority)
-            check_dates(authority, at, "the authority")
-            return certificate
-    raise DataError(f"{identity[2]}: its certificate was issued by another authority")
+            break
+    else:
+        raise DataError(f"{name}: its certificate was issued by another authority")
+    if not isinstance(certificate.public_key(), ec.EllipticCurvePublicKey):
+        raise DataError(f"{name}: the certificate has no key of an elliptic curve")
+    check_dates(certificate, at, name)
+    check_dates(authority, at, "the authority")
+    return certificate
+
+
+def verify(certificate: x509.Certificate, signature: bytes, data: bytes) -> None:
+    """Check the signature of data by the holder of a trusted certificate; DataError if it is wrong."""
+    key = certificate.public_key()
+    assert isinstance(key, ec.EllipticCurvePublicKey)
+    try:
+        key.verify(signature, data, ec.ECDSA(SHA256()))
+    except InvalidSignature as error:
+        raise DataError(f"the signature of {identity_of(certificate)[2]} does not fit: changed or forged") from error
 
 
 def check_dates(certificate: x509.Certificate, at: datetime, name: str) -> None:

@@ -13,6 +13,7 @@ from cryptography import x509
 
 from armident.configs import ConfigError
 from armident.configs.reasons import reason_of
+from armident.configs.yaml_loader import is_file
 from armident.daq.identity import OF_PLANT, VARIABLE
 from armident.daq.identity.certificates import (
     ANY_CELL,
@@ -67,10 +68,10 @@ class KeyFolder:
     def authority_certificates(self) -> tuple[x509.Certificate, ...]:
         """Return the certificates of the trusted authorities; ConfigError if there is none."""
         path = self.path / "authority.pem"
-        if self.local and not path.is_file():
+        if self.local and not is_file(path):
             with self._locked():
                 self._make_authority()
-        if not path.is_file():
+        if not is_file(path):
             raise ConfigError(f"{path}: no such file; copy it from the machine on which armident keys init ran")
         return read_certificates(path)
 
@@ -100,7 +101,7 @@ class KeyFolder:
         return max(found, key=lambda each: (each.cell == cell, each.certificate.not_valid_after_utc), default=None)
 
     def _make_authority(self) -> None:
-        if not (self.path / "authority.pem").is_file():
+        if not is_file(self.path / "authority.pem"):
             authority = new_authority(f"local {socket.gethostname()}"[:64], _DAYS, _FROM)
             write_key(self.path / "authority.key", authority.key)
             write_whole(self.path / "authority.pem", pem_of(authority.certificate), 0o644)
@@ -126,10 +127,11 @@ def key_folder(chosen: Path | None = None) -> KeyFolder:
     named = os.environ.get(VARIABLE)
     for path in (chosen, Path(named) if named else None):
         if path is not None:
-            if not path.is_dir():
+            if not os.path.isdir(path):
                 raise ConfigError(f"{path}: no such folder of keys; run: armident keys init")
             return KeyFolder(path)
-    if OF_PLANT.is_dir():
+    # A user who may not look into /etc/armident has keys of his own.
+    if os.path.isdir(OF_PLANT):
         return KeyFolder(OF_PLANT)
     if os.access(OF_SERVICES, os.W_OK):
         return KeyFolder(OF_SERVICES, local=True)

@@ -16,9 +16,6 @@ from datetime import UTC, datetime
 
 import zenoh
 from cryptography import x509
-from cryptography.exceptions import InvalidSignature
-from cryptography.hazmat.primitives.asymmetric import ec
-from cryptography.hazmat.primitives.hashes import SHA256
 from cryptography.hazmat.primitives.serialization import Encoding
 
 from armident.configs import ConfigError, DataError, SessionConfig
@@ -29,6 +26,7 @@ from armident.daq.identity.certificates import (
     check_dates,
     identity_of,
     trusted_certificate,
+    verify,
 )
 from armident.daq.identity.folder import KeyFolder, key_folder
 from armident.daq.identity.permissions import Action, may
@@ -119,7 +117,7 @@ class Trust:
     def __init__(self, folder: KeyFolder, base: str, clock: Callable[[], int] = time.time_ns) -> None:
         self._folder, self._base, self._clock = folder, f"{base}/", clock
         self._cell = base.split("/")[1]
-        self._checked: dict[bytes, x509.Certificate] = {}
+        self._known: dict[bytes, x509.Certificate] = {}
         self._load()
 
     def check(
@@ -136,30 +134,38 @@ class Trust:
 
         ``nonce``: that of the query which this answers. ``after_ns``: latest time of a message known so far, ns UTC.
         """
-        key = str(key)
+        try:
+            return self._checked(action, str(key), payload, attachment, nonce, after_ns)
+        except DataError as error:
+            raise DataError(f"{key}: {error}") from error
+
+    def _checked(
+        self,
+        action: Action,
+        key: str,
+        payload: bytes,
+        attachment: zenoh.ZBytes | bytes | None,
+        nonce: bytes | None,
+        after_ns: int | None,
+    ) -> Signed:
         if attachment is None:
-            raise DataError(f"{key}: a message without signature, as of a former version; update its sender")
+            raise DataError("a message without signature, as of a former version; update its sender")
         if len(attachment) > LARGEST:
-            raise DataError(f"{key}: an attachment of {len(attachment)} bytes")
+            raise DataError(f"an attachment of {len(attachment)} bytes")
         if not key.startswith(self._base):
-            raise DataError(f"{key}: not below {self._base}")
+            raise DataError(f"not below {self._base}")
         found = parse(bytes(attachment))
         certificate = self._certificate(found.certificate)
         role, cell, name = identity_of(certificate)
         if cell not in (self._cell, ANY_CELL):
-            raise DataError(f"{key}: signed by {name} of cell {cell}")
+            raise DataError(f"signed by {name} of cell {cell}")
         if not may(role, action, key.removeprefix(self._base)):
-            raise DataError(f"{key}: signed by {name}; a {role} may not {action} it")
-        public = certificate.public_key()
-        assert isinstance(public, ec.EllipticCurvePublicKey)
-        try:
-            public.verify(found.signature, _covered(found.signed, key, payload), ec.ECDSA(SHA256()))
-        except InvalidSignature as error:
-            raise DataError(f"{key}: the signature of {name} is not that of this message") from error
+            raise DataError(f"signed by {name}: the role {role} may not {action} it")
+        verify(certificate, found.signature, _covered(found.signed, key, payload))
         if nonce is not None and found.nonce != nonce:
-            raise DataError(f"{key}: an answer of {name} to another query")
+            raise DataError(f"an answer of {name} to another query")
         if after_ns is not None and found.time_ns <= after_ns:
-            raise DataError(f"{key}: an old message of {name}, repeated")
+            raise DataError(f"an old message of {name}, repeated")
         return Signed(role, cell, name, found.time_ns, found.nonce)
 
     def _certificate(self, data: bytes) -> x509.Certificate:
@@ -169,19 +175,19 @@ class Trust:
             # While the file is replaced, the known authorities count.
             with suppress(ConfigError):
                 self._load()
-        certificate = self._checked.get(data)
+        certificate = self._known.get(data)
         if certificate is None:
             certificate = trusted_certificate(data, self._authorities, at)
-            if len(self._checked) >= MOST_CERTIFICATES:
-                self._checked.clear()
-            self._checked[data] = certificate
+            if len(self._known) >= MOST_CERTIFICATES:
+                self._known.clear()
+            self._known[data] = certificate
         check_dates(certificate, at, identity_of(certificate)[2])
         return certificate
 
     def _load(self) -> None:
         self._authorities = self._folder.authority_certificates()
         self._stamp = self._folder.stamp("authority.pem")
-        self._checked.clear()
+        self._known.clear()
 
 
 def signer_for(session: SessionConfig, role: Role) -> Signer:

@@ -58,7 +58,8 @@ class LiveWatch:
     def __init__(self, session: SessionConfig, robot: RobotConfig, estimator: RecursiveEstimator) -> None:
         self._robot = robot
         self._keys = Keys(session.cell, robot.name)
-        self._waiting: queue.Queue[bytes] = queue.Queue(WAITING_BLOCKS)
+        self._waiting: queue.Queue[tuple[bytes, int]] = queue.Queue(WAITING_BLOCKS)
+        self._capture, self._newest_ns = "", 0
         self._last: bytes | None = None
         self.dropped = self.lost = 0
         self._signer, self._trust = signer_for(session, "worker"), trust_for(session, self._keys.base)
@@ -108,7 +109,7 @@ class LiveWatch:
         began = saved = time.monotonic()
         while not stop.is_set() and (duration is None or time.monotonic() - began < duration):
             try:
-                ready = order.add(self._decoded(self._waiting.get(timeout=0.2)), time.monotonic())
+                ready = order.add(self._decoded(*self._waiting.get(timeout=0.2)), time.monotonic())
             except queue.Empty:
                 ready = order.overdue(time.monotonic())
             except DataError as error:
@@ -124,24 +125,31 @@ class LiveWatch:
                 saved = time.monotonic()
                 save()
 
-    def _decoded(self, data: bytes) -> Block:
-        """Return the block of this robot in a message; others must not disturb the order of its blocks."""
+    def _decoded(self, data: bytes, time_ns: int) -> Block:
+        """Return the block of this robot in a message; others must not disturb the order of its blocks.
+
+        A block of an earlier capture that was signed before the newest one, ``time_ns``, is late or repeated.
+        """
         self._taken += len(data)
         block = decode_block(data)
         if block.layout.joints != tuple(joint.name for joint in self._robot.joints):
             raise DataError(f"a block of capture {block.capture}: of other joints than those of {self._robot.name}")
+        if block.capture != self._capture and time_ns < self._newest_ns:
+            raise DataError(
+                f"a block of capture {block.capture}: older than those of {self._capture}, late or repeated"
+            )
+        self._capture, self._newest_ns = block.capture, max(time_ns, self._newest_ns)
         return block
 
     def _on_block(self, sample: zenoh.Sample) -> None:
-        # A message that is too large for a block is refused as an empty one, without its memory.
+        # A message that is too large for a block is refused for its signature, without its memory.
         data = bytes(sample.payload) if len(sample.payload) <= LARGEST_BLOCK else b""
         if self._received - self._taken + len(data) > WAITING_BYTES:
             self.dropped += 1
             return
         try:
-            if data:
-                self._trust.check("publish", sample.key_expr, data, sample.attachment)
-            self._waiting.put_nowait(data)
+            signed = self._trust.check("publish", sample.key_expr, data, sample.attachment)
+            self._waiting.put_nowait((data, signed.time_ns))
         except DataError as error:
             self.refusals.refuse("unsigned", error)
         except queue.Full:
