@@ -14,12 +14,7 @@ from cryptography import x509
 from cryptography.exceptions import InvalidSignature, UnsupportedAlgorithm
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.hashes import SHA256
-from cryptography.hazmat.primitives.serialization import (
-    Encoding,
-    NoEncryption,
-    PrivateFormat,
-    load_pem_private_key,
-)
+from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat, load_pem_private_key
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from armident.configs import ConfigError, DataError
@@ -31,8 +26,6 @@ ANY_CELL = "*"
 """Cell of a router, and of an operator or viewer of the whole plant."""
 TOLERANCE = timedelta(minutes=5)
 """Difference of the clocks of two hosts that a new certificate allows for."""
-PRIVATE, OF_GROUP = 0o600, 0o640
-"""Modes of a file with a private key: of its owner alone, or readable by its group."""
 
 
 @dataclass(frozen=True)
@@ -125,7 +118,7 @@ def trusted_certificate(
             certificate.verify_directly_issued_by(authority)
             break
     else:
-        raise DataError(f"{name}: its certificate was issued by another authority")
+        raise DataError(f"{name!r}: its certificate was issued by another authority")
     if not isinstance(certificate.public_key(), ec.EllipticCurvePublicKey):
         raise DataError(f"{name}: the certificate has no key of an elliptic curve")
     check_dates(certificate, at, name)
@@ -157,12 +150,12 @@ def pem_of(*certificates: x509.Certificate) -> bytes:
     return b"".join(certificate.public_bytes(Encoding.PEM) for certificate in certificates)
 
 
-def write_key(path: Path, key: ec.EllipticCurvePrivateKey, mode: int = PRIVATE) -> None:
-    """Write a private key as PEM (PKCS 8); its file is never readable by others."""
+def write_key(path: Path, key: ec.EllipticCurvePrivateKey, mode: int = 0o600) -> None:
+    """Write a private key as PEM (PKCS 8); mode 0640: its group may read it."""
     write_whole(path, key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption()), mode)
 
 
-def write_identity(folder: Path, identity: Identity, mode: int = PRIVATE) -> None:
+def write_identity(folder: Path, identity: Identity, mode: int = 0o600) -> None:
     """Write ``NAME.key`` and then ``NAME.pem``, by which readers find an identity."""
     write_key(folder / f"{identity.name}.key", identity.key, mode)
     write_whole(folder / f"{identity.name}.pem", pem_of(identity.certificate), 0o644)

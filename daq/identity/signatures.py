@@ -35,21 +35,9 @@ VERSION = 1
 LARGEST = 4096
 """Largest attachment that is read, bytes; usual are 600."""
 NONCE_BYTES = 16
-MOST_CERTIFICATES = 256
-"""Number of checked certificates that are remembered."""
+_MOST_CERTIFICATES = 256
 _MAGIC = b"ARMS"
 _HEAD = struct.Struct("<4sBqBH")
-
-
-@dataclass(frozen=True)
-class Attachment:
-    """Content of an attachment; ``signed``: the bytes before the signature, ``time_ns`` in UTC."""
-
-    time_ns: int
-    nonce: bytes
-    certificate: bytes
-    signed: bytes
-    signature: bytes
 
 
 @dataclass(frozen=True)
@@ -61,20 +49,6 @@ class Signed:
     name: str
     time_ns: int
     nonce: bytes
-
-
-def parse(data: bytes) -> Attachment:
-    """Return the content of an attachment; DataError if it is none."""
-    if len(data) < _HEAD.size or not data.startswith(_MAGIC):
-        raise DataError("the attachment is no signature")
-    _, version, time_ns, of_nonce, of_certificate = _HEAD.unpack_from(data)
-    if version != VERSION:
-        raise DataError(f"a signature of version {version}, this program reads {VERSION}")
-    begin = _HEAD.size + of_nonce
-    end = begin + of_certificate
-    if end >= len(data):
-        raise DataError("a signature shorter than its head states")
-    return Attachment(time_ns, data[_HEAD.size : begin], data[begin:end], data[:end], data[end:])
 
 
 class Signer:
@@ -135,38 +109,28 @@ class Trust:
         ``nonce``: that of the query which this answers. ``after_ns``: latest time of a message known so far, ns UTC.
         """
         try:
-            return self._checked(action, str(key), payload, attachment, nonce, after_ns)
+            if attachment is None:
+                raise DataError("a message without signature, as of a former version; update its sender")
+            if len(attachment) > LARGEST:
+                raise DataError(f"an attachment of {len(attachment)} bytes")
+            suffix = str(key).removeprefix(self._base)
+            if suffix == str(key):
+                raise DataError(f"not below {self._base}")
+            time_ns, found, der, signed, signature = _parsed(bytes(attachment))
+            certificate = self._certificate(der)
+            role, cell, name = identity_of(certificate)
+            if cell not in (self._cell, ANY_CELL):
+                raise DataError(f"signed by {name} of cell {cell}")
+            if not may(role, action, suffix):
+                raise DataError(f"signed by {name}: the role {role} may not {action} it")
+            verify(certificate, signature, _covered(signed, str(key), payload))
+            if nonce is not None and found != nonce:
+                raise DataError(f"an answer of {name} to another query")
+            if after_ns is not None and time_ns <= after_ns:
+                raise DataError(f"an old message of {name}, repeated")
         except DataError as error:
             raise DataError(f"{key}: {error}") from error
-
-    def _checked(
-        self,
-        action: Action,
-        key: str,
-        payload: bytes,
-        attachment: zenoh.ZBytes | bytes | None,
-        nonce: bytes | None,
-        after_ns: int | None,
-    ) -> Signed:
-        if attachment is None:
-            raise DataError("a message without signature, as of a former version; update its sender")
-        if len(attachment) > LARGEST:
-            raise DataError(f"an attachment of {len(attachment)} bytes")
-        if not key.startswith(self._base):
-            raise DataError(f"not below {self._base}")
-        found = parse(bytes(attachment))
-        certificate = self._certificate(found.certificate)
-        role, cell, name = identity_of(certificate)
-        if cell not in (self._cell, ANY_CELL):
-            raise DataError(f"signed by {name} of cell {cell}")
-        if not may(role, action, key.removeprefix(self._base)):
-            raise DataError(f"signed by {name}: the role {role} may not {action} it")
-        verify(certificate, found.signature, _covered(found.signed, key, payload))
-        if nonce is not None and found.nonce != nonce:
-            raise DataError(f"an answer of {name} to another query")
-        if after_ns is not None and found.time_ns <= after_ns:
-            raise DataError(f"an old message of {name}, repeated")
-        return Signed(role, cell, name, found.time_ns, found.nonce)
+        return Signed(role, cell, name, time_ns, found)
 
     def _certificate(self, data: bytes) -> x509.Certificate:
         """Return a certificate that is valid now; its chain is checked once."""
@@ -178,7 +142,7 @@ class Trust:
         certificate = self._known.get(data)
         if certificate is None:
             certificate = trusted_certificate(data, self._authorities, at)
-            if len(self._known) >= MOST_CERTIFICATES:
+            if len(self._known) >= _MOST_CERTIFICATES:
                 self._known.clear()
             self._known[data] = certificate
         check_dates(certificate, at, identity_of(certificate)[2])
@@ -203,6 +167,20 @@ def trust_for(session: SessionConfig, base: str) -> Trust:
 def new_nonce() -> bytes:
     """Return a nonce for a query."""
     return secrets.token_bytes(NONCE_BYTES)
+
+
+def _parsed(data: bytes) -> tuple[int, bytes, bytes, bytes, bytes]:
+    """Return time, nonce, certificate, the bytes before the signature, and the signature of an attachment."""
+    if len(data) < _HEAD.size or not data.startswith(_MAGIC):
+        raise DataError("the attachment is no signature")
+    _, version, time_ns, of_nonce, of_certificate = _HEAD.unpack_from(data)
+    if version != VERSION:
+        raise DataError(f"a signature of version {version}, this program reads {VERSION}")
+    begin = _HEAD.size + of_nonce
+    end = begin + of_certificate
+    if end >= len(data):
+        raise DataError("a signature shorter than its head states")
+    return time_ns, data[_HEAD.size : begin], data[begin:end], data[:end], data[end:]
 
 
 def _covered(signed: bytes, key: str, payload: bytes) -> bytes:

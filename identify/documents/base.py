@@ -22,51 +22,20 @@ class Document(DescribedModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, populate_by_name=True)
 
 
-class Provenance(Document):
-    """Origin of a signed document.
-
-    Parameters
-    ----------
-    armident
-        Version of armident.
-    host, user
-        Machine and account.
-    time
-        Time of the signature, ISO 8601, UTC.
-    """
-
-    armident: str
-    host: str
-    user: str
-    time: str
-
-
-class Signature(Document):
-    """Signature of a document, over its JSON without ``signature``: keys sorted, no blanks, ASCII.
-
-    Parameters
-    ----------
-    certificate
-        Certificate of the signer (DER, base64), with his role and cell.
-    value
-        Signature (ECDSA, P-256, SHA-256; base64).
-    """
-
-    certificate: str
-    value: str
-
-
 class SignedDocument(Document):
-    """Document of a file that may be signed.
+    """Document of a file that may be signed; when it is written anew, the file has its own signature or none.
 
     Parameters
     ----------
-    provenance, signature
-        Origin and signature, of the file that was read; a file that is written anew has its own, or none.
+    provenance
+        Origin of the file: version of ``armident``, ``host``, ``user``, and ``time`` of the signature (UTC).
+    signature
+        ``certificate`` of the signer (DER) and ``value`` (ECDSA, P-256, SHA-256), base64. Signed is the document
+        without this entry as JSON: keys sorted, no blanks, ASCII, floats as Python writes them.
     """
 
-    provenance: Provenance | None = Field(None, exclude=True, description="Origin of a signed document.")
-    signature: Signature | None = Field(None, exclude=True, description="Signature; armident verify checks it.")
+    provenance: dict[str, str] | None = Field(None, exclude=True)
+    signature: dict[str, str] | None = Field(None, exclude=True)
 
 
 class RecordingReference(Document):

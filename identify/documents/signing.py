@@ -1,7 +1,6 @@
 """Signatures of result documents: who wrote a document, as what and when, and that it was not changed."""
 
 import base64
-import binascii
 import getpass
 import importlib.metadata
 import json
@@ -12,10 +11,9 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel
 
 from armident.configs import ArmidentError, ConfigError, DataError
-from armident.identify.documents.base import Provenance, Signature
 from armident.identify.documents.files import read_json, to_json, write_atomically
 
 if TYPE_CHECKING:
@@ -44,16 +42,17 @@ def verify_command(files: Sequence[Path], keys: Path | None, *, as_json: bool) -
     """Carry out ``armident verify``; 1 if a document is not rightly signed, otherwise 0."""
     from armident.daq.identity.folder import key_folder
 
-    authorities, results = key_folder(keys).authority_certificates(), []
+    authorities, results = key_folder(keys).authority_certificates(), list[dict[str, Any]]()
     for path in files:
         try:
-            found = {"file": str(path), "verified": True, **_verified(read_json(path), authorities)}
+            found = {"file": str(path), "verified": True} | _verified(read_json(path), authorities)
+            stated = "unchanged, signed by {name} ({role} of {cell}) on {host} at {time}".format_map(found)
         except DataError as error:
             found = {"file": str(path), "verified": False, "reason": str(error).removeprefix(f"{path}: ")}
+            stated = f"NOT VERIFIED: {found['reason']}"
         results.append(found)
         if not as_json:
-            stated = "unchanged, signed by {name} ({role} of {cell}) on {host} at {time}, armident {armident}"
-            print(f"{path}: {stated.format(**found) if found['verified'] else 'NOT VERIFIED: ' + found['reason']}")
+            print(f"{path}: {stated}")
     if as_json:
         print(json.dumps(results, indent=1))
     return 0 if all(found["verified"] for found in results) else ArmidentError.exit_code
@@ -64,42 +63,45 @@ def _verified(content: Mapping[str, Any], authorities: Sequence["x509.Certificat
     from armident.daq.identity.certificates import identity_of, trusted_certificate, verify
     from armident.daq.identity.permissions import may
 
-    if "signature" not in content:
+    signature, provenance = content.get("signature"), content.get("provenance", {})
+    if signature is None:
         raise DataError("not signed: nobody says who wrote it, nor that it is unchanged")
     try:
-        signature = Signature.model_validate(content["signature"])
-        provenance = Provenance.model_validate(content.get("provenance"))
-        at = datetime.fromisoformat(provenance.time)
-        if at.tzinfo is None:
-            raise ValueError("a time without zone")
-        der, value = (base64.b64decode(text, validate=True) for text in (signature.certificate, signature.value))
-    except (ValidationError, ValueError, binascii.Error) as error:
+        der, value = (base64.b64decode(signature[key], validate=True) for key in ("certificate", "value"))
+        origin = {key: str(provenance[key]) for key in ("armident", "host", "user", "time")}
+        certificate = trusted_certificate(der, authorities, datetime.fromisoformat(origin["time"]))
+    except (KeyError, TypeError, ValueError) as error:
         raise DataError("its signature or provenance is damaged") from error
-    certificate = trusted_certificate(der, authorities, at)
     role, cell, name = identity_of(certificate)
     if not may(role, "sign", "documents"):
         raise DataError(f"signed by {name}: the role {role} may not sign documents")
     verify(certificate, value, _canonical(content))
-    return {"name": name, "role": role, "cell": cell, **provenance.model_dump()}
+    return {"name": name, "role": role, "cell": cell, **origin}
 
 
 def _signed(text: str, identity: "Identity") -> str:
     from cryptography.hazmat.primitives.serialization import Encoding
 
+    provenance = {
+        "armident": importlib.metadata.version("armident"),
+        "host": socket.gethostname(),
+        "user": _user(),
+        "time": datetime.now(UTC).isoformat(timespec="milliseconds"),
+    }
+    content = json.loads(text) | {"provenance": provenance}
+    parts = {
+        "certificate": identity.certificate.public_bytes(Encoding.DER),
+        "value": identity.sign(_canonical(content)),
+    }
+    signature = {key: base64.b64encode(part).decode() for key, part in parts.items()}
+    return json.dumps(content | {"signature": signature}, indent=1, ensure_ascii=False) + "\n"
+
+
+def _user() -> str:
     try:
-        user = getpass.getuser()
+        return getpass.getuser()
     except (KeyError, OSError):
-        user = str(os.getuid())
-    provenance = Provenance(
-        armident=importlib.metadata.version("armident"),
-        host=socket.gethostname(),
-        user=user,
-        time=datetime.now(UTC).isoformat(timespec="milliseconds"),
-    )
-    content = json.loads(text) | {"provenance": provenance.model_dump()}
-    der, value = identity.certificate.public_bytes(Encoding.DER), identity.sign(_canonical(content))
-    signature = Signature(certificate=base64.b64encode(der).decode(), value=base64.b64encode(value).decode())
-    return json.dumps(content | {"signature": signature.model_dump()}, indent=1, ensure_ascii=False) + "\n"
+        return str(os.getuid())
 
 
 def _canonical(content: Mapping[str, Any]) -> bytes:

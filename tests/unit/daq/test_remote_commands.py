@@ -85,7 +85,7 @@ def asked(cell: SessionConfig, commands: Commands, attachments: Sequence[bytes],
     """Return the answers to a command ``stop`` with each of these attachments, asked on a key."""
     of_stop, answers = Keys(cell.cell, "tx40").command("stop"), []
     with open_session(cell, "observer") as observer:
-        until, found = time.monotonic() + 10, []
+        until, found = time.monotonic() + 10, list[zenoh.Reply]()
         while not found and time.monotonic() < until:
             found = list(observer.get(of_stop, payload=b"x"))
         for attachment in attachments:
@@ -100,10 +100,8 @@ def test_only_a_fresh_command_of_an_operator_counts_and_it_counts_once(tmp_path:
     cell = session(True)
     key, plant, stop = Keys(cell.cell, "tx40").command("stop"), key_folder(), new_nonce()
     once = signer_for(cell, "operator").attachment(key, b"", stop)
-    early, late = (
-        Signer(plant, "operator", "*", lambda off=off: time.time_ns() + off * 10**9).attachment(key, b"", new_nonce())
-        for off in (-60, 60)
-    )
+    early = Signer(plant, "operator", "*", lambda: time.time_ns() - 60 * 10**9).attachment(key, b"", new_nonce())
+    late = Signer(plant, "operator", "*", lambda: time.time_ns() + 60 * 10**9).attachment(key, b"", new_nonce())
     foreign = Signer(KeyFolder(tmp_path / "foreign", local=True), "operator", cell.cell)
     wrong = [
         (b"ARMS", "the attachment is no signature"),

@@ -64,6 +64,8 @@ def changed(text: str, **changes: Any) -> str:
         (lambda text: changed(text, more=None), "does not fit"),
         (lambda text: changed(text, provenance=json.loads(text)["provenance"] | {"host": "x"}), "does not fit"),
         (lambda text: changed(text, provenance=None), "damaged"),
+        (lambda text: changed(text, provenance={"time": "x"}), "damaged"),
+        (lambda text: changed(text, provenance=json.loads(text)["provenance"] | {"time": "2026-01-01"}), "damaged"),
         (lambda text: changed(text, signature={"certificate": "", "value": ""}), "not a certificate"),
         (lambda text: changed(text, signature={"certificate": "%", "value": ""}), "damaged"),
         (lambda text: changed(text, signature=[]), "damaged"),
