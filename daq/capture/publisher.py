@@ -45,7 +45,7 @@ class Publisher:
     """
 
     def __init__(self, session: SessionConfig, keys: Keys, *, exclusive: bool = True) -> None:
-        configuration(session, "capture")
+        is_client = configuration(session, "capture").get_json("mode") == '"client"'
         self.offered = 0
         self.dropped = 0
         self.events_dropped = 0
@@ -62,7 +62,11 @@ class Publisher:
         self.problem: str | None = None
         """Reason why there is no Zenoh session, or ``None``."""
         self.commands = Commands(keys, session.zenoh.commands)
-        if not self._try_open() and exclusive and _capture_runs(session, keys):
+        # A second peer finds the port taken; a second client of a router opens as well, and is looked for before.
+        runs = exclusive and is_client and _capture_runs(session, keys)
+        if not runs and not self._try_open() and not is_client:
+            runs = exclusive and _capture_runs(session, keys)
+        if runs:
             raise ConfigError(f"another capture of cell {session.cell}, robot {keys.robot}, is running")
         self._thread = threading.Thread(target=self._run, name="zenoh", daemon=True)
         self._thread.start()

@@ -618,6 +618,11 @@ def test_a_capture_that_listens_itself_denies_as_the_router_does(plant: Plant) -
     assert [bool(got) for got in read.values()] == [True, False]
 
 
+def test_a_second_capture_of_a_robot_is_refused_by_way_of_the_router(stage: Stage) -> None:
+    with pytest.raises(ConfigError, match="another capture of cell a, robot tx40, is running"):
+        Publisher(stage.plant.session("a"), Keys("a", "tx40"))
+
+
 def test_a_second_authority_is_not_trusted_beside_that_of_the_plant(plant: Plant) -> None:
     """An attacker who trusts his own authority as well does not make the router trust it."""
     both = plant.stolen / "both.pem"
