@@ -53,10 +53,9 @@ class KeyFolder:
                 # Another process may have made it while this one waited.
                 found = self._find(role, cell)
                 if found is None:
-                    self._make_authority()
                     of, name = (ANY_CELL, "local") if role in ("operator", "viewer") else (cell, cell)
-                    addresses = ("localhost", "127.0.0.1", "::1")
-                    found = read_authority(self.path).issue(role, of, f"{role}.{name}"[:64], addresses, _DAYS, _FROM)
+                    issue, addresses = read_authority(self.path).issue, ("localhost", "127.0.0.1", "::1")
+                    found = issue(role, of, f"{role}.{name}"[:64], addresses, _DAYS, _FROM)
                     write_identity(self.path, found)
         if found is None:
             raise ConfigError(
@@ -70,19 +69,17 @@ class KeyFolder:
         path = self.path / "authority.pem"
         if self.local and not is_file(path):
             with self._locked():
-                self._make_authority()
+                pass
         if not is_file(path):
             raise ConfigError(f"{path}: no such file; copy it from the machine on which armident keys init ran")
         return read_certificates(path)
 
     def stamp(self, name: str) -> tuple[int, ...]:
         """Return the times of change of the folder and of a file in it, by which a renewal is noticed."""
-        found = []
-        for path in (self.path, self.path / name):
-            try:
-                found.append(path.stat().st_mtime_ns)
-            except OSError:
-                found.append(0)
+        found = [0, 0]
+        with suppress(OSError):
+            found[0] = self.path.stat().st_mtime_ns
+            found[1] = (self.path / name).stat().st_mtime_ns
         return tuple(found)
 
     def _find(self, role: Role, cell: str) -> Identity | None:
@@ -100,23 +97,21 @@ class KeyFolder:
             raise refused
         return max(found, key=lambda each: (each.cell == cell, each.certificate.not_valid_after_utc), default=None)
 
-    def _make_authority(self) -> None:
-        if not is_file(self.path / "authority.pem"):
-            authority = new_authority(f"local {socket.gethostname()}"[:64], _DAYS, _FROM)
-            write_key(self.path / "authority.key", authority.key)
-            write_whole(self.path / "authority.pem", pem_of(authority.certificate), 0o644)
-
     @contextmanager
     def _locked(self) -> Iterator[None]:
-        """Hold the lock of the folder, which is made if it is missing."""
+        """Hold the lock of the folder; the folder and its authority are made if they are missing."""
         try:
             self.path.mkdir(mode=0o700, parents=True, exist_ok=True)
             lock = os.open(self.path / ".lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
         except OSError as error:
             reason = reason_of(error, named=False)
-            raise ConfigError(f"{self.path}: no keys can be made: {reason}; {VARIABLE} names another folder") from error
+            raise ConfigError(f"{self.path}: no keys can be made: {reason}; set XDG_STATE_HOME") from error
         try:
             fcntl.flock(lock, fcntl.LOCK_EX)
+            if not is_file(self.path / "authority.pem"):
+                authority = new_authority(f"local {socket.gethostname()}"[:64], _DAYS, _FROM)
+                write_key(self.path / "authority.key", authority.key)
+                write_whole(self.path / "authority.pem", pem_of(authority.certificate), 0o644)
             yield
         finally:
             os.close(lock)
@@ -138,4 +133,4 @@ def key_folder(chosen: Path | None = None) -> KeyFolder:
     state = os.environ.get("XDG_STATE_HOME")
     with suppress(RuntimeError):
         return KeyFolder((Path(state) if state else Path.home() / ".local" / "state") / "armident" / "keys", local=True)
-    raise ConfigError(f"no folder for keys: this user has no home; {VARIABLE} names one")
+    raise ConfigError("no folder for keys: this user has no home; set XDG_STATE_HOME")

@@ -149,8 +149,9 @@ class Trust:
         return certificate
 
     def _load(self) -> None:
-        self._authorities = self._folder.authority_certificates()
+        # Before it is read: what is replaced meanwhile is read again.
         self._stamp = self._folder.stamp("authority.pem")
+        self._authorities = self._folder.authority_certificates()
         self._known.clear()
 
 

@@ -149,7 +149,7 @@ def _protect(config: zenoh.Config, session: SessionConfig, role: certificates.Ro
     places = [*listen, *connect]
     if all(is_loopback(place) and not place.startswith(_ENCRYPTED) for place in places):
         return
-    for place in places:
+    for place in sorted(places, key=is_loopback):
         if not place.startswith(_ENCRYPTED):
             far = place if not is_loopback(place) else f"{place} beside endpoints of other hosts"
             raise ConfigError(f"{file}: {far}: expected tls/HOST:PORT; for its keys: armident keys enrol {role}")

@@ -286,7 +286,7 @@ CLIENT = f'mode: "client", {QUIET}, connect: {{endpoints: ["tls/192.0.2.1:7447"]
     [
         ({"listen": ("tcp/0.0.0.0:7447",)}, f"tcp/0.0.0.0:7447: {FAR}; for its keys: armident keys enrol"),
         ({"listen": ("tcp/[::]:7447",)}, FAR),
-        ({"connect": ("tcp/192.0.2.1:7447",)}, FAR),
+        ({"connect": ("tcp/192.0.2.1:7447",)}, f"tcp/192.0.2.1:7447: {FAR}"),
         ({"connect": ("udp/router.example:7447",)}, FAR),
         ({"connect": ("tls/192.0.2.1:7447", "tcp/127.0.0.1:7447")}, "beside endpoints of other hosts"),
         ({"connect": ("tls/192.0.2.1:7447#enable_mtls=false",)}, "expected no options of certificates"),
