@@ -159,7 +159,7 @@ def spoil(folder: Path, how: str) -> None:
         ("other key", "the certificate does not belong to the key beside it"),
         ("no key", "capture.press_7.key: No such file"),
         ("not PEM", "capture.press_7.pem: expected certificates (PEM)"),
-        ("foreign", "capture.press_7: its certificate was issued by another authority"),
+        ("foreign", "'capture.press_7': its certificate was issued by another authority"),
         ("other name", "is the certificate of capture.press_7; expected the name capture.press_7.pem"),
         ("no authority", "authority.pem: No such file"),
         ("router edited", "router.json5: does not match the enrolled names; run: armident keys router"),
