@@ -10,6 +10,7 @@ import sys
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
 from typing import Literal
@@ -29,6 +30,7 @@ from armident.configs.blanks import blank_lines, needed, pattern
 from armident.configs.loading import is_session
 from armident.configs.schema.session import Bus
 from armident.daq.capture.recording_files import chunk_duration_ns
+from armident.daq.identity.plant import of_session
 from armident.daq.matching.streams import captured_streams, unknown_phase
 from armident.daq.recording.clock import clock_state
 from armident.daq.streaming.zenoh_session import configuration, endpoints, unreadable_files
@@ -110,7 +112,7 @@ def run_checks(config: str | Path) -> list[Check]:
     for bus in session.all_buses:
         checks += _interface(bus)
     checks += [_installation(), _clock()]
-    checks += [*_disk(session, robot), _zenoh(session)]
+    checks += [*_disk(session, robot), _zenoh(session), *_keys(session)]
     return checks
 
 
@@ -312,13 +314,16 @@ def _speed(times: list[float], span_s: float) -> Check:
 def _zenoh(session: SessionConfig) -> Check:
     """Check the configuration of Zenoh, and that the port of the capture is free."""
     try:
-        unreadable = unreadable_files(configuration(session, "capture"))
+        config = configuration(session, "capture")
+        unreadable = unreadable_files(config)
     except ConfigError as error:
         return Check("zenoh", "failed", str(error))
     if unreadable:
-        return Check("zenoh", "failed", f"{session.zenoh.config}: cannot be read: {', '.join(unreadable)}")
+        return Check("zenoh", "failed", f"{session.zenoh.config or 'keys'}: cannot be read: {', '.join(unreadable)}")
     if session.zenoh.config is not None or session.zenoh.listen:
         return Check("zenoh", "ok", "configured by the session")
+    if config.get_json("mode") == '"client"':
+        return Check("zenoh", "ok", f"client of {', '.join(session.zenoh.connect)} by mutual TLS")
     host, _, port = endpoints(session)["capture"].removeprefix("tcp/").rpartition(":")
     with socket.socket() as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -327,6 +332,12 @@ def _zenoh(session: SessionConfig) -> Check:
         except OSError as error:
             return Check("zenoh", "warning", f"{host}:{port}: {error.strerror}; is a capture of this cell running?")
     return Check("zenoh", "ok", f"peers on loopback, port {port}")
+
+
+def _keys(session: SessionConfig) -> Iterator[Check]:
+    """Check the keys of the plant: a capture records without them, hence an expired certificate is a warning."""
+    for each in of_session(session, datetime.now(UTC)):
+        yield Check("keys", "ok" if each.verdict == "ok" else "warning", each.message)
 
 
 def doctor(config: str, as_json: bool, command: Command = "capture") -> None:

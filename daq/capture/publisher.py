@@ -13,6 +13,8 @@ import zenoh.ext
 
 from armident.configs import ConfigError, SessionConfig
 from armident.daq.capture.remote_commands import Commands
+from armident.daq.identity.plant import Countdown
+from armident.daq.identity.signatures import signer_for, trust_for
 from armident.daq.streaming import Block, Keys, encode_block, open_session
 from armident.daq.streaming.zenoh_session import configuration
 
@@ -43,7 +45,7 @@ class Publisher:
     """
 
     def __init__(self, session: SessionConfig, keys: Keys, *, exclusive: bool = True) -> None:
-        configuration(session, "capture")
+        is_client = configuration(session, "capture").get_json("mode") == '"client"'
         self.offered = 0
         self.dropped = 0
         self.events_dropped = 0
@@ -60,7 +62,11 @@ class Publisher:
         self.problem: str | None = None
         """Reason why there is no Zenoh session, or ``None``."""
         self.commands = Commands(keys, session.zenoh.commands)
-        if not self._try_open() and exclusive and _capture_runs(session, keys):
+        # A second peer finds the port taken; a second client of a router opens as well, and is looked for before.
+        runs = exclusive and is_client and _capture_runs(session, keys)
+        if not runs and not self._try_open() and not is_client:
+            runs = exclusive and _capture_runs(session, keys)
+        if runs:
             raise ConfigError(f"another capture of cell {session.cell}, robot {keys.robot}, is running")
         self._thread = threading.Thread(target=self._run, name="zenoh", daemon=True)
         self._thread.start()
@@ -126,8 +132,10 @@ class Publisher:
         """Open a session and declare all that is published; log a failure once."""
         opened = None
         try:
+            self._signer = signer_for(self._config, "capture")
+            trust = trust_for(self._config, self._keys.base)
             opened = open_session(self._config, "capture")
-            self.commands.declare(opened)
+            self.commands.declare(opened, self._signer, trust)
             cached = self._config.zenoh.cache_blocks
             self._samples = _declared(opened, self._keys.samples, cached, zenoh.CongestionControl.DROP)
             self._events = _declared(opened, self._keys.events, _EVENTS_KEPT, zenoh.CongestionControl.BLOCK)
@@ -161,7 +169,9 @@ class Publisher:
             self._ready.notify()
 
     def _run(self) -> None:
+        countdown = Countdown(self._config)
         while True:
+            countdown.check()
             if self._session is None and not self._try_open():
                 if self._over.wait(RETRY_S):
                     return
@@ -189,11 +199,12 @@ class Publisher:
     def _send(self, latest: Mapping[str, bytes], waiting: Block | bytes | None) -> None:
         assert self._session is not None
         for key, data in latest.items():
-            self._session.put(key, data)
+            self._session.put(key, data, attachment=self._signer.attachment(key, data))
         if isinstance(waiting, Block):
-            self._samples.put(encode_block(waiting))
+            block = encode_block(waiting)
+            self._samples.put(block, attachment=self._signer.attachment(self._keys.samples, block))
         elif waiting is not None:
-            self._events.put(waiting)
+            self._events.put(waiting, attachment=self._signer.attachment(self._keys.events, waiting))
 
 
 def _declared(
@@ -213,7 +224,7 @@ def _capture_runs(session: SessionConfig, keys: Keys) -> bool:
     """Return True if the token of another capture of this robot is found."""
     until = time.monotonic() + FIND_S
     try:
-        with open_session(session, "observer") as observer:
+        with open_session(session, "observer", identity="capture") as observer:
             while time.monotonic() < until:
                 if any(reply.ok is not None for reply in observer.liveliness().get(keys.alive("capture"), timeout=0.3)):
                     return True

@@ -64,7 +64,7 @@ def test_a_shipped_configuration_is_found_by_its_short_names(
         ("trajectories", "tx40_excitation.yaml"),
         ("scenarios", "tx40_worn_joint2.yaml"),
         ("eds", "cia402_servo.eds"),
-        ("zenoh", "peer.json5"),
+        ("zenoh", "client.json5"),
     ],
 )
 def test_shipped_files_of_every_kind_are_found_from_any_folder(
@@ -76,7 +76,7 @@ def test_shipped_files_of_every_kind_are_found_from_any_folder(
 
 def test_a_session_in_any_folder_finds_shipped_files_by_their_names(tmp_path: Path) -> None:
     data = yaml.safe_load((HERE / "cells" / "tx40_cell.yaml").read_text())
-    data |= {"robot": "tx40", "zenoh": {"config": "peer.json5"}, "setpoints": {"trajectory": "tx40_1.yaml"}}
+    data |= {"robot": "tx40", "zenoh": {"config": "client.json5"}, "setpoints": {"trajectory": "tx40_1.yaml"}}
     for drive in data["drives"]:
         drive["eds"] = "cia402_servo.eds"
     (tmp_path / "cell.yaml").write_text(yaml.safe_dump(data))
@@ -84,7 +84,7 @@ def test_a_session_in_any_folder_finds_shipped_files_by_their_names(tmp_path: Pa
     assert session.setpoints is not None
     assert session.robot == HERE / "robots" / "tx40.yaml"
     assert session.drives[3].eds == HERE / "eds" / "cia402_servo.eds"
-    assert session.zenoh.config == HERE / "zenoh" / "peer.json5"
+    assert session.zenoh.config == HERE / "zenoh" / "client.json5"
     assert session.setpoints.trajectory == HERE / "trajectories" / "tx40_1.yaml"
 
 

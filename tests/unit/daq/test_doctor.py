@@ -14,6 +14,7 @@ from typer.testing import CliRunner
 from armident.configs.loading import HERE
 from armident.daq.cli import application
 from armident.daq.doctor import Check, run_checks
+from armident.daq.identity.plant import enrol, make_authority
 from armident.systemd import Notifier
 from tests.integration.test_capture_vcan import session_file
 
@@ -90,16 +91,28 @@ def test_data_sheets_are_opened_though_the_robot_is_wrong(tmp_path: Path) -> Non
 
 
 def test_certificates_of_zenoh_are_opened(tmp_path: Path) -> None:
-    for name in ("ca", "cert", "key"):
-        (tmp_path / f"{name}.pem").write_text("PEM")
-    text = (HERE / "zenoh" / "tls.json5").read_text().replace("/etc/armident/tls", str(tmp_path))
-    (tmp_path / "tls.json5").write_text(text)
-    path = cell(tmp_path, zenoh={"config": "tls.json5"})
+    for name in ("authority.pem", "viewer.anna.pem", "viewer.anna.key"):
+        (tmp_path / name).write_text("PEM")
+    text = (HERE / "zenoh" / "client.json5").read_text().replace("/etc/armident/keys", str(tmp_path))
+    (tmp_path / "client.json5").write_text(text)
+    path = cell(tmp_path, zenoh={"config": "client.json5"})
     assert checks_of(path)["zenoh"].verdict == "ok"
-    (tmp_path / "ca.pem").unlink()
+    (tmp_path / "authority.pem").unlink()
     check = checks_of(path)["zenoh"]
     assert check.verdict == "failed"
-    assert f"root_ca_certificate {tmp_path}/ca.pem (No such file or directory)" in check.message
+    assert f"root_ca_certificate {tmp_path}/authority.pem (No such file or directory)" in check.message
+
+
+def test_the_end_of_certificates_is_counted_down_and_does_not_stop_a_capture(tmp_path: Path) -> None:
+    make_authority(tmp_path / "keys", "plant")
+    for role, days in (("capture", 5), ("worker", 20), ("viewer", 1)):
+        enrol(tmp_path / "keys", role, "other" if role == "viewer" else "doctor", None, [], days)
+    path = cell(tmp_path, cell="doctor", zenoh={"keys": "keys", "connect": ["tls/192.0.2.1:7447"]})
+    assert checks_of(path)["zenoh"] == Check("zenoh", "ok", "client of tls/192.0.2.1:7447 by mutual TLS")
+    found = [check for check in run_checks(path) if check.name == "keys"]
+    assert [check.verdict for check in found] == ["ok", "warning", "warning"]
+    assert found[1].message.endswith(", in 4 days; run where the authority is: armident keys renew capture.doctor")
+    assert "worker.doctor: valid until" in found[2].message
 
 
 def test_slow_streams_of_another_master_without_sync_counter_are_a_warning(tmp_path: Path) -> None:
