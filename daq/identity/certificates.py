@@ -110,7 +110,7 @@ def trusted_certificate(
     """Return a certificate from its bytes, checked as by `signer_of`."""
     try:
         certificate = x509.load_der_x509_certificate(certificate_der)
-    except (ValueError, TypeError, UnsupportedAlgorithm) as error:
+    except (ValueError, TypeError, UnsupportedAlgorithm, x509.InvalidVersion) as error:
         raise DataError("not a certificate (X.509, DER)") from error
     name = identity_of(certificate)[2]
     for authority in authority_certificates:

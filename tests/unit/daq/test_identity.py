@@ -174,3 +174,17 @@ def test_a_renewed_identity_is_the_one_that_ends_last(authority: Authority, tmp_
     for days in (30, 365):
         write_identity(tmp_path, authority.issue("worker", "c", f"worker.c{days}", [], days))
     assert KeyFolder(tmp_path).identity("worker", "c").name == "worker.c365"
+
+
+def test_bytes_that_are_no_certificate_are_refused(authority: Authority) -> None:
+    right = der(authority.issue("worker", "c", "worker.c", [], 9))
+    for wrong in (b"", right[:-1], right.replace(b"\xa0\x03\x02\x01\x02", b"\xa0\x03\x02\x01\x33")):
+        with pytest.raises(DataError, match="not a certificate"):
+            signer_of(wrong, [authority.certificate], NOW)
+
+
+def test_a_name_of_a_stranger_does_not_break_the_line_of_the_log(authority: Authority) -> None:
+    foreign = new_authority("plant", 365).issue("worker", "c", "worker\nERROR", [], 9)
+    with pytest.raises(DataError) as caught:
+        signer_of(der(foreign), [authority.certificate], NOW)
+    assert "\n" not in str(caught.value)
