@@ -153,10 +153,12 @@ class Worker:
     def _keep_alive(self) -> None:
         """Renew the leases, enter what others announced, and keep the Zenoh session open; in a thread of its own."""
         while not self._closing.wait(POLL_S):
+            # The identifying thread forgets a ledger that was deleted.
+            ledger = self._ledger
             try:
-                if self._ledger is not None:
-                    self._ledger.renew()
-                    self._announcements.enter_heard(self._ledger)
+                if ledger is not None:
+                    ledger.renew()
+                    self._announcements.enter_heard(ledger)
             except (ArmidentError, OSError) as error:
                 log.debug("lease not renewed: %s", error)
             self._link.check()
