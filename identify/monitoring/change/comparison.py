@@ -82,7 +82,7 @@ def _document(
     left_out: list[str],
 ) -> ComparisonDocument:
     old = {p.name: p for p in baseline[0].parameters}
-    places = joints, couplings = _places(now[0])
+    places = joints, couplings = places_of(now[0])
     parameters = [
         _compared(p, old[p.name], joint_of(p.name, *places), float(std), float(p_value), p.name in result.changed)
         for p, std, p_value in zip(result.parameters, result.std, result.p_values, strict=True)
@@ -191,8 +191,8 @@ def joint_of(parameter: str, joints: Sequence[str], couplings: Sequence[str] = (
     return joints[number - 1] if 1 <= number <= len(joints) else name
 
 
-def _places(document: IdentificationDocument) -> tuple[list[str], list[str]]:
-    """Return the names of the joints and of the couplings."""
+def places_of(document: IdentificationDocument) -> tuple[list[str], list[str]]:
+    """Return the names of the joints and of the couplings of a robot."""
     configuration = document.configuration or {}
     return list(document.relative_error_pct_by_joint), [each["name"] for each in configuration.get("couplings", [])]
 

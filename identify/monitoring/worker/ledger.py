@@ -16,7 +16,7 @@ import socket
 import sqlite3
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -132,6 +132,19 @@ class LedgerEntry:
     def digest(self) -> str | None:
         """SHA-256 of its samples, hexadecimal; ``None`` if its files were not read yet."""
         return None if self.sha256.startswith(_UNREAD) else self.sha256
+
+
+@dataclass(frozen=True)
+class LedgerView:
+    """Ledger as a reader sees it: number of recordings by state, and the last ones.
+
+    ``waiting_since``: time of the oldest file that waits, s since 1970; ``last``: entries with the time of their
+    result, or of their files without one, s since 1970.
+    """
+
+    counts: dict[str, int]
+    waiting_since: float | None
+    last: tuple[tuple[LedgerEntry, float], ...]
 
 
 _COLUMNS = "sha256, name, paths, state, attempts, result, message, announced, any_cell, version"
@@ -455,6 +468,41 @@ def open_ledger(path: Path, owner: str) -> Ledger:
                 path.with_name(path.name + suffix).rename(aside.with_name(aside.name + suffix))
         log.warning("%s: the ledger was damaged, and is now %s; a new one finds the results", path, aside.name)
         return Ledger(path, owner)
+
+
+def view_of(path: Path, most: int) -> LedgerView:
+    """Return the state of a ledger with the last ``most`` recordings; nothing is written, and no worker waits.
+
+    Raises LedgerUnusable if it is damaged, or of another version.
+    """
+    when = "coalesce(finished, made)"
+    try:
+        with closing(_reading(path)) as db:
+            version = int(db.execute("PRAGMA user_version").fetchone()[0])
+            if version != len(_MIGRATIONS):
+                raise LedgerUnusable(f"{path}: ledger of version {version}, not {len(_MIGRATIONS)}; restart its worker")
+            counts = dict(db.execute("SELECT state, count(*) FROM experiments GROUP BY state"))
+            (oldest,) = db.execute("SELECT min(made) FROM experiments WHERE state = 'waiting'").fetchone()
+            rows = db.execute(
+                f"SELECT {when}, {_COLUMNS} FROM experiments ORDER BY {when} DESC, name DESC LIMIT ?", (most,)
+            ).fetchall()
+            return LedgerView(counts, oldest, tuple((_entry(row[1:]), float(row[0])) for row in rows))
+    except (sqlite3.Error, ValueError, TypeError) as error:
+        reason = reason_of(error) if isinstance(error, sqlite3.Error) else "damaged (a row has other values)"
+        raise LedgerUnusable(f"{path}: {reason}") from error
+
+
+def _reading(path: Path) -> sqlite3.Connection:
+    """Return a connection that only reads, also in a folder that may not be written."""
+    uri = f"{path.absolute().as_uri()}?mode=ro"
+    db = sqlite3.connect(uri, timeout=1.0, isolation_level=None, uri=True)
+    try:
+        db.execute("SELECT 1 FROM sqlite_master")
+    except sqlite3.OperationalError:
+        db.close()
+        # No worker has it open: its index of the write-ahead log is missing, and could not be made here.
+        db = sqlite3.connect(f"{uri}&immutable=1", isolation_level=None, uri=True)
+    return db
 
 
 def unique_owner() -> str:

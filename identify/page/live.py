@@ -1,0 +1,162 @@
+"""Last messages of the captures and workers of the cells, heard on Zenoh."""
+
+import json
+import logging
+import threading
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import zenoh
+
+from armident.configs import ArmidentError, ConfigError
+from armident.daq.streaming import Keys, decode_event, open_session
+from armident.identify.monitoring.worker.stream_buffer import LARGEST_EVENT
+from armident.identify.page.cells import Cell
+
+log = logging.getLogger(__name__)
+
+LARGEST_MESSAGE = 1 << 16
+"""Largest health or status message, bytes; one of six axes has 2 kB."""
+
+
+@dataclass(frozen=True)
+class Message:
+    """Message with the time at which it was heard, s of the monotonic clock and s since 1970."""
+
+    heard: float
+    at: float
+    content: dict[str, Any]
+
+
+@dataclass
+class Live:
+    """Last messages of one cell; each is replaced as a whole.
+
+    ``moved``: time at which the last SYNC was seen to advance; ``ended``: time of the regular end of a capture, both s of
+    the monotonic clock; ``alive``: components with a liveliness token; ``began``: begin of the listening.
+    """
+
+    began: float
+    health: Message | None = None
+    moved: float | None = None
+    ended: float | None = None
+    status: dict[str, Message] = field(default_factory=dict)
+    alive: frozenset[str] = frozenset()
+    problem: str | None = None
+
+    def take_health(self, data: bytes) -> None:
+        """Take a health message; one that is none is left out."""
+        content, now = _object(data), time.monotonic()
+        if content is None:
+            return
+        if self.health is None or content.get("sync") != self.health.content.get("sync"):
+            self.moved = now
+        self.health = Message(now, time.time(), content)
+
+    def take_status(self, data: bytes) -> None:
+        """Take a status message of a capture, worker or re-identification."""
+        content = _object(data)
+        if content is not None and content.get("component") in ("capture", "worker", "reidentify"):
+            self.status = {**self.status, content["component"]: Message(time.monotonic(), time.time(), content)}
+
+    def take_event(self, data: bytes) -> None:
+        """Take an event: the regular end of a capture is no failure."""
+        try:
+            if decode_event(data)["kind"] == "experiment_end":
+                self.ended = time.monotonic()
+        except ArmidentError:
+            log.debug("an event that is none")
+
+
+def _object(data: bytes) -> dict[str, Any] | None:
+    """Return a JSON object with its plain values."""
+    try:
+        found = json.loads(data)
+    except (ValueError, RecursionError):
+        return None
+    if not isinstance(found, dict):
+        return None
+    return {key: value for key, value in found.items() if value is None or isinstance(value, str | int | float)}
+
+
+class Listener:
+    """Subscribes to health, status, ends and liveliness of cells; sessions that cannot be opened are tried again.
+
+    Cells with one Zenoh file share a session.
+    """
+
+    def __init__(self, cells: Sequence[Cell]) -> None:
+        now = time.monotonic()
+        self.live = {cell.name: Live(now) for cell in cells}
+        self._groups: dict[object, list[Cell]] = {}
+        for cell in cells:
+            if cell.session is not None:
+                options = cell.session.zenoh
+                key: tuple[Path | str, ...] = (
+                    (cell.name,) if options.config is None else (options.config, *options.connect)
+                )
+                self._groups.setdefault(key, []).append(cell)
+        self._sessions: dict[object, zenoh.Session] = {}
+        self._lock = threading.Lock()
+
+    def check(self) -> None:
+        """Open the sessions that are missing."""
+        with self._lock:
+            for key, cells in self._groups.items():
+                if key not in self._sessions:
+                    self._open(key, cells)
+
+    def close(self) -> None:
+        """Close all sessions."""
+        with self._lock:
+            for session in self._sessions.values():
+                session.close()
+            self._sessions, self._groups = {}, {}
+
+    def _open(self, key: object, cells: Sequence[Cell]) -> None:
+        first = cells[0].session
+        assert first is not None
+        problem = None
+        try:
+            # Of a file for all roles, the port belongs to the capture.
+            session = open_session(first, "observer", any_port=first.zenoh.config is not None)
+            self._sessions[key] = session
+            for cell in cells:
+                self._subscribe(session, cell)
+        except (ConfigError, zenoh.ZError) as error:
+            problem = str(error).splitlines()[0]
+            if (opened := self._sessions.pop(key, None)) is not None:
+                opened.close()
+        for cell in cells:
+            self.live[cell.name].problem = problem
+
+    def _subscribe(self, session: zenoh.Session, cell: Cell) -> None:
+        assert cell.session is not None
+        assert cell.robot is not None
+        live, keys = self.live[cell.name], Keys(cell.session.cell, cell.robot.name)
+        for expression, take, most in (
+            (keys.health, live.take_health, LARGEST_MESSAGE),
+            (keys.status, live.take_status, LARGEST_MESSAGE),
+            (keys.events, live.take_event, LARGEST_EVENT),
+        ):
+            session.declare_subscriber(expression, _taking(take, most))
+
+        def note(sample: zenoh.Sample) -> None:
+            component = str(sample.key_expr).rpartition("/")[2]
+            is_here = sample.kind == zenoh.SampleKind.PUT
+            live.alive = live.alive | {component} if is_here else live.alive - {component}
+
+        session.liveliness().declare_subscriber(keys.alive("*"), note, history=True)
+
+
+def _taking(take: Callable[[bytes], None], most: int) -> Callable[[zenoh.Sample], None]:
+    """Return a function that passes on messages of at most ``most`` bytes."""
+
+    def heard(sample: zenoh.Sample) -> None:
+        if len(sample.payload) <= most:
+            take(bytes(sample.payload))
+
+    return heard
