@@ -1,0 +1,269 @@
+"""Certificates of a plant: an authority, and one certificate for each role of a cell or person (X.509, P-256)."""
+
+import os
+import secrets
+from collections.abc import Iterable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from ipaddress import ip_address
+from pathlib import Path
+from typing import Literal, get_args
+
+from cryptography import x509
+from cryptography.exceptions import InvalidSignature, UnsupportedAlgorithm
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.hazmat.primitives.hashes import SHA256
+from cryptography.hazmat.primitives.serialization import (
+    Encoding,
+    NoEncryption,
+    PrivateFormat,
+    load_pem_private_key,
+)
+from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
+
+from armident.configs import ConfigError, DataError
+from armident.configs.reasons import reason_of
+
+Role = Literal["capture", "worker", "operator", "viewer"]
+ROLES: tuple[Role, ...] = get_args(Role)
+ANY_CELL = "*"
+"""Cell of an operator or viewer of the whole plant."""
+TOLERANCE = timedelta(minutes=5)
+"""Difference of the clocks of two hosts that a new certificate allows for."""
+PRIVATE, OF_GROUP = 0o600, 0o640
+"""Modes of a file with a private key: of its owner alone, or readable by its group."""
+
+
+@dataclass(frozen=True)
+class Identity:
+    """A role in a cell, `ANY_CELL` for an operator or viewer of the plant, with its key and certificate.
+
+    ``name``: common name of the certificate, ``ROLE.CELL`` or ``ROLE.PERSON``.
+    """
+
+    role: Role
+    cell: str
+    name: str
+    key: ec.EllipticCurvePrivateKey
+    certificate: x509.Certificate
+
+    def sign(self, data: bytes) -> bytes:
+        """Return the signature of data: ECDSA with SHA-256, DER."""
+        return self.key.sign(data, ec.ECDSA(SHA256()))
+
+
+@dataclass(frozen=True)
+class Authority:
+    """Certificate authority of a plant."""
+
+    key: ec.EllipticCurvePrivateKey
+    certificate: x509.Certificate
+
+    def issue(
+        self, role: Role, cell: str, name: str, addresses: Sequence[str], days: int, now: datetime | None = None
+    ) -> Identity:
+        """Return a new identity; ``addresses``: DNS names and IP addresses under which it is reached.
+
+        The certificate has the role as organisational unit and the cell as organisation. ConfigError if one is invalid.
+        """
+        if role not in ROLES:
+            raise ConfigError(f"role {role!r}: expected {', '.join(ROLES)}")
+        if cell == ANY_CELL and role not in ("operator", "viewer"):
+            raise ConfigError(f"role {role}: needs a cell; only operator and viewer may be of all cells ({ANY_CELL})")
+        key = ec.generate_private_key(ec.SECP256R1())
+        subject = _name((NameOID.COMMON_NAME, name), (NameOID.ORGANIZATIONAL_UNIT_NAME, role),
+                        (NameOID.ORGANIZATION_NAME, cell))  # fmt: skip
+        purposes = [ExtendedKeyUsageOID.CLIENT_AUTH, ExtendedKeyUsageOID.SERVER_AUTH]
+        builder = (
+            _builder(subject, self.certificate.subject, key, days, now)
+            .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
+            .add_extension(_usage(digital_signature=True), critical=True)
+            .add_extension(x509.ExtendedKeyUsage(purposes), critical=False)
+            .add_extension(x509.AuthorityKeyIdentifier.from_issuer_public_key(self.key.public_key()), critical=False)
+        )
+        if addresses:
+            names = x509.SubjectAlternativeName([_address(address) for address in addresses])
+            builder = builder.add_extension(names, critical=False)
+        return Identity(role, cell, name, key, builder.sign(self.key, SHA256()))
+
+
+def new_authority(plant: str, days: int, now: datetime | None = None) -> Authority:
+    """Return a new authority of a plant; its certificate signs itself, and no other authority."""
+    key = ec.generate_private_key(ec.SECP256R1())
+    name = _name((NameOID.COMMON_NAME, plant))
+    builder = (
+        _builder(name, name, key, days, now)
+        .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
+        .add_extension(_usage(key_cert_sign=True, crl_sign=True), critical=True)
+    )
+    return Authority(key, builder.sign(key, SHA256()))
+
+
+def identity_of(certificate: x509.Certificate) -> tuple[Role, str, str]:
+    """Return role, cell and name in a certificate; DataError if it has none."""
+    try:
+        name, unit, cell = (
+            str(certificate.subject.get_attributes_for_oid(oid)[0].value)
+            for oid in (NameOID.COMMON_NAME, NameOID.ORGANIZATIONAL_UNIT_NAME, NameOID.ORGANIZATION_NAME)
+        )
+        role = next(role for role in ROLES if role == unit)
+    except (IndexError, StopIteration, ValueError) as error:
+        raise DataError("a certificate without role and cell") from error
+    return role, cell, name
+
+
+def signer_of(
+    certificate_der: bytes, authority_certificates: Iterable[x509.Certificate], at: datetime
+) -> tuple[Role, str, str]:
+    """Return role, cell and name of a certificate that one of the authorities has issued and that is valid at a time.
+
+    DataError if it is of another authority, expired, not yet valid, or without a role.
+    """
+    return identity_of(trusted_certificate(certificate_der, authority_certificates, at))
+
+
+def trusted_certificate(
+    certificate_der: bytes, authority_certificates: Iterable[x509.Certificate], at: datetime
+) -> x509.Certificate:
+    """Return a certificate from its bytes, checked as by `signer_of`."""
+    try:
+        certificate = x509.load_der_x509_certificate(certificate_der)
+        identity = identity_of(certificate)
+        is_of_curve = isinstance(certificate.public_key(), ec.EllipticCurvePublicKey)
+    except (ValueError, TypeError, UnsupportedAlgorithm) as error:
+        raise DataError("not a certificate (X.509, DER)") from error
+    if not is_of_curve:
+        raise DataError(f"{identity[2]}: the certificate has no key of an elliptic curve")
+    check_dates(certificate, at, identity[2])
+    for authority in authority_certificates:
+        with suppress(InvalidSignature, ValueError, TypeError):
+            certificate.verify_directly_issued_by(authority)
+            check_dates(authority, at, "the authority")
+            return certificate
+    raise DataError(f"{identity[2]}: its certificate was issued by another authority")
+
+
+def check_dates(certificate: x509.Certificate, at: datetime, name: str) -> None:
+    """Check that a certificate is valid at a time; DataError with its ``name`` and the date if not."""
+    if at > certificate.not_valid_after_utc:
+        raise DataError(f"{name}: the certificate expired on {certificate.not_valid_after_utc:%Y-%m-%d}")
+    if at < certificate.not_valid_before_utc:
+        begin = certificate.not_valid_before_utc
+        raise DataError(f"{name}: the certificate is valid from {begin:%Y-%m-%d %H:%M} UTC; check the clock")
+
+
+def pem_of(*certificates: x509.Certificate) -> bytes:
+    """Return certificates as PEM."""
+    return b"".join(certificate.public_bytes(Encoding.PEM) for certificate in certificates)
+
+
+def write_key(path: Path, key: ec.EllipticCurvePrivateKey, mode: int = PRIVATE) -> None:
+    """Write a private key as PEM (PKCS 8); its file is never readable by others."""
+    write_whole(path, key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption()), mode)
+
+
+def write_identity(folder: Path, identity: Identity, mode: int = PRIVATE) -> None:
+    """Write ``NAME.key`` and then ``NAME.pem``, by which readers find an identity."""
+    write_key(folder / f"{identity.name}.key", identity.key, mode)
+    write_whole(folder / f"{identity.name}.pem", pem_of(identity.certificate), 0o644)
+
+
+def write_whole(path: Path, content: bytes, mode: int) -> None:
+    """Write a file so that a reader sees all of it or none of it; ConfigError if the folder may not be written."""
+    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
+    try:
+        with open(temporary, "xb", opener=lambda name, flags: os.open(name, flags, mode)) as stream:
+            os.fchmod(stream.fileno(), mode)
+            stream.write(content)
+            stream.flush()
+            os.fsync(stream.fileno())
+        os.replace(temporary, path)
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be written: {reason_of(error, named=False, step=True)}") from error
+    finally:
+        with suppress(OSError):
+            temporary.unlink(missing_ok=True)
+
+
+def read_certificates(path: Path) -> tuple[x509.Certificate, ...]:
+    """Return the certificates of a PEM file; ConfigError if it has none."""
+    try:
+        return tuple(x509.load_pem_x509_certificates(path.read_bytes()))
+    except OSError as error:
+        raise ConfigError(reason_of(error)) from error
+    except ValueError as error:
+        raise ConfigError(f"{path}: expected certificates (PEM)") from error
+
+
+def read_key(path: Path) -> ec.EllipticCurvePrivateKey:
+    """Return the private key of a PEM file; ConfigError if it is none, or if all users may read it."""
+    try:
+        if path.stat().st_mode & 0o007:
+            raise ConfigError(f"{path}: other users may read this private key; run: chmod o= {path}")
+        key = load_pem_private_key(path.read_bytes(), None)
+    except OSError as error:
+        raise ConfigError(reason_of(error)) from error
+    except (ValueError, TypeError, UnsupportedAlgorithm) as error:
+        raise ConfigError(f"{path}: expected a private key without password (PEM)") from error
+    if not isinstance(key, ec.EllipticCurvePrivateKey):
+        raise ConfigError(f"{path}: expected a key of the curve P-256")
+    return key
+
+
+def read_identity(path: Path) -> Identity:
+    """Return the identity of ``NAME.pem`` with its key beside it; ConfigError if one is missing or invalid."""
+    certificate, key = read_certificates(path)[0], read_key(path.with_suffix(".key"))
+    if certificate.public_key() != key.public_key():
+        raise ConfigError(f"{path}: the certificate does not belong to the key beside it")
+    try:
+        role, cell, name = identity_of(certificate)
+    except DataError as error:
+        raise ConfigError(f"{path}: {error}") from error
+    return Identity(role, cell, name, key, certificate)
+
+
+def read_authority(folder: Path) -> Authority:
+    """Return the authority whose key is in a folder; ConfigError if there is none."""
+    key = read_key(folder / "authority.key")
+    for certificate in read_certificates(folder / "authority.pem"):
+        if certificate.public_key() == key.public_key():
+            return Authority(key, certificate)
+    raise ConfigError(f"{folder / 'authority.pem'}: no certificate belongs to authority.key")
+
+
+def _name(*attributes: tuple[x509.ObjectIdentifier, str]) -> x509.Name:
+    try:
+        return x509.Name([x509.NameAttribute(oid, value) for oid, value in attributes])
+    except ValueError as error:
+        values = ", ".join(repr(value) for _, value in attributes)
+        raise ConfigError(f"{values}: names in certificates have 1 to 64 characters") from error
+
+
+def _address(text: str) -> x509.GeneralName:
+    with suppress(ValueError):
+        return x509.IPAddress(ip_address(text))
+    try:
+        return x509.DNSName(text)
+    except ValueError as error:
+        raise ConfigError(f"address {text!r}: expected an IP address or a DNS name in ASCII") from error
+
+
+def _builder(
+    subject: x509.Name, issuer: x509.Name, key: ec.EllipticCurvePrivateKey, days: int, now: datetime | None
+) -> x509.CertificateBuilder:
+    begin = now or datetime.now(UTC)
+    return (
+        x509.CertificateBuilder()
+        .subject_name(subject)
+        .issuer_name(issuer)
+        .public_key(key.public_key())
+        .serial_number(x509.random_serial_number())
+        .not_valid_before(begin - TOLERANCE)
+        .not_valid_after(begin + timedelta(days=days))
+        .add_extension(x509.SubjectKeyIdentifier.from_public_key(key.public_key()), critical=False)
+    )
+
+
+def _usage(*, digital_signature: bool = False, key_cert_sign: bool = False, crl_sign: bool = False) -> x509.KeyUsage:
+    return x509.KeyUsage(digital_signature, False, False, False, False, key_cert_sign, crl_sign, False, False)

@@ -1,0 +1,132 @@
+"""Folder of keys: that of the plant, or one of this user, in which keys for loopback are made when needed."""
+
+import fcntl
+import os
+import socket
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+from cryptography import x509
+
+from armident.configs import ConfigError
+from armident.configs.reasons import reason_of
+from armident.daq.identity.certificates import (
+    ANY_CELL,
+    Identity,
+    Role,
+    new_authority,
+    pem_of,
+    read_authority,
+    read_certificates,
+    read_identity,
+    write_identity,
+    write_key,
+    write_whole,
+)
+
+VARIABLE = "ARMIDENT_KEYS"
+"""Environment variable that names the folder of a plant's keys."""
+OF_PLANT = Path("/etc/armident/keys")
+"""Folder of a plant's keys, where it exists."""
+OF_SERVICES = Path("/var/lib/armident/keys")
+"""Local folder that the services of a machine share."""
+_FROM, _DAYS = datetime(1970, 1, 2, tzinfo=UTC), 47_481
+"""Begin and duration, to the end of 2099, of local certificates: a machine without a set clock needs them, too."""
+
+
+@dataclass(frozen=True)
+class KeyFolder:
+    """Folder with ``authority.pem``, perhaps ``authority.key``, and ``NAME.pem`` and ``NAME.key`` of identities.
+
+    ``local``: authority and identities are made here when they are first needed.
+    """
+
+    path: Path
+    local: bool = False
+
+    def identity(self, role: Role, cell: str) -> Identity:
+        """Return the identity of a role for a cell; a folder of a plant that lacks it is a ConfigError."""
+        found = self._find(role, cell)
+        if found is None and self.local:
+            with self._locked():
+                # Another process may have made it while this one waited.
+                found = self._find(role, cell)
+                if found is None:
+                    self._make_authority()
+                    of, name = (ANY_CELL, "local") if role in ("operator", "viewer") else (cell, cell)
+                    addresses = ("localhost", "127.0.0.1", "::1")
+                    found = read_authority(self.path).issue(role, of, f"{role}.{name}", addresses, _DAYS, _FROM)
+                    write_identity(self.path, found)
+        if found is None:
+            raise ConfigError(
+                f"{self.path}: no key of a {role} of cell {cell}; "
+                f"run where the authority is: armident keys enrol {role} --cell {cell}"
+            )
+        return found
+
+    def authority_certificates(self) -> tuple[x509.Certificate, ...]:
+        """Return the certificates of the trusted authorities; ConfigError if there is none."""
+        path = self.path / "authority.pem"
+        if self.local and not path.is_file():
+            with self._locked():
+                self._make_authority()
+        if not path.is_file():
+            raise ConfigError(f"{path}: no such file; copy it from the machine on which armident keys init ran")
+        return read_certificates(path)
+
+    def _find(self, role: Role, cell: str) -> Identity | None:
+        """Return the identity whose certificate ends last, rather of the cell than of the plant."""
+        found, refused = [], None
+        for path in sorted(self.path.glob(f"{role}.*.pem")):
+            try:
+                identity = read_identity(path)
+            except ConfigError as error:
+                refused = error
+                continue
+            if identity.role == role and identity.cell in (cell, ANY_CELL):
+                found.append(identity)
+        if not found and refused is not None:
+            raise refused
+        return max(found, key=lambda each: (each.cell == cell, each.certificate.not_valid_after_utc), default=None)
+
+    def _make_authority(self) -> None:
+        if not (self.path / "authority.pem").is_file():
+            authority = new_authority(f"local {socket.gethostname()}"[:64], _DAYS, _FROM)
+            write_key(self.path / "authority.key", authority.key)
+            write_whole(self.path / "authority.pem", pem_of(authority.certificate), 0o644)
+
+    @contextmanager
+    def _locked(self) -> Iterator[None]:
+        """Hold the lock of the folder, which is made if it is missing."""
+        try:
+            self.path.mkdir(mode=0o700, parents=True, exist_ok=True)
+            lock = os.open(self.path / ".lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        except OSError as error:
+            reason = reason_of(error, named=False)
+            raise ConfigError(f"{self.path}: no keys can be made: {reason}; {VARIABLE} names another folder") from error
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            yield
+        finally:
+            os.close(lock)
+
+
+def key_folder(chosen: Path | None = None) -> KeyFolder:
+    """Return the folder of keys: ``chosen`` (``zenoh.keys`` of a session), else the plant's, else a local one."""
+    named = os.environ.get(VARIABLE)
+    for path in (chosen, Path(named) if named else None):
+        if path is not None:
+            if not path.is_dir():
+                raise ConfigError(f"{path}: no such folder of keys; run: armident keys init")
+            return KeyFolder(path)
+    if OF_PLANT.is_dir():
+        return KeyFolder(OF_PLANT)
+    if os.access(OF_SERVICES, os.W_OK):
+        return KeyFolder(OF_SERVICES, local=True)
+    state = os.environ.get("XDG_STATE_HOME")
+    with suppress(RuntimeError):
+        return KeyFolder((Path(state) if state else Path.home() / ".local" / "state") / "armident" / "keys", local=True)
+    raise ConfigError(f"no folder for keys: this user has no home; {VARIABLE} names one")

@@ -1,0 +1,175 @@
+"""Certificates, and the folder in which they are found or made."""
+
+import subprocess
+import sys
+from datetime import UTC, datetime, timedelta
+from ipaddress import ip_address
+from pathlib import Path
+
+import pytest
+from cryptography import x509
+from cryptography.hazmat.primitives.serialization import Encoding
+
+from armident.configs import ConfigError, DataError
+from armident.daq.identity import folder as folders
+from armident.daq.identity.certificates import (
+    Authority,
+    Identity,
+    Role,
+    new_authority,
+    pem_of,
+    read_identity,
+    signer_of,
+    write_identity,
+    write_key,
+    write_whole,
+)
+from armident.daq.identity.folder import KeyFolder, key_folder
+
+NOW = datetime.now(UTC)
+
+
+@pytest.fixture(scope="module")
+def authority() -> Authority:
+    return new_authority("plant", 365)
+
+
+def der(identity: Identity) -> bytes:
+    return identity.certificate.public_bytes(Encoding.DER)
+
+
+def test_a_certificate_has_role_cell_name_and_addresses(authority: Authority) -> None:
+    identity = authority.issue("capture", "cell_1", "capture.cell_1", ["robot.plant.example", "192.0.2.7"], 30)
+    assert signer_of(der(identity), [authority.certificate], NOW) == ("capture", "cell_1", "capture.cell_1")
+    names = identity.certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+    assert names.get_values_for_type(x509.DNSName) == ["robot.plant.example"]
+    assert names.get_values_for_type(x509.IPAddress) == [ip_address("192.0.2.7")]
+
+
+def test_openssl_verifies_the_chain(authority: Authority, tmp_path: Path) -> None:
+    write_whole(tmp_path / "authority.pem", pem_of(authority.certificate), 0o644)
+    write_identity(tmp_path, authority.issue("worker", "c", "worker.c", ["localhost"], 30))
+    for purpose in ("sslclient", "sslserver"):
+        command = ["openssl", "verify", "-x509_strict", "-purpose", purpose, "-CAfile", "authority.pem", "worker.c.pem"]
+        done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize(
+    ("days", "reason"), [(timedelta(days=31), "expired on"), (timedelta(minutes=-6), "valid from")]
+)
+def test_a_certificate_out_of_its_time_is_refused(authority: Authority, days: timedelta, reason: str) -> None:
+    identity = authority.issue("viewer", "*", "viewer.ann", [], 30, NOW)
+    with pytest.raises(DataError, match=reason):
+        signer_of(der(identity), [authority.certificate], NOW + days)
+
+
+def test_another_authority_of_the_same_name_is_refused(authority: Authority) -> None:
+    foreign = new_authority("plant", 365).issue("operator", "*", "operator.eve", [], 30)
+    with pytest.raises(DataError, match="another authority"):
+        signer_of(der(foreign), [authority.certificate], NOW)
+
+
+def test_an_identity_issues_nothing(authority: Authority) -> None:
+    capture = authority.issue("capture", "c", "capture.c", [], 30)
+    forged = Authority(capture.key, capture.certificate).issue("operator", "*", "operator.eve", [], 30)
+    with pytest.raises(DataError, match="another authority"):
+        signer_of(der(forged), [authority.certificate], NOW)
+    with pytest.raises(DataError, match="without role"):
+        signer_of(authority.certificate.public_bytes(Encoding.DER), [authority.certificate], NOW)
+
+
+def test_both_authorities_are_trusted_during_renewal(authority: Authority) -> None:
+    new = new_authority("plant", 365)
+    both = [new.certificate, authority.certificate]
+    for each in (authority, new):
+        assert signer_of(der(each.issue("worker", "c", "worker.c", [], 9)), both, NOW)[0] == "worker"
+
+
+@pytest.mark.parametrize(
+    ("role", "cell", "name"), [("capture", "*", "x"), ("master", "c", "x"), ("viewer", "*", 65 * "x")]
+)
+def test_an_invalid_certificate_is_not_issued(authority: Authority, role: Role, cell: str, name: str) -> None:
+    with pytest.raises(ConfigError):
+        authority.issue(role, cell, name, [], 30)
+
+
+def test_a_key_is_private(authority: Authority, tmp_path: Path) -> None:
+    identity = authority.issue("worker", "c", "worker.c", [], 30)
+    write_identity(tmp_path, identity)
+    key = tmp_path / "worker.c.key"
+    assert key.stat().st_mode & 0o777 == 0o600
+    assert read_identity(tmp_path / "worker.c.pem").cell == "c"
+    key.chmod(0o644)
+    with pytest.raises(ConfigError, match="chmod"):
+        read_identity(tmp_path / "worker.c.pem")
+
+
+def test_a_key_of_another_certificate_is_refused(authority: Authority, tmp_path: Path) -> None:
+    one, two = (authority.issue("worker", "c", "worker.c", [], 30) for _ in range(2))
+    write_identity(tmp_path, one)
+    write_key(tmp_path / "worker.c.key", two.key)
+    with pytest.raises(ConfigError, match="does not belong"):
+        read_identity(tmp_path / "worker.c.pem")
+
+
+@pytest.fixture
+def no_folders(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    monkeypatch.delenv(folders.VARIABLE, raising=False)
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    monkeypatch.setattr(folders, "OF_PLANT", tmp_path / "plant")
+    monkeypatch.setattr(folders, "OF_SERVICES", tmp_path / "services")
+    return tmp_path
+
+
+def test_the_folder_of_the_plant_comes_before_the_local_one(no_folders: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert key_folder() == KeyFolder(no_folders / "state" / "armident" / "keys", local=True)
+    (no_folders / "services").mkdir()
+    assert key_folder() == KeyFolder(no_folders / "services", local=True)
+    (no_folders / "plant").mkdir()
+    assert key_folder() == KeyFolder(no_folders / "plant")
+    (no_folders / "named").mkdir()
+    monkeypatch.setenv(folders.VARIABLE, str(no_folders / "named"))
+    assert key_folder() == KeyFolder(no_folders / "named")
+    assert key_folder(no_folders) == KeyFolder(no_folders)
+    with pytest.raises(ConfigError, match="keys init"):
+        key_folder(no_folders / "missing")
+
+
+def test_a_folder_of_a_plant_makes_no_keys(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="armident keys enrol worker --cell c"):
+        KeyFolder(tmp_path).identity("worker", "c")
+    with pytest.raises(ConfigError, match="keys init"):
+        KeyFolder(tmp_path).authority_certificates()
+    assert not list(tmp_path.iterdir())
+
+
+def test_two_processes_make_one_authority(no_folders: Path) -> None:
+    program = (
+        "from armident.daq.identity.folder import key_folder\n"
+        "print(key_folder().identity('worker', 'c').certificate.serial_number)"
+    )
+    started = [subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE) for _ in range(3)]
+    assert len({process.communicate()[0] for process in started}) == 1
+    folder = key_folder()
+    assert signer_of(der(folder.identity("worker", "c")), folder.authority_certificates(), NOW)[1] == "c"
+    assert (folder.path.stat().st_mode & 0o777, (folder.path / "authority.key").stat().st_mode & 0o777) == (
+        0o700,
+        0o600,
+    )
+
+
+def test_the_key_of_the_cell_comes_before_that_of_the_plant(authority: Authority, tmp_path: Path) -> None:
+    folder = KeyFolder(tmp_path)
+    for cell, name in (("*", "operator.ann"), ("c", "operator.ben"), ("d", "operator.cem")):
+        write_identity(tmp_path, authority.issue("operator", cell, name, [], 30))
+    assert folder.identity("operator", "c").name == "operator.ben"
+    assert folder.identity("operator", "e").name == "operator.ann"
+    with pytest.raises(ConfigError, match="enrol"):
+        folder.identity("viewer", "c")
+
+
+def test_a_renewed_identity_is_the_one_that_ends_last(authority: Authority, tmp_path: Path) -> None:
+    for days in (30, 365):
+        write_identity(tmp_path, authority.issue("worker", "c", f"worker.c{days}", [], days))
+    assert KeyFolder(tmp_path).identity("worker", "c").name == "worker.c365"
