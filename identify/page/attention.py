@@ -22,7 +22,7 @@ SILENT_S = 180.0
 LATE_S = 10.0
 """Age of a health message from which it is no state of now, s: ten messages are missing."""
 FREE_BYTES = 10e9
-"""Free space below which somebody has to act: three hours of six axes at 5 kHz (190 bytes a row), before compression."""
+"""Free space below which somebody has to act: three hours of six axes at 5 kHz (190 bytes a row), uncompressed."""
 GAP_SHARE = 1e-3
 """Share of the samples in gaps from which somebody should look."""
 BACKLOG = 10

@@ -35,8 +35,8 @@ class Message:
 class Live:
     """Last messages of one cell; each is replaced as a whole.
 
-    ``moved``: time at which the last SYNC was seen to advance; ``ended``: time of the regular end of a capture, both s of
-    the monotonic clock; ``alive``: components with a liveliness token; ``began``: begin of the listening.
+    ``began``: begin of the listening; ``moved``: last advance of SYNC; ``ended``: regular end of a capture, s of the
+    monotonic clock; ``alive``: components with a liveliness token.
     """
 
     began: float

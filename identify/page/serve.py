@@ -4,14 +4,19 @@ import ipaddress
 import logging
 import signal
 import socket
+import ssl
 from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
 from types import FrameType
+from typing import Any
 
 import uvicorn
+from cryptography import x509
 
 from armident.configs import ConfigError
+from armident.daq.identity.certificates import ANY_CELL
+from armident.daq.identity.folder import KeyFolder, key_folder
 from armident.identify.page.cells import cells_in
 from armident.identify.page.plant import Plant
 from armident.identify.page.site import site
@@ -27,28 +32,55 @@ CONNECTIONS = 64
 def run_page(configs: Sequence[Path], out: Path | None, database: str | None, listen: str, keys: Path | None) -> None:
     """Carry out ``armident page`` until SIGTERM or SIGINT; ConfigError if address, keys or sessions are wrong."""
     host, port = address_of(listen)
-    if not is_loopback(host):
-        raise ConfigError(f"--listen {listen}: other machines may only connect with keys of the plant; give --keys")
+    hosts, security = (LOOPBACK, {}) if is_loopback(host) else sign_in(key_folder(keys), listen)
     cells = cells_in(configs, out, database)
-    with closing(Notifier()) as notifier, closing(_bound(host, port, listen)) as listening:
-        with Plant(cells, lambda: notifier.progress(f"{len(cells)} cells")) as plant:
-            options = uvicorn.Config(
-                site(plant, LOOPBACK),
-                log_config=None,
-                access_log=False,
-                server_header=False,
-                limit_concurrency=CONNECTIONS,
-                timeout_keep_alive=30,
-                timeout_graceful_shutdown=3,
-            )
-            number = listening.getsockname()[1]
-            print(f"page: http://{host}:{number}/ ({len(cells)} cells)", flush=True)
-            notifier.ready(f"{len(cells)} cells at {host}:{number}")
-            # The server repeats a signal when it has ended, for the handler of before.
-            for each in (signal.SIGTERM, signal.SIGINT):
-                signal.signal(each, _ended)
-            uvicorn.Server(options).run(sockets=[listening])
-            notifier.stopping()
+    with (
+        closing(Notifier()) as notifier,
+        closing(_bound(host, port, listen)) as listening,
+        Plant(cells, lambda: notifier.progress(f"{len(cells)} cells")) as plant,
+    ):
+        options = uvicorn.Config(
+            site(plant, hosts),
+            log_config=None,
+            access_log=False,
+            server_header=False,
+            limit_concurrency=CONNECTIONS,
+            timeout_graceful_shutdown=3,
+            **security,
+        )
+        url = f"{'https' if security else 'http'}://{host}:{listening.getsockname()[1]}/"
+        print(f"page: {url} ({len(cells)} cells)", flush=True)
+        notifier.ready(f"{len(cells)} cells at {url}")
+        # The server repeats a signal when it has ended, for the handler of before.
+        for number in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(number, _ended)
+        uvicorn.Server(options).run(sockets=[listening])
+        notifier.stopping()
+
+
+def sign_in(folder: KeyFolder, listen: str) -> tuple[Sequence[str], dict[str, Any]]:
+    """Return the names in the certificate of the page, and the options of mutual TLS with the keys of a plant.
+
+    ConfigError if the folder is none of a plant, or has no identity of a viewer of all cells with addresses.
+    """
+    if folder.local:
+        raise ConfigError(
+            f"--listen {listen}: other machines may only connect with keys of a plant; run: armident keys init"
+        )
+    identity = folder.identity("viewer", ANY_CELL)
+    try:
+        names = identity.certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+    except x509.ExtensionNotFound as error:
+        raise ConfigError(
+            f"{folder.path}: the certificate of {identity.name} has no address, under which browsers ask for the page"
+        ) from error
+    addresses = names.get_values_for_type(x509.IPAddress)
+    hosts = [*names.get_values_for_type(x509.DNSName), *(f"[{a}]" if a.version == 6 else str(a) for a in addresses)]
+    files = {
+        f"ssl_{kind}file": folder.path / f"{identity.name}.{end}" for kind, end in (("cert", "pem"), ("key", "key"))
+    }
+    authority = folder.path / "authority.pem"
+    return hosts, files | {"ssl_ca_certs": authority, "ssl_cert_reqs": ssl.CERT_REQUIRED}
 
 
 def _ended(_number: int, _frame: FrameType | None) -> None:

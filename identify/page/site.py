@@ -32,7 +32,7 @@ HEADERS = {
 _NOTHING = "default-src 'none'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'; "
 PAGE_POLICY = f"{_NOTHING}style-src 'self'; script-src 'self'; img-src 'self'; connect-src 'self'"
 REPORT_POLICY = f"{_NOTHING}sandbox allow-scripts; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data:"
-"""Reports and figures contain their scripts and styles; the sandbox gives them an origin of their own, without requests."""
+"""Reports contain their scripts and styles; the sandbox gives them an origin of their own, without requests."""
 
 ASSETS = {"page.css": "text/css", "page.js": "text/javascript", "page.svg": "image/svg+xml"}
 FIGURES = 4
@@ -49,7 +49,7 @@ _TEMPLATES.globals |= {"verdicts": VERDICTS, "outcomes": OUTCOMES}
 
 
 def site(plant: Plant, hosts: Sequence[str]) -> Starlette:
-    """Return the application. ``hosts``: names and addresses that a request may ask for, a defence against rebinding."""
+    """Return the application. ``hosts``: those that a request may name (DNS rebinding)."""
 
     def overview(request: Request) -> Response:
         return _page("overview.html", views=plant.views())
