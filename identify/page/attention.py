@@ -232,7 +232,7 @@ class CellView:
             yield Problem("act", f"The history cannot be read: {self.drift}", step)
         elif self.drift is not None and self.drift.drifted:
             step = "Look at the joint that is named, or diagnose the last recording against the first result"
-            yield Problem("act", f"The arm has changed: {self.drift.words}", step, self.drift.command)
+            yield Problem("act", f"The arm has {self.drift.words}", step, self.drift.command)
         last = self.identification
         if last is not None and last.problem is not None:
             step = "Identify the recording again"

@@ -234,10 +234,11 @@ def _document(path: Path, _stamp: str, kind: str) -> Document | str:
     """Return a document, or the reason for which it cannot be read."""
     try:
         if (size := path.stat().st_size) > LARGEST:
-            return f"{path.name}: {size / 1e6:.0f} MB, more than a document has; it is not read"
+            return f"{path}: {size / 1e6:.0f} MB, more than a document has; it is not read"
         return load_document(path, KINDS[kind])
     except (ArmidentError, OSError, RecursionError) as error:
-        return f"{path.name}: {reason_of(error) if isinstance(error, OSError) else str(error) or 'nested too deeply'}"
+        reason = str(error) if isinstance(error, ArmidentError) else f"{path}: cannot be read ({type(error).__name__})"
+        return reason.replace(f"{path.parent.parent}/", "", 1)
 
 
 def read_drift(cell: Cell) -> Drift | None:

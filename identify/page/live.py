@@ -6,7 +6,6 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import zenoh
@@ -24,10 +23,9 @@ LARGEST_MESSAGE = 1 << 16
 
 @dataclass(frozen=True)
 class Message:
-    """Message with the time at which it was heard, s of the monotonic clock and s since 1970."""
+    """Message with the time at which it was heard, s of the monotonic clock."""
 
     heard: float
-    at: float
     content: dict[str, Any]
 
 
@@ -50,17 +48,16 @@ class Live:
     def take_health(self, data: bytes) -> None:
         """Take a health message; one that is none is left out."""
         content, now = _object(data), time.monotonic()
-        if content is None:
-            return
-        if self.health is None or content.get("sync") != self.health.content.get("sync"):
-            self.moved = now
-        self.health = Message(now, time.time(), content)
+        if content is not None:
+            if self.health is None or content.get("sync") != self.health.content.get("sync"):
+                self.moved = now
+            self.health = Message(now, content)
 
     def take_status(self, data: bytes) -> None:
         """Take a status message of a capture, worker or re-identification."""
         content = _object(data)
         if content is not None and content.get("component") in ("capture", "worker", "reidentify"):
-            self.status = {**self.status, content["component"]: Message(time.monotonic(), time.time(), content)}
+            self.status = {**self.status, content["component"]: Message(time.monotonic(), content)}
 
     def take_event(self, data: bytes) -> None:
         """Take an event: the regular end of a capture is no failure."""
@@ -83,80 +80,53 @@ def _object(data: bytes) -> dict[str, Any] | None:
 
 
 class Listener:
-    """Subscribes to health, status, ends and liveliness of cells; sessions that cannot be opened are tried again.
-
-    Cells with one Zenoh file share a session.
-    """
+    """Subscribes to health, status, ends and liveliness of cells; sessions that cannot be opened are tried again."""
 
     def __init__(self, cells: Sequence[Cell]) -> None:
         now = time.monotonic()
         self.live = {cell.name: Live(now) for cell in cells}
-        self._groups: dict[object, list[Cell]] = {}
-        for cell in cells:
-            if cell.session is not None:
-                options = cell.session.zenoh
-                key: tuple[Path | str, ...] = (
-                    (cell.name,) if options.config is None else (options.config, *options.connect)
-                )
-                self._groups.setdefault(key, []).append(cell)
-        self._sessions: dict[object, zenoh.Session] = {}
+        self._missing = [cell for cell in cells if cell.session is not None]
+        self._sessions: list[zenoh.Session] = []
         self._lock = threading.Lock()
 
     def check(self) -> None:
         """Open the sessions that are missing."""
         with self._lock:
-            for key, cells in self._groups.items():
-                if key not in self._sessions:
-                    self._open(key, cells)
+            self._missing = [cell for cell in self._missing if not self._opened(cell, self.live[cell.name])]
 
     def close(self) -> None:
         """Close all sessions."""
         with self._lock:
-            for session in self._sessions.values():
+            for session in self._sessions:
                 session.close()
-            self._sessions, self._groups = {}, {}
+            self._sessions, self._missing = [], []
 
-    def _open(self, key: object, cells: Sequence[Cell]) -> None:
-        first = cells[0].session
-        assert first is not None
-        problem = None
-        try:
-            # Of a file for all roles, the port belongs to the capture.
-            session = open_session(first, "observer", any_port=first.zenoh.config is not None)
-            self._sessions[key] = session
-            for cell in cells:
-                self._subscribe(session, cell)
-        except (ConfigError, zenoh.ZError) as error:
-            problem = str(error).splitlines()[0]
-            if (opened := self._sessions.pop(key, None)) is not None:
-                opened.close()
-        for cell in cells:
-            self.live[cell.name].problem = problem
-
-    def _subscribe(self, session: zenoh.Session, cell: Cell) -> None:
+    def _opened(self, cell: Cell, live: Live) -> bool:
+        """Open the session of a cell and subscribe; False with the problem of the cell if that fails."""
         assert cell.session is not None
         assert cell.robot is not None
-        live, keys = self.live[cell.name], Keys(cell.session.cell, cell.robot.name)
-        for expression, take, most in (
-            (keys.health, live.take_health, LARGEST_MESSAGE),
-            (keys.status, live.take_status, LARGEST_MESSAGE),
-            (keys.events, live.take_event, LARGEST_EVENT),
-        ):
-            session.declare_subscriber(expression, _taking(take, most))
+        keys = Keys(cell.session.cell, cell.robot.name)
+        try:
+            # In a file for all roles, the port is that of the capture.
+            session = open_session(cell.session, "observer", any_port=cell.session.zenoh.config is not None)
+        except ConfigError as error:
+            live.problem = str(error)
+            return False
 
         def note(sample: zenoh.Sample) -> None:
             component = str(sample.key_expr).rpartition("/")[2]
             is_here = sample.kind == zenoh.SampleKind.PUT
             live.alive = live.alive | {component} if is_here else live.alive - {component}
 
+        session.declare_subscriber(keys.health, _taking(live.take_health, LARGEST_MESSAGE))
+        session.declare_subscriber(keys.status, _taking(live.take_status, LARGEST_MESSAGE))
+        session.declare_subscriber(keys.events, _taking(live.take_event, LARGEST_EVENT))
         session.liveliness().declare_subscriber(keys.alive("*"), note, history=True)
+        self._sessions.append(session)
+        live.problem = None
+        return True
 
 
 def _taking(take: Callable[[bytes], None], most: int) -> Callable[[zenoh.Sample], None]:
     """Return a function that passes on messages of at most ``most`` bytes."""
-
-    def heard(sample: zenoh.Sample) -> None:
-        if len(sample.payload) <= most:
-            take(bytes(sample.payload))
-
-    return heard
+    return lambda sample: take(bytes(sample.payload)) if len(sample.payload) <= most else None
