@@ -5,6 +5,7 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -19,6 +20,9 @@ log = logging.getLogger(__name__)
 
 LARGEST_MESSAGE = 1 << 16
 """Largest health or status message, bytes; one of six axes has 2 kB."""
+
+AT_A_TIME = 16
+"""Number of Zenoh sessions that are opened or closed at a time."""
 
 
 @dataclass(frozen=True)
@@ -87,22 +91,27 @@ class Listener:
         self.live = {cell.name: Live(now) for cell in cells}
         self._missing = [cell for cell in cells if cell.session is not None]
         self._sessions: list[zenoh.Session] = []
+        self._closing = False
         self._lock = threading.Lock()
 
     def check(self) -> None:
-        """Open the sessions that are missing."""
-        with self._lock:
-            self._missing = [cell for cell in self._missing if not self._opened(cell, self.live[cell.name])]
+        """Open the sessions that are missing, several at a time: each takes half a second."""
+        with self._lock, ThreadPoolExecutor(AT_A_TIME) as pool:
+            opened = list(pool.map(self._opened, self._missing))
+            self._missing = [cell for cell, done in zip(self._missing, opened, strict=True) if not done]
 
     def close(self) -> None:
         """Close all sessions."""
-        with self._lock:
-            for session in self._sessions:
-                session.close()
+        self._closing = True
+        with self._lock, ThreadPoolExecutor(AT_A_TIME) as pool:
+            list(pool.map(lambda session: session.close(), self._sessions))
             self._sessions, self._missing = [], []
 
-    def _opened(self, cell: Cell, live: Live) -> bool:
+    def _opened(self, cell: Cell) -> bool:
         """Open the session of a cell and subscribe; False with the problem of the cell if that fails."""
+        live = self.live[cell.name]
+        if self._closing:
+            return False
         assert cell.session is not None
         assert cell.robot is not None
         keys = Keys(cell.session.cell, cell.robot.name)

@@ -12,8 +12,8 @@ from armident.identify.page.live import Listener
 
 log = logging.getLogger(__name__)
 
-FILES_S, HISTORIES_S = 5.0, 60.0
-"""Intervals at which folders and histories are read, s."""
+FILES_S, SESSIONS_S, HISTORIES_S = 5.0, 5.0, 60.0
+"""Intervals at which folders are read, Zenoh sessions are tried again, and histories are read, s."""
 
 
 class Plant:
@@ -29,12 +29,11 @@ class Plant:
         self._files: dict[str, CellFiles] = {}
         self._drifts: dict[str, Drift | str | None] = {}
         self._stopped = threading.Event()
-        rounds = ((self.read_files, FILES_S), (self.read_histories, HISTORIES_S))
+        rounds = ((self.read_files, FILES_S), (self.listener.check, SESSIONS_S), (self.read_histories, HISTORIES_S))
         self._threads = [threading.Thread(target=self._repeat, args=each, daemon=True) for each in rounds]
 
     def __enter__(self) -> "Plant":
-        """Listen, read the folders once, and begin to read all of it again and again."""
-        self.listener.check()
+        """Read the folders once, listen, and begin to read all of it again and again."""
         self.read_files()
         for thread in self._threads:
             thread.start()
@@ -46,7 +45,7 @@ class Plant:
         self.listener.close()
 
     def read_files(self) -> None:
-        """Read the folders of all cells, and open Zenoh sessions that are missing."""
+        """Read the folders of all cells."""
         for cell in self.cells.values():
             if self._stopped.is_set():
                 return
@@ -57,7 +56,6 @@ class Plant:
                 log.debug("internal error", exc_info=True)
                 problem = {"results": f"{type(error).__name__} while the folders are read"}
                 self._files[cell.name] = CellFiles(problem, None, (), (), None)
-        self.listener.check()
         self._progress()
 
     def read_histories(self) -> None:
