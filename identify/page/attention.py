@@ -27,6 +27,12 @@ GAP_SHARE = 1e-3
 """Share of the samples in gaps from which somebody should look."""
 BACKLOG = 10
 """Number of waiting recordings from which somebody should look, as a worker warns."""
+STEPS = {
+    "not configured": "The session cannot be used: correct it, and start the page again",
+    "not connected": "The page has no Zenoh session: check the options zenoh of the session",
+    "bus down": "Check cable, termination and power of the drives",
+}
+"""Next steps by the state."""
 SETTINGS = Path("/etc/armident")
 """Folder of the sessions of services."""
 
@@ -165,89 +171,64 @@ class CellView:
 
     def _service(self, command: str) -> str:
         """Return the command that starts a part again: the unit of a cell in /etc/armident, else the program."""
-        if self.cell.file.resolve().parent == SETTINGS:
-            return f"sudo systemctl restart {shlex.quote(f'armident-{command}@{self.cell.name}')}"
-        return self._command(command)
+        unit = shlex.quote(f"armident-{command}@{self.cell.name}")
+        in_service = self.cell.file.resolve().parent == SETTINGS
+        return f"sudo systemctl restart {unit}" if in_service else self._command(command)
 
     def _problems(self) -> Iterator[Problem]:
         level, state, sentence = self.state
-        if self.cell.problem is not None:
-            yield Problem("act", "The session cannot be used", sentence, self._command("doctor"))
-        elif self.live.problem is not None:
-            yield Problem("act", "The page has no Zenoh session", sentence, self._command("doctor"))
-        elif state == "bus down":
-            yield Problem("act", sentence, "Check cable, termination and power of the drives", self._command("doctor"))
-        elif level == "act":
+        doctor, queue, worker = self._command("doctor"), self._command("queue list"), self._service("worker")
+        if level == "act" and state.startswith("not heard"):
             yield Problem(
                 "act", f"{state.capitalize()}. {sentence}", "Start the capture again", self._service("capture")
             )
-        elif level == "look":
-            yield Problem("look", sentence, "Check the machine and the master of the bus", self._command("doctor"))
-        yield from self._of_capture()
-        yield from self._of_worker()
-        yield from self._of_results()
-
-    def _of_capture(self) -> Iterator[Problem]:
-        free, options = self.free_bytes, None if self.cell.session is None else self.cell.session.recording
+        elif level in ("act", "look"):
+            yield Problem(level, sentence, STEPS.get(state, "Check the machine and the master of the bus"), doctor)
+        free, wanted = self.free_bytes, self.cell.session and self.cell.session.recording.min_free_gb
         # Retention keeps as much free as the session asks for.
-        wanted = None if options is None else options.min_free_gb
-        if free is not None and free < (FREE_BYTES if wanted is None else 0.5e9 * wanted):
+        if free is not None and free < (0.5e9 * wanted if wanted else FREE_BYTES):
             step = "Free space, or let the capture delete old recordings (recording.min_free_gb)"
             yield Problem("act", f"Only {free / 1e9:.1f} GB are free", step)
         if lost := self.number("rows_not_written"):
             yield Problem("act", f"{lost:.0f} samples were not written to the disk", "Check the disk of the capture")
-        if (share := self.gap_share) is not None and share > GAP_SHARE:
-            step = "Check the load of the bus and of the machine"
-            yield Problem("look", f"{100 * share:.2g} % of the samples are in gaps", step, self._command("bus-load"))
+        if (share := self.gap_share or 0.0) > GAP_SHARE:
+            text, step = (
+                f"{100 * share:.2g} % of the samples are in gaps",
+                "Check the load of the bus and of the machine",
+            )
+            yield Problem("look", text, step, self._command("bus-load"))
         if self.number("clock_synchronised") == 0.0:
             yield Problem(
                 "look", "The clock of the capture is not synchronised", "Set up NTP or PTP", "armident doctor"
             )
-
-    def _of_worker(self) -> Iterator[Problem]:
         if "ledger" in self.files.problems:
             step = "Start a worker again; it moves a damaged ledger aside"
-            yield Problem("act", self.files.problems["ledger"], step, self._service("worker"))
+            yield Problem("act", self.files.problems["ledger"], step, worker)
         if "results" in self.files.problems:
             yield Problem("act", self.files.problems["results"], "Check the folder and its permissions")
-        if self.files.ledger is None:
-            return
-        waiting, since = self.backlog or 0, self.files.ledger.waiting_since
-        old = since is not None and time.time() - since > SILENT_S
-        if waiting and old and "worker" not in self.live.alive and self.now - self.live.began > LATE_S:
-            yield Problem(
-                "act", f"{recordings(waiting)} and no worker runs", "Start the worker", self._service("worker")
-            )
+        waiting, since = self.backlog or 0, self.files.ledger and self.files.ledger.waiting_since
+        text = "1 recording waits" if waiting == 1 else f"{waiting} recordings wait"
+        is_left = since is not None and time.time() - since > SILENT_S and self.now - self.live.began > LATE_S
+        if waiting and is_left and "worker" not in self.live.alive:
+            yield Problem("act", f"{text} and no worker runs", "Start the worker", worker)
         elif waiting >= BACKLOG:
-            step = "Leave out what needs no result, or start a second worker"
-            yield Problem("look", recordings(waiting), step, self._command("queue list"))
-        if failed := self.files.ledger.counts.get("failed", 0):
+            yield Problem("look", text, "Leave out what needs no result, or start a second worker", queue)
+        if failed := self.files.ledger and self.files.ledger.counts.get("failed"):
             text = f"{failed} recording{'s' if failed > 1 else ''} could not be identified"
-            step = "Read the reasons; retry or ignore each"
-            yield Problem("look", text, step, self._command("queue list"))
-
-    def _of_results(self) -> Iterator[Problem]:
+            yield Problem("look", text, "Read the reasons; retry or ignore each", queue)
         if isinstance(self.drift, str):
-            step = "The page shows the rest; check the database"
-            yield Problem("act", f"The history cannot be read: {self.drift}", step)
+            yield Problem("act", f"The history cannot be read: {self.drift}", "Check the database")
         elif self.drift is not None and self.drift.drifted:
             step = "Look at the joint that is named, or diagnose the last recording against the first result"
             yield Problem("act", f"The arm has {self.drift.words}", step, self.drift.command)
         last = self.identification
         if last is not None and last.problem is not None:
-            step = "Identify the recording again"
-            yield Problem(
-                "act", last.problem, step, f"armident identify {shlex.quote(last.name.rpartition('.')[0])}.mcap"
-            )
-        if last is not None and isinstance(last.document, IdentificationDocument):
+            recording = shlex.quote(f"{last.name.rpartition('.')[0]}.mcap")
+            yield Problem("act", last.problem, "Identify the recording again", f"armident identify {recording}")
+        elif last is not None and isinstance(last.document, IdentificationDocument):
             for reason in last.document.reasons[:1]:
                 text = f"Last identification {last.document.verdict}: {reason.message}"
                 yield Problem("act" if reason.level == "unusable" else "look", text, reason.next_step)
-
-
-def recordings(number: int) -> str:
-    """Return a number of waiting recordings in words."""
-    return "1 recording waits" if number == 1 else f"{number} recordings wait"
 
 
 def words(seconds: float) -> str:

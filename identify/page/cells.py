@@ -154,45 +154,48 @@ def _cell(file: Path, out: Path | None, database: str | None) -> Cell:
 def read_files(cell: Cell) -> CellFiles:
     """Return the state of the files of a cell; what cannot be read is a problem of its part."""
     problems, ledger = dict[str, str](), None
-    for folder in cell.folders:
-        if ledger is None and (folder / FILE).is_file():
-            try:
-                ledger = view_of(folder / FILE, LISTED)
-            except ArmidentError as error:
-                problems["ledger"] = str(error)
+    folders = {folder.resolve(): None for folder in cell.folders if folder.is_dir()}
     results, recordings, free = list[ResultFolder](), list[tuple[str, int, datetime.datetime]](), None
-    try:
-        for folder in {folder.resolve(): None for folder in cell.folders if folder.is_dir()}:
+    for folder in folders:
+        try:
             free = shutil.disk_usage(folder).free if free is None else free
             results += _results(folder)
             recordings += _recordings(folder)
-    except OSError as error:
-        problems["results"] = reason_of(error)
+            if ledger is None and (folder / FILE).is_file():
+                ledger = view_of(folder / FILE, LISTED)
+        except OSError as error:
+            problems["results"] = reason_of(error)
+        except ArmidentError as error:
+            problems["ledger"] = str(error)
     results.sort(key=lambda each: each.made, reverse=True)
     recordings.sort(key=lambda each: each[2], reverse=True)
-    return CellFiles(problems, ledger, tuple(_with_documents(cell, results)), tuple(recordings[:LISTED]), free)
+    return CellFiles(problems, ledger, tuple(results[:LISTED]), tuple(recordings[:LISTED]), free)
 
 
-def _time(seconds: float) -> datetime.datetime:
-    return datetime.datetime.fromtimestamp(seconds, datetime.UTC)
+def _time(path: Path) -> datetime.datetime:
+    return datetime.datetime.fromtimestamp(path.stat().st_mtime, datetime.UTC)
 
 
 def _recordings(folder: Path) -> list[tuple[str, int, datetime.datetime]]:
     """Return the last recordings of a folder: name, size in bytes, time of the last change."""
-    files = sorted(folder.glob("*.mcap"), key=lambda path: path.name, reverse=True)[: 2 * LISTED]
-    stats = [(path.name, path.stat()) for path in files if path.is_file()]
-    return [(name, stat.st_size, _time(stat.st_mtime)) for name, stat in stats]
+    files = sorted(folder.glob("*.mcap"), key=lambda path: path.name, reverse=True)[:LISTED]
+    return [(path.name, path.stat().st_size, _time(path)) for path in files if path.is_file()]
 
 
-def _results(folder: Path) -> list[ResultFolder]:
-    """Return the last results of a folder without their documents."""
-    found = []
+def _results(folder: Path) -> Iterator[ResultFolder]:
+    """Yield the last results of a folder, the newest of each kind with their documents."""
+    left = dict(SHOWN)
     for path in _newest(folder, folder.stat().st_mtime_ns):
         kind = path.suffix[1:]
         files = tuple(name for name in ("report.html", f"{kind}.json") if file_in((folder,), path.name, name))
-        if files:
-            found.append(ResultFolder(path.name, kind, _time((path / files[-1]).stat().st_mtime), files))
-    return found
+        if not files:
+            continue
+        file, found = path / files[-1], None
+        if file.suffix == ".json" and left[kind]:
+            left[kind] -= 1
+            found = _document(file, stamp_of(file), kind)
+        document, problem = (None, found) if isinstance(found, str) else (found, None)
+        yield ResultFolder(path.name, kind, _time(file), files, document, problem)
 
 
 @lru_cache(maxsize=1024)
@@ -213,20 +216,6 @@ def file_in(folders: Sequence[Path], result: str, name: str) -> Path | None:
         if path.is_file() and path.resolve().is_relative_to(folder.resolve()):
             return path
     return None
-
-
-def _with_documents(cell: Cell, results: Sequence[ResultFolder]) -> Iterator[ResultFolder]:
-    """Yield the last results with documents, the newest of each kind."""
-    read = dict.fromkeys(KINDS, 0)
-    for each in results[:LISTED]:
-        path = file_in(cell.folders, each.name, f"{each.kind}.json")
-        read[each.kind] += path is not None
-        if path is None or read[each.kind] > SHOWN[each.kind]:
-            yield each
-            continue
-        found = _document(path, stamp_of(path), each.kind)
-        document, problem = (None, found) if isinstance(found, str) else (found, None)
-        yield ResultFolder(each.name, each.kind, each.made, each.files, document, problem)
 
 
 @lru_cache(maxsize=1024)

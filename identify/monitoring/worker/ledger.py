@@ -493,16 +493,10 @@ def view_of(path: Path, most: int) -> LedgerView:
 
 
 def _reading(path: Path) -> sqlite3.Connection:
-    """Return a connection that only reads, also in a folder that may not be written."""
-    uri = f"{path.absolute().as_uri()}?mode=ro"
-    db = sqlite3.connect(uri, timeout=1.0, isolation_level=None, uri=True)
-    try:
-        db.execute("SELECT 1 FROM sqlite_master")
-    except sqlite3.OperationalError:
-        db.close()
-        # No worker has it open: its index of the write-ahead log is missing, and could not be made here.
-        db = sqlite3.connect(f"{uri}&immutable=1", isolation_level=None, uri=True)
-    return db
+    """Return a connection that only reads, and creates no files beside the ledger."""
+    # Without a write-ahead log no process has the ledger open, and SQLite would make one to read it.
+    alone = "" if path.with_name(f"{path.name}-wal").exists() else "&immutable=1"
+    return sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro{alone}", 1.0, isolation_level=None, uri=True)
 
 
 def unique_owner() -> str:

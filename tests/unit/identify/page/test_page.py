@@ -311,8 +311,11 @@ def test_messages_of_a_capture_are_heard_and_its_end_is_no_alarm(tmp_path: Path,
     cell, keys = shown.plant.cells[name], Keys(name, "emps")
     assert cell.session is not None
 
-    def until(state: str) -> CellView:
+    def until(state: str, *message: object) -> CellView:
+        """Publish a message again and again, as a capture does, until the cell has a state."""
         for _ in range(400):
+            if message:
+                capture.put(*message)
             if (view := shown.plant.view(name)).state[1] == state:
                 return view
             time.sleep(0.05)
@@ -321,35 +324,24 @@ def test_messages_of_a_capture_are_heard_and_its_end_is_no_alarm(tmp_path: Path,
     with open_session(cell.session, "capture") as capture:
         token = capture.liveliness().declare_token(keys.alive("worker"))
         until("waiting")
-        for garbage in (
-            b"\xff",
-            b"[]",
-            b"{",
-            b"[" * 100_000,
-            bytes(1 << 20),
-            b'{"rows": 1e999}',
-            b'{"rows": ' + b"9" * 4000 + b"}",
-        ):
-            capture.put(keys.health, garbage)
-            capture.put(keys.status, garbage)
-            capture.put(keys.events, garbage)
-        capture.put(keys.health, health(rows=999, rows_in_gaps=1))
-        view = until("recording")
+        view = until("recording", keys.health, health(rows=999, rows_in_gaps=1))
+        huge = b'{"rows": ' + b"9" * 4000 + b"}"
+        for garbage in (b"\xff", b"[]", b"{", b"[" * 100_000, bytes(1 << 20), b'{"rows": 1e999}', huge):
+            for key in (keys.health, keys.status, keys.events):
+                capture.put(key, garbage)
+        view = until("bus down", keys.health, health(rows=999, rows_in_gaps=1, buses_down=1))
         assert view.number("rows") == 999
         assert view.gap_share == pytest.approx(1e-3)
-        assert "recording" in text_of(shown.get("/")[2])
-        capture.put(keys.health, health(buses_down=1, sync=1001))
-        assert until("bus down").problems[0].text == "1 of the buses of the capture is down."
-        late = CellView(cell, view.files, None, view.live, view.live.began + 2 * SILENT_S)
+        assert view.problems[0].text == "1 of the buses of the capture is down."
+        assert "bus down" in text_of(shown.get("/")[2])
+        late = CellView(cell, view.files, None, view.live, view.now + 2 * SILENT_S)
         assert late.state[1].startswith("not heard for")
         assert late.level == "act"
-        capture.put(keys.health, health(disk_free_bytes=1e9, sync=1002))
-        assert until("recording").problems[0].text == "Only 1.0 GB are free"
-        capture.put(keys.health, health(sync=1003))
+        view = until("recording", keys.health, health(disk_free_bytes=1e9, sync=1002))
+        assert view.problems[0].text == "Only 1.0 GB are free"
+        until("recording", keys.health, health(sync=1003))
         end = {"capture": "emps-1", "blocks": 1, "counters": {}, "gaps": [], "marks": [], "paths": []}
-        capture.put(keys.events, encode_event("experiment_end", end))
-        view = until("waiting")
-        assert view.level != "act"
+        assert until("waiting", keys.events, encode_event("experiment_end", end)).level != "act"
         token.undeclare()
 
 

@@ -61,13 +61,17 @@ def running(*words: str) -> Iterator[tuple[str, "subprocess.Popen[str]"]]:
 def test_a_signal_ends_the_page_in_order(folder: Path) -> None:
     for number in (signal.SIGTERM, signal.SIGINT):
         with running("--config", str(folder), "--listen", "127.0.0.1:0") as (url, process):
-            host = url.removeprefix("http://").rstrip("/")
-            connection = http.client.HTTPConnection(host, timeout=30)
-            connection.request("GET", "/")
-            assert b"press_4" in connection.getresponse().read()
+            assert b"press_4" in fetch(url.removeprefix("http://").rstrip("/"))
             process.send_signal(number)
             _, stderr = process.communicate(timeout=60)
             assert (process.returncode, stderr) == (0, "")
+
+
+def fetch(host: str) -> bytes:
+    """Overview of a page without TLS."""
+    connection = http.client.HTTPConnection(host, timeout=30)
+    connection.request("GET", "/")
+    return connection.getresponse().read()
 
 
 def refused(*words: str) -> str:
@@ -128,7 +132,7 @@ def test_other_machines_sign_in_with_a_certificate_of_the_plant(folder: Path, tm
         def asked(person: Path | None, host: str = "page.plant") -> int:
             context = ssl.create_default_context(cafile=str(tmp_path / "plant" / "authority.pem"))
             if person is not None:
-                context.load_cert_chain(person.with_suffix(".pem"), person.with_suffix(".key"))
+                context.load_cert_chain(f"{person}.pem", f"{person}.key")
             connection = http.client.HTTPSConnection("127.0.0.1", port, context=context, timeout=30)
             connection.request("GET", "/", headers={"Host": host})
             return connection.getresponse().status
@@ -142,8 +146,6 @@ def test_other_machines_sign_in_with_a_certificate_of_the_plant(folder: Path, tm
         for person in (None, eve):
             with pytest.raises((ssl.SSLError, ConnectionError, http.client.RemoteDisconnected)):
                 asked(person)
-        plain = http.client.HTTPConnection("127.0.0.1", port, timeout=30)
         with pytest.raises((ConnectionError, http.client.HTTPException)):
-            plain.request("GET", "/")
-            plain.getresponse()
+            fetch(f"127.0.0.1:{port}")
         assert asked(anna) == 200
