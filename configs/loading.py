@@ -255,8 +255,12 @@ def load_session(name: str | Path, command: str | None = None) -> SessionConfig:
         changes["setpoints"] = session.setpoints.model_copy(
             update={"trajectory": resolved(session.setpoints.trajectory, "setpoints.trajectory")}
         )
+    files: dict[str, Path] = {}
     if session.zenoh.config is not None:
-        changes["zenoh"] = session.zenoh.model_copy(update={"config": resolved(session.zenoh.config, "zenoh.config")})
+        files["config"] = resolved(session.zenoh.config, "zenoh.config")
+    if session.zenoh.keys is not None:
+        files["keys"] = base / session.zenoh.keys
+    changes["zenoh"] = session.zenoh.model_copy(update=files)
     session = session.model_copy(update=changes)
     robot = _robot(session.robot)
     check_filled(

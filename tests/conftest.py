@@ -1,8 +1,11 @@
 """Fixtures of all tests: the measured data, a bus of its own, and the folder of results shared between processes."""
 
+import atexit
 import gc
 import itertools
 import os
+import shutil
+import tempfile
 from collections.abc import Generator, Iterator
 from pathlib import Path
 
@@ -14,11 +17,17 @@ import pytest
 # threads of OpenBLAS only wait for each other.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
+# The keys of the tests, which their child processes inherit: not those of this user or of a plant.
+os.environ["XDG_STATE_HOME"] = tempfile.mkdtemp(prefix="armident-state-")
+os.environ.pop("ARMIDENT_KEYS", None)
+
 from armident.configs.schema.session import Bus
 from armident.drivers.can.udp import open_python_can
 from armident.drivers.vcan import ensure_vcan, have_socketcan, remove_vcan
 from tests.fixtures.store import use_folder
 from tests.fixtures.undeclared import UNDECLARED
+
+atexit.register(shutil.rmtree, os.environ["XDG_STATE_HOME"], ignore_errors=True)
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 NO_SOCKETCAN = "no SocketCAN in this kernel; run through `make test`"

@@ -22,8 +22,10 @@ class DescribedModel(BaseModel):
     def __get_pydantic_json_schema__(cls, core_schema: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
         """Return the JSON Schema of the model with the descriptions of its fields."""
         schema = handler.resolve_ref_schema(handler(core_schema))
-        summary, descriptions = split_docstring(cls.__doc__ or "")
-        schema["description"] = summary
+        schema["description"], descriptions = split_docstring(cls.__doc__ or "")
+        for base in cls.__mro__[1:]:
+            if issubclass(base, DescribedModel):
+                descriptions = split_docstring(base.__doc__ or "")[1] | descriptions
         for name, field in cls.model_fields.items():
             if name in descriptions:
                 entry: dict[str, Any] = schema["properties"][field.alias or name]

@@ -239,6 +239,8 @@ class ZenohOptions(FrozenModel):
         Maximum number of blocks that wait for publication.
     cache_blocks
         Number of published blocks kept for subscribers that missed them.
+    keys
+        Folder of the plant's keys, in place of ``ARMIDENT_KEYS`` and ``/etc/armident/keys``.
     """
 
     config: Path | None = None
@@ -247,6 +249,7 @@ class ZenohOptions(FrozenModel):
     commands: bool = False
     queue_blocks: Annotated[int, Field(ge=16)] = 512
     cache_blocks: Annotated[int, Field(ge=0)] = 4096
+    keys: Path | None = None
 
 
 class MetricsOptions(FrozenModel):

@@ -13,6 +13,7 @@ import zenoh.ext
 
 from armident.configs import ConfigError, SessionConfig
 from armident.daq.capture.remote_commands import Commands
+from armident.daq.identity.signatures import signer_for, trust_for
 from armident.daq.streaming import Block, Keys, encode_block, open_session
 from armident.daq.streaming.zenoh_session import configuration
 
@@ -126,8 +127,10 @@ class Publisher:
         """Open a session and declare all that is published; log a failure once."""
         opened = None
         try:
+            self._signer = signer_for(self._config, "capture")
+            trust = trust_for(self._config, self._keys.base)
             opened = open_session(self._config, "capture")
-            self.commands.declare(opened)
+            self.commands.declare(opened, self._signer, trust)
             cached = self._config.zenoh.cache_blocks
             self._samples = _declared(opened, self._keys.samples, cached, zenoh.CongestionControl.DROP)
             self._events = _declared(opened, self._keys.events, _EVENTS_KEPT, zenoh.CongestionControl.BLOCK)
@@ -189,11 +192,12 @@ class Publisher:
     def _send(self, latest: Mapping[str, bytes], waiting: Block | bytes | None) -> None:
         assert self._session is not None
         for key, data in latest.items():
-            self._session.put(key, data)
+            self._session.put(key, data, attachment=self._signer.attachment(key, data))
         if isinstance(waiting, Block):
-            self._samples.put(encode_block(waiting))
+            block = encode_block(waiting)
+            self._samples.put(block, attachment=self._signer.attachment(self._keys.samples, block))
         elif waiting is not None:
-            self._events.put(waiting)
+            self._events.put(waiting, attachment=self._signer.attachment(self._keys.events, waiting))
 
 
 def _declared(

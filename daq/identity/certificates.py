@@ -14,12 +14,7 @@ from cryptography import x509
 from cryptography.exceptions import InvalidSignature, UnsupportedAlgorithm
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.hashes import SHA256
-from cryptography.hazmat.primitives.serialization import (
-    Encoding,
-    NoEncryption,
-    PrivateFormat,
-    load_pem_private_key,
-)
+from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat, load_pem_private_key
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from armident.configs import ConfigError, DataError
@@ -31,8 +26,6 @@ ANY_CELL = "*"
 """Cell of an operator or viewer of the whole plant."""
 TOLERANCE = timedelta(minutes=5)
 """Difference of the clocks of two hosts that a new certificate allows for."""
-PRIVATE, OF_GROUP = 0o600, 0o640
-"""Modes of a file with a private key: of its owner alone, or readable by its group."""
 
 
 @dataclass(frozen=True)
@@ -67,37 +60,25 @@ class Authority:
 
         The certificate has the role as organisational unit and the cell as organisation. ConfigError if one is invalid.
         """
-        if role not in ROLES:
-            raise ConfigError(f"role {role!r}: expected {', '.join(ROLES)}")
-        if cell == ANY_CELL and role not in ("operator", "viewer"):
-            raise ConfigError(f"role {role}: needs a cell; only operator and viewer may be of all cells ({ANY_CELL})")
-        key = ec.generate_private_key(ec.SECP256R1())
-        subject = _name((NameOID.COMMON_NAME, name), (NameOID.ORGANIZATIONAL_UNIT_NAME, role),
-                        (NameOID.ORGANIZATION_NAME, cell))  # fmt: skip
-        purposes = [ExtendedKeyUsageOID.CLIENT_AUTH, ExtendedKeyUsageOID.SERVER_AUTH]
-        builder = (
-            _builder(subject, self.certificate.subject, key, days, now)
-            .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
-            .add_extension(_usage(digital_signature=True), critical=True)
-            .add_extension(x509.ExtendedKeyUsage(purposes), critical=False)
-            .add_extension(x509.AuthorityKeyIdentifier.from_issuer_public_key(self.key.public_key()), critical=False)
-        )
-        if addresses:
-            names = x509.SubjectAlternativeName([_address(address) for address in addresses])
-            builder = builder.add_extension(names, critical=False)
+        if role not in ROLES or (cell == ANY_CELL and role not in ("operator", "viewer")):
+            of_all = "only operator and viewer may be of all cells"
+            raise ConfigError(f"role {role!r} in cell {cell!r}: expected one of {', '.join(ROLES)}; {of_all}")
+        key, addressed = ec.generate_private_key(ec.SECP256R1()), [_address(address) for address in addresses]
+        more: list[tuple[x509.ExtensionType, bool]] = [
+            (x509.ExtendedKeyUsage([ExtendedKeyUsageOID.CLIENT_AUTH, ExtendedKeyUsageOID.SERVER_AUTH]), False),
+            (x509.AuthorityKeyIdentifier.from_issuer_public_key(self.key.public_key()), False),
+            *([(x509.SubjectAlternativeName(addressed), False)] if addressed else []),
+        ]
+        subject = {NameOID.COMMON_NAME: name, NameOID.ORGANIZATIONAL_UNIT_NAME: role, NameOID.ORGANIZATION_NAME: cell}
+        builder = _builder(subject, key, days, now, None, more).issuer_name(self.certificate.subject)
         return Identity(role, cell, name, key, builder.sign(self.key, SHA256()))
 
 
 def new_authority(plant: str, days: int, now: datetime | None = None) -> Authority:
     """Return a new authority of a plant; its certificate signs itself, and no other authority."""
     key = ec.generate_private_key(ec.SECP256R1())
-    name = _name((NameOID.COMMON_NAME, plant))
-    builder = (
-        _builder(name, name, key, days, now)
-        .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
-        .add_extension(_usage(key_cert_sign=True, crl_sign=True), critical=True)
-    )
-    return Authority(key, builder.sign(key, SHA256()))
+    builder = _builder({NameOID.COMMON_NAME: plant}, key, days, now, 0, [])
+    return Authority(key, builder.issuer_name(_name({NameOID.COMMON_NAME: plant})).sign(key, SHA256()))
 
 
 def identity_of(certificate: x509.Certificate) -> tuple[Role, str, str]:
@@ -129,19 +110,30 @@ def trusted_certificate(
     """Return a certificate from its bytes, checked as by `signer_of`."""
     try:
         certificate = x509.load_der_x509_certificate(certificate_der)
-        identity = identity_of(certificate)
-        is_of_curve = isinstance(certificate.public_key(), ec.EllipticCurvePublicKey)
     except (ValueError, TypeError, UnsupportedAlgorithm) as error:
         raise DataError("not a certificate (X.509, DER)") from error
-    if not is_of_curve:
-        raise DataError(f"{identity[2]}: the certificate has no key of an elliptic curve")
-    check_dates(certificate, at, identity[2])
+    name = identity_of(certificate)[2]
     for authority in authority_certificates:
-        with suppress(InvalidSignature, ValueError, TypeError):
+        with suppress(InvalidSignature, ValueError, TypeError, UnsupportedAlgorithm):
             certificate.verify_directly_issued_by(authority)
-            check_dates(authority, at, "the authority")
-            return certificate
-    raise DataError(f"{identity[2]}: its certificate was issued by another authority")
+            break
+    else:
+        raise DataError(f"{name!r}: its certificate was issued by another authority")
+    if not isinstance(certificate.public_key(), ec.EllipticCurvePublicKey):
+        raise DataError(f"{name}: the certificate has no key of an elliptic curve")
+    check_dates(certificate, at, name)
+    check_dates(authority, at, "the authority")
+    return certificate
+
+
+def verify(certificate: x509.Certificate, signature: bytes, data: bytes) -> None:
+    """Check the signature of data by the holder of a trusted certificate; DataError if it is wrong."""
+    key = certificate.public_key()
+    assert isinstance(key, ec.EllipticCurvePublicKey)
+    try:
+        key.verify(signature, data, ec.ECDSA(SHA256()))
+    except InvalidSignature as error:
+        raise DataError(f"the signature of {identity_of(certificate)[2]} does not fit: changed or forged") from error
 
 
 def check_dates(certificate: x509.Certificate, at: datetime, name: str) -> None:
@@ -158,12 +150,12 @@ def pem_of(*certificates: x509.Certificate) -> bytes:
     return b"".join(certificate.public_bytes(Encoding.PEM) for certificate in certificates)
 
 
-def write_key(path: Path, key: ec.EllipticCurvePrivateKey, mode: int = PRIVATE) -> None:
-    """Write a private key as PEM (PKCS 8); its file is never readable by others."""
+def write_key(path: Path, key: ec.EllipticCurvePrivateKey, mode: int = 0o600) -> None:
+    """Write a private key as PEM (PKCS 8); mode 0640: its group may read it."""
     write_whole(path, key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption()), mode)
 
 
-def write_identity(folder: Path, identity: Identity, mode: int = PRIVATE) -> None:
+def write_identity(folder: Path, identity: Identity, mode: int = 0o600) -> None:
     """Write ``NAME.key`` and then ``NAME.pem``, by which readers find an identity."""
     write_key(folder / f"{identity.name}.key", identity.key, mode)
     write_whole(folder / f"{identity.name}.pem", pem_of(identity.certificate), 0o644)
@@ -232,11 +224,34 @@ def read_authority(folder: Path) -> Authority:
     raise ConfigError(f"{folder / 'authority.pem'}: no certificate belongs to authority.key")
 
 
-def _name(*attributes: tuple[x509.ObjectIdentifier, str]) -> x509.Name:
+def _builder(
+    subject: dict[x509.ObjectIdentifier, str],
+    key: ec.EllipticCurvePrivateKey,
+    days: int,
+    now: datetime | None,
+    path_length: int | None,
+    more: list[tuple[x509.ExtensionType, bool]],
+) -> x509.CertificateBuilder:
+    """Return a certificate without issuer; ``path_length``: of an authority, ``None`` of a role."""
+    begin, ca = now or datetime.now(UTC), path_length is not None
+    builder = (
+        x509.CertificateBuilder(subject_name=_name(subject), public_key=key.public_key())
+        .serial_number(x509.random_serial_number())
+        .not_valid_before(begin - TOLERANCE)
+        .not_valid_after(begin + timedelta(days=days))
+    )
+    usage = x509.KeyUsage(not ca, False, False, False, False, ca, ca, False, False)
+    own = [(x509.BasicConstraints(ca, path_length), True), (usage, True)]
+    for extension, critical in (*own, (x509.SubjectKeyIdentifier.from_public_key(key.public_key()), False), *more):
+        builder = builder.add_extension(extension, critical)
+    return builder
+
+
+def _name(attributes: dict[x509.ObjectIdentifier, str]) -> x509.Name:
     try:
-        return x509.Name([x509.NameAttribute(oid, value) for oid, value in attributes])
+        return x509.Name([x509.NameAttribute(oid, value) for oid, value in attributes.items()])
     except ValueError as error:
-        values = ", ".join(repr(value) for _, value in attributes)
+        values = ", ".join(map(repr, attributes.values()))
         raise ConfigError(f"{values}: names in certificates have 1 to 64 characters") from error
 
 
@@ -247,23 +262,3 @@ def _address(text: str) -> x509.GeneralName:
         return x509.DNSName(text)
     except ValueError as error:
         raise ConfigError(f"address {text!r}: expected an IP address or a DNS name in ASCII") from error
-
-
-def _builder(
-    subject: x509.Name, issuer: x509.Name, key: ec.EllipticCurvePrivateKey, days: int, now: datetime | None
-) -> x509.CertificateBuilder:
-    begin = now or datetime.now(UTC)
-    return (
-        x509.CertificateBuilder()
-        .subject_name(subject)
-        .issuer_name(issuer)
-        .public_key(key.public_key())
-        .serial_number(x509.random_serial_number())
-        .not_valid_before(begin - TOLERANCE)
-        .not_valid_after(begin + timedelta(days=days))
-        .add_extension(x509.SubjectKeyIdentifier.from_public_key(key.public_key()), critical=False)
-    )
-
-
-def _usage(*, digital_signature: bool = False, key_cert_sign: bool = False, crl_sign: bool = False) -> x509.KeyUsage:
-    return x509.KeyUsage(digital_signature, False, False, False, False, key_cert_sign, crl_sign, False, False)

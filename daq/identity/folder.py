@@ -13,6 +13,8 @@ from cryptography import x509
 
 from armident.configs import ConfigError
 from armident.configs.reasons import reason_of
+from armident.configs.yaml_loader import is_file
+from armident.daq.identity import OF_PLANT, VARIABLE
 from armident.daq.identity.certificates import (
     ANY_CELL,
     Identity,
@@ -27,10 +29,6 @@ from armident.daq.identity.certificates import (
     write_whole,
 )
 
-VARIABLE = "ARMIDENT_KEYS"
-"""Environment variable that names the folder of a plant's keys."""
-OF_PLANT = Path("/etc/armident/keys")
-"""Folder of a plant's keys, where it exists."""
 OF_SERVICES = Path("/var/lib/armident/keys")
 """Local folder that the services of a machine share."""
 _FROM, _DAYS = datetime(1970, 1, 2, tzinfo=UTC), 47_481
@@ -48,17 +46,16 @@ class KeyFolder:
     local: bool = False
 
     def identity(self, role: Role, cell: str) -> Identity:
-        """Return the identity of a role for a cell; a folder of a plant that lacks it is a ConfigError."""
+        """Return the identity of a role for a cell, or of any (`ANY_CELL`); ConfigError if the plant has none here."""
         found = self._find(role, cell)
         if found is None and self.local:
             with self._locked():
                 # Another process may have made it while this one waited.
                 found = self._find(role, cell)
                 if found is None:
-                    self._make_authority()
                     of, name = (ANY_CELL, "local") if role in ("operator", "viewer") else (cell, cell)
-                    addresses = ("localhost", "127.0.0.1", "::1")
-                    found = read_authority(self.path).issue(role, of, f"{role}.{name}", addresses, _DAYS, _FROM)
+                    issue, addresses = read_authority(self.path).issue, ("localhost", "127.0.0.1", "::1")
+                    found = issue(role, of, f"{role}.{name}"[:64], addresses, _DAYS, _FROM)
                     write_identity(self.path, found)
         if found is None:
             raise ConfigError(
@@ -70,12 +67,20 @@ class KeyFolder:
     def authority_certificates(self) -> tuple[x509.Certificate, ...]:
         """Return the certificates of the trusted authorities; ConfigError if there is none."""
         path = self.path / "authority.pem"
-        if self.local and not path.is_file():
+        if self.local and not is_file(path):
             with self._locked():
-                self._make_authority()
-        if not path.is_file():
+                pass
+        if not is_file(path):
             raise ConfigError(f"{path}: no such file; copy it from the machine on which armident keys init ran")
         return read_certificates(path)
+
+    def stamp(self, name: str) -> tuple[int, ...]:
+        """Return the times of change of the folder and of a file in it, by which a renewal is noticed."""
+        found = [0, 0]
+        with suppress(OSError):
+            found[0] = self.path.stat().st_mtime_ns
+            found[1] = (self.path / name).stat().st_mtime_ns
+        return tuple(found)
 
     def _find(self, role: Role, cell: str) -> Identity | None:
         """Return the identity whose certificate ends last, rather of the cell than of the plant."""
@@ -86,29 +91,27 @@ class KeyFolder:
             except ConfigError as error:
                 refused = error
                 continue
-            if identity.role == role and identity.cell in (cell, ANY_CELL):
+            if identity.role == role and (cell == ANY_CELL or identity.cell in (cell, ANY_CELL)):
                 found.append(identity)
         if not found and refused is not None:
             raise refused
         return max(found, key=lambda each: (each.cell == cell, each.certificate.not_valid_after_utc), default=None)
 
-    def _make_authority(self) -> None:
-        if not (self.path / "authority.pem").is_file():
-            authority = new_authority(f"local {socket.gethostname()}"[:64], _DAYS, _FROM)
-            write_key(self.path / "authority.key", authority.key)
-            write_whole(self.path / "authority.pem", pem_of(authority.certificate), 0o644)
-
     @contextmanager
     def _locked(self) -> Iterator[None]:
-        """Hold the lock of the folder, which is made if it is missing."""
+        """Hold the lock of the folder; the folder and its authority are made if they are missing."""
         try:
             self.path.mkdir(mode=0o700, parents=True, exist_ok=True)
             lock = os.open(self.path / ".lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
         except OSError as error:
             reason = reason_of(error, named=False)
-            raise ConfigError(f"{self.path}: no keys can be made: {reason}; {VARIABLE} names another folder") from error
+            raise ConfigError(f"{self.path}: no keys can be made: {reason}; set XDG_STATE_HOME") from error
         try:
             fcntl.flock(lock, fcntl.LOCK_EX)
+            if not is_file(self.path / "authority.pem"):
+                authority = new_authority(f"local {socket.gethostname()}"[:64], _DAYS, _FROM)
+                write_key(self.path / "authority.key", authority.key)
+                write_whole(self.path / "authority.pem", pem_of(authority.certificate), 0o644)
             yield
         finally:
             os.close(lock)
@@ -119,14 +122,15 @@ def key_folder(chosen: Path | None = None) -> KeyFolder:
     named = os.environ.get(VARIABLE)
     for path in (chosen, Path(named) if named else None):
         if path is not None:
-            if not path.is_dir():
+            if not os.path.isdir(path):
                 raise ConfigError(f"{path}: no such folder of keys; run: armident keys init")
             return KeyFolder(path)
-    if OF_PLANT.is_dir():
+    # A user who may not look into /etc/armident has keys of his own.
+    if os.path.isdir(OF_PLANT):
         return KeyFolder(OF_PLANT)
     if os.access(OF_SERVICES, os.W_OK):
         return KeyFolder(OF_SERVICES, local=True)
     state = os.environ.get("XDG_STATE_HOME")
     with suppress(RuntimeError):
         return KeyFolder((Path(state) if state else Path.home() / ".local" / "state") / "armident" / "keys", local=True)
-    raise ConfigError(f"no folder for keys: this user has no home; {VARIABLE} names one")
+    raise ConfigError("no folder for keys: this user has no home; set XDG_STATE_HOME")

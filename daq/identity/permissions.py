@@ -6,21 +6,23 @@ from typing import Literal
 
 from armident.daq.identity.certificates import Role
 
-Action = Literal["publish", "answer", "ask", "read"]
+Action = Literal["publish", "answer", "ask", "read", "sign"]
 
 
 @dataclass(frozen=True)
 class Permission:
     """Keys below ``armident/CELL/ROBOT/`` for each action; ``*`` stands for one or more parts of a key.
 
-    ``publish``: messages and liveliness tokens. ``answer``: replies to queries. ``ask``: queries. ``read``: subscriptions,
-    also of liveliness. Who reads samples and events asks their publisher for those that it missed, below ``@adv``.
+    ``publish``: messages and liveliness tokens. ``answer``: replies to queries. ``ask``: queries. ``read``:
+    subscriptions, also of liveliness. A reader of samples and events asks for those that it missed below ``@adv``.
+    ``sign``: ``documents``, which are files.
     """
 
     publish: tuple[str, ...] = ()
     answer: tuple[str, ...] = ()
     ask: tuple[str, ...] = ()
     read: tuple[str, ...] = ()
+    sign: tuple[str, ...] = ()
 
 
 _STREAMS = ("samples", "events", "samples/@adv/*", "events/@adv/*")
@@ -38,8 +40,9 @@ PERMISSIONS: dict[Role, Permission] = {
         answer=("result/*",),
         ask=(*_STREAMS, "result/*", "alive/*"),
         read=(*_STREAMS, "result/*", "status", "sent", "alive/*"),
+        sign=("documents",),
     ),
-    "operator": Permission(ask=("command/*", "result/*", *_STREAMS, "alive/*"), read=_ALL),
+    "operator": Permission(ask=("command/*", "result/*", *_STREAMS, "alive/*"), read=_ALL, sign=("documents",)),
     "viewer": Permission(ask=("result/*", *_STREAMS, "alive/*"), read=_ALL),
 }
 """Permissions by role; an operator or viewer of all cells has them in each cell. All else is forbidden.

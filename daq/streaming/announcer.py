@@ -6,6 +6,7 @@ from typing import Any
 
 import zenoh
 
+from armident.daq.identity.signatures import Signer
 from armident.daq.streaming.keys import Keys
 
 SENT_IN_ORDER: dict[str, Any] = {"transport/unicast/qos/enabled": False, "transport/link/tx/queue/size/data": 1}
@@ -17,15 +18,15 @@ CONNECTING_S = 1.0
 
 
 class Announcer:
-    """Publishes messages that are not repeated, such as results; ``session`` has the settings `SENT_IN_ORDER`.
+    """Publishes signed messages that are not repeated, such as results; ``session`` has the settings `SENT_IN_ORDER`.
 
     ``put`` of Zenoh returns before the message is sent, so that a killed process loses it. Here a declaration follows
     each message in the same queue; it is taken when the operating system has taken the message. Zenoh also forgets
     messages if nobody listens: lost listeners get ``retry_s``, the longest interval between attempts to connect, s.
     """
 
-    def __init__(self, session: zenoh.Session, keys: Keys, retry_s: float) -> None:
-        self._session, self._keys = session, keys
+    def __init__(self, session: zenoh.Session, keys: Keys, retry_s: float, signer: Signer) -> None:
+        self._session, self._keys, self._signer = session, keys, signer
         self._ready = time.monotonic() + retry_s + CONNECTING_S
 
     @property
@@ -37,7 +38,13 @@ class Announcer:
         """Publish messages (key expression, content), and return when the operating system has taken them."""
         for key, content in messages:
             # Express: not batched with later messages. Block: not dropped if the queue is full.
-            self._session.put(key, content, express=True, congestion_control=zenoh.CongestionControl.BLOCK)
+            self._session.put(
+                key,
+                content,
+                attachment=self._signer.attachment(key, content),
+                express=True,
+                congestion_control=zenoh.CongestionControl.BLOCK,
+            )
         self._session.declare_subscriber(self._keys.sent, _ignore).undeclare()
 
 

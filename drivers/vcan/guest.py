@@ -32,9 +32,9 @@ NICENESS = -10
 """Nice value of the guest."""
 MALLOC_TUNABLES = "glibc.malloc.mmap_threshold=1073741824:glibc.malloc.trim_threshold=1073741824"
 """Tunables of glibc that keep freed memory in the process, because page faults are slow in a guest."""
-CACHES = {"MPLCONFIGDIR": "matplotlib", "XDG_CACHE_HOME": "guest"}
-"""Environment variables of cache folders, and their default folders in the cache of armident. The user's own caches are
-read-only in the guest, which Matplotlib and Fontconfig report on stderr."""
+CACHES = {"MPLCONFIGDIR": "matplotlib", "XDG_CACHE_HOME": "guest", "XDG_STATE_HOME": "guest-state"}
+"""Environment variables of folders that programs write, and their default folders in the cache of armident. The user's
+own ones are read-only in the guest."""
 MAPPINGS = Path("/proc/sys/vm/max_map_count")
 """Most mappings of a process (documentation of the Linux kernel, sysctl/vm). In a guest, each page of a process that
 is not beside its neighbour in the memory of the guest is one mapping of the host."""

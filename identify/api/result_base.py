@@ -9,6 +9,7 @@ from pydantic import BaseModel
 
 from armident.identify.api.result_tables import Table
 from armident.identify.documents.files import to_json, write_atomically
+from armident.identify.documents.signing import write_document
 
 
 class Result(ABC):
@@ -66,7 +67,7 @@ class Result(ABC):
         result, further = self._for_folder(Path(folder))
         for file, text in further.items():
             write_atomically(file, text)
-        write_atomically(document, result.to_json())
+        write_document(document, result.document)
         return document, result.report(Path(folder) / "report.html"), *further
 
     def __repr__(self) -> str:

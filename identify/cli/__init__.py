@@ -101,6 +101,26 @@ def queue(
     queue_command(action, names or [], config, out, as_json=json)
 
 
+def verify(
+    files: Annotated[list[Path], typer.Argument(help="Result documents (.json).")],
+    keys: Annotated[
+        Path | None, typer.Option("--keys", help="Folder with authority.pem. [default: keys of the plant]")
+    ] = None,
+    json: Json = False,
+) -> None:
+    """Check who signed result documents, in which role and when, and that nobody has changed them since.
+
+    Exit code 1 if a document is not signed, was changed, or its signer is not of this plant.
+
+    Example: armident verify recordings/*.identification/identification.json
+    """
+    from armident.identify.documents.signing import verify_command
+
+    code = verify_command(files, keys, as_json=json)
+    if code:
+        raise typer.Exit(code)
+
+
 @with_options
 def diagnose(
     recordings: Annotated[list[Path], typer.Argument(help="Recordings to fit.")],

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydantic import ConfigDict
+from pydantic import ConfigDict, Field
 
 from armident.configs.schema.base import DescribedModel
 from armident.daq.recording import Recording
@@ -20,6 +20,22 @@ class Document(DescribedModel):
     """Part of a result document, without unknown keys and without NaN."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, populate_by_name=True)
+
+
+class SignedDocument(Document):
+    """Document of a file that may be signed; when it is written anew, the file has its own signature or none.
+
+    Parameters
+    ----------
+    provenance
+        Origin of the file: version of ``armident``, ``host``, ``user``, and ``time`` of the signature (UTC).
+    signature
+        ``certificate`` of the signer (DER) and ``value`` (ECDSA, P-256, SHA-256), base64. Signed is the document
+        without this entry as JSON: keys sorted, no blanks, ASCII, floats as Python writes them.
+    """
+
+    provenance: dict[str, str] | None = Field(None, exclude=True)
+    signature: dict[str, str] | None = Field(None, exclude=True)
 
 
 class RecordingReference(Document):

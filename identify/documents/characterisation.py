@@ -4,7 +4,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from armident.identify.documents.base import Document, RecordingReference
+from armident.identify.documents.base import Document, RecordingReference, SignedDocument
 
 NORMAL_95 = 1.959964
 """Half width of a 95 % interval, standard deviations of a normal distribution."""
@@ -133,7 +133,7 @@ class Presliding(Document):
     model: list[float]
 
 
-class CharacterisationDocument(Document):
+class CharacterisationDocument(SignedDocument):
     """``characterisation.json``: friction, ripple and reversals of one joint.
 
     Parameters

@@ -4,7 +4,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from armident.identify.documents.base import Document, RecordingReference
+from armident.identify.documents.base import Document, RecordingReference, SignedDocument
 
 Outcome = Literal["running", "trusted", "set_up", "not_trusted", "stopped"]
 
@@ -30,7 +30,7 @@ class CommissioningMotion(Document):
     recording: RecordingReference
 
 
-class CommissioningDocument(Document):
+class CommissioningDocument(SignedDocument):
     """``commissioning.json``: the stages of a new arm on the way to a trusted model.
 
     Parameters

@@ -4,7 +4,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from armident.identify.documents.base import Document, RecordingReference
+from armident.identify.documents.base import Document, RecordingReference, SignedDocument
 
 LEVEL_95 = 1.959964
 """Half width of a 95 % interval of a normal distribution, standard deviations."""
@@ -99,7 +99,7 @@ class NamedChange(Document):
     not_excluded: list[str]
 
 
-class ComparisonDocument(Document):
+class ComparisonDocument(SignedDocument):
     """Content of ``comparison.json``: the change test of two identifications of one robot.
 
     Parameters

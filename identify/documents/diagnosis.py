@@ -4,7 +4,7 @@ from typing import Any, Literal
 
 from pydantic import Field
 
-from armident.identify.documents.base import Document, RecordingReference
+from armident.identify.documents.base import Document, RecordingReference, SignedDocument
 
 Verdict = Literal["no_gap", "explained", "partly_explained", "unexplained"]
 
@@ -266,7 +266,7 @@ class Gaps(Document):
     validation: BeforeAfter
 
 
-class DiagnosisDocument(Document):
+class DiagnosisDocument(SignedDocument):
     """``diagnosis.json``: effects that the model lacks, their share of the torque error, and the unexplained rest.
 
     Parameters

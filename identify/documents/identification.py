@@ -5,7 +5,7 @@ from typing import Any, Literal
 
 from pydantic import Field
 
-from armident.identify.documents.base import Document, RecordingReference
+from armident.identify.documents.base import Document, RecordingReference, SignedDocument
 
 
 class Parameter(Document):
@@ -180,7 +180,7 @@ class Comparison(Document):
     relative_error_pct: float | None = None
 
 
-class IdentificationDocument(Document):
+class IdentificationDocument(SignedDocument):
     """Content of ``identification.json``: estimated parameters, their covariance, the data, method and diagnostics.
 
     Parameters

@@ -4,7 +4,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from armident.identify.documents.base import Document, RecordingReference
+from armident.identify.documents.base import Document, RecordingReference, SignedDocument
 from armident.identify.documents.diagnosis import Explanation
 
 Outcome = Literal["running", "healthy", "named", "set_up", "unnamed", "cannot_tell"]
@@ -83,7 +83,7 @@ class InvestigationRound(Document):
     refused: str | None = None
 
 
-class InvestigationDocument(Document):
+class InvestigationDocument(SignedDocument):
     """``investigation.json``: questions to an arm, its answers, and what they say about the missing effects.
 
     Parameters

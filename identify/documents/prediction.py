@@ -5,13 +5,13 @@ from typing import Literal
 
 from pydantic import Field
 
-from armident.identify.documents.base import Document, RecordingReference
+from armident.identify.documents.base import RecordingReference, SignedDocument
 
 ALL_PCT = 100.0
 """Torque error of no model at all, percent."""
 
 
-class PredictionDocument(Document):
+class PredictionDocument(SignedDocument):
     """Content of ``prediction.json``: error of an identified model on a recording.
 
     Torques are low-passed as in the identification, at twice the closed-loop bandwidth.
@@ -82,7 +82,7 @@ class PredictionDocument(Document):
         return f"Torque error {self.relative_error_pct:.2f} % ({data}); {own}{worse}."
 
 
-class PredictionsDocument(Document):
+class PredictionsDocument(SignedDocument):
     """Content of ``predictions.json``: errors of an identified model on several recordings.
 
     Parameters

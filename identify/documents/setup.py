@@ -4,7 +4,7 @@ from typing import Any, Literal
 
 from pydantic import Field
 
-from armident.identify.documents.base import Document, RecordingReference
+from armident.identify.documents.base import Document, RecordingReference, SignedDocument
 
 
 class SetupMistake(Document):
@@ -37,7 +37,7 @@ class SetupMistake(Document):
     correction: bool = True
 
 
-class SetupDocument(Document):
+class SetupDocument(SignedDocument):
     """Content of ``check.json``, which ``armident check --json`` prints.
 
     Parameters

@@ -4,10 +4,10 @@ from typing import Literal
 
 from pydantic import Field
 
-from armident.identify.documents.base import Document, RecordingReference
+from armident.identify.documents.base import RecordingReference, SignedDocument
 
 
-class SimulationDocument(Document):
+class SimulationDocument(SignedDocument):
     """Output of ``armident simulate --json``: the file that was written and what it was simulated from.
 
     Parameters

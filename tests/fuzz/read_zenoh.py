@@ -1,12 +1,15 @@
 """What comes over Zenoh: blocks of samples and events, spoiled on the way or made up."""
 
 import json
+import tempfile
 from functools import cache
 from pathlib import Path
 
 import numpy as np
 
 from armident.configs import DataError
+from armident.daq.identity.folder import KeyFolder
+from armident.daq.identity.signatures import Signer, Trust
 from armident.daq.streaming import Block, assemble, decode_block, decode_event, encode_block, encode_event
 from tests.fuzz.harness import MisreadError, Target
 from tests.fuzz.mutate import either, forge_block, spoil_bytes, spoil_json, spoil_text
@@ -77,7 +80,38 @@ def _check_event(data: bytes, _: Path) -> bool:
     return bool(made)
 
 
+_KEY = "armident/cell/robot/events"
+_TEMPORARY = tempfile.TemporaryDirectory(prefix="armident-fuzz-")
+
+
+@cache
+def _folder() -> KeyFolder:
+    return KeyFolder(Path(_TEMPORARY.name), local=True)
+
+
+@cache
+def _attachments() -> list[bytes]:
+    """Attachments that may be on an event without content, and not: of another role, cell, key, and authority."""
+    capture = Signer(_folder(), "capture", "cell")
+    others = [Signer(_folder(), "viewer", "cell"), Signer(_folder(), "capture", "other")]
+    return [
+        capture.attachment(_KEY, b""),
+        capture.attachment(_KEY, b"", bytes(16)),
+        capture.attachment(_KEY + "x", b""),
+        *(signer.attachment(_KEY, b"") for signer in others),
+    ]
+
+
+def _check_attachment(data: bytes, _: Path) -> bool:
+    Trust(_folder(), "armident/cell/robot").check("publish", _KEY, b"", data)
+    # Of a signature by ECDSA there are two forms.
+    if not any(data[:-80] == right[:-80] for right in _attachments()[:2]):
+        raise MisreadError("a signature that nobody made")
+    return True
+
+
 TARGETS = (
+    Target("attachment", _attachments, spoil_bytes, _check_attachment),
     Target("block", lambda: [encode_block(b) for b in _blocks()], spoil_bytes, _check_block),
     Target("block-forged", lambda: [encode_block(b) for b in _blocks()], forge_block, _check_forged),
     Target("event", _event_seeds, either(spoil_json, spoil_json, spoil_text), _check_event),

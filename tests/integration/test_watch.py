@@ -26,6 +26,7 @@ from armident.identify.monitoring.recursive.saved_state import state_of
 from armident.identify.monitoring.recursive.watch import WatchOptions, watch_cell, watch_recordings
 from armident.identify.monitoring.worker.stream_buffer import LARGEST_BLOCK
 from tests.fixtures import arms
+from tests.fixtures.signed import put_signed
 from tests.integration.test_worker import blocks_of as published_blocks
 
 pytestmark = pytest.mark.slow
@@ -92,7 +93,7 @@ def test_the_live_stream_and_the_replay_give_the_same_bits(session: SessionConfi
         key = Keys(session.cell, recording.robot.name).recursive
         replies = list(observer.get(key))
         publisher.close()
-    assert watch.dropped == watch.refused == 0
+    assert watch.dropped == watch.refusals.total == 0
     replayed = RecursiveEstimator(recording.robot, reference(), recording.sample_rate_hz)
     for piece in blocks_of(recording, 777):
         replayed.handle(piece)
@@ -160,11 +161,11 @@ def test_blocks_of_strangers_end_no_watch(session: SessionConfig) -> None:
         (block, *_) = published_blocks(recording)
         others = replace(block.layout, joints=tuple(f"other_{joint}" for joint in block.layout.joints))
         for message in (b"no block", encode_block(replace(block, layout=others)), bytes(LARGEST_BLOCK + 1)):
-            before, end = watch.refused, time.monotonic() + 60.0
-            while watch.refused == before and time.monotonic() < end:
-                stranger.put(key, message)
+            before, end = watch.refusals.total, time.monotonic() + 60.0
+            while watch.refusals.total == before and time.monotonic() < end:
+                put_signed(stranger, session, key, message)
                 time.sleep(0.2)
-            assert watch.refused > before
+            assert watch.refusals.total > before
     assert estimator.result().sync == -1
     # Blocks of another robot are not waited for.
     assert watch.lost == 0

@@ -25,6 +25,7 @@ from armident.identify.documents.files import from_json, load_document
 from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.monitoring.worker.worker import Worker
 from tests.fixtures import arms
+from tests.fixtures.signed import put_signed
 
 pytestmark = pytest.mark.slow
 
@@ -55,9 +56,10 @@ def in_a_cell(robot: str, name: str, options: dict[str, str]) -> SessionConfig:
 
 
 @pytest.fixture
-def session(request: pytest.FixtureRequest) -> SessionConfig:
-    """A cell for one test."""
-    return in_a_cell("emps", request.node.name, {"method": "idim-ls"})
+def session(request: pytest.FixtureRequest, tmp_path: Path) -> SessionConfig:
+    """A cell for one test, which may read the files in the folders of all tests."""
+    session = in_a_cell("emps", request.node.name, {"method": "idim-ls"})
+    return session.model_copy(update={"recording": session.recording.model_copy(update={"directory": tmp_path.parent})})
 
 
 def blocks_of(recording: Recording) -> Iterator[Block]:
@@ -178,7 +180,7 @@ def test_invalid_messages_are_logged_once_and_then_at_powers_of_ten(
         until = time.monotonic() + 10.0
         while "(10 times)" not in caplog.text and time.monotonic() < until:
             for _ in range(5):
-                observer.put(keys.samples, b"no block")
+                put_signed(observer, session, keys.samples, b"no block")
             time.sleep(0.1)
         publish(captured, session)
         assert worker.result(LONGEST_S) == 0
@@ -218,8 +220,8 @@ def test_payloads_that_are_not_ours_do_no_harm(captured: Recording, session: Ses
     with Worker(session, captured.robot, tmp_path) as worker:
         with open_session(session, "capture") as stranger:
             for junk in (b"", b"ARMB", np.random.default_rng(0).bytes(1000), b"{}"):
-                stranger.put(keys.samples, junk)
-                stranger.put(keys.events, junk)
+                put_signed(stranger, session, keys.samples, junk)
+                put_signed(stranger, session, keys.events, junk)
         assert worker.result(1.0) is None
         publish(captured, session, leave_out=0, path=tmp_path / "gone.mcap")
 

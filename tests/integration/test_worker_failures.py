@@ -32,6 +32,7 @@ from armident.identify.monitoring.worker.stream_buffer import (
 from armident.identify.monitoring.worker.worker import Worker
 from armident.identify.report.robot_file import write_identification
 from tests.fixtures import arms
+from tests.fixtures.signed import put_signed
 from tests.integration.test_worker import LONGEST_S, in_a_cell, publish
 from tests.unit.daq.test_streaming import blocks, events
 
@@ -197,8 +198,8 @@ def test_an_end_that_a_stranger_announces_does_not_end_a_capture(
         until = time.monotonic() + 10.0
         while "its file is being written" not in caplog.text:
             assert time.monotonic() < until
-            stranger.put(keys.events, encode_event("experiment_start", start))
-            stranger.put(keys.events, encode_event("experiment_end", end))
+            put_signed(stranger, session, keys.events, encode_event("experiment_start", start))
+            put_signed(stranger, session, keys.events, encode_event("experiment_end", end))
             stranger.put(keys.samples, np.random.default_rng(0).bytes(2_000_000))
             time.sleep(0.2)
         assert worker.result(0.5) is None

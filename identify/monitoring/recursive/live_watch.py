@@ -2,7 +2,6 @@
 
 import json
 import logging
-import math
 import queue
 import threading
 import time
@@ -13,7 +12,8 @@ import zenoh
 import zenoh.ext
 
 from armident.configs import DataError, RobotConfig, SessionConfig
-from armident.daq.streaming import Block, Keys, decode_block, open_session
+from armident.daq.identity.signatures import signer_for, trust_for
+from armident.daq.streaming import Block, Keys, Refusals, decode_block, open_session
 from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.monitoring.recursive.block_order import BlockOrder
 from armident.identify.monitoring.recursive.estimator import RecursiveEstimator, RecursiveResult
@@ -58,9 +58,12 @@ class LiveWatch:
     def __init__(self, session: SessionConfig, robot: RobotConfig, estimator: RecursiveEstimator) -> None:
         self._robot = robot
         self._keys = Keys(session.cell, robot.name)
-        self._waiting: queue.Queue[bytes] = queue.Queue(WAITING_BLOCKS)
+        self._waiting: queue.Queue[tuple[bytes, int]] = queue.Queue(WAITING_BLOCKS)
+        self._capture, self._newest_ns = "", 0
         self._last: bytes | None = None
-        self.dropped = self.refused = self.lost = 0
+        self.dropped = self.lost = 0
+        self._signer, self._trust = signer_for(session, "worker"), trust_for(session, self._keys.base)
+        self.refusals = Refusals(log)
         # Bytes; each is changed by one thread only.
         self._received = self._taken = 0
         self.estimator = estimator
@@ -96,7 +99,8 @@ class LiveWatch:
         def publish(result: RecursiveResult) -> None:
             self._last = json.dumps(document(result, self._robot)).encode()
             try:
-                self._session.put(self._keys.recursive, self._last)
+                key = self._keys.recursive
+                self._session.put(key, self._last, attachment=self._signer.attachment(key, self._last))
             except zenoh.ZError:
                 log.debug("result not published")
             show(result)
@@ -105,38 +109,49 @@ class LiveWatch:
         began = saved = time.monotonic()
         while not stop.is_set() and (duration is None or time.monotonic() - began < duration):
             try:
-                ready = order.add(self._decoded(self._waiting.get(timeout=0.2)), time.monotonic())
+                ready = order.add(self._decoded(*self._waiting.get(timeout=0.2)), time.monotonic())
             except queue.Empty:
                 ready = order.overdue(time.monotonic())
             except DataError as error:
-                self._refuse(error)
+                self.refusals.refuse("samples", error)
                 continue
             for block in ready:
                 try:
                     watch.handle(block)
                 except DataError as error:
-                    self._refuse(error)
+                    self.refusals.refuse("samples", error)
             self._count_lost(order.lost)
             if time.monotonic() - saved > SAVED_S:
                 saved = time.monotonic()
                 save()
 
-    def _decoded(self, data: bytes) -> Block:
-        """Return the block of this robot in a message; others must not disturb the order of its blocks."""
+    def _decoded(self, data: bytes, time_ns: int) -> Block:
+        """Return the block of this robot in a message; others must not disturb the order of its blocks.
+
+        A block of an earlier capture that was signed before the newest one, ``time_ns``, is late or repeated.
+        """
         self._taken += len(data)
         block = decode_block(data)
         if block.layout.joints != tuple(joint.name for joint in self._robot.joints):
             raise DataError(f"a block of capture {block.capture}: of other joints than those of {self._robot.name}")
+        if block.capture != self._capture and time_ns < self._newest_ns:
+            raise DataError(
+                f"a block of capture {block.capture}: older than those of {self._capture}, late or repeated"
+            )
+        self._capture, self._newest_ns = block.capture, max(time_ns, self._newest_ns)
         return block
 
     def _on_block(self, sample: zenoh.Sample) -> None:
-        # A message that is too large for a block is refused as an empty one, without its memory.
+        # A message that is too large for a block is refused for its signature, without its memory.
         data = bytes(sample.payload) if len(sample.payload) <= LARGEST_BLOCK else b""
         if self._received - self._taken + len(data) > WAITING_BYTES:
             self.dropped += 1
             return
         try:
-            self._waiting.put_nowait(data)
+            signed = self._trust.check("publish", sample.key_expr, data, sample.attachment)
+            self._waiting.put_nowait((data, signed.time_ns))
+        except DataError as error:
+            self.refusals.refuse("unsigned", error)
         except queue.Full:
             self.dropped += 1
         else:
@@ -146,19 +161,13 @@ class LiveWatch:
         if self._last is None:
             query.reply_err(b"no result yet")
         else:
-            query.reply(self._keys.recursive, self._last)
+            self._signer.reply(query, self._keys.recursive, self._last)
 
     def _count_lost(self, lost: int) -> None:
         """Report blocks that never arrived: the first ones, and all at the end."""
         if lost and not self.lost:
             log.warning("%d blocks did not arrive: the capture began before the watch, or was found late", lost)
         self.lost = lost
-
-    def _refuse(self, error: DataError) -> None:
-        """Report an invalid block: the first one, the tenth, the hundredth, and so on."""
-        self.refused += 1
-        if math.log10(self.refused).is_integer():
-            log.warning("%s (%d times)", error, self.refused)
 
 
 def live_estimator(session: SessionConfig, robot: RobotConfig, reference: IdentificationDocument) -> RecursiveEstimator:

@@ -9,8 +9,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from armident.configs import ArmidentError, DataError, RobotConfig
+from armident.daq.identity.certificates import Identity
 from armident.daq.recording import Recording
-from armident.identify.documents.files import load_document, to_json
+from armident.identify.documents.files import load_document
 from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.identification.identify_recording import identify_recording
 from armident.identify.identification.options import Options
@@ -52,8 +53,8 @@ class _Recorded:
     published: bool = False
 
     def publish(self, done: OnceIdentified) -> None:
-        """Publish a result once."""
-        if not self.published and not self.publisher.result(to_json(done.document)):
+        """Publish the signed document of a result once."""
+        if not self.published and not self.publisher.result(done.path.read_text(encoding="utf-8")):
             raise _NotPublished
         self.published = True
 
@@ -82,7 +83,11 @@ def identify_once(
     files = [each for each in beside if path is not None and path.resolve() in each.paths]
     name = files[0].name if files else "recording" if path is None else path.name.removesuffix(".mcap")
     folder = out / f"{name}.identification"
-    recorded = _Recorded(recording.sha256, name, lambda: _identified(recording, robot, options, folder), publisher)
+
+    def identify() -> OnceIdentified:
+        return _identified(recording, robot, options, folder, publisher.signer.identity)
+
+    recorded = _Recorded(recording.sha256, name, identify, publisher)
     paths = files[0].paths if files else ()
     problem: ArmidentError | None = None
     until = math.inf
@@ -173,13 +178,15 @@ def _announce_failure(ledger: Ledger, recorded: _Recorded, message: str) -> None
             recorded.publish_failure(message)
 
 
-def _identified(recording: Recording, robot: RobotConfig, options: Options, folder: Path) -> OnceIdentified:
+def _identified(
+    recording: Recording, robot: RobotConfig, options: Options, folder: Path, identity: Identity
+) -> OnceIdentified:
     found = result_of(recording.sha256, folder)
     if found is not None:
         return OnceIdentified(found[1], found[0], ours=True)
     outcome = identify_recording(recording, robot, options)
     try:
-        path, _ = write_identification(outcome, folder)
+        path, _ = write_identification(outcome, folder, identity)
     except OSError as error:
         raise ArmidentError(
             f"{error.filename or folder}: the result cannot be written: {error.strerror}; fix this; "

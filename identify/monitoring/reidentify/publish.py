@@ -8,6 +8,7 @@ from typing import Any, Self
 import zenoh
 
 from armident.configs import ConfigError, RobotConfig, SessionConfig
+from armident.daq.identity.signatures import signer_for
 from armident.daq.streaming import Announcer, Keys, open_session
 from armident.daq.streaming.announcer import longest_retry_s
 from armident.daq.streaming.zenoh_session import configuration
@@ -24,11 +25,14 @@ class StatusPublisher:
 
     def __init__(self, session: SessionConfig, robot: RobotConfig) -> None:
         self._keys = Keys(session.cell, robot.name)
+        self.signer = signer_for(session, "worker")
+        """Signs what the job publishes, and its documents."""
         try:
             self._session = open_session(session, "worker")
         except ConfigError:
             self._session = open_session(session, "worker", any_port=True)
-        self._announcer = Announcer(self._session, self._keys, longest_retry_s(configuration(session, "worker")))
+        retry_s = longest_retry_s(configuration(session, "worker"))
+        self._announcer = Announcer(self._session, self._keys, retry_s, self.signer)
         self._last: bytes | None = None
         self._queryable = self._session.declare_queryable(self._keys.identification, self._answer)
 
@@ -39,7 +43,7 @@ class StatusPublisher:
             elif self._last is None:
                 query.reply_err(b"no identification yet")
             else:
-                query.reply(self._keys.identification, self._last)
+                self.signer.reply(query, self._keys.identification, self._last)
 
     def wait_for_listeners(self) -> None:
         """Wait until all listeners have had time to connect."""

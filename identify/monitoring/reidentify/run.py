@@ -4,6 +4,7 @@ import json
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,7 @@ from armident.identify.documents.diagnosis import DiagnosisDocument
 from armident.identify.documents.files import from_json, to_json
 from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.documents.investigation import InvestigationDocument
+from armident.identify.documents.signing import sign_file
 from armident.identify.effects.terms import arm_model
 from armident.identify.excitation.point_to_point import sample_trajectory
 from armident.identify.excitation.previous_estimate import previous_estimate
@@ -205,7 +207,7 @@ def _concluded(
         announcer.status("diagnosing", words=drift.words)
         outcome = _diagnosed(job, recording, Outcome(document, path, drift, tuple(change_lines(drift, job.robot))), say)
         if outcome.diagnosis is not None:
-            announcer.diagnosis(outcome.diagnosis.read_text(encoding="utf-8"))
+            announcer.diagnosis(sign_file(outcome.diagnosis, announcer.signer.identity))
         outcome = _investigated(job, recording, outcome, announcer, say)
     _announce(outcome, announcer)
     return outcome
@@ -235,7 +237,7 @@ def _unexpected(
         outcome = _diagnosed(job, recording, Outcome(document, path, None, (defect,), unusable=True), say)
         if outcome.diagnosis is None or not outcome.findings:
             raise unknown
-        announcer.diagnosis(outcome.diagnosis.read_text(encoding="utf-8"))
+        announcer.diagnosis(sign_file(outcome.diagnosis, announcer.signer.identity))
         outcome = _investigated(job, recording, outcome, announcer, say)
         _announce(outcome, announcer)
         return outcome
@@ -303,6 +305,8 @@ def _investigated(job: Job, recording: Recording, outcome: Outcome, announcer: S
     except ArmidentError as error:
         say(f"warning: no investigation: {error}")
         return outcome
+    with suppress(OSError):
+        sign_file(folder / "investigation.json", announcer.signer.identity)
     answer = f"{document.outcome.replace('_', ' ')}: {document.statement}"
     return replace(outcome, investigation=folder / "investigation.json", answer=answer)
 

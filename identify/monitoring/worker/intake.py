@@ -60,9 +60,13 @@ class Intake:
         """Take over what a ledger knows."""
         self._known = ledger.files()
 
-    def take_stream(self, ledger: Ledger, assembly: Assembly) -> None:
-        """Enter the files of a capture that has ended; without them the stream itself."""
-        found = captured_as(assembly.files)
+    def take_stream(self, ledger: Ledger, assembly: Assembly, folders: Sequence[Path]) -> None:
+        """Enter the files of a capture that has ended, below ``folders``; without them the stream itself."""
+        try:
+            found = captured_as(assembly.files(folders))
+        except DataError as error:
+            self._buffer.refuse("paths", error)
+            found = []
         if any(not captured.finished for captured in found):
             with self._lock:
                 self._buffer.keep(assembly)

@@ -4,7 +4,7 @@ import logging
 import math
 import time
 from collections import OrderedDict
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,7 @@ from typing import Any
 from armident.configs import DataError
 from armident.configs.yaml_loader import is_file
 from armident.daq.recording import Recording
-from armident.daq.streaming import Block, assemble, decode_block, decode_event
+from armident.daq.streaming import Block, Refusals, assemble, decode_block, decode_event
 
 log = logging.getLogger(__name__)
 
@@ -56,12 +56,19 @@ class Assembly:
             return False
         return self.too_long or len(self.blocks) >= int(self.end["blocks"])
 
-    @property
-    def files(self) -> tuple[Path, ...]:
-        """Files of the capture if all of them can be reached, otherwise none."""
+    def files(self, folders: Sequence[Path]) -> tuple[Path, ...]:
+        """Return the files of the capture if all of them can be reached, otherwise none.
+
+        No event may name a file outside of ``folders`` and their subfolders: DataError.
+        """
         paths = [] if self.end is None else [str(path) for path in self.end["paths"]]
         found = tuple(Path(path) for path in paths)
-        return found if all(path.endswith(".mcap") for path in paths) and all(map(is_file, found)) else ()
+        if not all(path.endswith(".mcap") for path in paths) or not all(map(is_file, found)):
+            return ()
+        for path in found:
+            if not any(path.resolve().is_relative_to(folder.resolve()) for folder in folders):
+                raise DataError(f"capture {self.capture}: {path} is not read: it is outside of {folders[0]} and --out")
+        return found
 
     @property
     def triggered(self) -> bool:
@@ -86,14 +93,15 @@ class Assembly:
 class StreamBuffer:
     """Collects events and blocks by the name of their capture, up to ``most_bytes``; then its file is read.
 
-    Anybody may publish on the keys of a cell: foreign messages are counted and reported.
+    Messages that cannot be used are counted and reported.
     """
 
     def __init__(self, most_bytes: int | None = None, clock: Callable[[], float] = time.monotonic) -> None:
         self._most_bytes, self._clock = MOST_BYTES if most_bytes is None else most_bytes, clock
         self._captures: dict[str, Assembly] = {}
         self._finished: OrderedDict[str, None] = OrderedDict()
-        self._reported: dict[str, int] = {}
+        self.refuse = Refusals(log).refuse
+        """Reports a message that cannot be used, with its kind and the reason."""
 
     @property
     def nbytes(self) -> int:
@@ -163,12 +171,6 @@ class StreamBuffer:
         self._finished.pop(assembly.capture, None)
         assembly.end, assembly.ended = None, math.inf
         self._captures[assembly.capture] = assembly
-
-    def refuse(self, kind: str, message: str) -> None:
-        """Report a message that cannot be used: the first one, the tenth, the hundredth of a kind, and so on."""
-        number = self._reported[kind] = self._reported.get(kind, 0) + 1
-        if math.log10(number).is_integer():
-            log.warning("%s%s", message, f" ({number} times)" if number > 1 else "")
 
     def _assembly(self, capture: str) -> Assembly:
         if capture not in self._captures:

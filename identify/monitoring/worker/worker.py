@@ -177,7 +177,7 @@ class Worker:
                 with self._lock:
                     ended = self._buffer.take_ended()
                 for assembly in ended:
-                    self._intake.take_stream(ledger, assembly)
+                    self._intake.take_stream(ledger, assembly, self._folders)
                 if time.monotonic() - scanned >= SCAN_S:
                     self._intake.scan(ledger, self._folders)
                     scanned = time.monotonic()
@@ -296,7 +296,9 @@ class Worker:
             self._link.status("identifying", capture=entry.name, stage=stage, share=share)
 
         outcome = identify_recording(recording, self._robot, self._options, progress)
-        document, report = self._until_possible("result", lambda: write_identification(outcome, folder))
+        document, report = self._until_possible(
+            "result", lambda: write_identification(outcome, folder, self._link.signer.identity)
+        )
         for reason in outcome.result.verdict.reasons:
             log.warning("%s: %s. Next: %s", reason.level, reason.message, reason.next_step)
         for warning in outcome.document.warnings:

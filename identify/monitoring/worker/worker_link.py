@@ -8,6 +8,7 @@ from typing import Any
 import zenoh
 
 from armident.configs import ArmidentError, ConfigError, SessionConfig
+from armident.daq.identity.signatures import signer_for
 from armident.daq.streaming import Announcer, Keys, open_session
 from armident.daq.streaming.announcer import longest_retry_s
 from armident.daq.streaming.zenoh_session import configuration
@@ -26,7 +27,7 @@ class WorkerLink:
 
     The first worker of a cell listens on the port of its role; others take it over when it is free. ``limits``: event
     and block, bytes; larger ones are ``None``. ``answer`` takes parameter ``since`` of a query for results if it has
-    one; its ArmidentError or OSError is answered. Raises ConfigError if Zenoh's configuration is wrong.
+    one; its ArmidentError or OSError is answered. ConfigError: wrong configuration of Zenoh, or no key.
     """
 
     def __init__(
@@ -40,6 +41,8 @@ class WorkerLink:
     ) -> None:
         self._retry_s = longest_retry_s(configuration(session, "worker"))
         self._config, self._keys, self._answer = session, keys, answer
+        self.signer = signer_for(session, "worker")
+        """Signs what the worker publishes, and its documents."""
         self.receiver = WorkerReceiver(session, keys, on_event, on_block, limits)
         """Subscriptions, in a session of their own."""
         self.backlog = 0
@@ -93,7 +96,8 @@ class WorkerLink:
             if self._session is None:
                 return
             try:
-                self._session.put(self._keys.status, content)
+                key = self._keys.status
+                self._session.put(key, content, attachment=self.signer.attachment(key, content))
             except zenoh.ZError as error:
                 log.debug("status not published: %s", error)
 
@@ -117,7 +121,7 @@ class WorkerLink:
             raise
         with self._lock:
             old, self._session = self._session, session
-            self._announcer = Announcer(session, self._keys, self._retry_s)
+            self._announcer = Announcer(session, self._keys, self._retry_s, self.signer)
             self._declared, self._shared, self._problem = kept, shared, None
         if old is not None:
             old.close()
@@ -125,6 +129,6 @@ class WorkerLink:
     def _on_query(self, query: zenoh.Query) -> None:
         with query:
             try:
-                query.reply(self._keys.identification, self._answer(query.parameters.get("since")))
+                self.signer.reply(query, self._keys.identification, self._answer(query.parameters.get("since")))
             except (ArmidentError, OSError) as error:
                 query.reply_err(str(error).encode())

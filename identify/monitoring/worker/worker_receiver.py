@@ -9,8 +9,9 @@ from typing import Any
 import zenoh
 import zenoh.ext
 
-from armident.configs import ConfigError, SessionConfig
-from armident.daq.streaming import Keys, open_session
+from armident.configs import ConfigError, DataError, SessionConfig
+from armident.daq.identity.signatures import trust_for
+from armident.daq.streaming import Keys, Refusals, open_session
 
 log = logging.getLogger(__name__)
 
@@ -20,13 +21,14 @@ MOST_HEARD = 1000
 """Number of messages of other workers that are noted between two looks at the ledger."""
 
 Take = Callable[[bytes | None, int], None]
-"""Takes an encoded message (``None`` if it is larger than the limit) and its size, bytes."""
+"""Takes a message that is rightly signed (``None`` if it is larger than the limit) and its size, bytes."""
 
 
 class WorkerReceiver:
     """Subscriptions of a worker, up to ``limits`` of event and block, bytes; announcements of others by their hash.
 
-    Their session is their own: one that announces sends in a single queue, and more bursts of blocks would be lost.
+    Messages that are not rightly signed are counted and reported. Their session is their own: one that announces sends
+    in a single queue, and more bursts of blocks would be lost.
     """
 
     def __init__(
@@ -35,6 +37,7 @@ class WorkerReceiver:
         self._config, self._keys = session, keys
         self._handlers = ((keys.events, on_event, limits[0]), (keys.samples, on_block, limits[1]))
         self._heard: deque[bytes] = deque(maxlen=MOST_HEARD)
+        self._trust, self._refusals = trust_for(session, keys.base), Refusals(log)
         self._session: zenoh.Session | None = None
         self._problem: str | None = None
 
@@ -71,7 +74,7 @@ class WorkerReceiver:
         recovery = zenoh.ext.RecoveryConfig(heartbeat=True, periodic_queries=None)
         declared: list[Any] = [
             zenoh.ext.declare_advanced_subscriber(
-                session, key, _limited(take, limit), history=history, recovery=recovery, subscriber_detection=True
+                session, key, self._limited(take, limit), history=history, recovery=recovery, subscriber_detection=True
             )
             for key, take, limit in self._handlers
         ]
@@ -80,17 +83,30 @@ class WorkerReceiver:
         return declared
 
     def _hear(self, sample: zenoh.Sample) -> None:
-        self._heard.append(content_hash(bytes(sample.payload)))
+        if (content := self._trusted(sample)) is not None:
+            self._heard.append(content_hash(content))
+
+    def _trusted(self, sample: zenoh.Sample) -> bytes | None:
+        """Return the content of a message; ``None`` if it is not signed by somebody who may publish it."""
+        content = bytes(sample.payload)
+        try:
+            self._trust.check("publish", sample.key_expr, content, sample.attachment)
+        except DataError as error:
+            self._refusals.refuse(str(sample.key_expr), error)
+            return None
+        return content
+
+    def _limited(self, take: Take, limit: int) -> Callable[[zenoh.Sample], None]:
+        def on_sample(sample: zenoh.Sample) -> None:
+            size = len(sample.payload)
+            if size > limit:
+                take(None, size)
+            elif (content := self._trusted(sample)) is not None:
+                take(content, size)
+
+        return on_sample
 
 
 def content_hash(content: bytes) -> bytes:
     """Return the hash by which an announcement is known."""
     return hashlib.sha256(content).digest()
-
-
-def _limited(take: Take, limit: int) -> Callable[[zenoh.Sample], None]:
-    def on_sample(sample: zenoh.Sample) -> None:
-        size = len(sample.payload)
-        take(bytes(sample.payload) if size <= limit else None, size)
-
-    return on_sample

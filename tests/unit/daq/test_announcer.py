@@ -10,6 +10,7 @@ import pytest
 import zenoh
 
 from armident.configs import SessionConfig
+from armident.daq.identity.signatures import signer_for
 from armident.daq.streaming import Announcer, Keys, open_session
 from armident.daq.streaming.announcer import RETRY_S, longest_retry_s
 from tests.unit.daq.test_streaming import cell
@@ -22,7 +23,7 @@ def announce_and_end(session: SessionConfig, number: int, size: int) -> None:
     """Announce a number, followed by blanks up to a size, and end by SIGKILL."""
     keys = Keys(session.cell, "emps")
     opened = open_session(session, "worker", any_port=True)
-    announcer = Announcer(opened, keys, 1.0)
+    announcer = Announcer(opened, keys, 1.0, signer_for(session, "worker"))
     time.sleep(announcer.ready_in_s)
     announcer.announce((keys.identification, str(number).encode().ljust(size)))
     os.kill(os.getpid(), signal.SIGKILL)
@@ -73,7 +74,7 @@ def test_the_wait_for_listeners_follows_the_configuration(retry: str, longest_s:
 def test_an_announcer_is_ready_when_listeners_have_had_time_to_connect() -> None:
     session = cell("announcer_ready")
     with open_session(session, "worker") as opened:
-        announcer = Announcer(opened, Keys(session.cell, "emps"), 0.5)
+        announcer = Announcer(opened, Keys(session.cell, "emps"), 0.5, signer_for(session, "worker"))
         assert 1.0 < announcer.ready_in_s <= 1.5
         time.sleep(1.6)
         assert announcer.ready_in_s == 0.0

@@ -11,6 +11,7 @@ from cryptography import x509
 from cryptography.hazmat.primitives.serialization import Encoding
 
 from armident.configs import ConfigError, DataError
+from armident.daq.identity import VARIABLE
 from armident.daq.identity import folder as folders
 from armident.daq.identity.certificates import (
     Authority,
@@ -115,7 +116,7 @@ def test_a_key_of_another_certificate_is_refused(authority: Authority, tmp_path:
 
 @pytest.fixture
 def no_folders(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
-    monkeypatch.delenv(folders.VARIABLE, raising=False)
+    monkeypatch.delenv(VARIABLE, raising=False)
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
     monkeypatch.setattr(folders, "OF_PLANT", tmp_path / "plant")
     monkeypatch.setattr(folders, "OF_SERVICES", tmp_path / "services")
@@ -129,7 +130,7 @@ def test_the_folder_of_the_plant_comes_before_the_local_one(no_folders: Path, mo
     (no_folders / "plant").mkdir()
     assert key_folder() == KeyFolder(no_folders / "plant")
     (no_folders / "named").mkdir()
-    monkeypatch.setenv(folders.VARIABLE, str(no_folders / "named"))
+    monkeypatch.setenv(VARIABLE, str(no_folders / "named"))
     assert key_folder() == KeyFolder(no_folders / "named")
     assert key_folder(no_folders) == KeyFolder(no_folders)
     with pytest.raises(ConfigError, match="keys init"):
