@@ -11,8 +11,9 @@ from typing import Any
 
 import zenoh
 
-from armident.configs import ArmidentError, ConfigError
-from armident.daq.streaming import Keys, decode_event, open_session
+from armident.configs import ArmidentError, ConfigError, DataError
+from armident.daq.identity.signatures import trust_for
+from armident.daq.streaming import Keys, Refusals, decode_event, open_session
 from armident.identify.monitoring.worker.stream_buffer import LARGEST_EVENT
 from armident.identify.page.cells import Cell
 
@@ -91,7 +92,7 @@ class Listener:
         self.live = {cell.name: Live(now) for cell in cells}
         self._missing = [cell for cell in cells if cell.session is not None]
         self._sessions: list[zenoh.Session] = []
-        self._closing = False
+        self._closing, self._refusals = False, Refusals(log)
         self._lock = threading.Lock()
 
     def check(self) -> None:
@@ -116,6 +117,7 @@ class Listener:
         assert cell.robot is not None
         keys = Keys(cell.session.cell, cell.robot.name)
         try:
+            trust = trust_for(cell.session, keys.base)
             # In a file for all roles, the port is that of the capture.
             session = open_session(cell.session, "observer", any_port=cell.session.zenoh.config is not None)
         except ConfigError as error:
@@ -127,15 +129,28 @@ class Listener:
             is_here = sample.kind == zenoh.SampleKind.PUT
             live.alive = live.alive | {component} if is_here else live.alive - {component}
 
-        session.declare_subscriber(keys.health, _taking(live.take_health, LARGEST_MESSAGE))
-        session.declare_subscriber(keys.status, _taking(live.take_status, LARGEST_MESSAGE))
-        session.declare_subscriber(keys.events, _taking(live.take_event, LARGEST_EVENT))
+        def taking(take: Callable[[bytes], None], most: int) -> Callable[[zenoh.Sample], None]:
+            newest: dict[str, int] = {}
+
+            def heard(sample: zenoh.Sample) -> None:
+                try:
+                    if (size := len(sample.payload)) > most:
+                        raise DataError(f"{sample.key_expr}: a message of {size} bytes")
+                    data = bytes(sample.payload)
+                    found = trust.check("publish", sample.key_expr, data, sample.attachment)
+                    if found.time_ns <= newest.get(found.name, 0):
+                        raise DataError(f"{sample.key_expr}: an old message of {found.name}, repeated")
+                    newest[found.name] = found.time_ns
+                    take(data)
+                except DataError as error:
+                    self._refusals.refuse("page", error)
+
+            return heard
+
+        session.declare_subscriber(keys.health, taking(live.take_health, LARGEST_MESSAGE))
+        session.declare_subscriber(keys.status, taking(live.take_status, LARGEST_MESSAGE))
+        session.declare_subscriber(keys.events, taking(live.take_event, LARGEST_EVENT))
         session.liveliness().declare_subscriber(keys.alive("*"), note, history=True)
         self._sessions.append(session)
         live.problem = None
         return True
-
-
-def _taking(take: Callable[[bytes], None], most: int) -> Callable[[zenoh.Sample], None]:
-    """Return a function that passes on messages of at most ``most`` bytes."""
-    return lambda sample: take(bytes(sample.payload)) if len(sample.payload) <= most else None

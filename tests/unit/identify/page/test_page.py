@@ -9,9 +9,12 @@ from contextlib import closing
 from html import escape
 from html.parser import HTMLParser
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from armident.daq.identity.certificates import Role
+from armident.daq.identity.signatures import signer_for
 from armident.daq.streaming import Keys, encode_event, open_session
 from armident.identify.documents.diagnosis import DiagnosisDocument
 from armident.identify.documents.files import load_document
@@ -310,12 +313,19 @@ def test_messages_of_a_capture_are_heard_and_its_end_is_no_alarm(tmp_path: Path,
     shown.plant.listener.check()
     cell, keys = shown.plant.cells[name], Keys(name, "emps")
     assert cell.session is not None
+    roles: tuple[Role, ...] = ("capture", "worker", "viewer")
+    signers = {role: signer_for(cell.session, role) for role in roles}
 
-    def until(state: str, *message: object) -> CellView:
+    def put(key: str, payload: bytes, role: Role | None = "capture") -> bytes | None:
+        attachment = None if role is None else signers[role].attachment(key, payload)
+        capture.put(key, payload, attachment=attachment)
+        return attachment
+
+    def until(state: str, *message: Any) -> CellView:
         """Publish a message again and again, as a capture does, until the cell has a state."""
         for _ in range(400):
             if message:
-                capture.put(*message)
+                put(*message)
             if (view := shown.plant.view(name)).state[1] == state:
                 return view
             time.sleep(0.05)
@@ -324,11 +334,11 @@ def test_messages_of_a_capture_are_heard_and_its_end_is_no_alarm(tmp_path: Path,
     with open_session(cell.session, "capture") as capture:
         token = capture.liveliness().declare_token(keys.alive("worker"))
         until("waiting")
-        view = until("recording", keys.health, health(rows=999, rows_in_gaps=1))
+        until("recording", keys.health, health(rows=999, rows_in_gaps=1))
         huge = b'{"rows": ' + b"9" * 4000 + b"}"
         for garbage in (b"\xff", b"[]", b"{", b"[" * 100_000, bytes(1 << 20), b'{"rows": 1e999}', huge):
             for key in (keys.health, keys.status, keys.events):
-                capture.put(key, garbage)
+                put(key, garbage)
         view = until("bus down", keys.health, health(rows=999, rows_in_gaps=1, buses_down=1))
         assert view.number("rows") == 999
         assert view.gap_share == pytest.approx(1e-3)
@@ -340,6 +350,22 @@ def test_messages_of_a_capture_are_heard_and_its_end_is_no_alarm(tmp_path: Path,
         view = until("recording", keys.health, health(disk_free_bytes=1e9, sync=1002))
         assert view.problems[0].text == "Only 1.0 GB are free"
         until("recording", keys.health, health(sync=1003))
+        # Forged, of another role, and repeated: none counts.
+        down = health(sync=1003, buses_down=1)
+        old = put(keys.health, down)
+        until("bus down")
+        until("recording", keys.health, health(sync=1004))
+        put(keys.health, down, None)
+        put(keys.health, down, "viewer")
+        put(keys.health, down, "worker")
+        capture.put(keys.health, down, attachment=old)
+        put(keys.status, json.dumps({"component": "worker", "state": "identifying"}).encode(), "worker")
+        for _ in range(400):
+            if "worker" in (view := shown.plant.view(name)).live.status:
+                break
+            time.sleep(0.05)
+        assert view.live.status["worker"].content["state"] == "identifying"
+        assert view.state[1] == "recording"
         end = {"capture": "emps-1", "blocks": 1, "counters": {}, "gaps": [], "marks": [], "paths": []}
         assert until("waiting", keys.events, encode_event("experiment_end", end)).level != "act"
         token.undeclare()
