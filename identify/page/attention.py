@@ -166,8 +166,10 @@ class CellView:
         return self.problems[0].level if self.problems else self.state[0]
 
     def _command(self, command: str) -> str:
-        """Return a command of armident with the session of this cell."""
-        return f"armident {command} --config {shlex.quote(str(self.cell.file))}"
+        """Return a command of armident with the session of this cell and, where it has one, the folder of results."""
+        words = f"armident {command} --config {shlex.quote(str(self.cell.file))}"
+        has_folder = command.startswith(("worker", "queue")) and len(self.cell.folders) > 1
+        return f"{words} --out {shlex.quote(str(self.cell.folders[0]))}" if has_folder else words
 
     def _service(self, command: str) -> str:
         """Return the command that starts a part again: the unit of a cell in /etc/armident, else the program."""
