@@ -7,6 +7,7 @@ import json
 import os
 import socket
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -32,9 +33,10 @@ def write_document(path: Path, document: BaseModel, identity: "Identity | None" 
 
 
 def sign_file(path: Path, identity: "Identity") -> str:
-    """Sign the document in a file, and return its new text."""
+    """Sign the document in a file, and return its new text, also if the file cannot be written."""
     text = _signed(path.read_text(encoding="utf-8"), identity)
-    write_atomically(path, text)
+    with suppress(OSError):
+        write_atomically(path, text)
     return text
 
 

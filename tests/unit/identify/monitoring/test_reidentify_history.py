@@ -8,6 +8,7 @@ from typing import Any, cast
 import pytest
 
 from armident.configs import ArmidentError, DataError, config_path, load_session
+from armident.daq.identity.signatures import signer_for
 from armident.daq.recording import Recording, read_recording, write_recording
 from armident.identify.monitoring.change import history_schema
 from armident.identify.monitoring.change.history import History
@@ -30,6 +31,7 @@ class Published:
         self.states: list[str] = []
         self.more: list[dict[str, Any]] = []
         self.reachable = reachable
+        self.signer = signer_for(load_session("emps_cell.yaml"), "worker")
 
     def status(self, state: str, **more: Any) -> None:
         self.states.append(state)
