@@ -208,14 +208,14 @@ class CellView:
             yield Problem("act", self.files.problems["ledger"], step, worker)
         if "results" in self.files.problems:
             yield Problem("act", self.files.problems["results"], "Check the folder and its permissions")
-        waiting, since = self.backlog or 0, self.files.ledger and self.files.ledger.waiting_since
+        waiting, since = self.backlog or 0, None if self.files.ledger is None else self.files.ledger.waiting_since
         text = "1 recording waits" if waiting == 1 else f"{waiting} recordings wait"
         is_left = since is not None and time.time() - since > SILENT_S and self.now - self.live.began > LATE_S
         if waiting and is_left and "worker" not in self.live.alive:
             yield Problem("act", f"{text} and no worker runs", "Start the worker", worker)
         elif waiting >= BACKLOG:
             yield Problem("look", text, "Leave out what needs no result, or start a second worker", queue)
-        if failed := self.files.ledger and self.files.ledger.counts.get("failed"):
+        if failed := 0 if self.files.ledger is None else self.files.ledger.counts.get("failed", 0):
             text = f"{failed} recording{'s' if failed > 1 else ''} could not be identified"
             yield Problem("look", text, "Read the reasons; retry or ignore each", queue)
         if isinstance(self.drift, str):
