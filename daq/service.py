@@ -183,8 +183,8 @@ def _file(system: System, path: Path, plain: str, kind: str) -> InstallStep:
 
 def _unit_names() -> list[str]:
     """Return the names of the shipped units, those that start others first."""
-    files = sorted((CONFIGS / "systemd").glob("armident-*@.*"), key=lambda file: (file.suffix != ".timer", file.name))
-    return [file.name for file in files]
+    units = [file for file in (CONFIGS / "systemd").iterdir() if file.suffix in (".service", ".timer")]
+    return [file.name for file in sorted(units, key=lambda file: (file.suffix != ".timer", file.name))]
 
 
 def shipped_text(name: str) -> str:
@@ -302,7 +302,7 @@ def uninstall(cell: str, root: Path = Path("/"), dry_run: bool = False) -> list[
 
 
 def _instances(cell: str) -> list[str]:
-    return [name.replace("@.", f"@{cell}.") for name in _unit_names()]
+    return [name.replace("@.", f"@{cell}.") for name in _unit_names() if "@" in name]
 
 
 def _links(system: System, name: str) -> list[Path]:
@@ -331,11 +331,13 @@ def _removals(system: System, cell: str) -> Iterator[InstallStep]:
     def step(name: str, apply: Callable[[], object]) -> InstallStep:
         return InstallStep(name, lambda: False, apply)
 
-    for name in _instances(cell):
+    # Units without a cell, such as the page, end with the last one.
+    shared = [] if _other_cells(system, cell) else [name for name in _unit_names() if "@" not in name]
+    for name in (names := [*_instances(cell), *shared]):
         if _is_active(system, name):
             words = ("systemctl", "stop", name)
             yield step(f"stop {name}", partial(system.run, *words, timeout_s=LONGEST_STOP_S))
-    links = [link for name in _instances(cell) for link in _links(system, name)]
+    links = [link for name in names for link in _links(system, name)]
     yield from (step(f"disable {link.name} ({link.parent.name})", link.unlink) for link in links)
     own = [system.root / path for path in (f"etc/tmpfiles.d/armident-{cell}.conf", _drop_in(system, cell)[0])]
     units = [] if _other_cells(system, cell) else [unit for unit in _units(system) if _is_ours(unit)]

@@ -248,6 +248,44 @@ def history(
         raise typer.Exit(code)
 
 
+def page(
+    config: Annotated[
+        list[Path], typer.Option("--config", help="Session of a cell, or a folder of sessions; can be repeated.")
+    ] = [Path("/etc/armident")],  # noqa: B006 (typer copies it)
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out",
+            help="Folder with the results of each session in a folder of its name, as services have them. "
+            "[default: recording.directory of each session]",
+        ),
+    ] = None,
+    database: Annotated[
+        str | None,
+        typer.Option(
+            help="SQLAlchemy URL of the history of all cells. [default: history.sqlite beside the results of each]",
+            envvar="ARMIDENT_HISTORY",
+        ),
+    ] = None,
+    listen: Annotated[str, typer.Option(help="Address and port.")] = "127.0.0.1:8484",
+    keys: Annotated[
+        Path | None, typer.Option(help="Folder of the plant's keys: needed if other machines may connect.")
+    ] = None,
+) -> None:
+    """Show the cells of a plant as a web page: captures, results, changes, and what to do. It changes nothing.
+
+    Sessions are read at the start; all else is read again every few seconds.
+
+    Example: armident page --config configs/emps_cell.yaml
+    """
+    from armident.extras import require
+
+    require("armident page", "identify", "page")
+    from armident.identify.page.serve import run_page
+
+    run_page(config, out, database, listen, keys)
+
+
 @with_options
 def trajectory(
     options: TrajectoryOptions,

@@ -40,23 +40,30 @@ STYLE: Any = {
     "svg.hashsalt": "armident",
 }
 
-_TEMPLATES = Environment(
-    loader=PackageLoader("armident.identify.report", "templates"),
-    autoescape=select_autoescape(default=True),
-    undefined=StrictUndefined,
-    trim_blocks=True,
-    lstrip_blocks=True,
-)
-_TEMPLATES.filters["code"] = lambda text: Markup(re.sub("`([^`]+)`", r"<code>\1</code>", str(escape(text))))
-_TEMPLATES.filters["words"] = in_words
-_TEMPLATES.filters["mentioned"] = mentioned
+
+def templates_of(package: str) -> Environment:
+    """Return the HTML templates of a package's folder ``templates``, with the filters of the reports."""
+    found = Environment(
+        loader=PackageLoader(package, "templates"),
+        autoescape=select_autoescape(default=True),
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    found.filters["code"] = lambda text: Markup(re.sub("`([^`]+)`", r"<code>\1</code>", str(escape(text))))
+    found.filters["words"] = in_words
+    found.filters["mentioned"] = mentioned
+    found.filters["g"] = lambda value, digits=4: "" if value is None else f"{value:.{digits}g}"
+    found.filters["fixed"] = lambda value, digits=2: "" if value is None else f"{value:.{digits}f}"
+    return found
+
+
+_TEMPLATES = templates_of("armident.identify.report")
 _TEMPLATES.globals["conventions"] = CONVENTIONS
 _TEMPLATES.globals["plot_hint"] = Markup(
     '<p class="hint">Drag over a plot to zoom all of them, double-click to see all again. '
     "The line below a plot reads the values under the pointer; a click on a name hides its curve.</p>"
 )
-_TEMPLATES.filters["g"] = lambda value, digits=4: "" if value is None else f"{value:.{digits}g}"
-_TEMPLATES.filters["fixed"] = lambda value, digits=2: "" if value is None else f"{value:.{digits}f}"
 
 
 def render(template: str, **content: Any) -> str:

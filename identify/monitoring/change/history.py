@@ -45,6 +45,17 @@ class HistoryRun:
     document: IdentificationDocument
 
 
+@dataclass(frozen=True)
+class ParameterSeries:
+    """Essential parameter over the last runs: times of the recordings (UTC), values and standard deviations."""
+
+    name: str
+    unit: str
+    times: tuple[datetime.datetime, ...]
+    values: tuple[float, ...]
+    deviations: tuple[float, ...]
+
+
 class History:
     """Identifications in a database (SQLAlchemy URL); missing or former tables are created or upgraded.
 
@@ -220,6 +231,22 @@ class History:
         """
         return self._read(_of(robot, cell))
 
+    def last(self, robot: str, cell: str | None = None) -> HistoryRun | None:
+        """Newest identification of an arm; runs whose cell the history does not know are included."""
+        found = self._read(_latest(robot, cell, 1))
+        return found[0] if found else None
+
+    def series(self, robot: str, cell: str | None, most: int) -> list[ParameterSeries]:
+        """Return the essential parameters of the last ``most`` runs of an arm, without reading their documents."""
+        newest = _latest(robot, cell, most).with_only_columns(runs.c.id, runs.c.recorded).subquery()
+        columns = (newest.c.recorded, parameters.c.name, parameters.c.unit, parameters.c.value, parameters.c.std)
+        query = sa.select(*columns).join(newest, parameters.c.identification == newest.c.id)
+        query = query.where(parameters.c.essential).order_by(newest.c.recorded, newest.c.id)
+        found: dict[tuple[str, str], list[tuple[datetime.datetime, float, float]]] = {}
+        for recorded, name, unit, value, std in self._rows(query):
+            found.setdefault((name, unit), []).append((recorded.replace(tzinfo=datetime.UTC), value, std))
+        return [ParameterSeries(*key, *zip(*points, strict=True)) for key, points in found.items()]
+
     def arms(self) -> list[tuple[str, str | None]]:
         """Return robots and their cells; ``None`` for an unknown cell."""
         query = sa.select(runs.c.robot, recordings.c.cell).select_from(_WHERE).distinct()
@@ -259,6 +286,11 @@ def _of(robot: str | None, cell: str | None) -> sa.Select[Any]:
     if cell is not None:
         query = query.where(sa.or_(recordings.c.cell == cell, recordings.c.cell.is_(None)))
     return query.order_by(runs.c.recorded, runs.c.id)
+
+
+def _latest(robot: str, cell: str | None, most: int) -> sa.Select[Any]:
+    """Return the query of the last runs of an arm, the newest first."""
+    return _of(robot, cell).order_by(None).order_by(runs.c.recorded.desc(), runs.c.id.desc()).limit(most)
 
 
 def _digest(document: IdentificationDocument) -> str:

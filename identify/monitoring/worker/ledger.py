@@ -16,7 +16,7 @@ import socket
 import sqlite3
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, get_args
@@ -146,6 +146,17 @@ class LedgerSummary:
     verdict: str | None
     ended: float | None
     result: Path | None
+
+
+@dataclass(frozen=True)
+class LedgerView:
+    """Ledger as a reader sees it, with the last recordings.
+
+    ``last``: entries with the time of their result, or of their files without one, s since 1970.
+    """
+
+    summary: LedgerSummary
+    last: tuple[tuple[LedgerEntry, float], ...]
 
 
 _COLUMNS = "sha256, name, paths, state, attempts, result, message, announced, any_cell, version"
@@ -380,16 +391,8 @@ class Ledger:
 
     def summary(self) -> LedgerSummary:
         """Return what the ledger has; those under way are among the waiting ones."""
-        newest = "SELECT CASE state WHEN 'done' THEN message ELSE state END, finished, result FROM experiments WHERE "
-        order = " AND finished ORDER BY finished DESC LIMIT 1"
         with self._transaction() as db:
-            rows = db.execute("SELECT state, count(*), min(added) FROM experiments GROUP BY state").fetchall()
-            ended = db.execute(f"{newest} state IN ('done', 'failed') {order}").fetchone()
-            result = db.execute(f"{newest} result IS NOT NULL {order}").fetchone()
-        numbers = dict.fromkeys(get_args(State), 0) | {state: number for state, number, _ in rows}
-        since = next((added for state, _, added in rows if state == "waiting"), None)
-        verdict, moment, _ = ended or (None, None, None)
-        return LedgerSummary(numbers, since, verdict, moment, Path(result[2]) if result else None)
+            return _summary_of(db)
 
     def retry_after_upgrade(self, version: str) -> None:
         """Let recordings wait again that failed under another version of the program."""
@@ -477,6 +480,45 @@ def open_ledger(path: Path, owner: str) -> Ledger:
                 path.with_name(path.name + suffix).rename(aside.with_name(aside.name + suffix))
         log.warning("%s: the ledger was damaged, and is now %s; a new one finds the results", path, aside.name)
         return Ledger(path, owner)
+
+
+def view_of(path: Path, most: int) -> LedgerView:
+    """Return the state of a ledger with the last ``most`` recordings; nothing is written, and no worker waits.
+
+    Raises LedgerUnusable if it is damaged, or of another version.
+    """
+    when = "coalesce(finished, made)"
+    try:
+        with closing(_reading(path)) as db:
+            version = int(db.execute("PRAGMA user_version").fetchone()[0])
+            if version != len(_MIGRATIONS):
+                raise LedgerUnusable(f"{path}: ledger of version {version}, not {len(_MIGRATIONS)}; restart its worker")
+            rows = db.execute(
+                f"SELECT {when}, {_COLUMNS} FROM experiments ORDER BY {when} DESC, name DESC LIMIT ?", (most,)
+            ).fetchall()
+            return LedgerView(_summary_of(db), tuple((_entry(row[1:]), float(row[0])) for row in rows))
+    except (sqlite3.Error, ValueError, TypeError) as error:
+        reason = reason_of(error) if isinstance(error, sqlite3.Error) else "damaged (a row has other values)"
+        raise LedgerUnusable(f"{path}: {reason}") from error
+
+
+def _summary_of(db: sqlite3.Connection) -> LedgerSummary:
+    newest = "SELECT CASE state WHEN 'done' THEN message ELSE state END, finished, result FROM experiments WHERE "
+    order = " AND finished ORDER BY finished DESC LIMIT 1"
+    rows = db.execute("SELECT state, count(*), min(added) FROM experiments GROUP BY state").fetchall()
+    ended = db.execute(f"{newest} state IN ('done', 'failed') {order}").fetchone()
+    result = db.execute(f"{newest} result IS NOT NULL {order}").fetchone()
+    numbers = dict.fromkeys(get_args(State), 0) | {state: number for state, number, _ in rows}
+    since = next((added for state, _, added in rows if state == "waiting"), None)
+    verdict, moment, _ = ended or (None, None, None)
+    return LedgerSummary(numbers, since, verdict, moment, Path(result[2]) if result else None)
+
+
+def _reading(path: Path) -> sqlite3.Connection:
+    """Return a connection that only reads, and creates no files beside the ledger."""
+    # Without a write-ahead log no process has the ledger open, and SQLite would make one to read it.
+    alone = "" if path.with_name(f"{path.name}-wal").exists() else "&immutable=1"
+    return sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro{alone}", 1.0, isolation_level=None, uri=True)
 
 
 def unique_owner() -> str:

@@ -19,7 +19,7 @@ from armident.identify.monitoring.change.history_schema import BUSY_S
 from armident.identify.monitoring.reidentify.keep import RETRY_S
 from armident.identify.monitoring.reidentify.run import DIAGNOSIS_S
 
-UNITS = sorted((HERE / "systemd").glob("*@.*"))
+UNITS = sorted(path for path in (HERE / "systemd").iterdir() if path.suffix in (".service", ".timer"))
 SERVICES = [path for path in UNITS if path.suffix == ".service"]
 CRON = HERE / "cron" / "armident-reidentify.cron"
 
@@ -106,7 +106,7 @@ def test_services_are_bounded_in_memory_system_calls_and_network(path: Path) -> 
 @pytest.mark.parametrize("path", SERVICES, ids=lambda path: path.name)
 def test_a_service_loads_no_code_that_another_one_has_compiled(path: Path) -> None:
     """The worker reads files of strangers; capture and job have capabilities."""
-    (name,) = re.findall("armident-([a-z]+)@", path.name)
+    (name,) = re.findall("armident-([a-z]+)[@.]", path.name)
     assert values(path, "CacheDirectory") == [f"armident/{name}"]
     assert f"XDG_CACHE_HOME=/var/cache/armident/{name}" in values(path, "Environment")
 

@@ -176,8 +176,11 @@ def test_the_units_agree_with_the_account_and_the_folders(image: Path) -> None:
         unit.read_string(file.read_text())
         keys = unit["Service"]
         assert (keys["User"], keys["Group"]) == (ACCOUNT, ACCOUNT)
-        assert keys["StateDirectory"] == "armident/%i"
-        assert keys["WorkingDirectory"] == f"/{STATE}/%i"
+        # The page is of no cell, and only reads.
+        of_cell = "@" in file.name
+        assert keys.get("StateDirectory") == ("armident/%i" if of_cell else None)
+        assert keys.get("ReadOnlyPaths") == (None if of_cell else f"/{STATE}")
+        assert keys["WorkingDirectory"] == (f"/{STATE}/%i" if of_cell else f"/{STATE}")
         assert keys["CacheDirectory"].rpartition("/")[0] == str(CACHE.relative_to("var/cache"))
         assert keys.get("StateDirectoryMode", "0755") == "0755"
     names = [step.name for step in steps(System(image, Path("/x")), "%i")]
@@ -220,6 +223,7 @@ def test_a_removed_cell_keeps_its_recordings_and_its_configuration(image: Path) 
     install("line3", image)
     session = session_of(image, "line3")
     link = enable(image, "armident-capture@line3.service", "multi-user.target")
+    of_page = enable(image, "armident-page.service", "multi-user.target")
     recording = image / STATE / "line3" / "monday.mcap"
     recording.write_bytes(b"1" * 2_000_000)
     before = list(contents(image))
@@ -228,6 +232,7 @@ def test_a_removed_cell_keeps_its_recordings_and_its_configuration(image: Path) 
     done = uninstall("line3", image)
     assert [line.replace("done: ", "to do: ") for line in done] == planned
     assert not link.is_symlink()
+    assert not of_page.is_symlink()
     assert not list((image / UNITS).glob("armident-*"))
     assert not list((image / "etc/tmpfiles.d").iterdir())
     assert not (image / CACHE).exists()
@@ -280,10 +285,13 @@ def test_units_stay_while_another_cell_uses_them(image: Path) -> None:
         session_of(image, cell)
     (image / SETTINGS / "arm.yaml").write_text("schema: armident/robot/1\n")
     enable(image, "armident-worker@line3.service", "multi-user.target")
+    of_page = enable(image, "armident-page.service", "multi-user.target")
     lines = uninstall("line3", image)
+    assert of_page.is_symlink()
     assert lines[0] == "done: disable armident-worker@line3.service (multi-user.target.wants)"
     assert (image / "etc/tmpfiles.d/armident-line4.conf").is_file()
-    assert len(list((image / UNITS).glob("armident-*"))) == len(list((HERE / "systemd").glob("*@.*")))
+    shipped = {path.name for path in (HERE / "systemd").iterdir() if path.suffix in (".service", ".timer")}
+    assert {path.name for path in (image / UNITS).glob("armident-*")} == shipped
     assert any(line.startswith("kept: unit files, for line4 ") for line in lines)
 
 

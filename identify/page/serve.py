@@ -1,0 +1,112 @@
+"""Command ``armident page``: its addresses, its keys, and the server."""
+
+import ipaddress
+import logging
+import signal
+import socket
+import ssl
+from collections.abc import Sequence
+from contextlib import closing
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import uvicorn
+from cryptography import x509
+
+from armident.configs import ConfigError
+from armident.daq.identity.certificates import ANY_CELL
+from armident.daq.identity.folder import KeyFolder, key_folder
+from armident.identify.page.cells import cells_in
+from armident.identify.page.plant import Plant
+from armident.identify.page.site import site
+from armident.systemd import Notifier
+
+log = logging.getLogger(__name__)
+
+LOOPBACK = ("localhost", "127.0.0.1", "[::1]")
+CONNECTIONS = 64
+"""Most connections at a time; a browser opens six."""
+
+
+def run_page(configs: Sequence[Path], out: Path | None, database: str | None, listen: str, keys: Path | None) -> None:
+    """Carry out ``armident page`` until SIGTERM or SIGINT; ConfigError if address, keys or sessions are wrong."""
+    host, port = address_of(listen)
+    hosts, security = (LOOPBACK, {}) if is_loopback(host) else sign_in(key_folder(keys), listen)
+    cells = cells_in(configs, out, database)
+    with (
+        closing(Notifier()) as notifier,
+        closing(_bound(host, port, listen)) as listening,
+        Plant(cells, lambda: notifier.progress(f"{len(cells)} cells")) as plant,
+    ):
+        options = uvicorn.Config(
+            site(plant, hosts),
+            log_config=None,
+            access_log=False,
+            server_header=False,
+            limit_concurrency=CONNECTIONS,
+            timeout_graceful_shutdown=3,
+            **security,
+        )
+        url = f"{'https' if security else 'http'}://{host}:{listening.getsockname()[1]}/"
+        print(f"page: {url} ({len(cells)} cells)", flush=True)
+        notifier.ready(f"{len(cells)} cells at {url}")
+        # The server repeats a signal when it has ended, for the handler of before.
+        for number in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(number, _ended)
+        uvicorn.Server(options).run(sockets=[listening])
+        notifier.stopping()
+
+
+def sign_in(folder: KeyFolder, listen: str) -> tuple[Sequence[str], dict[str, Any]]:
+    """Return the names in the certificate of the page, and the options of mutual TLS with the keys of a plant.
+
+    ConfigError if the folder is none of a plant, or has no identity of a viewer of all cells with addresses.
+    """
+    if folder.local:
+        raise ConfigError(
+            f"--listen {listen}: other machines may only connect with keys of a plant; run: armident keys init"
+        )
+    identity = folder.identity("viewer", ANY_CELL)
+    try:
+        names = identity.certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+    except x509.ExtensionNotFound as error:
+        raise ConfigError(
+            f"{folder.path}: the certificate of {identity.name} has no address, under which browsers ask for the page"
+        ) from error
+    addresses = names.get_values_for_type(x509.IPAddress)
+    hosts = [*names.get_values_for_type(x509.DNSName), *(f"[{a}]" if a.version == 6 else str(a) for a in addresses)]
+    files = {
+        f"ssl_{kind}file": folder.path / f"{identity.name}.{end}" for kind, end in (("cert", "pem"), ("key", "key"))
+    }
+    authority = folder.path / "authority.pem"
+    return hosts, files | {"ssl_ca_certs": authority, "ssl_cert_reqs": ssl.CERT_REQUIRED}
+
+
+def _ended(_number: int, _frame: FrameType | None) -> None:
+    log.debug("page: ended by a signal")
+
+
+def address_of(listen: str) -> tuple[str, int]:
+    """Return host and port of ``HOST:PORT``; an IPv6 address stands in brackets."""
+    host, colon, port = listen.rpartition(":")
+    if not colon or not host or not port.isdecimal() or int(port) > 65_535 or (":" in host) != host.startswith("["):
+        raise ConfigError(f"--listen {listen}: expected HOST:PORT, such as 127.0.0.1:8484 or [::1]:8484")
+    return host, int(port)
+
+
+def is_loopback(host: str) -> bool:
+    """Return True if only programs of this machine reach a host."""
+    try:
+        return host == "localhost" or ipaddress.ip_address(host.strip("[]")).is_loopback
+    except ValueError:
+        return False
+
+
+def _bound(host: str, port: int, listen: str) -> socket.socket:
+    """Return a socket that listens; ConfigError if the address is taken or not of this machine."""
+    try:
+        family = socket.AF_INET6 if host.startswith("[") else socket.AF_INET
+        return socket.create_server((host.strip("[]"), port), family=family, backlog=128)
+    except OSError as error:
+        raise ConfigError(f"--listen {listen}: {error.strerror}; choose another address or port") from error
