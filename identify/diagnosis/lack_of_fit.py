@@ -5,6 +5,7 @@ would otherwise take a missing effect for noise. Block sums contain further seri
 Statistics 17(3)).
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -195,7 +196,7 @@ class LackOfFit:
             away = away_from_reversals(errors, *self._speeds(joint, held=True))
             changes = np.split(test.change, np.cumsum([e.size for e in errors])[:-1])
             fall = max(map(_fall_of_error, errors, changes, away))
-        return float(100.0 * fall / max(np.sqrt(mean_square(torque)), 1e-300))
+        return 100.0 * float(fall) / max(float(np.sqrt(mean_square(torque))), 1e-300)
 
     def _dependence(self, p: Projection, own: JointResidual) -> ResidualDependence:
         """Dependence with its curve."""
@@ -412,10 +413,9 @@ class LackOfFit:
 
 def _fall_of_error(error: Array, change: Array, away: Array) -> float:
     """Return by how much the root mean square of errors (M,) falls with a change (M,) where ``away`` is not zero."""
-    removed, power = (error**2 - (error - change) ** 2)[away != 0.0].sum(), np.sum(error**2)
-    return float(np.sqrt(power) - np.sqrt(np.clip(power - removed, 0.0, power))) / np.sqrt(
-        max(np.count_nonzero(error), 1)
-    )
+    removed, power = (error**2 - (error - change) ** 2)[away != 0.0].sum(), float(error @ error)
+    fall = float(np.sqrt(power) - np.sqrt(np.clip(power - removed, 0.0, power)))
+    return fall / math.sqrt(int(np.count_nonzero(error)) or 1)
 
 
 def _refitted(errors: Sequence[Array], regressors: Sequence[Array]) -> list[Array]:

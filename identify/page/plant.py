@@ -14,6 +14,8 @@ log = logging.getLogger(__name__)
 
 FILES_S, SESSIONS_S, HISTORIES_S = 5.0, 5.0, 60.0
 """Intervals at which folders are read, Zenoh sessions are tried again, and histories are read, s."""
+LEAVE_S = 20.0
+"""Longest wait for a thread at the end, s: a database that hangs is left after 15 s."""
 
 
 class Plant:
@@ -40,9 +42,12 @@ class Plant:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """End the threads, and close the Zenoh sessions; a database that hangs is not waited for."""
+        """End the threads, and close the Zenoh sessions."""
         self._stopped.set()
         self.listener.close()
+        # An interpreter that ends beside a thread in compiled code aborts.
+        for thread in self._threads:
+            thread.join(LEAVE_S)
 
     def read_files(self) -> None:
         """Read the folders of all cells."""

@@ -192,7 +192,7 @@ def test_results_are_used_with_the_code_that_produced_them_only(tmp_path: Path) 
     line = json.loads(path.read_text(encoding="utf-8").splitlines()[0])
     assert document().items() <= line["document"].items()
     keys = {field.alias or name for name, field in DiagnosisDocument.model_fields.items()}
-    assert line["document"].keys() == keys - {"recordings", "versions", "model"}
+    assert line["document"].keys() == keys - {"recordings", "versions", "model", "provenance", "signature"}
 
 
 def test_a_line_that_is_no_result_is_named(tmp_path: Path) -> None:

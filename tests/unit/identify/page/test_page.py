@@ -374,7 +374,7 @@ def test_messages_of_a_capture_are_heard_and_its_end_is_no_alarm(tmp_path: Path,
 def test_a_worker_that_is_missing_is_named_with_the_command(copied: Path, serving: Serve) -> None:
     shown = serving(copied)
     with closing(sqlite3.connect(copied / "press_2" / FILE)) as db, db:
-        db.execute("UPDATE experiments SET made = made - 1000")
+        db.execute("UPDATE experiments SET added = added - 1000")
     shown.read()
     view = shown.plant.view("press_2")
     view.live.began -= 60.0
