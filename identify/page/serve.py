@@ -34,10 +34,11 @@ def run_page(configs: Sequence[Path], out: Path | None, database: str | None, li
     host, port = address_of(listen)
     hosts, security = (LOOPBACK, {}) if is_loopback(host) else sign_in(key_folder(keys), listen)
     cells = cells_in(configs, out, database)
+    number = "1 cell" if len(cells) == 1 else f"{len(cells)} cells"
     with (
         closing(Notifier()) as notifier,
         closing(_bound(host, port, listen)) as listening,
-        Plant(cells, lambda: notifier.progress(f"{len(cells)} cells")) as plant,
+        Plant(cells, lambda: notifier.progress(number)) as plant,
     ):
         options = uvicorn.Config(
             site(plant, hosts),
@@ -49,11 +50,11 @@ def run_page(configs: Sequence[Path], out: Path | None, database: str | None, li
             **security,
         )
         url = f"{'https' if security else 'http'}://{host}:{listening.getsockname()[1]}/"
-        print(f"page: {url} ({len(cells)} cells)", flush=True)
-        notifier.ready(f"{len(cells)} cells at {url}")
+        print(f"page: {url} ({number})", flush=True)
+        notifier.ready(f"{number} at {url}")
         # The server repeats a signal when it has ended, for the handler of before.
-        for number in (signal.SIGTERM, signal.SIGINT):
-            signal.signal(number, _ended)
+        for each in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(each, _ended)
         uvicorn.Server(options).run(sockets=[listening])
         notifier.stopping()
 
