@@ -27,7 +27,10 @@ from armident.daq.identity.certificates import (
 )
 from armident.daq.identity.folder import KeyFolder, key_folder
 
-NOW = datetime.now(UTC)
+
+def now() -> datetime:
+    """Return the time of a call: certificates that are made later than the module was read are not valid then."""
+    return datetime.now(UTC)
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +44,7 @@ def der(identity: Identity) -> bytes:
 
 def test_a_certificate_has_role_cell_name_and_addresses(authority: Authority) -> None:
     identity = authority.issue("capture", "cell_1", "capture.cell_1", ["robot.plant.example", "192.0.2.7"], 30)
-    assert signer_of(der(identity), [authority.certificate], NOW) == ("capture", "cell_1", "capture.cell_1")
+    assert signer_of(der(identity), [authority.certificate], now()) == ("capture", "cell_1", "capture.cell_1")
     names = identity.certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
     assert names.get_values_for_type(x509.DNSName) == ["robot.plant.example"]
     assert names.get_values_for_type(x509.IPAddress) == [ip_address("192.0.2.7")]
@@ -60,31 +63,31 @@ def test_openssl_verifies_the_chain(authority: Authority, tmp_path: Path) -> Non
     ("days", "reason"), [(timedelta(days=31), "expired on"), (timedelta(minutes=-6), "valid from")]
 )
 def test_a_certificate_out_of_its_time_is_refused(authority: Authority, days: timedelta, reason: str) -> None:
-    identity = authority.issue("viewer", "*", "viewer.ann", [], 30, NOW)
+    identity = authority.issue("viewer", "*", "viewer.ann", [], 30, now())
     with pytest.raises(DataError, match=reason):
-        signer_of(der(identity), [authority.certificate], NOW + days)
+        signer_of(der(identity), [authority.certificate], now() + days)
 
 
 def test_another_authority_of_the_same_name_is_refused(authority: Authority) -> None:
     foreign = new_authority("plant", 365).issue("operator", "*", "operator.eve", [], 30)
     with pytest.raises(DataError, match="another authority"):
-        signer_of(der(foreign), [authority.certificate], NOW)
+        signer_of(der(foreign), [authority.certificate], now())
 
 
 def test_an_identity_issues_nothing(authority: Authority) -> None:
     capture = authority.issue("capture", "c", "capture.c", [], 30)
     forged = Authority(capture.key, capture.certificate).issue("operator", "*", "operator.eve", [], 30)
     with pytest.raises(DataError, match="another authority"):
-        signer_of(der(forged), [authority.certificate], NOW)
+        signer_of(der(forged), [authority.certificate], now())
     with pytest.raises(DataError, match="without role"):
-        signer_of(authority.certificate.public_bytes(Encoding.DER), [authority.certificate], NOW)
+        signer_of(authority.certificate.public_bytes(Encoding.DER), [authority.certificate], now())
 
 
 def test_both_authorities_are_trusted_during_renewal(authority: Authority) -> None:
     new = new_authority("plant", 365)
     both = [new.certificate, authority.certificate]
     for each in (authority, new):
-        assert signer_of(der(each.issue("worker", "c", "worker.c", [], 9)), both, NOW)[0] == "worker"
+        assert signer_of(der(each.issue("worker", "c", "worker.c", [], 9)), both, now())[0] == "worker"
 
 
 @pytest.mark.parametrize(
@@ -153,7 +156,7 @@ def test_two_processes_make_one_authority(no_folders: Path) -> None:
     started = [subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE) for _ in range(3)]
     assert len({process.communicate()[0] for process in started}) == 1
     folder = key_folder()
-    assert signer_of(der(folder.identity("worker", "c")), folder.authority_certificates(), NOW)[1] == "c"
+    assert signer_of(der(folder.identity("worker", "c")), folder.authority_certificates(), now())[1] == "c"
     assert (folder.path.stat().st_mode & 0o777, (folder.path / "authority.key").stat().st_mode & 0o777) == (
         0o700,
         0o600,
@@ -180,11 +183,11 @@ def test_bytes_that_are_no_certificate_are_refused(authority: Authority) -> None
     right = der(authority.issue("worker", "c", "worker.c", [], 9))
     for wrong in (b"", right[:-1], right.replace(b"\xa0\x03\x02\x01\x02", b"\xa0\x03\x02\x01\x33")):
         with pytest.raises(DataError, match="not a certificate"):
-            signer_of(wrong, [authority.certificate], NOW)
+            signer_of(wrong, [authority.certificate], now())
 
 
 def test_a_name_of_a_stranger_does_not_break_the_line_of_the_log(authority: Authority) -> None:
     foreign = new_authority("plant", 365).issue("worker", "c", "worker\nERROR", [], 9)
     with pytest.raises(DataError) as caught:
-        signer_of(der(foreign), [authority.certificate], NOW)
+        signer_of(der(foreign), [authority.certificate], now())
     assert "\n" not in str(caught.value)

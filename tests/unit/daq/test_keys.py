@@ -29,7 +29,10 @@ from armident.daq.streaming.zenoh_session import configuration
 from tests.unit.daq.test_identity import der
 from tests.unit.daq.test_streaming import cell
 
-NOW = datetime.now(UTC)
+
+def now() -> datetime:
+    """Return the time of a call: certificates that are made later than the module was read are not valid then."""
+    return datetime.now(UTC)
 
 
 @pytest.fixture
@@ -49,7 +52,7 @@ def run(*words: str | Path) -> tuple[int, str, str]:
 
 
 def problems(folder: Path, **how: Any) -> list[str]:
-    return [each.message for each in findings(folder, how.pop("now", NOW), **how) if each.verdict == "failed"]
+    return [each.message for each in findings(folder, how.pop("now", now()), **how) if each.verdict == "failed"]
 
 
 def test_a_plant_is_made_by_the_commands_and_says_who_may_do_what(tmp_path: Path) -> None:
@@ -236,7 +239,7 @@ def test_a_renewed_authority_still_trusts_the_former_one(plant: Path) -> None:
     trusted = read_certificates(plant / "authority.pem")
     assert [len(trusted), problems(plant)] == [2, []]
     for identity in (old, new):
-        assert signer_of(der(identity), trusted, NOW)[2] == "capture.press_7"
+        assert signer_of(der(identity), trusted, now())[2] == "capture.press_7"
     assert read_authority(plant).certificate == trusted[0]
 
 
