@@ -13,6 +13,7 @@ from typing import Any
 
 import pytest
 import zenoh
+import zenoh.ext
 
 from armident.configs import DataError, SessionConfig
 from armident.daq.identity import VARIABLE
@@ -165,7 +166,12 @@ def test_a_repeated_capture_has_no_second_result(session: SessionConfig, capture
 
     with Worker(session, captured.robot, tmp_path) as worker:
         with open_session(session, "observer") as observer:
-            declared = [observer.declare_subscriber(key, listen) for key in (keys.events, keys.samples)]
+            # A busy machine may connect it after the first messages: it asks for those before.
+            history = zenoh.ext.HistoryConfig(detect_late_publishers=True)
+            declared = [
+                zenoh.ext.declare_advanced_subscriber(observer, key, listen, history=history)
+                for key in (keys.events, keys.samples)
+            ]
             publish(captured, session, path=tmp_path / "gone.mcap")
             assert worker.result(LONGEST_S) == 0
             for each in declared:
