@@ -250,8 +250,11 @@ def history(
 
 def page(
     config: Annotated[
-        list[Path], typer.Option("--config", help="Session of a cell, or a folder of sessions; can be repeated.")
-    ] = [Path("/etc/armident")],  # noqa: B006 (typer copies it)
+        list[Path] | None,
+        typer.Option(
+            "--config", help="Session of a cell, or a folder of sessions; can be repeated. [default: /etc/armident]"
+        ),
+    ] = None,
     out: Annotated[
         Path | None,
         typer.Option(
@@ -283,7 +286,7 @@ def page(
     require("armident page", "identify", "page")
     from armident.identify.page.serve import run_page
 
-    run_page(config, out, database, listen, keys)
+    run_page(config or [Path("/etc/armident")], out, database, listen, keys)
 
 
 @with_options

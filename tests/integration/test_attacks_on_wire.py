@@ -422,7 +422,7 @@ def test_the_worker_and_a_viewer_of_the_plant_read_the_cell(stage: Stage) -> Non
 
 
 def read_by(stage: Stage, name: str, key: str, sender: str, sent: str) -> list[zenoh.Sample]:
-    """What somebody hears on a key while another one publishes."""
+    """Return the messages that arrive on a key while another session publishes."""
     heard: list[zenoh.Sample] = []
     with stage.by(sender) as capture, stage.by(name) as reader:
         kept = reader.declare_subscriber(key, heard.append)

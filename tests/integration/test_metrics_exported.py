@@ -149,7 +149,8 @@ def test_a_capture_exports_what_it_declares(udp_bus: Bus, tmp_path: Path, caplog
     assert 0 < found["sync_jitter_seconds"][*bus, "max"] < 10
     assert abs(found["updated_timestamp_seconds"][()] - time.time()) < LONGEST_S
     assert found["events_total"]["heartbeat_lost",] <= result.counters["heartbeat_lost"]
-    with pytest.raises(OSError):  # noqa: PT011 the endpoint has ended with the capture
+    # The endpoint has ended with the capture.
+    with pytest.raises(OSError, match="refused"):
         scraped(CAPTURE, caplog, lambda _: True)
 
 

@@ -26,13 +26,8 @@ from armident.daq.identity.certificates import (
 )
 from armident.daq.identity.plant import Countdown, enrol, enrolled, findings, make_authority, missing, renew, revoke
 from armident.daq.streaming.zenoh_session import configuration
-from tests.unit.daq.test_identity import der
+from tests.unit.daq.test_identity import der, now
 from tests.unit.daq.test_streaming import cell
-
-
-def now() -> datetime:
-    """Return the time of a call: certificates that are made later than the module was read are not valid then."""
-    return datetime.now(UTC)
 
 
 @pytest.fixture
