@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from armident.configs import ConfigError, DataError
 from armident.configs.errors import FOUND
+from armident.daq.recording.objects import ObjectUrl, located
 from armident.identify.diagnosis.diagnosis_options import DiagnosisOptions
 from armident.identify.documents.files import to_json, write_atomically
 from armident.identify.identification.options import Options
@@ -176,4 +177,7 @@ def _writing(folder: Path) -> Iterator[None]:
 
 
 def _beside(path: Path, suffix: str) -> Path:
+    """Return the folder of the results: beside the recording, of an object in the working directory."""
+    if isinstance(located(path), ObjectUrl):
+        path = Path(path.name)
     return path.with_name(f"{path.name.removesuffix('.mcap')}.{suffix}")

@@ -10,6 +10,7 @@ EXTRAS: dict[str, tuple[str, ...]] = {
     ),
     "virtual": ("clarabel", "pinocchio", "scipy"),
     "fleet": ("distributed",),
+    "objects": ("fsspec", "s3fs"),
     "page": ("starlette", "uvicorn"),
     "parquet": ("pyarrow",),
     "postgresql": ("psycopg",),
