@@ -14,6 +14,10 @@ _URL = re.compile(r"([a-z][a-z0-9+.-]+):/+(?=[^/])")
 """Begin of a URL; a path (`pathlib`) has one of its two slashes only."""
 
 
+_OPTIONS: dict[str, dict[str, Any]] = {"s3": {"config_kwargs": {"retries": {"max_attempts": 1}}}}
+"""Options of file systems: s3fs tries again itself, and twenty-five attempts take minutes without a network."""
+
+
 class ObjectUrl(PosixPath):
     """URL of an object, such as ``s3://bucket/cell/run.mcap``, where a path is expected: name and stem are its own."""
 
@@ -59,8 +63,9 @@ def _file_system(url: ObjectUrl) -> tuple[Any, str]:
     """Return the file system of fsspec for a URL, and the name of the object in it."""
     from fsspec.core import url_to_fs
 
+    options = _OPTIONS.get(str(url).partition(":")[0], {})
     # A listing that was kept would hide that an object has been replaced.
-    return cast("tuple[Any, str]", url_to_fs(str(url), use_listings_cache=False))
+    return cast("tuple[Any, str]", url_to_fs(str(url), use_listings_cache=False, **options))
 
 
 @contextmanager
