@@ -14,7 +14,7 @@ import subprocess
 import sys
 import time
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
@@ -41,7 +41,7 @@ WORKER_BYTES = 1 << 30
 """Memory of a worker, bytes."""
 LARGE_ROWS = 16_000_000
 """Rows of the large recording, 64 bytes each in memory: they take more than `WORKER_BYTES`."""
-POLL_S = 0.1
+POLL_S = 0.25
 TICKS = os.sysconf("SC_CLK_TCK")
 
 
@@ -130,30 +130,23 @@ def write_recordings(arms: int, folder: Path) -> list[str]:
     return names
 
 
-def processes_of(root: int) -> Iterator[tuple[int, Process]]:
-    """Yield the processes that descend from one, with what they have used so far."""
-    parents: dict[int, int] = {}
+def processes_of(root: int) -> dict[int, Process]:
+    """Return a process and those that descend from it, with what they have used so far."""
     found: dict[int, Process] = {}
-    for entry in Path("/proc").iterdir():
-        if not entry.name.isdigit():
-            continue
+    waiting = [root]
+    while waiting:
+        place = Path(f"/proc/{waiting.pop()}")
         try:
-            fields = (entry / "stat").read_text().rpartition(")")[2].split()
-            status = (entry / "status").read_text()
-            command = (entry / "cmdline").read_bytes()
+            used = (place / "stat").read_text().rpartition(")")[2].split()
+            status = (place / "status").read_text()
+            worker = b"spawn_main" in (place / "cmdline").read_bytes()
+            for thread in (place / "task").iterdir():
+                waiting += map(int, (thread / "children").read_text().split())
         except OSError:
             continue
-        pid = int(entry.name)
-        parents[pid] = int(fields[1])
         peak = next((int(line.split()[1]) for line in status.splitlines() if line.startswith("VmHWM")), 0)
-        cpu = (int(fields[11]) + int(fields[12])) / TICKS
-        found[pid] = Process(b"spawn_main" in command, cpu, 1024 * peak)
-    for pid, process in found.items():
-        at: int | None = pid
-        while at is not None and at != root:
-            at = parents.get(at)
-        if at == root:
-            yield pid, process
+        found[int(place.name)] = Process(worker, (int(used[11]) + int(used[12])) / TICKS, 1024 * peak)
+    return found
 
 
 def limit_memory(workers: int) -> None:
@@ -184,17 +177,17 @@ def run(recordings: Path, out: Path, workers: int, names: Sequence[str], failing
             preexec_fn=lambda: limit_memory(workers),
         )
         while command.poll() is None:
-            seen |= dict(processes_of(command.pid))
+            seen |= processes_of(command.pid)
             lines = [line for line in (out / "stderr").read_text(encoding="utf-8").splitlines() if ".mcap: " in line]
             if not killed_after and len(lines) >= max(1, len(names) // 2):
                 killed_after = len(lines)
                 # The one with the largest memory is identifying.
-                alive = [(p.peak, pid) for pid, p in processes_of(command.pid) if p.worker]
+                alive = [(p.peak, pid) for pid, p in processes_of(command.pid).items() if p.worker]
                 os.kill(max(alive)[1], signal.SIGKILL)
             time.sleep(POLL_S)
     seconds = time.monotonic() - begin
     of_workers = [process for process in seen.values() if process.worker]
-    others = [process for pid, process in seen.items() if not process.worker]
+    others = [process for process in seen.values() if not process.worker]
     runs = json.loads((out / "runs.json").read_text())["runs"]
     failed = {str(Path(one["recording"]).relative_to(recordings)): one["error"] for one in runs if one["error"]}
     return Outcome(

@@ -16,7 +16,7 @@ from armident.identify.monitoring.reidentify import fleet
 from tests.evaluation.fleet import REST, Outcome, at_rest, run
 from tests.fixtures.arms import hide, recording
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
 WORN = hide("friction_drift", "joint_1", change=0.1, time_constant=1e-6)
 RUNS = {
     "cell_1/monday.mcap": (1, (), 2),

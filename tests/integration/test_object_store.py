@@ -16,15 +16,15 @@ from armident.daq.recording import RecordingWriter, StreamLayout, read_recording
 from tests.fixtures.arms import recording
 from tests.fixtures.objects import BUCKET, ObjectStore, found_in, object_store
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
 URL = f"s3://{BUCKET}/cell_1/emps.mcap"
 
 
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ObjectStore]:
-    with object_store(tmp_path_factory.mktemp("store") / "log") as found, pytest.MonkeyPatch.context() as patch:
-        with found_in(found, patch):
-            yield found
+    log = tmp_path_factory.mktemp("store") / "log"
+    with object_store(log) as found, pytest.MonkeyPatch.context() as patch, found_in(found, patch):
+        yield found
 
 
 @pytest.fixture(scope="module")
@@ -131,7 +131,7 @@ def test_a_missing_extra_names_its_installation(file: Path, monkeypatch: pytest.
 def test_without_permission_the_credentials_are_named(store: ObjectStore, file: Path) -> None:
     store.ask_for_permission()
     try:
-        with pytest.raises(ConfigError, match="no permission .*; check the credentials"):
+        with pytest.raises(ConfigError, match=r"no permission .*; check the credentials"):
             read_recording(URL)
     finally:
         store.ask_for_permission(False)

@@ -5,6 +5,7 @@ import json
 import logging
 import os
 import sys
+import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import CancelledError
 from contextlib import contextmanager
@@ -35,6 +36,10 @@ if TYPE_CHECKING:
 
 CONNECT_S = 10.0
 """Longest wait for the scheduler, s."""
+WORKERLESS_S = 600.0
+"""Longest wait for a worker, s: one that was killed may need minutes to start on a busy machine."""
+POLL_S = 0.2
+"""Interval at which results are asked for, s."""
 
 _Arm = tuple[str, str | None]
 """Names of robot and cell, as arms of one type often share a name."""
@@ -146,10 +151,22 @@ def identified(
     del futures
     for k in range(len(tasks)):
         while k not in waiting:
-            future = next(following)
+            future = _next(client, following)
             waiting[places[future.key]] = _fetched(future)
             future.release()
         yield waiting.pop(k)
+
+
+def _next(client: "Client", following: Any) -> Any:
+    """Return the next task that has ended; ArmidentError if the cluster has no worker for `WORKERLESS_S`."""
+    until = time.monotonic() + WORKERLESS_S
+    while not following.has_ready():
+        time.sleep(POLL_S)
+        if time.monotonic() > until:
+            if not client.scheduler_info()["workers"]:
+                raise ArmidentError(f"the cluster has no worker, after {WORKERLESS_S / 60:g} minutes; start workers")
+            until = time.monotonic() + WORKERLESS_S
+    return next(following)
 
 
 def _fetched(future: Any) -> Identified | ArmidentError:
@@ -182,10 +199,22 @@ def cluster(scheduler: str | None, workers: int | None) -> "Iterator[Client]":
     # Failures of a recording are in its line, those of the cluster are raised.
     logging.getLogger("distributed").setLevel(logging.CRITICAL)
     if scheduler is None:
-        # A worker holds one task at a time, so that no other is blamed for its end.
-        with dask.config.set({"distributed.scheduler.worker-saturation": 1.0}):
-            local = LocalCluster(n_workers=workers, threads_per_worker=1, dashboard_address="127.0.0.1:0")
-        with local, Client(local) as client:
+        settings = {
+            # A worker holds one task at a time, so that no other is blamed for its end.
+            "distributed.scheduler.worker-saturation": 1.0,
+            # Dask gives up a worker that has not started again by then: 15 s, with none left in the end.
+            "distributed.deploy.lost-worker-timeout": WORKERLESS_S,
+        }
+        with (
+            dask.config.set(settings),
+            LocalCluster(
+                n_workers=workers,
+                threads_per_worker=1,
+                dashboard_address="127.0.0.1:0",
+                silence_logs=logging.CRITICAL,
+            ) as local,
+            Client(local) as client,
+        ):
             yield client
         return
     try:
