@@ -8,7 +8,7 @@ from pathlib import Path, PosixPath
 from typing import Any, BinaryIO, cast
 
 from armident.configs import ArmidentError, ConfigError
-from armident.extras import install_line
+from armident.extras import install_line, needed_extra
 
 _URL = re.compile(r"([a-z][a-z0-9+.-]+):/+(?=[^/])")
 """Begin of a URL; a path (`pathlib`) has one of its two slashes only."""
@@ -76,8 +76,8 @@ def _explained(url: ObjectUrl) -> Iterator[None]:
     except ArmidentError:
         raise
     except ImportError as error:
-        own = error.name == "fsspec" or "s3fs" in str(error)
-        raise ConfigError(install_line(str(url), ["objects"]) if own else f"{url}: {_line(error)}") from error
+        extra = needed_extra(error) or ("objects" if "s3fs" in str(error) else None)
+        raise ConfigError(f"{url}: {_line(error)}" if extra is None else install_line(str(url), [extra])) from error
     except FileNotFoundError as error:
         raise ConfigError(f"{url}: no such recording, or no such bucket") from error
     except PermissionError as error:

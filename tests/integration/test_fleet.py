@@ -6,6 +6,7 @@ import signal
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import duckdb
 import pytest
@@ -85,7 +86,8 @@ def end_of_worker(number: int) -> int:
 
 def test_a_recording_whose_workers_end_is_given_up_and_no_other_is(client: Client) -> None:
     futures = [client.submit(end_of_worker, number, pure=False) for number in range(3)]
-    first, deadly, last = (fleet._fetched(future) for future in futures)
+    results: list[Any] = [fleet._fetched(future) for future in futures]
+    first, deadly, last = results
     assert (first, last) == (0, 2)
     assert isinstance(deadly, ArmidentError)
     assert "4 workers ended while it was identified" in str(deadly)

@@ -1,12 +1,14 @@
 """Recordings in an object store: read by range, identified in place, and errors of one line."""
 
 import json
+import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from distributed import LocalCluster
 from typer.testing import CliRunner, Result
 
 import armident
@@ -79,12 +81,16 @@ def test_a_recording_is_identified_and_checked_in_place(
 
 def test_a_fleet_takes_a_pattern_of_objects(store: ObjectStore, file: Path, tmp_path: Path) -> None:
     store.put(file.read_bytes()[:3000], "cell_2/emps.mcap")
-    words = ["reidentify", "--recordings", f"s3://{BUCKET}/cell_*/*.mcap", "--workers", "1", "--json"]
+    words = ["reidentify", "--recordings", f"s3://{BUCKET}/cell_*/*.mcap", "--json"]
     words += ["--store", f"sqlite:///{tmp_path}/history.sqlite"]
     refused = command(*words)
     assert refused.exit_code == 2
     assert "--out: missing" in refused.stderr
-    done = command(*words, "--out", str(tmp_path / "results"))
+    # The worker is a thread of this process, which has imported everything.
+    with LocalCluster(
+        n_workers=1, threads_per_worker=1, processes=False, protocol="tcp://", dashboard_address=None
+    ) as remote:
+        done = command(*words, "--out", str(tmp_path / "results"), "--scheduler", remote.scheduler_address)
     assert done.exit_code == 1, done.stderr
     one, other = json.loads(done.stdout)["runs"]
     assert (one["recording"], one["error"]) == (URL, None)
@@ -122,8 +128,8 @@ def test_an_object_that_is_cut_off_is_read_as_far_as_it_goes(store: ObjectStore,
 
 
 def test_a_missing_extra_names_its_installation(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(__import__("sys").modules, "fsspec.core", None)
-    monkeypatch.setitem(__import__("sys").modules, "fsspec", None)
+    monkeypatch.setitem(sys.modules, "fsspec.core", None)
+    monkeypatch.setitem(sys.modules, "fsspec", None)
     with pytest.raises(ConfigError, match=r"emps\.mcap needs extra packages: pip install 'armident\[objects\]'"):
         read_recording(URL)
 

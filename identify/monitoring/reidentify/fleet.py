@@ -82,8 +82,10 @@ class _Baselines:
     def of(self, arm: _Arm) -> IdentificationDocument | None:
         """Return the baseline of an arm; ``None`` before its first run."""
         known = self.known.get(arm)
-        if self.given is not None or isinstance(known, IdentificationDocument):
-            return self.given or known  # type: ignore[return-value]
+        if self.given is not None:
+            return self.given
+        if isinstance(known, IdentificationDocument):
+            return known
         run = self.history.first(*arm) if known is None else self.history.of_recording(arm[0], known)
         return None if run is None else run.document
 

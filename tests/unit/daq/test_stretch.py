@@ -1,7 +1,6 @@
 """A stretch of a recording: the rows of the whole one, of a file that is whole, truncated or rewritten."""
 
 from pathlib import Path
-from typing import BinaryIO, cast
 
 import numpy as np
 import pytest
@@ -53,7 +52,7 @@ def test_a_stretch_has_the_rows_of_the_whole_recording(file: Path) -> None:
 
 def test_a_fraction_of_the_file_is_read_for_a_stretch(file: Path) -> None:
     with file.open("rb") as opened:
-        table = chunk_table(cast(BinaryIO, opened))
+        table = chunk_table(opened)
     assert table is not None
     needed = sum(end - first for first, end in table.needed(window(table.begin_ns, STRETCH)))
     assert needed < 0.2 * file.stat().st_size
