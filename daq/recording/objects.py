@@ -81,9 +81,7 @@ def _explained(url: ObjectUrl) -> Iterator[None]:
     except FileNotFoundError as error:
         raise ConfigError(f"{url}: no such recording, or no such bucket") from error
     except PermissionError as error:
-        raise ConfigError(
-            f"{url}: no permission ({_line(error)}); check the credentials, as in AWS_PROFILE or AWS_ACCESS_KEY_ID"
-        ) from error
+        raise ConfigError(f"{url}: no permission: {_line(error)}; check the credentials (AWS_PROFILE)") from error
     except Exception as error:
         # The libraries of the object stores have no common class: network, time limit, credentials, address.
         raise ConfigError(f"{url}: cannot be read: {_line(error)}") from error

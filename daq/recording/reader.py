@@ -117,13 +117,8 @@ def is_recording(path: Path) -> bool:
 def unpacked_bytes(path: Path) -> int:
     """Return the bytes of a recording's records if its chunks were unpacked; a damaged chunk counts nothing.
 
-    The arrays of `read_recording` are smaller. Of an object, its summary is believed. Raises OSError or, of an object,
-    ConfigError if it cannot be read.
+    The arrays of `read_recording` are smaller. Raises OSError if the file cannot be read.
     """
-    if isinstance(path, ObjectUrl):
-        with opened(path) as remote:
-            table = chunk_table(remote)
-        return 0 if table is None else table.unpacked
     with path.open("rb") as file:
         if path.stat().st_size == 0:
             return 0

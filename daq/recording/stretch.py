@@ -29,11 +29,6 @@ class ChunkTable:
     size: int
 
     @property
-    def unpacked(self) -> int:
-        """Size of the unpacked chunks, bytes."""
-        return sum(chunk.uncompressed_size for chunk in self.chunks)
-
-    @property
     def begin_ns(self) -> int:
         """Time of the first message, ns UTC."""
         return min((chunk.message_start_time for chunk in self.chunks), default=0)

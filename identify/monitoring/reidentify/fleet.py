@@ -70,9 +70,9 @@ class Row:
 
 @dataclass
 class _Baselines:
-    """The given baseline, or that of each arm: an older recording that follows must not replace it.
+    """The given baseline, or that of each arm, which an older recording that follows must not replace.
 
-    Memory holds no document that the history has: ten thousand are gigabytes.
+    Documents stay in the history: ten thousand are gigabytes.
     """
 
     given: IdentificationDocument | None
@@ -124,7 +124,8 @@ def fleet_command(pattern: str, asked: ReidentifyOptions, *, as_json: bool) -> i
                 # Printed at once: a fleet takes hours.
                 print(_line(row), file=sys.stderr if as_json else sys.stdout, flush=True)
                 if table is not None:
-                    _tabulated(table, row)
+                    cell, recorded = (row.found.facts["cell"], row.found.recorded) if row.found else (None, None)
+                    table.add(row.recording, row.error, row.document, cell, recorded, row.drift)
                 if as_json:
                     entries.append(_entry(row))
     finally:
@@ -291,15 +292,6 @@ def _entered(
     except ConfigError as error:
         return (f"not in the history: {error}",)
     return ()
-
-
-def _tabulated(table: ResultsTable, row: Row) -> None:
-    """Add a result to the table."""
-    if row.found is None:
-        table.add(row.recording, row.error)
-    else:
-        cell, recorded = row.found.facts["cell"], row.found.recorded
-        table.add(row.recording, row.error, row.document, cell, recorded, row.drift)
 
 
 def _name(robot: str, cell: str | None) -> str:

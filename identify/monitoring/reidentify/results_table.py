@@ -2,6 +2,7 @@
 
 import datetime
 import io
+import os
 import secrets
 from pathlib import Path
 from typing import Any
@@ -30,31 +31,19 @@ class ResultsTable:
         self._folder = folder
         self._rows: list[dict[str, Any]] = []
         self._runs = 0
-        time = pa.timestamp("us", tz="UTC")
+        time, text, number, flag = pa.timestamp("us", tz="UTC"), pa.string(), pa.float64(), pa.bool_()
         self._schema = pa.schema(
-            [
-                pa.field("identified", time, nullable=False),
-                pa.field("armident", pa.string(), nullable=False),
-                pa.field("recording", pa.string(), nullable=False),
-                *(pa.field(name, pa.string()) for name in ("sha256", "robot", "cell")),
-                pa.field("recorded", time),
-                *(pa.field(name, pa.string()) for name in ("method", "verdict", "error")),
-                pa.field("relative_error_pct", pa.float64()),
-                pa.field("drifted", pa.bool_()),
-                pa.field("parameter", pa.string()),
-                *(pa.field(name, pa.float64()) for name in ("value", "std")),
-                pa.field("unit", pa.string()),
-                *(pa.field(name, pa.bool_()) for name in ("essential", "changed")),
-            ]
+            {"identified": time, "armident": text, "recording": text, "sha256": text, "recorded": time, "robot": text}
+            | {"cell": text, "method": text, "verdict": text, "error": text, "relative_error_pct": number}
+            | {"drifted": flag, "parameter": text, "value": number, "std": number, "unit": text}
+            | {"essential": flag, "changed": flag}
         )
-        # An empty table tells now, not after hours, that the folder cannot be written.
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            trial = folder / f".{secrets.token_hex(4)}"
-            trial.touch()
-            trial.unlink()
         except OSError as error:
             raise ConfigError(f"--results {folder}: cannot be written: {error.strerror}") from error
+        if not os.access(folder, os.W_OK | os.X_OK):
+            raise ConfigError(f"--results {folder}: cannot be written: no permission")
 
     def add(
         self,
