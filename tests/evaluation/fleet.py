@@ -176,15 +176,21 @@ def run(recordings: Path, out: Path, workers: int, names: Sequence[str], failing
             env={**os.environ, **ONE_THREAD},
             preexec_fn=lambda: limit_memory(workers),
         )
-        while command.poll() is None:
-            seen |= processes_of(command.pid)
-            lines = [line for line in (out / "stderr").read_text(encoding="utf-8").splitlines() if ".mcap: " in line]
-            if not killed_after and len(lines) >= max(1, len(names) // 2):
-                killed_after = len(lines)
-                # The one with the largest memory is identifying.
-                alive = [(p.peak, pid) for pid, p in processes_of(command.pid).items() if p.worker]
-                os.kill(max(alive)[1], signal.SIGKILL)
-            time.sleep(POLL_S)
+        try:
+            while command.poll() is None:
+                seen |= processes_of(command.pid)
+                lines = [
+                    line for line in (out / "stderr").read_text(encoding="utf-8").splitlines() if ".mcap: " in line
+                ]
+                if not killed_after and len(lines) >= max(1, len(names) // 2):
+                    killed_after = len(lines)
+                    # The one with the largest memory is identifying.
+                    alive = [(p.peak, pid) for pid, p in processes_of(command.pid).items() if p.worker]
+                    os.kill(max(alive)[1], signal.SIGKILL)
+                time.sleep(POLL_S)
+        finally:
+            command.kill()
+            command.wait()
     seconds = time.monotonic() - begin
     of_workers = [process for process in seen.values() if process.worker]
     others = [process for process in seen.values() if not process.worker]

@@ -137,7 +137,7 @@ def test_a_missing_extra_names_its_installation(file: Path, monkeypatch: pytest.
 def test_without_permission_the_credentials_are_named(store: ObjectStore, file: Path) -> None:
     store.ask_for_permission()
     try:
-        with pytest.raises(ConfigError, match="no permission: [^;]+; check the credentials"):
+        with pytest.raises(ConfigError, match=r"no permission: [^;]+; check the credentials"):
             read_recording(URL)
     finally:
         store.ask_for_permission(False)
