@@ -83,7 +83,7 @@ def arm_of(robot: RobotConfig, source: SourceUrdf | None) -> tuple[Arm, list[str
 
 
 def colours(deviations: Floats) -> NDArray[np.uint8]:
-    """Return colours (..., 4) of unexplained torques (...), standard deviations: cividis, which is perceptually even."""
+    """Return colours (..., 4) of unexplained torques (...) in standard deviations; cividis is perceptually even."""
     return np.asarray(colormaps["cividis"](np.clip(np.abs(deviations) / FULL, 0.0, 1.0), bytes=True))
 
 
@@ -122,9 +122,9 @@ def _triangles(shape: UrdfShape) -> Floats | None:
         rings = [np.sqrt(1 - z**2) * _circle(24) + [0.0, 0.0, z] for z in height]
         points = shape.size[0] * np.concatenate([*rings, [[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]]])
     else:
-        points = points_of(shape)
+        points = np.asarray(points_of(shape))
     try:
-        return None if not np.isfinite(points).all() else _hull(points)
+        return _hull(points)
     except (QhullError, ValueError):
         return None
 

@@ -1,10 +1,14 @@
 """Command ``armident view``."""
 
 import os
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
+
+if TYPE_CHECKING:
+    from armident.identify.view.contents import Contents
 
 
 def view(
@@ -75,7 +79,7 @@ def view(
     if viewer == "foxglove":
         from armident.identify.view.foxglove_files import write_layout, write_mcap
 
-        writers = [write_layout, write_mcap]
+        writers: list[Callable[[Contents, Path], None]] = [write_layout, write_mcap]
         how = f"open {files[1]} and {recording} together in Foxglove, and import the layout {files[0]}"
     else:
         from armident.identify.view.rerun_file import show

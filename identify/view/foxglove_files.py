@@ -15,7 +15,7 @@ from mcap_protobuf.schema import register_schema
 from armident.configs.schema.collision import BASE
 from armident.daq.recording.names import GAPS_TOPIC, MARKS_TOPIC
 from armident.identify.view.arm import colours
-from armident.identify.view.contents import Contents, Floats
+from armident.identify.view.contents import Contents
 
 TRANSFORMS, LINKS, JOINTS = "/arm/transforms", "/arm/links", "/arm/joints"
 """Topics of the arm: poses; the links, once; the joints in their colours."""
