@@ -110,6 +110,8 @@ def contents_of(
             _plot(robot, "deviations", "Unexplained torque, standard deviations", ("", ""), {"": (when, deviations)}),
         ]
         levels, lines = _levels(when, deviations), _model_lines(prediction, deviations)
+        if prediction.model.path.name == diagnosis.name:
+            diagnosis = prediction.model.path
     plots.insert(2, _plot(robot, "torque", "Torque, {}", ("N m", "N"), torques))
     findings = "\n".join([*_heading(recording), *lines, *_diagnosis_lines(diagnosis)])
     return Contents(robot, arm, tuple(plots), poses, levels, findings)
