@@ -1,6 +1,9 @@
 """Command ``armident view``."""
 
 import os
+import shlex
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -33,7 +36,7 @@ def view(
         typer.Option(
             "--out",
             help="File to write: .rrd (rerun), or .json (layout of foxglove, beside an .mcap with the data). "
-            "[default: rerun is opened where there is a display, else a file beside RECORDING]",
+            "[default: a file in RECORDING.view, and rerun opens it where there is a display]",
         ),
     ] = None,
 ) -> None:
@@ -58,7 +61,7 @@ def view(
     from armident.identify.view.arm import arm_of
     from armident.identify.view.contents import contents_of, prediction_of
 
-    suffixes = {"rerun": (".rrd",), "foxglove": (".json", ".mcap")}[viewer]
+    suffixes = {"rerun": [".rrd"], "foxglove": [".json", ".mcap"]}[viewer]
     files = [(out or beside(recording, "view") / f"{viewer}.x").with_suffix(suffix) for suffix in suffixes]
     if out is not None and out != files[0]:
         raise ConfigError(f"--out {out}: expected a name that ends in {suffixes[0]}")
@@ -76,20 +79,23 @@ def view(
         prediction = prediction_of(read, model, beside(recording, "identification"), robot, remarks, report)
         shown = contents_of(read, robot, arm, prediction, beside(recording, "diagnosis") / "diagnosis.json")
     warn(remarks)
+    # The viewer listens for further data, by default on every interface.
+    rerun = [sys.executable, "-m", "rerun", "--bind", "127.0.0.1", str(files[0])]
+    writers: list[Callable[[Contents, Path], None]]
     if viewer == "foxglove":
         from armident.identify.view.foxglove_files import write_layout, write_mcap
 
-        writers: list[Callable[[Contents, Path], None]] = [write_layout, write_mcap]
+        writers = [write_layout, write_mcap]
         how = f"open {files[1]} and {recording} together in Foxglove, and import the layout {files[0]}"
     else:
-        from armident.identify.view.rerun_file import show
+        from armident.identify.view.rerun_file import write_rrd
 
-        if out is None and (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-            show(shown, None)
-            return
-        writers, how = [show], f"rerun {files[0]}"
-    for file, write in zip(files, writers, strict=True):
+        writers, how = [write_rrd], shlex.join(rerun)
+    # The layout comes last: it is of no use without the data.
+    for file, write in reversed(list(zip(files, writers, strict=True))):
         with writing(file), whole_file(file) as temporary:
             write(shown, temporary)
         print(f"written: {file}")
     print(f"to see it: {how}")
+    if viewer == "rerun" and out is None and (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        subprocess.Popen(rerun, start_new_session=True)

@@ -1,5 +1,6 @@
 """A view as data of Rerun, with the blueprint that arranges it."""
 
+import errno
 from pathlib import Path
 
 import numpy as np
@@ -21,13 +22,21 @@ def blueprint(view: Contents) -> rrb.Blueprint:
     return rrb.Blueprint(rrb.Horizontal(left, right, column_shares=[2, 3]), collapse_panels=True)
 
 
-def show(view: Contents, file: Path | None) -> None:
-    """Write a view to a file, or without one open the viewer; time lines: ``time`` (UTC) and ``since_start``."""
-    begin, stream = view.poses[0][0], rr.RecordingStream("armident")
-    if file is None:
-        stream.spawn(default_blueprint=blueprint(view))
-    else:
+def write_rrd(view: Contents, file: Path) -> None:
+    """Write a view to a file; OSError if it cannot be written as a whole."""
+    stream = rr.RecordingStream("armident")
+    try:
         stream.save(file, default_blueprint=blueprint(view))
+        _send(view, stream)
+        stream.flush()
+        stream.disconnect()
+    except RuntimeError as error:
+        raise OSError(errno.EIO, str(error)) from error
+
+
+def _send(view: Contents, stream: rr.RecordingStream) -> None:
+    """Send the data of a view; time lines: ``time`` (UTC) and ``since_start``."""
+    begin = view.poses[0][0]
 
     def send_columns(path: str, t_ns: Times, columns: rr.ComponentColumnList) -> None:
         time = rr.TimeColumn("time", timestamp=t_ns.astype("datetime64[ns]"))
@@ -54,8 +63,6 @@ def show(view: Contents, file: Path | None) -> None:
         if view.levels is not None:
             shades = rr.Cylinders3D.columns(colors=colours(view.levels[1][:, j]))
             send_columns(f"{path}/axis", view.levels[0], shades)
-    stream.flush()
-    stream.disconnect()
 
 
 def _mesh(triangles: Floats) -> rr.Mesh3D:

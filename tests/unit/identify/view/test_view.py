@@ -1,6 +1,7 @@
 """The command view: what the files for Rerun and Foxglove hold, read back by the libraries of both."""
 
 import json
+import sys
 from dataclasses import replace
 from importlib.metadata import EntryPoint
 from itertools import pairwise
@@ -85,7 +86,7 @@ def worn(folder: Path) -> Path:
     words = ("--model", folder / "tx40.json", "--urdf", folder / "tx40.urdf", "--out", file)
     done = call(folder / "worn.mcap", *words)
     assert done.exit_code == 0, done.output
-    assert done.stdout == f"written: {file}\nto see it: rerun {file}\n"
+    assert done.stdout == f"written: {file}\nto see it: {sys.executable} -m rerun --bind 127.0.0.1 {file}\n"
     return file
 
 
