@@ -40,7 +40,7 @@ def view(
         ),
     ] = None,
 ) -> None:
-    """Show a recording and what a model does not explain of it: the arm in 3D, curves, events and findings.
+    """Show a recording and what a model does not explain of it: the arm in 3D, curves and findings.
 
     The joints of the arm have the colour of their unexplained torque, in standard deviations.
 
@@ -69,14 +69,15 @@ def view(
     if existing is not None:
         raise ConfigError(f"--out {out}: {existing} exists already: give another name, or remove it")
     read = read_recording(recording)
-    robot = read.robot if config is None else load_robot(config, "identify")
+    given = None if config is None else load_robot(config, "identify")
+    robot = given or read.robot
     check_same_robot(read.robot, robot)
     source = source_for(robot, urdf) if urdf is not None else None if config is None else source_of(config)
     arm, remarks = arm_of(robot, source)
     if read.missing is not None:
         remarks.append(f"{recording}: torn: {read.missing}")
     with progress(f"view {recording.name}") as report:
-        prediction = prediction_of(read, model, beside(recording, "identification"), robot, remarks, report)
+        prediction = prediction_of(read, model, beside(recording, "identification"), given, remarks, report)
         shown = contents_of(read, robot, arm, prediction, beside(recording, "diagnosis") / "diagnosis.json")
     warn(remarks)
     # The viewer listens for further data, by default on every interface.

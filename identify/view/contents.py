@@ -55,11 +55,16 @@ class Contents:
 
 
 def prediction_of(
-    recording: Recording, model: Path | None, beside: Path, robot: RobotConfig, remarks: list[str], report: Progress
+    recording: Recording,
+    model: Path | None,
+    beside: Path,
+    robot: RobotConfig | None,
+    remarks: list[str],
+    report: Progress,
 ) -> TorquePrediction | None:
     """Return the torques of a model, by default of the identification ``beside`` the recording, if it can be used.
 
-    ``remarks`` takes the warnings, or the reason why there are none.
+    ``robot``: configuration of the model; ``None``: its own. ``remarks`` takes the warnings, or why there are none.
     """
     if model is None and not (beside / "identification.json").is_file():
         remarks.append("no model, so only measured signals: give --model, or run armident identify first")

@@ -143,7 +143,7 @@ def test_the_curves_are_the_signals_of_the_recording_and_of_the_prediction(folde
         full = samples.t_ns if len(signal) == samples.sync.size else samples.t_ns[0] + np.round(1e9 * seconds)
         for joint, column in zip(joints, signal.T, strict=True):
             times, values = curve(found[path.format(joint)])
-            rows = np.searchsorted(full, times - 1000)  # times of receipt are whole microseconds
+            rows = np.searchsorted(full, times - 1000)  # times are rounded
             np.testing.assert_allclose(values, column[rows], rtol=1e-12)
             assert values.size == min(column.size, POINTS)
             assert (values.min(), values.max()) == (column.min(), column.max())
@@ -236,7 +236,8 @@ def test_the_findings_have_the_verdict_the_errors_and_the_diagnosis(folder: Path
     armident.diagnose(tmp_path / "sprung.mcap").save(tmp_path / "sprung.diagnosis")
     assert call(tmp_path / "sprung.mcap", "--model", model).exit_code == 0
     ((text,),) = entities(tmp_path / "sprung.view" / "rerun.rrd")["findings"]["TextDocument:text"]
-    error = armident.predict(data, model).relative_error_pct
+    prediction = armident.predict(data, model)
+    error = prediction.relative_error_pct
     for words in (
         "# emps: sprung.mcap",
         "1 gaps",
@@ -362,7 +363,7 @@ def test_the_layout_names_topics_and_fields_of_the_data_and_of_the_recording(fol
         (("healthy.mcap", "--urdf", "none.urdf"), 2, "--urdf: none.urdf: no such file"),
         (("healthy.mcap", "--urdf", "tx40.json"), 2, "tx40.json: not valid XML"),
         (("healthy.mcap", "--model", "none"), 2, "none: no such file"),
-        (("healthy.mcap", "--model", "tx40.json"), 3, "the model is of robot 'tx40', the configuration of 'emps'"),
+        (("healthy.mcap", "--model", "tx40.json"), 3, "the recording is of robot 'emps', the configuration describes"),
         (("healthy.mcap", "--config", "tx40.yaml"), 3, "the recording is of robot 'emps', the configuration describes"),
         (("torn.mcap", "--out", "torn.rrd"), 3, "truncated before its first chunk, or its head is damaged"),
         (("healthy.mcap", "--out", "tx40.json/a.rrd"), 2, "--out tx40.json/a.rrd: cannot be written: "),
