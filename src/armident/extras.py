@@ -13,6 +13,7 @@ EXTRAS: dict[str, tuple[str, ...]] = {
     "page": ("starlette", "uvicorn"),
     "parquet": ("pyarrow",),
     "postgresql": ("psycopg",),
+    "viewer": ("foxglove_schemas_protobuf", "mcap_protobuf", "rerun"),
 }  # fmt: skip
 """Modules that each extra brings; the base has none of them."""
 
