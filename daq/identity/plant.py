@@ -129,6 +129,8 @@ def enrol(folder: Path, role: str, cell: str | None, name: str | None, addresses
         if not addresses:
             raise ConfigError("a router needs --address, once for each DNS name or IP address to reach it")
         full = router_name(plant_of(folder))
+    elif known == "opcua" and cell is not None:
+        raise ConfigError("opcua has no --cell: its server has all cells; give --name")
     else:
         if cell is not None and not _CELL.fullmatch(cell):
             raise ConfigError(f"--cell {cell!r}: expected the name of a cell as in its session, such as press_7")
