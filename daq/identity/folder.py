@@ -58,9 +58,10 @@ class KeyFolder:
                     found = issue(role, of, f"{role}.{name}"[:64], addresses, _DAYS, _FROM)
                     write_identity(self.path, found)
         if found is None:
+            option = "--name NAME --address HOST" if cell == ANY_CELL else f"--cell {cell}"
             raise ConfigError(
                 f"{self.path}: no key of a {role} of cell {cell}; "
-                f"run where the authority is: armident keys enrol {role} --cell {cell}"
+                f"run where the authority is: armident keys enrol {role} {option}"
             )
         return found
 

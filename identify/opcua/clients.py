@@ -4,7 +4,6 @@ import asyncio
 import logging
 import secrets
 import socket
-from collections.abc import Callable
 from datetime import UTC, datetime
 from typing import Any
 
@@ -24,16 +23,12 @@ from armident.daq.streaming import Refusals
 
 log = logging.getLogger(__name__)
 
-CONNECTIONS, SESSIONS = 64, 32
-"""Most connections, and most sessions, at a time."""
-SUBSCRIPTIONS, ITEMS = 4, 5000
-"""Most subscriptions of a session, and most monitored items of a subscription."""
+CONNECTIONS, SESSIONS, SUBSCRIPTIONS, ITEMS, NODES = 32, 16, 4, 2000, 500
+"""Most connections and sessions, subscriptions of a session, items of one of these, and nodes of a request to read."""
 FASTEST_MS, SLOWEST_MS, TIMEOUT_MS = 500.0, 60_000.0, 120_000.0
 """Shortest and longest publishing interval, and longest session without a request, ms."""
-OPERATIONS = 500
-"""Most nodes in a request to read."""
 LARGEST, SMALLEST_BUFFER = 1 << 20, 8192
-"""Largest message and largest number of bytes that wait, and smallest buffer of a client (OPC 10000-6, 7.1.2.3)."""
+"""Largest message, and smallest buffer of a client (OPC 10000-6, 7.1.2.3), bytes."""
 
 
 class Clients(UserManager):
@@ -47,9 +42,9 @@ class Clients(UserManager):
         if self.folder is None:
             return
         try:
-            found = signer_of(certificate or b"", self.folder.authority_certificates(), datetime.now(UTC))
-            if found[0] != "opcua":
-                raise DataError(f"{found[2]}: a certificate for {found[0]}, not for opcua")
+            role, _, name = signer_of(certificate or b"", self.folder.authority_certificates(), datetime.now(UTC))
+            if role != "opcua":
+                raise DataError(f"{name}: a certificate of the role {role}, not of opcua")
         except (DataError, ConfigError) as error:
             self._refusals.refuse("client", f"a client is refused: {error}")
             raise ServiceError(ua.StatusCodes.BadCertificateUntrusted) from error
@@ -57,34 +52,30 @@ class Clients(UserManager):
     def get_user(
         self, iserver: InternalServer, username: Any = None, password: Any = None, certificate: Any = None
     ) -> User:
-        """Return the user of a session; with the keys of a plant, ``certificate`` is that of the user."""
+        """Return the user of a session; with the keys of a plant, the user has signed with ``certificate``."""
         self.check(certificate)
         return User(UserRole.User)
 
 
-class Session(InternalSession):
-    """Session that reads. Nobody guesses its token, and it takes nothing that belongs to another one."""
+class _Session(InternalSession):
+    """Session that only reads. Nobody guesses its token, and it takes nothing that belongs to another one."""
 
     def __init__(self, *arguments: Any, **more: Any) -> None:
         super().__init__(*arguments, **more)
-        self._peer: bytes | None = None
         # asyncua counts; who knows the token of a session continues it.
         self.iserver.unregister_external_session(self)
         self.auth_token = ua.NodeId(secrets.token_bytes(32))
         self.iserver.register_external_session(self)
+        self._peer: bytes | None = None
 
     async def create_session(self, params: ua.CreateSessionParameters, sockname: Any = None) -> ua.CreateSessionResult:
-        """Return the answer to a request for a session, whose time without a request is limited."""
-        # In this order, NaN is replaced, too: a timer of it never ends.
+        # In this order also NaN, whose timer would not rest.
         params.RequestedSessionTimeout = min(TIMEOUT_MS, params.RequestedSessionTimeout)
         return await super().create_session(params, sockname)
 
-    def activate_session(
-        self, params: ua.ActivateSessionParameters, peer_certificate: bytes | None
-    ) -> ua.ActivateSessionResult:
-        """Return the answer to a sign-in over a channel that the holder of ``peer_certificate`` has signed."""
-        clients = self.iserver.user_manager
-        assert isinstance(clients, Clients)
+    def activate_session(self, params: Any, peer_certificate: bytes | None) -> ua.ActivateSessionResult:
+        # The peer has proved to hold its certificate; asyncua does not check whose it is.
+        clients: Any = self.iserver.user_manager
         clients.check(peer_certificate)
         if self.is_activated() and peer_certificate != self._peer:
             raise ServiceError(ua.StatusCodes.BadSecurityChecksFailed)
@@ -92,115 +83,102 @@ class Session(InternalSession):
         return super().activate_session(params, peer_certificate)
 
     async def read(self, params: ua.ReadParameters) -> list[ua.DataValue]:
-        """Return the values of nodes."""
-        if len(params.NodesToRead) > OPERATIONS:
+        if len(params.NodesToRead) > NODES:
             raise ServiceError(ua.StatusCodes.BadTooManyOperations)
         return await super().read(params)
 
-    async def create_subscription(
-        self, params: ua.CreateSubscriptionParameters, callback: Callable[..., Any], request_callback: Any = None
-    ) -> ua.CreateSubscriptionResult:
-        """Return a new subscription."""
+    async def create_subscription(self, params: Any, callback: Any, request_callback: Any = None) -> Any:
         service = self.subscription_service
         if sum(each.session_id == self.session_id for each in service.subscriptions.values()) >= SUBSCRIPTIONS:
             raise ServiceError(ua.StatusCodes.BadTooManySubscriptions)
-        wanted = params.RequestedPublishingInterval
-        params.RequestedPublishingInterval = max(FASTEST_MS, min(SLOWEST_MS, wanted))
-        # Services find a subscription by its number alone: those of others are not to be guessed.
+        params.RequestedPublishingInterval = max(FASTEST_MS, min(SLOWEST_MS, params.RequestedPublishingInterval))
+        # A number is all that a request needs: those of other sessions are not to be guessed.
         service._sub_id_counter = secrets.randbits(31)
         return await super().create_subscription(params, callback, request_callback)
 
-    async def create_monitored_items(
-        self, params: ua.CreateMonitoredItemsParameters
-    ) -> list[ua.MonitoredItemCreateResult]:
-        """Return new monitored items."""
+    async def create_monitored_items(self, params: ua.CreateMonitoredItemsParameters) -> Any:
         found = self.subscription_service.subscriptions.get(params.SubscriptionId)
         if found and len(found.monitored_item_srv._monitored_items) + len(params.ItemsToCreate) > ITEMS:
             raise ServiceError(ua.StatusCodes.BadTooManyMonitoredItems)
         return await super().create_monitored_items(params)
 
     async def close_session(self, delete_subs: bool = True) -> None:
-        """Close the session with its subscriptions, also if the client would leave them."""
         await super().close_session(True)
 
-    async def _refuse(self, *_: Any) -> Any:
-        raise ServiceError(ua.StatusCodes.BadUserAccessDenied)
 
-    write: Any = _refuse
-    call: Any = _refuse
-    add_nodes: Any = _refuse
-    delete_nodes: Any = _refuse
-    add_references: Any = _refuse
-    delete_references: Any = _refuse
-    history_read: Any = _refuse
-    transfer_subscriptions: Any = _refuse
+async def _refuse(*_: object) -> None:
+    raise ServiceError(ua.StatusCodes.BadUserAccessDenied)
 
 
-class Sessions(InternalServer):
+for _service in (
+    "write", "call", "add_nodes", "delete_nodes", "add_references", "delete_references", "history_read",
+    "transfer_subscriptions",
+):  # fmt: skip
+    setattr(_Session, _service, _refuse)
+
+
+class _Sessions(InternalServer):
     """Address space with the sessions of its clients, one for each connection."""
 
     def __init__(self, clients: Clients) -> None:
         super().__init__(clients)
         self.supported_tokens = (ua.AnonymousIdentityToken if clients.folder is None else ua.X509IdentityToken,)
-        self.allow_remote_admin = False
         self.max_connections, self.max_subscriptions = CONNECTIONS, SESSIONS * SUBSCRIPTIONS
         self.max_pending_messages_per_connection, self.max_pending_activation_seconds = 100, 10.0
-        self.max_monitored_item_queue_size, self.max_unacked_messages_per_subscription = 100, 100
-        self.max_lifetime_count, self.max_session_timeout_ms = 600, TIMEOUT_MS
+        self.max_monitored_item_queue_size = self.max_unacked_messages_per_subscription = 100
+        self.max_lifetime_count = 600
 
-    def create_session(self, name: str, user: User | None = None, external: bool = False) -> InternalSession:
-        """Return a new session of a connection, whose address is its ``name``."""
-        if len(self._external_sessions) >= SESSIONS or any(e.name == name for e in self._external_sessions.values()):
+    def create_session(self, name: str, user: Any = None, external: bool = False) -> InternalSession:
+        # The name is the address of a connection: it has one session at a time.
+        if len(self._external_sessions) >= SESSIONS or name in {each.name for each in self._external_sessions.values()}:
             raise ServiceError(ua.StatusCodes.BadTooManySessions)
-        return Session(self, self.aspace, self.subscription_service, name, external=external)
+        return _Session(self, self.aspace, self.subscription_service, name, external=external)
 
     def register_server(self, server: Any, conf: Any = None) -> None:
-        """Refuse to be a directory of other servers."""
         raise ServiceError(ua.StatusCodes.BadServiceUnsupported)
 
 
 class _Limits(TransportLimits):
+    """Limits without buffers of a few bytes, for which an answer would be cut into as many parts."""
+
     def create_acknowledge_and_set_limits(self, msg: ua.Hello) -> ua.Acknowledge:
-        """Return the sizes of messages; a client with buffers of a few bytes would get millions of them."""
         if min(msg.ReceiveBufferSize, msg.SendBufferSize) < SMALLEST_BUFFER:
             raise ua.UaError("a buffer below the smallest one")
         return super().create_acknowledge_and_set_limits(msg)
 
 
 class _Connection(OPCUAProtocol):
+    """Connection that leaves a client which announces more than a message, or does not take its answers."""
+
     def data_received(self, data: bytes) -> None:
-        """Take bytes; a client that announces more than a message, or does not take its answers, is left."""
         super().data_received(data)
         if self.transport is not None and max(len(self._buffer), self.transport.get_write_buffer_size()) > 2 * LARGEST:
             self.transport.abort()
 
 
 class _Listener(BinaryServer):
-    def __init__(self, sessions: Sessions, listening: socket.socket, limits: TransportLimits) -> None:
-        super().__init__(sessions, *listening.getsockname()[:2], limits)
-        self._socket = listening
+    listening: socket.socket
 
     def _make_protocol(self) -> OPCUAProtocol:
         return _Connection(self.iserver, self._policies, self.clients, self.closing_tasks, self.limits)
 
     async def start(self) -> None:
-        self._server = await asyncio.get_running_loop().create_server(self._make_protocol, sock=self._socket)
+        self._server = await asyncio.get_running_loop().create_server(self._make_protocol, sock=self.listening)
         self.cleanup_task = asyncio.create_task(self._close_task_loop())
 
 
 class LimitedServer(Server):
-    """Server of `Sessions` on a socket that listens."""
+    """Server for ``clients``, on a socket that listens."""
 
     def __init__(self, clients: Clients, listening: socket.socket) -> None:
-        super().__init__(Sessions(clients))
-        self._listening = listening
-        self.limits = _Limits(1 << 16, 1 << 16, 32, LARGEST)
+        super().__init__(_Sessions(clients))
+        self._listening, self.limits = listening, _Limits(1 << 16, 1 << 16, 32, LARGEST)
 
     async def start(self) -> None:
         """Begin to serve."""
         await self._setup_server_nodes()
         await self.iserver.start()
-        assert isinstance(self.iserver, Sessions)
-        self.bserver = _Listener(self.iserver, self._listening, self.limits)
-        self.bserver.set_policies(self._policies)
-        await self.bserver.start()
+        self.bserver = listener = _Listener(self.iserver, "", 0, self.limits)
+        listener.listening = self._listening
+        listener.set_policies(self._policies)
+        await listener.start()

@@ -3,19 +3,16 @@
 import asyncio
 import logging
 import signal
-import socket
 import threading
 from collections.abc import Sequence
 from contextlib import closing, suppress
-from datetime import UTC, datetime
-from importlib import metadata
 from pathlib import Path
 
 from asyncua import ua
 from cryptography import x509
 
 from armident.configs import ConfigError
-from armident.daq.identity.certificates import ANY_CELL
+from armident.daq.identity.certificates import ANY_CELL, Identity
 from armident.daq.identity.folder import KeyFolder, key_folder
 from armident.identify.opcua.clients import Clients, LimitedServer
 from armident.identify.opcua.nodes import Nodes
@@ -25,7 +22,7 @@ from armident.identify.page.plant import Plant
 from armident.systemd import Notifier
 
 ROUND_S = 1.0
-"""Interval at which what is read is compared with what clients know, s."""
+"""Interval at which what was read is compared with what clients know, s."""
 POLICIES = [
     ua.SecurityPolicyType.Basic256Sha256_SignAndEncrypt,
     ua.SecurityPolicyType.Aes128Sha256RsaOaep_SignAndEncrypt,
@@ -37,37 +34,42 @@ POLICIES = [
 def run_opcua(configs: Sequence[Path], out: Path | None, database: str | None, listen: str, keys: Path | None) -> None:
     """Carry out ``armident opcua`` until SIGTERM or SIGINT; ConfigError if address, keys or sessions are wrong."""
     host, port = address_of(listen)
-    folder = None if is_loopback(host) else _of_plant(key_folder(keys), listen)
+    folder = None if is_loopback(host) else key_folder(keys)
+    identity = None if folder is None else _identity(folder, listen)
     cells, read = cells_in(configs, out, database), threading.Event()
-    # It reports each refused request of a stranger with a traceback.
+    # It reports each wrong request of a stranger with a traceback.
     logging.getLogger("asyncua").setLevel(logging.CRITICAL)
     with closing(bound(host, port, listen)) as listening, Plant(cells, read.set, listens=False) as plant:
-        asyncio.run(_serve(plant, Clients(folder), host, listening, read))
+        server = LimitedServer(Clients(folder), listening)
+        asyncio.run(_serve(server, identity, plant, f"opc.tcp://{host}:{listening.getsockname()[1]}/", read))
 
 
-def _of_plant(folder: KeyFolder, listen: str) -> KeyFolder:
+def _identity(folder: KeyFolder, listen: str) -> Identity:
+    """Return the identity of the server; ConfigError if the folder is none of a plant, or has none."""
     if folder.local:
-        raise ConfigError(
-            f"--listen {listen}: other machines may only connect with keys of a plant; run: armident keys init"
-        )
-    return folder
+        reason = "other machines may only connect with keys of a plant; run: armident keys init"
+        raise ConfigError(f"--listen {listen}: {reason}")
+    return folder.identity("opcua", ANY_CELL)
 
 
-async def _serve(plant: Plant, clients: Clients, host: str, listening: socket.socket, read: threading.Event) -> None:
+async def _serve(
+    server: LimitedServer, identity: Identity | None, plant: Plant, url: str, read: threading.Event
+) -> None:
     """Serve until a signal; ``read`` is set when the folders have been read again, which the watchdog hears of."""
-    stopped, loop = asyncio.Event(), asyncio.get_running_loop()
+    stopped, number = asyncio.Event(), "1 cell" if len(plant.cells) == 1 else f"{len(plant.cells)} cells"
     for each in (signal.SIGTERM, signal.SIGINT):
-        loop.add_signal_handler(each, stopped.set)
-    server = LimitedServer(clients, listening)
+        asyncio.get_running_loop().add_signal_handler(each, stopped.set)
     await server.init()
-    server.name, server.product_uri = "armident", "urn:armident"
-    server.application_type = ua.ApplicationType.Server
-    version = metadata.version("armident")
-    await server.set_build_info(server.product_uri, "armident", "armident", version, version, datetime.now(UTC))
-    url = f"opc.tcp://{host}:{listening.getsockname()[1]}/"
+    server.name, server.product_uri, server.application_type = "armident", "urn:armident", ua.ApplicationType.Server
     server.set_endpoint(url)
-    await _identify(server, clients.folder)
-    nodes, number = Nodes(server), "1 cell" if len(plant.cells) == 1 else f"{len(plant.cells)} cells"
+    server.set_security_policy([ua.SecurityPolicyType.NoSecurity] if identity is None else POLICIES)
+    uri = "urn:armident:opcua"
+    if identity is not None:
+        server.iserver.certificate, server.iserver.private_key = identity.certificate, identity.key
+        names = identity.certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+        uri = names.get_values_for_type(x509.UniformResourceIdentifier)[0]
+    await server.set_application_uri(uri)
+    nodes = Nodes(server)
     await nodes.build(plant.cells.values())
     with closing(Notifier()) as notifier:
         async with server:
@@ -82,19 +84,3 @@ async def _serve(plant: Plant, clients: Clients, host: str, listening: socket.so
                 with suppress(TimeoutError):
                     await asyncio.wait_for(stopped.wait(), ROUND_S)
             notifier.stopping()
-
-
-async def _identify(server: LimitedServer, folder: KeyFolder | None) -> None:
-    """Give the server its name and channels: with keys of a plant, those of its certificate of ``opcua``."""
-    server.set_security_policy([ua.SecurityPolicyType.NoSecurity] if folder is None else POLICIES)
-    if folder is None:
-        await server.set_application_uri("urn:armident:opcua")
-        return
-    try:
-        identity = folder.identity("opcua", ANY_CELL)
-    except ConfigError as error:
-        raise ConfigError(f"{folder.path}: no key of opcua") from error
-    names = identity.certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
-    await server.set_application_uri(names.get_values_for_type(x509.UniformResourceIdentifier)[0])
-    await server.load_certificate(folder.path / f"{identity.name}.pem")
-    await server.load_private_key(folder.path / f"{identity.name}.key")
