@@ -82,7 +82,7 @@ class _Session(InternalSession):
         self._peer = peer_certificate
         return super().activate_session(params, peer_certificate)
 
-    async def read(self, params: ua.ReadParameters) -> list[ua.DataValue]:
+    async def read(self, params: ua.ReadParameters) -> Any:
         if len(params.NodesToRead) > NODES:
             raise ServiceError(ua.StatusCodes.BadTooManyOperations)
         return await super().read(params)

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterable
 from datetime import UTC, datetime
-from typing import Any
 
 import numpy as np
 from asyncua import Node, Server, ua
@@ -14,8 +13,8 @@ from armident.identify.page.attention import CellView
 from armident.identify.page.cells import Cell
 
 DI, ROBOTICS = "http://opcfoundation.org/UA/DI/", "http://opcfoundation.org/UA/Robotics/"
-OWN = "urn:armident:model-health"
-"""Namespaces of devices (OPC 10000-100) and robots (OPC 40010-1), and that of armident."""
+OWN, HEALTH = "urn:armident:model-health", "ModelHealthType"
+"""Namespaces of devices (OPC 10000-100) and robots (OPC 40010-1), and that of armident with its type."""
 SYSTEM, DEVICE, MOTOR, AXIS, TRAIN = 1002, 1004, 1019, 16601, 16794
 TYPES = {SYSTEM: "MotionDeviceSystem", DEVICE: "MotionDevice", MOTOR: "Motor", AXIS: "Axis", TRAIN: "PowerTrain"}
 """Object types of `ROBOTICS` by their identifiers there; they have no instance declarations here."""
@@ -25,16 +24,11 @@ MOVES, REQUIRES = 18178, 18179
 """References from a power train to its axes, and from an axis to its power trains."""
 
 
-def _id(identifier: Any, namespace: Any = 0) -> ua.NodeId:
-    """Return an identifier; asyncua declares integers and texts of its own, and takes any."""
-    return ua.NodeId(identifier, namespace)
-
-
 _NUMBER = (ua.VariantType.Double, 0.0, None)
 _KINDS: dict[str, tuple[ua.VariantType, object, ua.NodeId | None]] = {
     "Probability": _NUMBER,
     "Size": _NUMBER,
-    "Interval": (ua.VariantType.ExtensionObject, ua.Range(), _id(ua.ObjectIds.Range)),
+    "Interval": (ua.VariantType.ExtensionObject, ua.Range(), ua.NodeId(ua.ObjectIds.Range)),
     "Since": (ua.VariantType.DateTime, datetime.now(UTC), None),
 }
 """Kind, placeholder and data type of the readings that are no text."""
@@ -54,9 +48,11 @@ class Nodes:
         self._di, self._robotics, self._own = [await server.register_namespace(uri) for uri in (DI, ROBOTICS, OWN)]
         for large in (ua.ObjectIds.OpcUa_BinarySchema, ua.ObjectIds.OpcUa_XmlSchema):
             # Deprecated. A client that reads half a megabyte again and again would fill the memory.
-            await self._server.write_attribute_value(_id(large), _value("", UNKNOWN))
+            await self._server.write_attribute_value(ua.NodeId(large), _value("", UNKNOWN))
         await self._types()
-        devices = await server.nodes.objects.add_object(_id(5001, self._di), ua.QualifiedName("DeviceSet", self._di))
+        devices = await server.nodes.objects.add_object(
+            ua.NodeId(5001, self._di), ua.QualifiedName("DeviceSet", self._di)
+        )
         system = await self._object(devices, "MotionDeviceSystem", SYSTEM)
         for name in ("Controllers", "SafetyStates"):
             await self._object(system, name)
@@ -76,29 +72,25 @@ class Nodes:
                 continue
             place = alarm.event.SourceNode.Identifier
             unit = ua.EUInformation(DisplayName=ua.LocalizedText(str(health.readings["Unit"].value)), UnitId=-1)
-            await self._server.write_attribute_value(
-                _id(f"{place}/Size/EngineeringUnits", self._own), ua.DataValue(ua.Variant(unit))
-            )
+            await self._write(f"{place}/Size/EngineeringUnits", ua.DataValue(ua.Variant(unit)))
             for name in NAMES:
                 if known is None or health.readings[name] != known.readings[name]:
-                    await self._server.write_attribute_value(
-                        _id(f"{place}/{name}", self._own), _value(name, health.readings[name])
-                    )
+                    await self._write(f"{place}/{name}", _value(name, health.readings[name]))
             self._known[key] = health
             if known is not None and known.state != health.state:
                 await _announce(alarm, f"{view.cell.title}, {joint.name}: {health.sentence}", health, known)
 
     async def _types(self) -> None:
         """Add the types that the arms name."""
-        root, robotics = self._server.nodes.base_object_type, self._robotics
-        await root.add_object_type(_id("ModelHealthType", self._own), ua.QualifiedName("ModelHealthType", self._own))
+        root, robotics, own = self._server.nodes.base_object_type, self._robotics, self._own
+        await root.add_object_type(ua.NodeId(HEALTH, own), ua.QualifiedName(HEALTH, own))
         for number, name in ((1001, "TopologyElementType"), (15063, "ComponentType")):
-            root = await root.add_object_type(_id(number, self._di), ua.QualifiedName(name, self._di))
+            root = await root.add_object_type(ua.NodeId(number, self._di), ua.QualifiedName(name, self._di))
         for number, name in TYPES.items():
-            await root.add_object_type(_id(number, robotics), ua.QualifiedName(f"{name}Type", robotics))
-        root = self._server.get_node(_id(ua.ObjectIds.HierarchicalReferences))
+            await root.add_object_type(ua.NodeId(number, robotics), ua.QualifiedName(f"{name}Type", robotics))
+        root = self._server.get_node(ua.NodeId(ua.ObjectIds.HierarchicalReferences))
         for number, name, inverse in ((MOVES, "Moves", "IsMovedBy"), (REQUIRES, "Requires", "IsRequiredBy")):
-            await root.add_reference_type(_id(number, robotics), ua.QualifiedName(name, robotics), False, inverse)
+            await root.add_reference_type(ua.NodeId(number, robotics), ua.QualifiedName(name, robotics), False, inverse)
 
     async def _arm(self, arm: Node, cell: str, robot: RobotConfig) -> None:
         """Add category, axes and power trains of an arm."""
@@ -119,22 +111,22 @@ class Nodes:
             await self._identify(await self._object(train, "Motor", MOTOR), None)
             for other, axis in enumerate(axes):
                 if moved[other, number]:
-                    await train.add_reference(axis, _id(MOVES, self._robotics))
+                    await train.add_reference(axis, ua.NodeId(MOVES, self._robotics))
                 if ratios[number, other]:
-                    await axis.add_reference(train, _id(REQUIRES, self._robotics))
+                    await axis.add_reference(train, ua.NodeId(REQUIRES, self._robotics))
 
     async def _health(self, axis: Node) -> EventGenerator:
         """Add the health of an axis, without values, and return its alarm."""
-        place = await axis.add_object(*self._place(axis, "ModelHealth", self._own), _id("ModelHealthType", self._own))
+        place = await axis.add_object(*self._place(axis, "ModelHealth", self._own), ua.NodeId(HEALTH, self._own))
         for name in NAMES:
             kind, first, datatype = _KINDS.get(name, (ua.VariantType.String, "", None))
             node = await place.add_variable(*self._place(place, name, self._own), first, kind, datatype)
-            await self._server.write_attribute_value(node.nodeid, _value(name, UNKNOWN))
+            await self._write(node.nodeid.Identifier, _value(name, UNKNOWN))
             if name == "Size":
                 await node.add_property(*self._place(node, "EngineeringUnits", 0), ua.EUInformation())
-        alarm = await self._server.get_event_generator(_id(ua.ObjectIds.OffNormalAlarmType))
-        event, event.SourceNode, event.NodeId = alarm.event, place.nodeid, self._place(place, "Alarm", 0)[0]
-        event.SourceName = event.ConditionName = place.nodeid.Identifier
+        alarm = await self._server.get_event_generator(ua.NodeId(ua.ObjectIds.OffNormalAlarmType))
+        alarm.event.SourceNode, alarm.event.NodeId = place.nodeid, self._place(place, "Alarm", 0)[0]
+        alarm.event.SourceName = alarm.event.ConditionName = place.nodeid.Identifier
         return alarm
 
     async def _identify(self, device: Node, model: str | None) -> None:
@@ -143,26 +135,29 @@ class Nodes:
             first = "" if name == "SerialNumber" else ua.LocalizedText(text or "")
             node = await device.add_property(*self._place(device, name, self._di), first)
             if text is None:
-                await self._server.write_attribute_value(node.nodeid, _value(name, UNKNOWN))
+                await self._write(node.nodeid.Identifier, _value(name, UNKNOWN))
 
     async def _object(self, parent: Node, name: str, kind: int | None = None) -> Node:
         """Add an object of a type of `ROBOTICS`, by default a folder."""
-        of_type = _id(ua.ObjectIds.FolderType) if kind is None else _id(kind, self._robotics)
+        of_type = ua.NodeId(ua.ObjectIds.FolderType) if kind is None else ua.NodeId(kind, self._robotics)
         return await parent.add_object(*self._place(parent, name, self._robotics), of_type)
 
     def _place(self, parent: Node, name: str, namespace: int) -> tuple[ua.NodeId, ua.QualifiedName]:
         """Return identifier and name of a node below another one."""
         above = parent.nodeid.Identifier
         path = f"{above}/{name}" if isinstance(above, str) else name
-        return _id(path, self._own), ua.QualifiedName(name, namespace)
+        return ua.NodeId(path, self._own), ua.QualifiedName(name, namespace)
+
+    async def _write(self, path: str, value: ua.DataValue) -> None:
+        await self._server.write_attribute_value(ua.NodeId(path, self._own), value)
 
 
 def _value(name: str, reading: Reading) -> ua.DataValue:
     """Return a reading as it is sent."""
     value, kind = reading.value, _KINDS.get(name, (ua.VariantType.String,))[0]
     variant = ua.Variant(ua.Range(*value) if isinstance(value, tuple) else value, kind) if value is not None else None
-    time: Any = datetime.now(UTC)
-    return ua.DataValue(variant, ua.StatusCode(getattr(ua.StatusCodes, reading.status)), SourceTimestamp=time)
+    status = ua.StatusCode(getattr(ua.StatusCodes, reading.status))
+    return ua.DataValue(variant, status, SourceTimestamp=datetime.now(UTC))
 
 
 async def _announce(alarm: EventGenerator, text: str, health: Health, before: Health) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 from cryptography import x509
-from cryptography.hazmat.primitives.asymmetric import rsa
+from cryptography.hazmat.primitives.asymmetric import ec, rsa
 from cryptography.hazmat.primitives.hashes import SHA256
 from cryptography.hazmat.primitives.serialization import Encoding
 from cryptography.x509.oid import NameOID
@@ -114,6 +114,7 @@ def test_another_authority_of_the_same_name_is_refused(authority: Authority) -> 
 
 def test_an_identity_issues_nothing(authority: Authority) -> None:
     capture = authority.issue("capture", "c", "capture.c", [], 30)
+    assert isinstance(capture.key, ec.EllipticCurvePrivateKey)
     forged = Authority(capture.key, capture.certificate).issue("operator", "*", "operator.eve", [], 30)
     with pytest.raises(DataError, match="another authority"):
         signer_of(der(forged), [authority.certificate], now())

@@ -22,7 +22,7 @@ LONGEST_S = 60
 def serving(config: Path, *words: object, listen: str = "127.0.0.1:0") -> Iterator[tuple[str, "subprocess.Popen[str]"]]:
     """Run the command; yield its address on loopback."""
     command = [sys.executable, "-m", "armident.daq.cli", "opcua", "--config", config, "--listen", listen, *words]
-    with subprocess.Popen(map(str, command), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+    with subprocess.Popen([*map(str, command)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         try:
             assert process.stdout is not None
             line = process.stdout.readline()

@@ -52,7 +52,7 @@ def diagnose(cell: Path, week: int, *findings: Finding) -> Path:
     both = BeforeAfter(before=GAP, after=GAP)
     verdict: Verdict = "explained" if findings else "no_gap"
     document = DiagnosisDocument(
-        schema="armident/diagnosis/2",
+        schema_="armident/diagnosis/2",
         robot="emps",
         recordings=[],
         verdict=verdict,

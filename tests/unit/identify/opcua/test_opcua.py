@@ -204,7 +204,7 @@ def test_a_certificate_that_is_only_stated_does_not_count(secured: str, keys: Pa
             params.ClientCertificate = anna.public_bytes(Encoding.DER)
             return await send(params)
 
-        client.uaclient.create_session = state  # type: ignore[method-assign]  the client has no such option
+        client.uaclient.create_session = state
         await client.connect()
 
     with pytest.raises(BadCertificateUntrusted):
