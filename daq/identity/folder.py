@@ -58,10 +58,10 @@ class KeyFolder:
                     found = issue(role, of, f"{role}.{name}"[:64], addresses, _DAYS, _FROM)
                     write_identity(self.path, found)
         if found is None:
-            option = "--name NAME --address HOST" if cell == ANY_CELL else f"--cell {cell}"
+            of = ("all cells", "--name NAME --address HOST") if cell == ANY_CELL else (f"cell {cell}", f"--cell {cell}")
             raise ConfigError(
-                f"{self.path}: no key of a {role} of cell {cell}; "
-                f"run where the authority is: armident keys enrol {role} {option}"
+                f"{self.path}: no key of a {role} of {of[0]}; "
+                f"run where the authority is: armident keys enrol {role} {of[1]}"
             )
         return found
 

@@ -180,9 +180,18 @@ def test_a_client_of_the_plant_reads_and_changes_nothing(secured: str, keys: Pat
     ],
 )  # fmt: skip
 def test_nobody_else_signs_in(
-    secured: str, keys: Path, channel: str | None, user: str | None, reason: type[ua.UaError]
+    secured: str,
+    keys: Path,
+    channel: str | None,
+    user: str | None,
+    reason: type[ua.UaError],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Anonymous, without encryption, of another authority, expired: of the channel, of the user, or of both."""
+    """Anonymous, without encryption, of another authority, expired: of the channel, of the user, or of both.
+
+    The client asks although the server offers no such endpoint.
+    """
+    monkeypatch.setattr(Client, "find_endpoint", staticmethod(lambda endpoints, *_: endpoints[0]))
 
     async def ask() -> None:
         async with await client_of(secured, keys, channel, user):
@@ -322,4 +331,4 @@ def test_mistakes_are_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     (tmp_path / "keys").mkdir()
     write_whole(tmp_path / "keys" / "authority.pem", pem_of(new_authority("plant", 30).certificate), 0o644)
     line = refused(*config, "--listen", "0.0.0.0:0", "--keys", tmp_path / "keys")
-    assert "run where the authority is: armident keys enrol opcua --name HOST" in line
+    assert "run where the authority is: armident keys enrol opcua --name NAME --address HOST" in line
