@@ -10,6 +10,7 @@ EXTRAS: dict[str, tuple[str, ...]] = {
     ),
     "virtual": ("clarabel", "pinocchio", "scipy"),
     "fleet": ("distributed",),
+    "opcua": ("asyncua",),
     "page": ("starlette", "uvicorn"),
     "parquet": ("pyarrow",),
     "postgresql": ("psycopg",),
