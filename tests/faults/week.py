@@ -18,7 +18,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -76,7 +76,7 @@ class Week:
         """Carry out a fault on a cell, and wait until work goes on; ``size`` is from 0 to 1."""
         fault = Fault(kind, cell.name, round(time.monotonic() - self.began, 1))
         self.faults.append(fault)
-        with FAULTS[kind](self, cell, size, fault) as (seconds, count):
+        with contextmanager(FAULTS[kind])(self, cell, size, fault) as (seconds, count):
             self.stop.wait(seconds)
             fault.held_s = round(time.monotonic() - self.began - fault.at_s, 1)
         before = count()
@@ -89,19 +89,15 @@ class Week:
         """Add new results to the history as a timer does, until all are in it."""
         added: set[Path] = set()
         while True:
-            ended, refused = self.over.wait(2.0), False
-            for cell in self.plant.cells:
-                if fresh := {*cell.results.glob("*.identification/identification.json")} - added:
-                    begin = time.monotonic()
-                    words = "history", *fresh, "--database", self.database, "--cell", cell.name
-                    process = processes.armident(*words)
-                    reason = process.communicate()[1].strip().rpartition("\n")[2]
-                    if process.returncode in (0, 4):
-                        added |= fresh
-                        reason = ""
-                    self.jobs.append((time.monotonic() - begin, reason))
-                    refused = refused or bool(reason)
-            if ended and not refused:
+            ended, begin = self.over.wait(10.0), time.monotonic()
+            found = {path for cell in self.plant.cells for path in cell.results.glob("*/identification.json")}
+            if fresh := found - added:
+                process = processes.armident("history", *fresh, "--database", self.database)
+                reason = process.communicate()[1].strip().rpartition("\n")[2]
+                if process.returncode in (0, 4):
+                    added, reason = added | fresh, ""
+                self.jobs.append((time.monotonic() - begin, reason))
+            if ended and found == added:
                 return
 
     def done_in(self, cell: Cell) -> Callable[[], int]:
@@ -110,112 +106,94 @@ class Week:
     def heard(self, kind: str, *cells: Cell) -> Callable[[], int]:
         return lambda: sum(self.listener.heard[cell.name, kind] for cell in cells)
 
+    def _killed(self, cell: Cell, _size: float, _fault: Fault) -> Held:
+        self.plant.services[cell.name].kill()
+        yield 0.0, self.done_in(cell)
 
-@contextmanager
-def _killed(week: Week, cell: Cell, _size: float, _fault: Fault) -> Held:
-    week.plant.services[cell.name].kill()
-    yield 0.0, week.done_in(cell)
+    def _router_gone(self, _cell: Cell, size: float, _fault: Fault) -> Held:
+        router = self.plant.services["router"]
+        router.away.set()
+        router.kill()
+        yield 15.0 * size, self.heard("result", *self.plant.cells)
+        router.away.clear()
 
+    def _capture_killed(self, _cell: Cell, _size: float, _fault: Fault) -> Held:
+        self.plant.services["capture"].kill()
+        yield 0.0, self.heard("samples", self.plant.cells[-1])
 
-@contextmanager
-def _router_gone(week: Week, _cell: Cell, size: float, _fault: Fault) -> Held:
-    router = week.plant.services["router"]
-    router.away.set()
-    router.kill()
-    yield 15.0 * size, week.heard("result", *week.plant.cells)
-    router.away.clear()
+    def _bus_silent(self, _cell: Cell, size: float, _fault: Fault) -> Held:
+        """The drives of the arm end and start again, or hang."""
+        robot = self.plant.services["robot"]
+        robot.kill(signal.SIGKILL if size < 0.5 else signal.SIGSTOP)
+        yield 12.0 * size, self.heard("samples", self.plant.cells[-1])
+        robot.kill(signal.SIGCONT)
 
+    def _disk_full(self, cell: Cell, size: float, _fault: Fault) -> Held:
+        cell.resize(full=True)
+        yield 5.0 + 15.0 * size, self.done_in(cell)
+        cell.resize(full=False)
 
-@contextmanager
-def _capture_killed(week: Week, _cell: Cell, _size: float, _fault: Fault) -> Held:
-    week.plant.services["capture"].kill()
-    yield 0.0, week.heard("samples", week.plant.cells[-1])
+    def _clock_jumped(self, cell: Cell, size: float, fault: Fault) -> Held:
+        """The clock is an hour behind or ahead, or forty days ahead, and later right again."""
+        offset = (-3600.0, 3600.0, 40 * 86_400.0)[int(3 * size)]
+        fault.note = f"{offset:+g} s"
+        set_clock(cell.clock, offset)
+        yield 5.0 + 20.0 * size, self.done_in(cell)
+        set_clock(cell.clock, 0.0)
 
+    def _history_hung(self, _cell: Cell, size: float, _fault: Fault) -> Held:
+        assert self.server is not None
+        first = int((self.server / "postmaster.pid").read_text().split()[0])
+        pids = [first, *map(int, Path(f"/proc/{first}/task/{first}/children").read_text().split())]
+        for pid in pids:
+            os.kill(pid, signal.SIGSTOP)
+        yield 10.0 + 30.0 * size, lambda: sum(not reason for _, reason in self.jobs)
+        for pid in pids:
+            with suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGCONT)
 
-@contextmanager
-def _bus_silent(week: Week, _cell: Cell, size: float, _fault: Fault) -> Held:
-    """The drives of the arm end and start again, or hang."""
-    robot = week.plant.services["robot"]
-    robot.kill(signal.SIGKILL if size < 0.5 else signal.SIGSTOP)
-    yield 12.0 * size, week.heard("samples", week.plant.cells[-1])
-    robot.kill(signal.SIGCONT)
+    def _certificate_expired(self, cell: Cell, size: float, fault: Fault) -> Held:
+        """The certificate of a worker ends soon; after the alarm, and its end, it is renewed."""
+        name = f"worker.{cell.name}"
+        self.plant.shorten(cell, 15.0)
+        self.plant.services[cell.name].kill()
+        out, _ = processes.armident("keys", "check", "--folder", self.plant.host).communicate()
+        fault.note = next((line for line in out.splitlines() if line.startswith("failed") and name in line), "no alarm")
+        yield 15.0 + 10.0 * size, self.heard("result", cell)
+        processes.armident("keys", "renew", name, "--folder", self.plant.folder).communicate()
+        self.plant.install(name)
 
-
-@contextmanager
-def _disk_full(week: Week, cell: Cell, size: float, _fault: Fault) -> Held:
-    cell.resize(full=True)
-    yield 5.0 + 15.0 * size, week.done_in(cell)
-    cell.resize(full=False)
-
-
-@contextmanager
-def _clock_jumped(week: Week, cell: Cell, size: float, fault: Fault) -> Held:
-    """The clock is an hour behind or ahead, or forty days ahead, and later right again."""
-    offset = (-3600.0, 3600.0, 40 * 86_400.0)[int(3 * size)]
-    fault.note = f"{offset:+g} s"
-    set_clock(cell.clock, offset)
-    yield 5.0 + 20.0 * size, week.done_in(cell)
-    set_clock(cell.clock, 0.0)
-
-
-@contextmanager
-def _history_hung(week: Week, _cell: Cell, size: float, _fault: Fault) -> Held:
-    assert week.server is not None
-    first = int((week.server / "postmaster.pid").read_text().split()[0])
-    pids = [first, *map(int, Path(f"/proc/{first}/task/{first}/children").read_text().split())]
-    for pid in pids:
-        os.kill(pid, signal.SIGSTOP)
-    yield 10.0 + 30.0 * size, lambda: sum(not reason for _, reason in week.jobs)
-    for pid in pids:
-        with suppress(ProcessLookupError):
-            os.kill(pid, signal.SIGCONT)
-
-
-@contextmanager
-def _certificate_expired(week: Week, cell: Cell, size: float, fault: Fault) -> Held:
-    """The certificate of a worker ends soon; after the alarm, and its end, it is renewed."""
-    name = f"worker.{cell.name}"
-    week.plant.shorten(cell, 15.0)
-    week.plant.services[cell.name].kill()
-    out, _ = processes.armident("keys", "check", "--folder", week.plant.host).communicate()
-    fault.note = next((line for line in out.splitlines() if line.startswith("failed") and name in line), "no alarm")
-    yield 15.0 + 10.0 * size, week.heard("result", cell)
-    processes.armident("keys", "renew", name, "--folder", week.plant.folder).communicate()
-    week.plant.install(name)
-
-
-@contextmanager
-def _attack(week: Week, cell: Cell, _size: float, fault: Fault) -> Held:
-    """Connections without a valid certificate, and messages and commands beyond a role."""
-    plant, last = week.plant, week.plant.cells[-1].name
-    nobody = {"root_ca_certificate": str(plant.folder / "authority.pem")}
-    for name, tls in (("no", nobody), ("a foreign", plant.tls("foreign")), ("an expired", plant.tls("expired"))):
-        week.attacks += 1
-        with suppress(zenoh.ZError), zenoh.open(raw(plant.place, tls)):
-            week.passed.append(f"connected with {name} certificate")
-    for name, at in (("viewer.anna", cell.name), ("worker.week_1", last), ("capture.week_1", last)):
-        try:
-            with plant.attacker(name) as session:
-                for key in ("samples", "events", "health", "status", "result/identification"):
-                    session.put(f"armident/{at}/emps/{key}", FORGED)
-                answers = [ask(session, f"armident/{at}/emps/command/{command}") for command in ("stop", "mark")]
-                week.attacks += 7
-                week.passed += [f"{name} commands {at}"] if any(answers) else []
-        except zenoh.ZError:
-            fault.note = "a router that is away has no gate"
-    yield 0.0, lambda: time.monotonic_ns()
+    def _attack(self, cell: Cell, _size: float, fault: Fault) -> Held:
+        """Connections without a valid certificate, and messages and commands beyond a role."""
+        plant, last = self.plant, self.plant.cells[-1].name
+        nobody = {"root_ca_certificate": str(plant.folder / "authority.pem")}
+        for name, tls in (("no", nobody), ("a foreign", plant.tls("foreign")), ("an expired", plant.tls("expired"))):
+            self.attacks += 1
+            with suppress(zenoh.ZError), zenoh.open(raw(plant.place, tls)):
+                self.passed.append(f"connected with {name} certificate")
+        for name, at in (("viewer.anna", cell.name), ("worker.week_1", last), ("capture.week_1", last)):
+            try:
+                with plant.attacker(name) as session:
+                    for key in ("samples", "events", "health", "status", "result/identification"):
+                        session.put(f"armident/{at}/emps/{key}", FORGED)
+                    answers = [ask(session, f"armident/{at}/emps/command/{command}") for command in ("stop", "mark")]
+                    self.attacks += 7
+                    self.passed += [f"{name} commands {at}"] if any(answers) else []
+            except zenoh.ZError:
+                fault.note = "a router that is away has no gate"
+        yield 0.0, lambda: time.monotonic_ns()
 
 
-FAULTS: dict[str, Callable[[Week, Cell, float, Fault], AbstractContextManager[tuple[float, Callable[[], int]]]]] = {
-    "worker killed": _killed,
-    "router gone": _router_gone,
-    "capture killed": _capture_killed,
-    "bus silent": _bus_silent,
-    "disk full": _disk_full,
-    "clock jumped": _clock_jumped,
-    "PostgreSQL hung": _history_hung,
-    "certificate expired": _certificate_expired,
-    "attack": _attack,
+FAULTS: dict[str, Callable[[Week, Cell, float, Fault], Held]] = {
+    "worker killed": Week._killed,
+    "router gone": Week._router_gone,
+    "capture killed": Week._capture_killed,
+    "bus silent": Week._bus_silent,
+    "disk full": Week._disk_full,
+    "clock jumped": Week._clock_jumped,
+    "PostgreSQL hung": Week._history_hung,
+    "certificate expired": Week._certificate_expired,
+    "attack": Week._attack,
 }
 
 
@@ -240,22 +218,23 @@ def run(
         missing |= {"PostgreSQL hung"} if server is None else set()
         missing |= {"capture killed", "bus silent"} if plant.bus is None else set()
         week = Week(plant, listener, database, server)
-        threads = []
+        feeds, threads = [], [threading.Thread(target=week.keep_history)]
         for cell in plant.cells:
             kinds = [
                 rng.choice(odd or KINDS) if rng.random() < ODD_SHARE else "whole"
                 for _ in range(round(RECORDINGS * minutes / 60.0))
             ]
             sizes = [rng.random() for _ in kinds]
-            threads.append(threading.Thread(target=_feed, args=(cell, kinds, sizes, seconds, week.stop)))
+            feeds.append(threading.Thread(target=_feed, args=(cell, kinds, sizes, seconds, week.stop)))
         for at_s, kind in _plan(rng, [kind for kind in faults or FAULTS if kind not in missing], seconds, every_s):
             threads.append(threading.Timer(at_s, week.inject, (kind, rng.choice(plant.cells), rng.random())))
-        threads.append(threading.Thread(target=week.keep_history))
-        for thread in threads:
+        for thread in [*feeds, *threads]:
             thread.daemon = True
             thread.start()
         time.sleep(seconds)
         week.stop.set()
+        for thread in feeds:
+            thread.join()
         audit = Audit(wrong=_settle(week))
         week.over.set()
         for thread in threads:

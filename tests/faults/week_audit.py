@@ -113,7 +113,8 @@ class Audit:
             self._file(cell.name, fed, entries, results)
         self._announcements(cell.name, entries, listener)
         done = Counter(entry.sha256 for entry in entries if entry.state == "done")
-        runs = Counter(run.document.recording.sha256 for run in History(history).runs("emps", cell.name))
+        known = Counter(run.document.recording.sha256 for run in History(history).runs("emps"))
+        runs = Counter({digest: count for digest, count in known.items() if digest in done})
         self.figures["entries in the history"] += runs.total()
         for name, found in (("documents", results), ("entries in the history", runs)):
             if found != done:
@@ -126,7 +127,7 @@ class Audit:
             self.wrong += [f"{path.name}: {line}" for line in lines if FAULTY.search(line)][:3]
 
     def add_life(self, name: str, service: Service) -> None:
-        """Compare memory and open files of the longest-lived process in the second and in the last third of its life."""
+        """Compare memory and open files of the longest-lived process in the last two thirds of its life."""
         life = max(service.lives, key=len)
         third = len(life) // 3
         if third < 20:

@@ -228,14 +228,9 @@ def _bomb(data: bytes) -> bytes:
     return data[:first] + 160 * chunk + mcap_records.MAGIC
 
 
-def _damaged(data: bytes) -> bytes:
-    third = len(data) // 3
-    return data[:third] + bytes(byte ^ 0xFF for byte in data[third : third + 2000]) + data[third + 2000 :]
-
-
 POISON: dict[str, Callable[[bytes], bytes]] = {
     "bomb": _bomb,
-    "damaged": _damaged,
+    "damaged": lambda data: data[: len(data) // 3] + bytes(2000) + data[len(data) // 3 + 2000 :],
     "no recording": lambda _: b"no recording" + mcap_records.MAGIC,
     "empty": lambda _: b"",
     "huge": lambda data: data[: len(data) // 2],
