@@ -176,8 +176,8 @@ class Audit:
 def settled(cell: Cell) -> tuple[bool, int]:
     """Return True if all files of a cell are known and announced, and the number of entries that are."""
     with suppress(ArmidentError, OSError):
-        entries = Ledger(cell.results / FILE, "witness").entries()
-        known = {path for entry in entries for path in _paths(entry)}
+        ledger = Ledger(cell.results / FILE, "witness")
+        entries, known = ledger.entries(), {path.resolve() for path in ledger.files()}
         done = sum(entry.announced for entry in entries)
         return known >= {each.path.resolve() for each in _captures(cell, ())} and done == len(entries), done
     return False, -1
