@@ -276,13 +276,9 @@ def _database(folder: Path) -> Iterator[tuple[str, Path | None]]:
 
 def _listener(plant: WeekPlant) -> Listener:
     """Return the listener as soon as the router lets it in."""
-    until = time.monotonic() + 120.0
     while True:
-        try:
+        with suppress(ConfigError):
             return Listener(plant.cells)
-        except ConfigError:
-            if time.monotonic() > until:
-                raise
 
 
 def _plan(rng: random.Random, kinds: Sequence[str], seconds: float, every_s: float) -> list[tuple[float, str]]:

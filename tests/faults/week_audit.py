@@ -109,8 +109,10 @@ class Audit:
             self.figures["documents"] += 1
             if signer != f"worker.{cell.name}":
                 self.wrong.append(f"{path.parent.name}: {signer}")
-        for fed in [*cell.fed, *_captures(cell)]:
-            self._file(cell.name, fed, entries, results)
+        of_files = {
+            key for fed in [*cell.fed, *_captures(cell)] for key in self._file(cell.name, fed, entries, results)
+        }
+        self.wrong += [f"{cell.name}: {entry.name} is of no file" for entry in entries if entry.sha256 not in of_files]
         self._announcements(cell.name, entries, listener)
         done = Counter(entry.sha256 for entry in entries if entry.state == "done")
         known = Counter(run.document.recording.sha256 for run in History(history).runs("emps"))
@@ -139,8 +141,11 @@ class Audit:
         if memory_then > 1.2 * memory + 20 or files_then > files + 8:
             self.wrong.append(f"{name}: {text}")
 
-    def _file(self, cell: str, fed: Fed, entries: list[LedgerEntry], results: Counter[str]) -> None:
-        """Find the one result or the one reason of a file, by its content, or by its name if that was never read."""
+    def _file(self, cell: str, fed: Fed, entries: list[LedgerEntry], results: Counter[str]) -> list[str]:
+        """Find the one result or the one reason of a file, by its content, or by its name if that was never read.
+
+        Returns the keys of its entries.
+        """
         path = fed.path.resolve()
         found = [entry for entry in entries if fed.sha256 and entry.digest == fed.sha256] or [
             entry for entry in entries if path in _paths(entry) and not (fed.sha256 and entry.digest)
@@ -155,6 +160,7 @@ class Audit:
         else:
             states = [(entry.state, entry.message, results[entry.sha256]) for entry in found]
             self.wrong.append(f"{cell}: {path.name} ({fed.kind}): {states}")
+        return [entry.sha256 for entry in found]
 
     def _announcements(self, cell: str, entries: list[LedgerEntry], listener: Listener) -> None:
         try:
