@@ -305,7 +305,7 @@ class WeekPlant(Plant):
     def _cell(self, folder: Path, name: str) -> Cell:
         place = folder / name
         place.mkdir()
-        mount = ["mount", "-t", "tmpfs", "-o", f"size={DISK_MB}m", "disk", place]
+        mount = ["mount", "-t", "tmpfs", "-o", f"size={DISK_MB}m", "disk", str(place)]
         has_disk = os.geteuid() == 0 and subprocess.run(mount, check=False, capture_output=True).returncode == 0
         data = yaml.safe_load((HERE / "cells" / "emps_cell.yaml").read_text(encoding="utf-8")) | {
             "cell": name,
