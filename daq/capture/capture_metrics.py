@@ -1,6 +1,6 @@
 """Metrics of a capture; their keys are those of the health message and of `Health`."""
 
-from armident.metrics import INFO, UPDATED, Family, Metrics
+from armident.metrics import CERTIFICATES, INFO, UPDATED, Family, Metrics
 
 _US = 1e-6
 _BUS = ("bus",)
@@ -39,6 +39,7 @@ CAPTURE = Metrics(
         Family("clock_offset_us", "clock_offset_seconds", "Offset of the clock, still to be corrected.", scale=_US),
         Family("clock_error_us", "clock_error_seconds", "Estimated error of the clock.", scale=_US),
         Family("clock_largest_error_us", "clock_largest_error_seconds", "Upper bound of the clock error.", scale=_US),
+        CERTIFICATES,
     ),
 )
 """Metrics of a capture; statistics are those since its start."""

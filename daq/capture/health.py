@@ -15,6 +15,7 @@ from armident.daq.capture.plan import CapturePlan
 from armident.daq.capture.publisher import Publisher
 from armident.daq.capture.recording_files import free_space
 from armident.daq.capture.sink import Sink
+from armident.daq.identity.plant import certificate_ends
 from armident.daq.matching.assembler import Assembler
 from armident.daq.recording.clock import clock_state
 from armident.drivers.can.receiver import Receiver
@@ -182,6 +183,7 @@ class Health:
                 for bus, jitter in zip(received, self._jitters, strict=True)
                 for statistic, value in jitter.statistics().items()
             },
+            "certificate_ends": certificate_ends(self._plan.session, "capture"),
             "celsius_of": {(joint,): celsius for joint, celsius in self.temperatures().items()},
         }
 

@@ -55,7 +55,7 @@ def access_control(enrolled: Iterable[tuple[Role, str, str]], router: str) -> di
     """
     names: dict[tuple[Role, str], list[str]] = defaultdict(list)
     for role, cell, name in enrolled:
-        if role != "router":
+        if role not in ("router", "opcua"):
             names[role, cell].append(name)
     rules = [_rule("all", ("ingress", "egress"), _EVERY, ("**", "**/@adv/**"))]
     subjects = [{"id": "router", "cert_common_names": [router]}]
@@ -162,6 +162,10 @@ def explained(role: Role, cell: str, name: str) -> str:
     """Return what an identity may do, in words."""
     if role == "router":
         return f"{name}: forwards between the others; publishes, reads and commands nothing of its own"
+    if role == "opcua":
+        return (
+            f"{name}: serves or reads the verdicts of all cells over OPC UA; publishes, reads and commands nothing else"
+        )
     may = PERMISSIONS[role]
     where = "all cells" if cell == ANY_CELL else f"cell {cell}"
     parts = [

@@ -1,4 +1,4 @@
-"""Certificates of a plant: an authority, and one certificate for each role of a cell or person (X.509, P-256)."""
+"""Certificates of a plant: an authority, and one for each role of a cell, person or application (X.509)."""
 
 import os
 import secrets
@@ -12,7 +12,7 @@ from typing import Literal, get_args
 
 from cryptography import x509
 from cryptography.exceptions import InvalidSignature, UnsupportedAlgorithm
-from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.hazmat.primitives.asymmetric import ec, rsa
 from cryptography.hazmat.primitives.hashes import SHA256
 from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat, load_pem_private_key
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
@@ -20,12 +20,21 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 from armident.configs import ConfigError, DataError
 from armident.configs.reasons import reason_of
 
-Role = Literal["capture", "worker", "operator", "viewer", "router"]
+Role = Literal["capture", "worker", "operator", "viewer", "router", "opcua"]
 ROLES: tuple[Role, ...] = get_args(Role)
 ANY_CELL = "*"
-"""Cell of a router, and of an operator or viewer of the whole plant."""
+"""Cell of a router, of an application of OPC UA, and of an operator or viewer of the whole plant."""
 TOLERANCE = timedelta(minutes=5)
 """Difference of the clocks of two hosts that a new certificate allows for."""
+APPLICATION = "urn:"
+"""Begin of an address that is the URI of an application of OPC UA."""
+RSA_BITS = 3072
+"""Length of an RSA key, as strong as the curve P-256 (NIST SP 800-57)."""
+
+PrivateKey = ec.EllipticCurvePrivateKey | rsa.RSAPrivateKey
+"""Key of P-256, or of RSA for role ``opcua``: the usual security policies of OPC UA know nothing else."""
+_KEYS = (ec.EllipticCurvePublicKey, rsa.RSAPublicKey)
+"""Kinds of keys of the other roles, and of role ``opcua``."""
 
 
 @dataclass(frozen=True)
@@ -38,11 +47,12 @@ class Identity:
     role: Role
     cell: str
     name: str
-    key: ec.EllipticCurvePrivateKey
+    key: PrivateKey
     certificate: x509.Certificate
 
     def sign(self, data: bytes) -> bytes:
-        """Return the signature of data: ECDSA with SHA-256, DER."""
+        """Return the signature of data: ECDSA with SHA-256, DER; an application of OPC UA signs nothing else."""
+        assert isinstance(self.key, ec.EllipticCurvePrivateKey)
         return self.key.sign(data, ec.ECDSA(SHA256()))
 
 
@@ -56,14 +66,19 @@ class Authority:
     def issue(
         self, role: Role, cell: str, name: str, addresses: Sequence[str], days: int, now: datetime | None = None
     ) -> Identity:
-        """Return a new identity; ``addresses``: DNS names and IP addresses under which it is reached.
+        """Return a new identity; ``addresses``: DNS names, IP addresses and URI of an application (`APPLICATION`).
 
         The certificate has the role as organisational unit and the cell as organisation. ConfigError if one is invalid.
         """
-        if role not in ROLES or (cell == ANY_CELL and role not in ("operator", "viewer", "router")):
-            of_all = "only operator, viewer and router may be of all cells"
+        if role not in ROLES or (cell == ANY_CELL and role in ("capture", "worker")):
+            of_all = "capture and worker are of one cell"
             raise ConfigError(f"role {role!r} in cell {cell!r}: expected one of {', '.join(ROLES)}; {of_all}")
-        key, addressed = ec.generate_private_key(ec.SECP256R1()), [_address(address) for address in addresses]
+        key: PrivateKey = ec.generate_private_key(ec.SECP256R1())
+        if role == "opcua":
+            key = rsa.generate_private_key(65_537, RSA_BITS)
+            if not any(address.startswith(APPLICATION) for address in addresses):
+                addresses = [f"{APPLICATION}armident:{name}", *addresses]
+        addressed = [_address(address) for address in addresses]
         more: list[tuple[x509.ExtensionType, bool]] = [
             (x509.ExtendedKeyUsage([ExtendedKeyUsageOID.CLIENT_AUTH, ExtendedKeyUsageOID.SERVER_AUTH]), False),
             (x509.AuthorityKeyIdentifier.from_issuer_public_key(self.key.public_key()), False),
@@ -119,8 +134,8 @@ def trusted_certificate(
             break
     else:
         raise DataError(f"{name!r}: its certificate was issued by another authority")
-    if not isinstance(certificate.public_key(), ec.EllipticCurvePublicKey):
-        raise DataError(f"{name}: the certificate has no key of an elliptic curve")
+    if not isinstance(certificate.public_key(), _KEYS[identity_of(certificate)[0] == "opcua"]):
+        raise DataError(f"{name}: the certificate has another kind of key than its role")
     check_dates(certificate, at, name)
     check_dates(authority, at, "the authority")
     return certificate
@@ -129,8 +144,9 @@ def trusted_certificate(
 def verify(certificate: x509.Certificate, signature: bytes, data: bytes) -> None:
     """Check the signature of data by the holder of a trusted certificate; DataError if it is wrong."""
     key = certificate.public_key()
-    assert isinstance(key, ec.EllipticCurvePublicKey)
     try:
+        if not isinstance(key, ec.EllipticCurvePublicKey):
+            raise InvalidSignature
         key.verify(signature, data, ec.ECDSA(SHA256()))
     except InvalidSignature as error:
         raise DataError(f"the signature of {identity_of(certificate)[2]} does not fit: changed or forged") from error
@@ -150,7 +166,7 @@ def pem_of(*certificates: x509.Certificate) -> bytes:
     return b"".join(certificate.public_bytes(Encoding.PEM) for certificate in certificates)
 
 
-def write_key(path: Path, key: ec.EllipticCurvePrivateKey, mode: int = 0o600) -> None:
+def write_key(path: Path, key: PrivateKey, mode: int = 0o600) -> None:
     """Write a private key as PEM (PKCS 8); mode 0640: its group may read it."""
     write_whole(path, key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption()), mode)
 
@@ -188,7 +204,7 @@ def read_certificates(path: Path) -> tuple[x509.Certificate, ...]:
         raise ConfigError(f"{path}: expected certificates (PEM)") from error
 
 
-def read_key(path: Path) -> ec.EllipticCurvePrivateKey:
+def read_key(path: Path) -> PrivateKey:
     """Return the private key of a PEM file; ConfigError if it is none, or if all users may read it."""
     try:
         if path.stat().st_mode & 0o007:
@@ -198,8 +214,8 @@ def read_key(path: Path) -> ec.EllipticCurvePrivateKey:
         raise ConfigError(reason_of(error)) from error
     except (ValueError, TypeError, UnsupportedAlgorithm) as error:
         raise ConfigError(f"{path}: expected a private key without password (PEM)") from error
-    if not isinstance(key, ec.EllipticCurvePrivateKey):
-        raise ConfigError(f"{path}: expected a key of the curve P-256")
+    if not isinstance(key, PrivateKey):
+        raise ConfigError(f"{path}: expected a key of the curve P-256, or of RSA")
     return key
 
 
@@ -219,14 +235,14 @@ def read_authority(folder: Path) -> Authority:
     """Return the authority whose key is in a folder; ConfigError if there is none."""
     key = read_key(folder / "authority.key")
     for certificate in read_certificates(folder / "authority.pem"):
-        if certificate.public_key() == key.public_key():
+        if isinstance(key, ec.EllipticCurvePrivateKey) and certificate.public_key() == key.public_key():
             return Authority(key, certificate)
     raise ConfigError(f"{folder / 'authority.pem'}: no certificate belongs to authority.key")
 
 
 def _builder(
     subject: dict[x509.ObjectIdentifier, str],
-    key: ec.EllipticCurvePrivateKey,
+    key: PrivateKey,
     days: int,
     now: datetime | None,
     path_length: int | None,
@@ -240,7 +256,9 @@ def _builder(
         .not_valid_before(begin - TOLERANCE)
         .not_valid_after(begin + timedelta(days=days))
     )
-    usage = x509.KeyUsage(not ca, False, False, False, False, ca, ca, False, False)
+    # OPC 10000-6, 6.2.2: an application signs, and receives keys that are encrypted.
+    uses = isinstance(key, rsa.RSAPrivateKey)
+    usage = x509.KeyUsage(not ca, uses, uses, uses, False, ca, ca, False, False)
     own = [(x509.BasicConstraints(ca, path_length), True), (usage, True)]
     for extension, critical in (*own, (x509.SubjectKeyIdentifier.from_public_key(key.public_key()), False), *more):
         builder = builder.add_extension(extension, critical)
@@ -259,6 +277,6 @@ def _address(text: str) -> x509.GeneralName:
     with suppress(ValueError):
         return x509.IPAddress(ip_address(text))
     try:
-        return x509.DNSName(text)
+        return x509.UniformResourceIdentifier(text) if text.startswith(APPLICATION) else x509.DNSName(text)
     except ValueError as error:
         raise ConfigError(f"address {text!r}: expected an IP address or a DNS name in ASCII") from error

@@ -58,9 +58,12 @@ class KeyFolder:
                     found = issue(role, of, f"{role}.{name}"[:64], addresses, _DAYS, _FROM)
                     write_identity(self.path, found)
         if found is None:
+            where, option = f"cell {cell}", f"--cell {cell}"
+            if cell == ANY_CELL:
+                where, option = "all cells", "--name NAME --address HOST"
             raise ConfigError(
-                f"{self.path}: no key of a {role} of cell {cell}; "
-                f"run where the authority is: armident keys enrol {role} --cell {cell}"
+                f"{self.path}: no key of a {role} of {where}; "
+                f"run where the authority is: armident keys enrol {role} {option}"
             )
         return found
 

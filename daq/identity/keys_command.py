@@ -17,7 +17,7 @@ def keys(
     action: Annotated[str, typer.Argument(help="init, enrol, show, check, renew, revoke or router.")],
     subject: Annotated[
         str | None,
-        typer.Argument(help="enrol: capture, worker, operator, viewer or router. renew, revoke: a name."),
+        typer.Argument(help="enrol: capture, worker, operator, viewer, router or opcua. renew, revoke: a name."),
     ] = None,
     folder: Annotated[
         Path | None,
@@ -32,7 +32,9 @@ def keys(
     name: Annotated[str | None, typer.Option("--name", help="enrol: person or host. [default: the cell]")] = None,
     address: Annotated[
         list[str] | None,
-        typer.Option("--address", help="enrol, renew: DNS name or IP address to reach it; can be repeated."),
+        typer.Option(
+            "--address", help="enrol, renew: DNS name, IP address, or urn: of an OPC UA application; can be repeated."
+        ),
     ] = None,
     days: Annotated[int, typer.Option("--days", min=1, max=3650, help="enrol, renew: validity, days.")] = 365,
     every: Annotated[bool, typer.Option("--all", help="renew: all names.")] = False,
@@ -70,7 +72,7 @@ def keys(
         raise ConfigError(f"{OF_PLANT}: no such folder; run armident keys init, or name the folder with --folder")
     path = found.path
     if subject is None and (action in ("enrol", "revoke") or (action == "renew" and not every)):
-        what = "role: capture, worker, operator, viewer or router" if action == "enrol" else "name, or --all"
+        what = "role: capture, worker, operator, viewer, router or opcua" if action == "enrol" else "name, or --all"
         raise ConfigError(f"armident keys {action}: expected a {what}")
     made = []
     if action == "enrol":

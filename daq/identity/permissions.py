@@ -45,10 +45,11 @@ PERMISSIONS: dict[Role, Permission] = {
     "operator": Permission(ask=("command/*", "result/*", *_STREAMS, "alive/*"), read=_ALL, sign=("documents",)),
     "viewer": Permission(ask=("result/*", *_STREAMS, "alive/*"), read=_ALL),
     "router": Permission(),
+    "opcua": Permission(),
 }
 """Permissions by role; an operator or viewer of all cells has them in each cell. All else is forbidden.
 
-A re-identification and ``armident watch`` have the role of a worker.
+A re-identification and ``armident watch`` have the role of a worker. An application of OPC UA has no part in Zenoh.
 """
 
 

@@ -4,8 +4,10 @@ import logging
 import re
 import time
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal
 
@@ -32,7 +34,7 @@ from armident.daq.identity.certificates import (
     write_key,
     write_whole,
 )
-from armident.daq.identity.folder import key_folder
+from armident.daq.identity.folder import KeyFolder, key_folder
 
 log = logging.getLogger(__name__)
 
@@ -129,6 +131,8 @@ def enrol(folder: Path, role: str, cell: str | None, name: str | None, addresses
         if not addresses:
             raise ConfigError("a router needs --address, once for each DNS name or IP address to reach it")
         full = router_name(plant_of(folder))
+    elif known == "opcua" and cell is not None:
+        raise ConfigError("opcua has no --cell: its server has all cells; give --name")
     else:
         if cell is not None and not _CELL.fullmatch(cell):
             raise ConfigError(f"--cell {cell!r}: expected the name of a cell as in its session, such as press_7")
@@ -209,6 +213,23 @@ def of_session(session: SessionConfig, now: datetime) -> Iterator[Finding]:
     else:
         if not folder.local:
             yield from findings(folder.path, now, session)
+
+
+def certificate_ends(session: SessionConfig, role: Role) -> dict[tuple[str, ...], float]:
+    """Return the ends of the authority and of the certificate of a role in a cell, by name, s UTC; empty without."""
+    with suppress(ConfigError):
+        folder = key_folder(session.zenoh.keys)
+        return _ends(folder, role, session.cell, folder.stamp(f"{AUTHORITY}.pem"))
+    return {}
+
+
+@lru_cache(maxsize=8)
+def _ends(folder: KeyFolder, role: Role, cell: str, _stamp: tuple[int, ...]) -> dict[tuple[str, ...], float]:
+    own, authority = folder.identity(role, cell), folder.authority_certificates()[0]
+    return {
+        (name,): each.not_valid_after_utc.timestamp()
+        for name, each in ((own.name, own.certificate), (AUTHORITY, authority))
+    }
 
 
 class Countdown:

@@ -67,6 +67,13 @@ class Signer:
                 self._load()
         return self._identity
 
+    @property
+    def is_valid(self) -> bool:
+        """True if its certificate is valid now; what another one signs is refused everywhere."""
+        certificate = self.identity.certificate
+        at = datetime.fromtimestamp(self._clock() / 1e9, UTC)
+        return certificate.not_valid_before_utc <= at <= certificate.not_valid_after_utc
+
     def attachment(self, key: str, payload: bytes, nonce: bytes = b"") -> bytes:
         """Return the attachment that signs a payload on a key expression."""
         identity = self.identity

@@ -63,6 +63,8 @@ class TorquePrediction(Result):
         Torques (M, n), N m or N, with the same filter.
     std
         Standard deviations of the predicted torques due to those of the parameters, (M, n), N m or N.
+    since_start
+        The instants since the recording began (M,), s.
     """
 
     document: PredictionDocument
@@ -71,6 +73,7 @@ class TorquePrediction(Result):
     measured: Array
     predicted: Array
     std: Array
+    since_start: Array
     file = "prediction.json"
 
     @property
@@ -174,6 +177,7 @@ def predict(
     show("set-up", 0.0)
     experiments, remarks = experiments_of([read], configured, name_files=False)
     setup = _setup(experiments, model, notes)
+    starts = [experiment.start for experiment in experiments]
     options = _options(model.document.options)
     experiments = shifted_experiments(corrected_experiments(experiments, configured), configured, options, setup, notes)
     show("torques", 0.5)
@@ -194,6 +198,7 @@ def predict(
         np.concatenate([block.y for block in blocks]),
         np.concatenate([block.x @ theta for block in blocks]),
         np.sqrt(np.maximum(np.concatenate(variance), 0.0)),
+        np.concatenate([block.t + start for block, start in zip(blocks, starts, strict=True)]),
     )
 
 

@@ -248,32 +248,37 @@ def history(
         raise typer.Exit(code)
 
 
+_Sessions = Annotated[
+    list[Path] | None,
+    typer.Option(
+        "--config", help="Session of a cell, or a folder of sessions; can be repeated. [default: /etc/armident]"
+    ),
+]
+_Results = Annotated[
+    Path | None,
+    typer.Option(
+        "--out",
+        help="Folder with the results of each session in a folder of its name, as services have them. "
+        "[default: recording.directory of each session]",
+    ),
+]
+_HistoryOfAll = Annotated[
+    str | None,
+    typer.Option(
+        help="SQLAlchemy URL of the history of all cells. [default: history.sqlite beside the results of each]",
+        envvar="ARMIDENT_HISTORY",
+    ),
+]
+_Listen = Annotated[str, typer.Option(help="Address and port.")]
+_Keys = Annotated[Path | None, typer.Option(help="Folder of the plant's keys: needed if other machines may connect.")]
+
+
 def page(
-    config: Annotated[
-        list[Path] | None,
-        typer.Option(
-            "--config", help="Session of a cell, or a folder of sessions; can be repeated. [default: /etc/armident]"
-        ),
-    ] = None,
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            "--out",
-            help="Folder with the results of each session in a folder of its name, as services have them. "
-            "[default: recording.directory of each session]",
-        ),
-    ] = None,
-    database: Annotated[
-        str | None,
-        typer.Option(
-            help="SQLAlchemy URL of the history of all cells. [default: history.sqlite beside the results of each]",
-            envvar="ARMIDENT_HISTORY",
-        ),
-    ] = None,
-    listen: Annotated[str, typer.Option(help="Address and port.")] = "127.0.0.1:8484",
-    keys: Annotated[
-        Path | None, typer.Option(help="Folder of the plant's keys: needed if other machines may connect.")
-    ] = None,
+    config: _Sessions = None,
+    out: _Results = None,
+    database: _HistoryOfAll = None,
+    listen: _Listen = "127.0.0.1:8484",
+    keys: _Keys = None,
 ) -> None:
     """Show the cells of a plant as a web page: captures, results, changes, and what to do. It changes nothing.
 
@@ -287,6 +292,27 @@ def page(
     from armident.identify.page.serve import run_page
 
     run_page(config or [Path("/etc/armident")], out, database, listen, keys)
+
+
+def opcua(
+    config: _Sessions = None,
+    out: _Results = None,
+    database: _HistoryOfAll = None,
+    listen: _Listen = "127.0.0.1:4840",
+    keys: _Keys = None,
+) -> None:
+    """Serve the health of each axis over OPC UA: verdict, effect, size and drift, with an alarm. It changes nothing.
+
+    Sessions are read at the start; results are read again every few seconds.
+
+    Example: armident opcua --config configs/emps_cell.yaml
+    """
+    from armident.extras import require
+
+    require("armident opcua", "identify", "opcua")
+    from armident.identify.opcua.serve import run_opcua
+
+    run_opcua(config or [Path("/etc/armident")], out, database, listen, keys)
 
 
 @with_options

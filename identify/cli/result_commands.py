@@ -31,7 +31,7 @@ def identify_command(path: Path, config: Path | None, options: Options, out: Pat
 
     with progress(f"identify {path.name}") as report:
         result = identify(path, config, options=options, progress=report)
-    document, html = _saved(result, out or _beside(path, "identification"))
+    document, html = _saved(result, out or beside(path, "identification"))
     if as_json:
         sys.stdout.write(result.to_json())
     else:
@@ -70,7 +70,7 @@ def diagnose_command(
 
     with progress("diagnose") as report:
         found = diagnose(list(paths), config, validate=validate, baseline=baseline, progress=report, **asdict(options))
-    written, html, *model = _saved(found, out or _beside(paths[0], "diagnosis"))
+    written, html, *model = _saved(found, out or beside(paths[0], "diagnosis"))
     document = found.document
     if as_json:
         sys.stdout.write(written.read_text(encoding="utf-8"))
@@ -114,7 +114,7 @@ def predict_command(paths: Sequence[Path], model: Path, config: Path | None, out
         return FOUND if found[0].worthless else 0
     together = predictions_document(found)
     if out is not None:
-        with _writing(out):
+        with writing(out):
             write_atomically(out / "predictions.json", to_json(together))
     if as_json:
         sys.stdout.write(to_json(together))
@@ -129,7 +129,7 @@ def predict_command(paths: Sequence[Path], model: Path, config: Path | None, out
 def _prediction_folders(paths: Sequence[Path], out: Path | None) -> list[Path]:
     """Return the folder for the results of each recording, all different."""
     if out is None:
-        folders = [_beside(path, "prediction") for path in paths]
+        folders = [beside(path, "prediction") for path in paths]
     else:
         folders = [out] if len(paths) == 1 else [out / path.stem for path in paths]
     twice = next((path for path, folder in zip(paths, folders, strict=True) if folders.count(folder) > 1), None)
@@ -163,12 +163,12 @@ def compare_command(
 
 def _saved(result: "Result", folder: Path) -> tuple[Path, ...]:
     """Write a result to the folder of the results."""
-    with _writing(folder):
+    with writing(folder):
         return result.save(folder)
 
 
 @contextmanager
-def _writing(folder: Path) -> Iterator[None]:
+def writing(folder: Path) -> Iterator[None]:
     """Turn an error of the file system into one line that names the folder of the results."""
     try:
         yield
@@ -176,8 +176,8 @@ def _writing(folder: Path) -> Iterator[None]:
         raise ConfigError(f"--out {folder}: cannot be written: {error.strerror}") from error
 
 
-def _beside(path: Path, suffix: str) -> Path:
-    """Return the folder of the results: beside the recording, of an object in the working directory."""
+def beside(path: Path, suffix: str) -> Path:
+    """Return the name of a folder or file beside a recording that belongs to it; of an object in the working folder."""
     if isinstance(located(path), ObjectUrl):
         path = Path(path.name)
     return path.with_name(f"{path.name.removesuffix('.mcap')}.{suffix}")

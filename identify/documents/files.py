@@ -3,6 +3,8 @@
 import json
 import os
 import secrets
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -59,14 +61,24 @@ def _text(path: Path) -> str:
 
 def write_atomically(path: Path, content: str | bytes) -> None:
     """Write a file so that a reader sees all of it or none of it; missing folders are created."""
+    with whole_file(path) as temporary, temporary.open("wb") as stream:
+        stream.write(content if isinstance(content, bytes) else content.encode())
+        stream.flush()
+        os.fsync(stream.fileno())
+
+
+@contextmanager
+def whole_file(path: Path) -> Iterator[Path]:
+    """Yield the name of an empty file that takes the place of ``path`` in the end; after an error there is none.
+
+    Missing folders are created. OSError names ``path``.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     # Created like any other file, so that the umask decides who may read it.
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
     try:
-        with temporary.open("xb") as stream:
-            stream.write(content if isinstance(content, bytes) else content.encode())
-            stream.flush()
-            os.fsync(stream.fileno())
+        temporary.open("x").close()
+        yield temporary
         os.replace(temporary, path)
     except OSError as error:
         raise OSError(error.errno, error.strerror, str(path)) from error

@@ -40,6 +40,18 @@ def sign_file(path: Path, identity: "Identity") -> str:
     return text
 
 
+def is_signed_in_time(text: bytes) -> bool:
+    """Return False if the certificate that signed a document was not valid at that time: nobody accepts it."""
+    from cryptography import x509
+
+    content = json.loads(text)
+    if "signature" not in content:
+        return True
+    certificate = x509.load_der_x509_certificate(base64.b64decode(content["signature"]["certificate"]))
+    at = datetime.fromisoformat(content["provenance"]["time"])
+    return certificate.not_valid_before_utc <= at <= certificate.not_valid_after_utc
+
+
 def verify_command(files: Sequence[Path], keys: Path | None, *, as_json: bool) -> int:
     """Carry out ``armident verify``; 1 if a document is not rightly signed, otherwise 0."""
     from armident.daq.identity.folder import key_folder

@@ -20,7 +20,7 @@ def capsules_of(shapes: Iterable[UrdfShape]) -> tuple[list[LinkCapsule], list[st
     capsules: list[LinkCapsule] = []
     unread: list[str] = []
     for shape in shapes:
-        points = _points(shape)
+        points = points_of(shape)
         if points is None:
             unread.append("" if shape.mesh is None else f"{shape.mesh.name} of the link of {shape.link}")
             continue
@@ -52,8 +52,8 @@ def bounding_capsule(points: Array) -> tuple[Array, float]:
     return centre + np.outer([low, high], axes[0]), radius
 
 
-def _points(shape: UrdfShape) -> Array | None:
-    """Points (K, 3) whose capsule contains a shape, in its frame, m; ``None`` for a mesh that cannot be read."""
+def points_of(shape: UrdfShape) -> Array | None:
+    """Return points (K, 3) whose capsule contains a shape, in its frame, m; ``None`` for an unreadable mesh."""
     if shape.kind == "sphere":
         return np.zeros((1, 3))
     if shape.kind == "box":

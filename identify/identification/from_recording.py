@@ -69,7 +69,7 @@ def experiments_from_recording(
 def _converted(
     recording: Recording, robot: RobotConfig, stretches: StretchRule
 ) -> tuple[Sequence[Experiment], list[str]]:
-    _check_same_robot(recording.robot, robot)
+    check_same_robot(recording.robot, robot)
     _check_counters(recording)
     long = recording.samples.sync.size * robot.n > stretches.beyond
     remarks: Sequence[str] = ()
@@ -228,8 +228,8 @@ def _part(recording: Recording, rows: NDArray[np.int64]) -> Recording:
     return replace(recording, streams=streams)
 
 
-def joint_positions(stream: Stream, quantity: Literal["position", "demand"], robot: RobotConfig) -> Array:
-    """Position or demand of a stream, joint side, (N, n), rad or m; DataError if it is missing or not finite."""
+def joint_positions(stream: Stream, quantity: Literal["position", "demand", "velocity"], robot: RobotConfig) -> Array:
+    """Position, demand or velocity of a stream, joint side, (N, n), SI; DataError if it is missing or not finite."""
     name = stream.named(quantity)
     if name is None:
         raise DataError(f"stream {stream.name!r} has no {quantity}; it has {', '.join(sorted(stream.fields))}")
@@ -260,7 +260,8 @@ def joint_torques(stream: Stream, robot: RobotConfig) -> Array:
     )
 
 
-def _check_same_robot(recorded: RobotConfig, robot: RobotConfig) -> None:
+def check_same_robot(recorded: RobotConfig, robot: RobotConfig) -> None:
+    """Raise DataError if two configurations differ in name, joints or transmission."""
     differences = []
     if recorded.name != robot.name:
         differences.append(f"named {recorded.name!r} / {robot.name!r}")

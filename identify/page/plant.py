@@ -21,17 +21,20 @@ LEAVE_S = 20.0
 class Plant:
     """Cells with their files, changes and messages; a request reads no disk and waits for no database.
 
-    ``progress`` is called after each round of reading, for a watchdog.
+    ``progress`` is called after each round of reading, for a watchdog. ``listens``: False without the messages.
     """
 
-    def __init__(self, cells: Sequence[Cell], progress: Callable[[], None] = lambda: None) -> None:
+    def __init__(
+        self, cells: Sequence[Cell], progress: Callable[[], None] = lambda: None, *, listens: bool = True
+    ) -> None:
         self.cells = {cell.name: cell for cell in cells}
         self.listener = Listener(cells)
         self._progress = progress
         self._files: dict[str, CellFiles] = {}
         self._drifts: dict[str, Drift | str | None] = {}
         self._stopped = threading.Event()
-        rounds = ((self.read_files, FILES_S), (self.listener.check, SESSIONS_S), (self.read_histories, HISTORIES_S))
+        rounds = [(self.read_files, FILES_S), (self.read_histories, HISTORIES_S)]
+        rounds += [(self.listener.check, SESSIONS_S)] if listens else []
         self._threads = [threading.Thread(target=self._repeat, args=each, daemon=True) for each in rounds]
 
     def __enter__(self) -> "Plant":

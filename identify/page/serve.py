@@ -1,9 +1,7 @@
 """Command ``armident page``: its addresses, its keys, and the server."""
 
-import ipaddress
 import logging
 import signal
-import socket
 import ssl
 from collections.abc import Sequence
 from contextlib import closing
@@ -17,6 +15,7 @@ from cryptography import x509
 from armident.configs import ConfigError
 from armident.daq.identity.certificates import ANY_CELL
 from armident.daq.identity.folder import KeyFolder, key_folder
+from armident.identify.page.addresses import address_of, bound, is_loopback
 from armident.identify.page.cells import cells_in
 from armident.identify.page.plant import Plant
 from armident.identify.page.site import site
@@ -37,7 +36,7 @@ def run_page(configs: Sequence[Path], out: Path | None, database: str | None, li
     number = "1 cell" if len(cells) == 1 else f"{len(cells)} cells"
     with (
         closing(Notifier()) as notifier,
-        closing(_bound(host, port, listen)) as listening,
+        closing(bound(host, port, listen)) as listening,
         Plant(cells, lambda: notifier.progress(number)) as plant,
     ):
         options = uvicorn.Config(
@@ -86,28 +85,3 @@ def sign_in(folder: KeyFolder, listen: str) -> tuple[Sequence[str], dict[str, An
 
 def _ended(_number: int, _frame: FrameType | None) -> None:
     log.debug("page: ended by a signal")
-
-
-def address_of(listen: str) -> tuple[str, int]:
-    """Return host and port of ``HOST:PORT``; an IPv6 address stands in brackets."""
-    host, colon, port = listen.rpartition(":")
-    if not colon or not host or not port.isdecimal() or int(port) > 65_535 or (":" in host) != host.startswith("["):
-        raise ConfigError(f"--listen {listen}: expected HOST:PORT, such as 127.0.0.1:8484 or [::1]:8484")
-    return host, int(port)
-
-
-def is_loopback(host: str) -> bool:
-    """Return True if only programs of this machine reach a host."""
-    try:
-        return host == "localhost" or ipaddress.ip_address(host.strip("[]")).is_loopback
-    except ValueError:
-        return False
-
-
-def _bound(host: str, port: int, listen: str) -> socket.socket:
-    """Return a socket that listens; ConfigError if the address is taken or not of this machine."""
-    try:
-        family = socket.AF_INET6 if host.startswith("[") else socket.AF_INET
-        return socket.create_server((host.strip("[]"), port), family=family, backlog=128)
-    except OSError as error:
-        raise ConfigError(f"--listen {listen}: {error.strerror}; choose another address or port") from error

@@ -11,9 +11,11 @@ EXTRAS: dict[str, tuple[str, ...]] = {
     "virtual": ("clarabel", "pinocchio", "scipy"),
     "fleet": ("distributed",),
     "objects": ("fsspec", "s3fs"),
+    "opcua": ("asyncua",),
     "page": ("starlette", "uvicorn"),
     "parquet": ("pyarrow",),
     "postgresql": ("psycopg",),
+    "viewer": ("foxglove_schemas_protobuf", "mcap_protobuf", "rerun"),
 }  # fmt: skip
 """Modules that each extra brings; the base has none of them."""
 

@@ -40,6 +40,10 @@ class Family:
 INFO = Family("version", "info", "Always 1, with the version of armident.", ("version",))
 UPDATED = Family("time_s", "updated_timestamp_seconds", "Time at which the values were read.")
 """Families of every program; `INFO` has its value by itself."""
+CERTIFICATES = Family(
+    "certificate_ends", "certificate_expiry_timestamp_seconds", "Time at which a certificate ends.", ("certificate",)
+)
+"""Family of the programs that sign."""
 _VERSION: Value = {(importlib.metadata.version("armident"),): 1.0}
 
 

@@ -260,7 +260,8 @@ def main() -> None:
     known = {(case["case"], case["way"]) for case in done}
     todo = {k: [w for w in options.ways if (f"{options.half}_{k:04d}", w) not in known] for k in options.cases}
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(options.jobs, context) as pool:
+    # A process for each case: memory that a diagnosis has freed counts towards the limit of the next one.
+    with ProcessPoolExecutor(options.jobs, context, max_tasks_per_child=1) as pool:
         futures = {pool.submit(_entered, options.half, k, ways, options.out): k for k, ways in todo.items() if ways}
         for number, future in enumerate(as_completed(futures), 1):
             error = future.exception()

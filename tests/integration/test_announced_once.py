@@ -6,20 +6,24 @@ import signal
 import time
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Literal
 
 import pytest
 
 from armident.configs import SessionConfig
+from armident.daq.identity.certificates import read_authority, write_identity
+from armident.daq.identity.plant import enrol, make_authority, renew
 from armident.daq.recording import clock, read_recording
 from armident.daq.recording.clock import ClockState
 from armident.daq.streaming import Keys, open_session
+from armident.identify.documents.signing import sign_file, verify_command
 from armident.identify.identification.identify_recording import identify_recording
 from armident.identify.monitoring.worker.announcements import Announcements
 from armident.identify.monitoring.worker.ledger import FILE, Ledger, LedgerEntry, LedgerError
 from armident.identify.monitoring.worker.worker import Worker
-from armident.identify.monitoring.worker.worker_link import WorkerLink
+from armident.identify.monitoring.worker.worker_link import LinkDown, WorkerLink
 from armident.identify.report.robot_file import write_identification
 from tests.faults.service import Audience, cell_of
 from tests.integration.test_worker_failures import recorded
@@ -161,3 +165,31 @@ def test_each_announcement_deletes_results_that_are_too_old(tmp_path: Path, monk
         Announcements(Keys(session.cell, "emps"), link, keep_days=365.0).make(ledger, entry.sha256)
     assert not old.exists()
     assert [each.sha256 for each in ledger.entries()] == [entry.sha256]
+
+
+def test_a_result_signed_by_an_expired_certificate_is_signed_again_and_announced_after_the_renewal(
+    tmp_path: Path,
+) -> None:
+    entry, keys = entered(tmp_path, "done", lease_s=LONG_S), tmp_path / "keys"
+    assert entry.result is not None
+    session = cell_of(tmp_path)
+    session = session.model_copy(update={"zenoh": session.zenoh.model_copy(update={"keys": keys})})
+    make_authority(keys, "werk")
+    name = enrol(keys, "worker", session.cell, None, [], 365).name
+    then = datetime.now(UTC) - timedelta(days=10)
+    expired = read_authority(keys).issue("worker", session.cell, name, [], 9, then)
+    write_identity(keys, expired)
+    sign_file(entry.result, expired)
+    assert verify_command([entry.result], keys, as_json=False) == 1
+    ledger, names = Ledger(tmp_path / FILE, "one", LONG_S), Keys(session.cell, "emps")
+    with closing(WorkerLink(session, names, nothing, nothing, (0, 0), lambda _: b"")) as link:
+        link.check()
+        while link._announcer is None or link._announcer.ready_in_s > 0.0:
+            time.sleep(0.05)
+        with pytest.raises(LinkDown):
+            Announcements(names, link).make(ledger, entry.sha256)
+        renew(keys, name, (), 365)
+        assert link.can_announce
+        document = Announcements(names, link).make(ledger, entry.sha256)
+    assert document == entry.result.read_bytes()
+    assert verify_command([entry.result], keys, as_json=False) == 0

@@ -211,6 +211,7 @@ def plant(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Plant]:
     issue(authority, plant.stolen, "worker_as_router", "worker", addresses=["localhost"])
     self_signed(plant.stolen)
     anna = read_identity(plant.host / "viewer.anna.pem")
+    assert isinstance(anna.key, ec.EllipticCurvePrivateKey)
     made = issue(Authority(anna.key, anna.certificate), plant.stolen, "signed_by_a_viewer")
     write_whole(plant.stolen / "signed_by_a_viewer.pem", pem_of(made.certificate, anna.certificate), 0o644)
     with plant.router():

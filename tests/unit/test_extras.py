@@ -10,7 +10,13 @@ import pytest
 from armident.configs import ConfigError
 from armident.extras import EXTRAS, needed_extra, require
 
-DISTRIBUTIONS = {"pinocchio": "pin", "markupsafe": "jinja2"}
+DISTRIBUTIONS = {
+    "foxglove_schemas_protobuf": "foxglove-schemas-protobuf",
+    "markupsafe": "jinja2",
+    "mcap_protobuf": "mcap-protobuf-support",
+    "pinocchio": "pin",
+    "rerun": "rerun-sdk",
+}
 """Distributions whose name is another than that of the module."""
 
 

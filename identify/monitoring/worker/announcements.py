@@ -4,6 +4,7 @@ import logging
 
 from armident.configs import ArmidentError
 from armident.daq.streaming import Keys
+from armident.identify.documents.signing import is_signed_in_time, sign_file
 from armident.identify.monitoring.worker.ledger import Ledger, LedgerEntry
 from armident.identify.monitoring.worker.results import prune_results
 from armident.identify.monitoring.worker.status_messages import failure_status, status_message
@@ -39,6 +40,8 @@ class Announcements:
         if not self._link.can_announce:
             raise LinkDown("zenoh: no session yet")
         document, message = _outcome(entry)
+        if document is not None and entry.result is not None and not is_signed_in_time(document):
+            document = sign_file(entry.result, self._link.signer.identity).encode()
         with ledger.announcement(sha256) as mine:
             if mine and sha256 not in self._sent:
                 if document is None:

@@ -56,9 +56,9 @@ class WorkerLink:
 
     @property
     def can_announce(self) -> bool:
-        """True if there is a session that all listeners have had time to find."""
+        """True if there is a session that all listeners have had time to find, and a certificate that is valid."""
         announcer = self._announcer
-        return announcer is not None and announcer.ready_in_s == 0.0
+        return announcer is not None and announcer.ready_in_s == 0.0 and self.signer.is_valid
 
     def check(self) -> None:
         """Open sessions that are missing, and take the port of the role if another worker has left it."""

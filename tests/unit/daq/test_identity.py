@@ -8,7 +8,10 @@ from pathlib import Path
 
 import pytest
 from cryptography import x509
+from cryptography.hazmat.primitives.asymmetric import ec, rsa
+from cryptography.hazmat.primitives.hashes import SHA256
 from cryptography.hazmat.primitives.serialization import Encoding
+from cryptography.x509.oid import NameOID
 
 from armident.configs import ConfigError, DataError
 from armident.daq.identity import VARIABLE
@@ -21,6 +24,7 @@ from armident.daq.identity.certificates import (
     pem_of,
     read_identity,
     signer_of,
+    verify,
     write_identity,
     write_key,
     write_whole,
@@ -50,11 +54,45 @@ def test_a_certificate_has_role_cell_name_and_addresses(authority: Authority) ->
     assert names.get_values_for_type(x509.IPAddress) == [ip_address("192.0.2.7")]
 
 
-def test_openssl_verifies_the_chain(authority: Authority, tmp_path: Path) -> None:
+def test_an_application_of_opc_ua_has_an_rsa_key_its_uri_and_the_usage_of_the_standard(authority: Authority) -> None:
+    """OPC 10000-6, 6.2.2; the key is as strong as the curve P-256 (NIST SP 800-57, table 2)."""
+    identity = authority.issue("opcua", "*", "opcua.scada", ["192.0.2.7"], 30)
+    key, extensions = identity.certificate.public_key(), identity.certificate.extensions
+    assert isinstance(key, rsa.RSAPublicKey)
+    assert key.key_size == 3072
+    names = extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+    assert names.get_values_for_type(x509.UniformResourceIdentifier) == ["urn:armident:opcua.scada"]
+    usage = extensions.get_extension_for_class(x509.KeyUsage).value
+    uses = (usage.digital_signature, usage.content_commitment, usage.key_encipherment, usage.data_encipherment)
+    assert uses == (True, True, True, True)
+    assert signer_of(der(identity), [authority.certificate], now())[0] == "opcua"
+    # It signs no message and no document.
+    with pytest.raises(DataError, match="does not fit"):
+        verify(identity.certificate, b"x", b"y")
+
+
+def test_a_role_has_its_kind_of_key(authority: Authority) -> None:
+    """A certificate of RSA that claims another role is refused, whoever has signed it."""
+    identity = authority.issue("opcua", "*", "opcua.scada", [], 30)
+    subject = x509.Name([*identity.certificate.subject][:1])
+    for oid, value in ((NameOID.ORGANIZATIONAL_UNIT_NAME, "capture"), (NameOID.ORGANIZATION_NAME, "c")):
+        subject = x509.Name([*subject, x509.NameAttribute(oid, value)])
+    forged = (
+        x509.CertificateBuilder(authority.certificate.subject, subject, identity.certificate.public_key(), 7)
+        .not_valid_before(now() - timedelta(days=1))
+        .not_valid_after(now() + timedelta(days=1))
+        .sign(authority.key, SHA256())
+    )
+    with pytest.raises(DataError, match="another kind of key than its role"):
+        signer_of(forged.public_bytes(Encoding.DER), [authority.certificate], now())
+
+
+@pytest.mark.parametrize(("role", "cell", "name"), [("worker", "c", "worker.c"), ("opcua", "*", "opcua.c")])
+def test_openssl_verifies_the_chain(authority: Authority, tmp_path: Path, role: Role, cell: str, name: str) -> None:
     write_whole(tmp_path / "authority.pem", pem_of(authority.certificate), 0o644)
-    write_identity(tmp_path, authority.issue("worker", "c", "worker.c", ["localhost"], 30))
+    write_identity(tmp_path, authority.issue(role, cell, name, ["localhost"], 30))
     for purpose in ("sslclient", "sslserver"):
-        command = ["openssl", "verify", "-x509_strict", "-purpose", purpose, "-CAfile", "authority.pem", "worker.c.pem"]
+        command = ["openssl", "verify", "-x509_strict", "-purpose", purpose, "-CAfile", "authority.pem", f"{name}.pem"]
         done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
         assert done.returncode == 0, done.stderr
 
@@ -76,6 +114,7 @@ def test_another_authority_of_the_same_name_is_refused(authority: Authority) -> 
 
 def test_an_identity_issues_nothing(authority: Authority) -> None:
     capture = authority.issue("capture", "c", "capture.c", [], 30)
+    assert isinstance(capture.key, ec.EllipticCurvePrivateKey)
     forged = Authority(capture.key, capture.certificate).issue("operator", "*", "operator.eve", [], 30)
     with pytest.raises(DataError, match="another authority"):
         signer_of(der(forged), [authority.certificate], now())

@@ -24,7 +24,17 @@ from armident.daq.identity.certificates import (
     write_key,
     write_whole,
 )
-from armident.daq.identity.plant import Countdown, enrol, enrolled, findings, make_authority, missing, renew, revoke
+from armident.daq.identity.plant import (
+    Countdown,
+    certificate_ends,
+    enrol,
+    enrolled,
+    findings,
+    make_authority,
+    missing,
+    renew,
+    revoke,
+)
 from armident.daq.streaming.zenoh_session import configuration
 from tests.unit.daq.test_identity import der, now
 from tests.unit.daq.test_streaming import cell
@@ -86,7 +96,7 @@ def test_a_plant_is_made_by_the_commands_and_says_who_may_do_what(tmp_path: Path
         (["enrol"], "expected a role"),
         (["enrol", "vewer"], "no role 'vewer'; expected capture, worker"),
         (["enrol", "capture"], "--cell is missing"),
-        (["enrol", "capture", "--name", "x"], "only operator, viewer and router may be of all cells"),
+        (["enrol", "capture", "--name", "x"], "capture and worker are of one cell"),
         (["enrol", "viewer"], "--cell is missing, or --name"),
         (["enrol", "viewer", "--cell", "a/**"], "expected the name of a cell"),
         (["enrol", "viewer", "--name", "../x"], "--name '../x'"),
@@ -94,6 +104,8 @@ def test_a_plant_is_made_by_the_commands_and_says_who_may_do_what(tmp_path: Path
         (["enrol", "capture", "--cell", "press_7"], "or: armident keys renew capture.press_7"),
         (["enrol", "worker", "--cell", "b", "--address", "é.example"], "expected an IP address or a DNS name"),
         (["enrol", "router", "--cell", "b"], "neither --cell nor --name"),
+        (["enrol", "opcua", "--cell", "press_7"], "opcua has no --cell"),
+        (["enrol", "opcua", "--name", "x", "--address", "urn:é"], "expected an IP address or a DNS name"),
         (["renew"], "expected a name, or --all"),
         (["renew", "viewer.otto"], "no viewer.otto.pem; armident keys show lists"),
         (["revoke", "viewer.otto"], "no viewer.otto.pem"),
@@ -225,6 +237,33 @@ def test_a_renewal_keeps_name_role_cell_and_addresses_with_a_new_key(plant: Path
         assert (each.role, each.cell, each.addresses) == (old.role, old.cell, old.addresses)
         assert each.certificate.public_key() != old.certificate.public_key()
     assert problems(plant) == []
+
+
+def test_an_application_of_opc_ua_has_no_part_in_zenoh(plant: Path) -> None:
+    code, said, _ = run("enrol", "opcua", "--name", "scada", "--address", "urn:scada.example:client", "--folder", plant)
+    assert code == 0
+    assert "opcua.scada.pem, opcua.scada.key and authority.pem" in said
+    assert "opcua" not in (plant / "router.json5").read_text()
+    renewed = renew(plant, "opcua.scada", (), 30)
+    assert [each.addresses for each in enrolled(plant) if each.role == "opcua"] == [["urn:scada.example:client"]]
+    assert read_identity(plant / "opcua.scada.pem").key.private_numbers() == renewed.key.private_numbers()
+    assert problems(plant) == []
+    words = (
+        "opcua.scada: serves or reads the verdicts of all cells over OPC UA; publishes, reads and commands nothing else"
+    )
+    assert words in run("check", "--folder", plant)[1]
+
+
+def test_the_ends_of_certificates_follow_a_renewal(plant: Path) -> None:
+    session = cell("press_7", keys=plant)
+    authority = read_certificates(plant / "authority.pem")[0].not_valid_after_utc.timestamp()
+    for days in (365, 20):
+        renewed = renew(plant, "capture.press_7", (), days).certificate.not_valid_after_utc
+        assert abs(renewed - now() - timedelta(days=days)) < timedelta(hours=1)
+        found = certificate_ends(session, "capture")
+        assert found == {("capture.press_7",): renewed.timestamp(), ("authority",): authority}
+    assert certificate_ends(cell("b", keys=plant), "capture") == {}
+    assert certificate_ends(cell("b", keys=plant / "none"), "worker") == {}
 
 
 def test_a_renewed_authority_still_trusts_the_former_one(plant: Path) -> None:

@@ -1,6 +1,5 @@
 """Preview channels: SI units at the joints, at a low rate, shown by viewers and ignored by our reader."""
 
-import json
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -103,22 +102,14 @@ def test_channels_say_the_scale_factors_of_their_raw_values(tmp_path: Path) -> N
     assert channel.metadata["current"].startswith(f"A, motor side = raw int16 times: joint_1 {scale[0]:.9g}, joint_2 ")
 
 
-def test_layouts_of_viewers_show_fields_that_recordings_have(tmp_path: Path) -> None:
+def test_the_layout_of_plotjuggler_shows_fields_that_recordings_have(tmp_path: Path) -> None:
     written(tmp_path / "r.mcap", 50.0)
     with (tmp_path / "r.mcap").open("rb") as file:
-        summary = make_reader(file).get_summary()
-        assert summary is not None
-        topics = {channel.topic for channel in summary.channels.values()}
         known: set[str] = set()
         for _, channel, _, message in make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages():
             if channel.topic.startswith("/si_"):
                 joints = [(f.name, getattr(message, f.name)) for f in message.DESCRIPTOR.fields if f.message_type]
                 known |= {f"{channel.topic}/{name}/{f.name}" for name, one in joints for f in one.DESCRIPTOR.fields}
-    foxglove = json.loads((HERE / "viewers" / "foxglove.json").read_text())
-    panels = foxglove["configById"].values()
-    shown = [path["value"] for panel in panels for path in panel.get("paths", [])]
-    assert {panel["topicPath"] for panel in panels if "topicPath" in panel} <= topics
     curves = [curve.attrib["name"] for curve in ElementTree.parse(HERE / "viewers" / "plotjuggler.xml").iter("curve")]
-    assert len(curves) == len(shown) == 24
-    assert {value.replace(".", "/") for value in shown} | set(curves) <= known
+    assert len(curves) == 24
     assert known == set(curves)

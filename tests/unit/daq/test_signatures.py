@@ -63,4 +63,4 @@ def test_a_viewer_changes_nothing_and_only_an_operator_commands() -> None:
     assert commanding == ["operator"]
     assert [role for role in ROLES if may(role, "publish", "samples")] == ["capture"]
     assert [role for role in ROLES if may(role, "publish", "result/identification")] == ["worker"]
-    assert [role for role in ROLES if not may(role, "read", "samples")] == ["capture", "router"]
+    assert [role for role in ROLES if not may(role, "read", "samples")] == ["capture", "router", "opcua"]

@@ -60,6 +60,7 @@ def test_the_worn_screw_of_the_emps_is_admitted_first(shared_data: Path) -> None
 
 
 @pytest.mark.nightly
+@pytest.mark.xfail(strict=True, reason=OTHER_LAWS)
 def test_the_worn_screw_of_the_emps_is_named_first(worn_screw: DiagnosisResult) -> None:
     finding = worn_screw.document.findings[0]
     assert finding.effect == "asymmetric_viscous_friction"

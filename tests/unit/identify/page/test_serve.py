@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 from armident.configs import ConfigError
 from armident.daq.cli import application
 from armident.daq.identity.certificates import ANY_CELL, Authority, new_authority, pem_of, write_identity, write_whole
-from armident.identify.page.serve import address_of, is_loopback
+from armident.identify.page.addresses import address_of, is_loopback
 from tests.fixtures import plant
 
 pytestmark = pytest.mark.slow
