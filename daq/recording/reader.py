@@ -221,7 +221,9 @@ def _read(path: Path, mapped: mmap.mmap, *, part: bool) -> Recording:
     except mcap.MalformedRecord as error:
         raise DataError(f"{path}: damaged: {error}") from error
     except DataError as error:
-        raise error if str(path) in str(error) else DataError(f"{path}: {error}") from error
+        if str(path) in str(error):
+            raise
+        raise DataError(f"{path}: {error}") from error
 
 
 def _recording(path: Path, content: _Content) -> Recording:

@@ -63,7 +63,9 @@ def experiments_from_recording(
         robot.check_filled("identify")
         return _converted(recording, robot, stretches)
     except DataError as error:
-        raise error if recording.path is None else DataError(f"{recording.path}: {error}") from error
+        if recording.path is None:
+            raise
+        raise DataError(f"{recording.path}: {error}") from error
 
 
 def _converted(

@@ -160,7 +160,7 @@ def fleet_in_process(folder: Path, *options: str) -> Result:
 @pytest.mark.slow
 @pytest.mark.timeout(300)
 def test_a_fleet_is_compared_in_order_and_survives_a_failed_recording(tmp_path: Path) -> None:
-    """One line per recording and one history; one file is not a recording."""
+    """One line per recording and one history; one file is torn before its first chunk."""
     from distributed import LocalCluster
 
     friction = hide("friction_drift", "joint_1", change=0.1, time_constant=1e-6)
@@ -168,7 +168,7 @@ def test_a_fleet_is_compared_in_order_and_survives_a_failed_recording(tmp_path: 
     for name, seed, effects in (("a_monday", 1, ()), ("b_tuesday", 2, ()), ("d_worn", 3, (friction,))):
         made = replace(recording("emps", "emps_excitation", seed, *effects), session=session)
         write_recording(made, tmp_path / f"{name}.mcap")
-    (tmp_path / "c_broken.mcap").write_bytes(b"not a recording")
+    (tmp_path / "c_broken.mcap").write_bytes((tmp_path / "a_monday.mcap").read_bytes()[:3000])
     # The worker is two threads of this process, which has imported everything.
     with LocalCluster(
         n_workers=1, threads_per_worker=2, processes=False, protocol="tcp://", dashboard_address=None
