@@ -2,6 +2,7 @@
 
 import json
 import mmap
+import os
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -30,7 +31,9 @@ from armident.daq.recording.names import (
     SCHEMA,
     SESSION,
 )
+from armident.daq.recording.objects import ObjectUrl, located, opened
 from armident.daq.recording.scan import LARGEST_CHUNK, ChunkItem, RecordingScan
+from armident.daq.recording.stretch import chunk_table, copied, stretch_of, window
 
 _LEAST_ROW, _MOST_RESERVED = 2, 1 << 25
 """Least share of a compressed file that a row takes, bytes, and largest number of rows for which memory is reserved."""
@@ -40,36 +43,56 @@ _RELEASE_EVERY = 1 << 26
 """Number of bytes read between two releases of the mapped file's pages."""
 
 
-def read_recording(path: Path | str) -> Recording:
-    """Read a recording; of a truncated one, all complete chunks.
+def read_recording(path: Path | str, between_s: tuple[float, float] | None = None) -> Recording:
+    """Read a recording, or a stretch of it; of a truncated one, all complete chunks.
 
     Parameters
     ----------
     path
-        The MCAP file.
+        The MCAP file, or the URL of an object such as ``s3://bucket/run.mcap`` (extra ``objects``).
+    between_s
+        Begin and end of the stretch to read, s after the first sample; of a file or object little else is read.
 
     Returns
     -------
     Recording
-        Raw values in the dtypes they were captured in; ``missing`` is ``None`` if the file is complete.
+        Raw values in the dtypes they were captured in; ``missing`` is ``None`` if the file is complete. A stretch has
+        no counters, and its ``sha256`` is that of its own samples.
 
     Raises
     ------
     ConfigError
-        If there is no such file, or it cannot be read.
+        If there is no such file or object, or it cannot be read.
     DataError
-        If it is not a recording of armident.
+        If it is not a recording of armident, or has no sample in the stretch.
     """
-    path = Path(path)
+    path = located(path)
+    table = None
     try:
-        with path.open("rb") as file:
-            if path.stat().st_size == 0:
+        with opened(path) as file:
+            size = file.seek(0, os.SEEK_END)
+            if size == 0:
                 raise DataError(f"{path}: empty, not a recording")
-            return _read(path, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))
+            if between_s is not None:
+                table = chunk_table(file)
+            if table is not None and between_s is not None:
+                data = copied(file, table.needed(window(table.begin_ns, between_s)))
+            elif isinstance(path, ObjectUrl):
+                data = copied(file, [(0, size)])
+            else:
+                data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
     except FileNotFoundError as error:
         raise ConfigError(f"{path}: no such recording") from error
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
+    recording = _read(path, data, part=table is not None)
+    if between_s is None:
+        return recording
+    begin_ns = int(min(recording.samples.t_ns, default=0)) if table is None else table.begin_ns
+    found = stretch_of(recording, window(begin_ns, between_s))
+    if not found.samples.sync.size:
+        raise DataError(f"{path}: no sample between {between_s[0]:g} s and {between_s[1]:g} s after its begin")
+    return found
 
 
 def is_recording(path: Path) -> bool:
@@ -179,11 +202,12 @@ class _Content:
             raise DataError(f"topic {topic}: an invalid event: {_one_line(error)}") from error
 
 
-def _read(path: Path, mapped: mmap.mmap) -> Recording:
+def _read(path: Path, mapped: mmap.mmap, *, part: bool) -> Recording:
+    """Read the records of a file, or ``part`` of it: its chunks are then fewer than its summary says."""
     data = memoryview(mapped)
     released = 0
     try:
-        scan = RecordingScan(data)
+        scan = RecordingScan(data, part=part)
         # The size of the file bounds the memory that its statistics can have us reserve.
         content = _Content(scan, min(len(data) // _LEAST_ROW, _MOST_RESERVED))
         for item in scan:

@@ -111,23 +111,24 @@ class RecordingScan:
     A damaged record behind the head is skipped and described in ``damage``; other threads decompress chunks ahead. A
     file of another MCAP tool (``rewritten``) is judged by its chunks' checksums, numbers of messages and metadata.
 
-    By channel id: ``channels``, ``layouts``, ``messages`` so far, ``expected`` (``None``: the summary is invalid).
+    By channel id: ``channels``, ``layouts``, ``messages`` so far, ``expected`` (``None``: the summary is invalid, or
+    ``part`` of the chunks have been left out).
     ``finished``: data end and closing magic are there. ``end``: end of the last complete record, bytes.
     """
 
-    def __init__(self, data: memoryview) -> None:
+    def __init__(self, data: memoryview, *, part: bool = False) -> None:
         if bytes(data[: len(mcap.MAGIC)]) != mcap.MAGIC:
             raise DataError("not a recording (not an MCAP file)")
         self.channels: dict[int, Channel] = {}
         self.layouts: dict[int, StreamLayout] = {}
         self.metadata: dict[str, dict[str, str]] = {}
         self.messages: dict[int, int] = {}
-        self.expected = expected_messages(data)
+        self.expected = None if part else expected_messages(data)
         self.damage: list[str] = []
         self.head_crc: int | None = None
         self.finished = self.rewritten = False
         self.end = 0
-        self._data = data
+        self._data, self._part = data, part
 
     def __iter__(self) -> Iterator[Item]:
         """Yield the records in file order, the data end last; MalformedRecord at a damaged head."""
@@ -170,7 +171,7 @@ class RecordingScan:
                 for k, count in (self.expected or {}).items()
                 if k in self.channels and count != self.messages.get(k, 0)
             ]
-        if self.rewritten:
+        if self.rewritten and not self._part:
             words += self._lost_in_rewriting()
         if not self.finished:
             since = "from the start" if last_sync is None else f"after SYNC {last_sync}"
@@ -296,21 +297,30 @@ class RecordingScan:
 
 def expected_messages(data: memoryview) -> dict[int, int] | None:
     """Return the number of messages by channel id of a file's summary; ``None`` without a valid one."""
-    footer_start = len(data) - len(mcap.MAGIC) - mcap.FOOTER_SIZE
-    footer_end = footer_start + mcap.FOOTER_SIZE
-    if footer_start < len(mcap.MAGIC) or bytes(data[footer_end:]) != mcap.MAGIC:
-        return None
     try:
-        footer = mcap.read_footer(data[footer_start:footer_end])
-        start, crc = footer.summary_start, footer.summary_crc
-        if not 0 < start <= footer_start or (crc and zlib.crc32(data[start : footer_end - 4]) != crc):
-            return None
-        for opcode, _, body in mcap.records(data[:footer_start], start):
+        for opcode, body in summary_records(data) or ():
             if opcode == Opcode.STATISTICS:
                 return dict(mcap.decode(Statistics, body).channel_message_counts)
     except mcap.MalformedRecord:
         return None
     return None
+
+
+def summary_records(data: memoryview, begin: int = 0) -> Iterator[tuple[int, memoryview]] | None:
+    """Return opcode and content of the records of a valid summary, from the bytes of a file from ``begin`` to its end.
+
+    ``None`` if there is none, or it begins before. Raises MalformedRecord if the footer is none.
+    """
+    footer_start = len(data) - len(mcap.MAGIC) - mcap.FOOTER_SIZE
+    footer_end = footer_start + mcap.FOOTER_SIZE
+    if begin + footer_start < len(mcap.MAGIC) or footer_start < 0 or bytes(data[footer_end:]) != mcap.MAGIC:
+        return None
+    footer = mcap.read_footer(data[footer_start:footer_end])
+    start, crc = footer.summary_start - begin, footer.summary_crc
+    whole = footer.summary_start > 0 and 0 <= start <= footer_start
+    if not whole or (crc and zlib.crc32(data[start : footer_end - 4]) != crc):
+        return None
+    return ((opcode, body) for opcode, _, body in mcap.records(data[:footer_start], start))
 
 
 def _uncompressed(body: memoryview, checked: bool) -> bytes | None:

@@ -22,7 +22,7 @@ Robot = Annotated[
 
 @with_options
 def identify(
-    recording: Annotated[Path, typer.Argument(help="Recording (.mcap).")],
+    recording: Annotated[Path, typer.Argument(help="Recording (.mcap), or the URL of one (s3://BUCKET/run.mcap).")],
     options: Options,
     config: Robot = None,
     out: OutDirectory = None,

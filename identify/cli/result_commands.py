@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from armident.configs import ConfigError, DataError
 from armident.configs.errors import FOUND
+from armident.daq.recording.objects import ObjectUrl, located
 from armident.identify.diagnosis.diagnosis_options import DiagnosisOptions
 from armident.identify.documents.files import to_json, write_atomically
 from armident.identify.identification.options import Options
@@ -176,5 +177,7 @@ def writing(folder: Path) -> Iterator[None]:
 
 
 def beside(path: Path, suffix: str) -> Path:
-    """Return the name of a folder or file beside a recording that belongs to it."""
+    """Return the name of a folder or file beside a recording that belongs to it; of an object in the working folder."""
+    if isinstance(located(path), ObjectUrl):
+        path = Path(path.name)
     return path.with_name(f"{path.name.removesuffix('.mcap')}.{suffix}")

@@ -59,10 +59,10 @@ def _text(path: Path) -> str:
         raise DataError(f"{path}: cannot be read: {error.strerror}") from error
 
 
-def write_atomically(path: Path, text: str) -> None:
+def write_atomically(path: Path, content: str | bytes) -> None:
     """Write a file so that a reader sees all of it or none of it; missing folders are created."""
-    with whole_file(path) as temporary, temporary.open("w", encoding="utf-8") as stream:
-        stream.write(text)
+    with whole_file(path) as temporary, temporary.open("wb") as stream:
+        stream.write(content if isinstance(content, bytes) else content.encode())
         stream.flush()
         os.fsync(stream.fileno())
 

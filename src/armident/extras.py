@@ -10,6 +10,7 @@ EXTRAS: dict[str, tuple[str, ...]] = {
     ),
     "virtual": ("clarabel", "pinocchio", "scipy"),
     "fleet": ("distributed",),
+    "objects": ("fsspec", "s3fs"),
     "opcua": ("asyncua",),
     "page": ("starlette", "uvicorn"),
     "parquet": ("pyarrow",),

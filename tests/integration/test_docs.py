@@ -31,7 +31,7 @@ BLOCK = re.compile(
     r"|^(?P<margin> *)```(?P<language>[\w{}]*)(?: \S+)?\n(?P<code>.*?)^ *```$",
     re.MULTILINE | re.DOTALL,
 )
-LANGUAGES = {"sh", "python", "yaml", "toml", "json", "text", "ini", "{toctree}", "{literalinclude}"}
+LANGUAGES = {"sh", "python", "sql", "yaml", "toml", "json", "text", "ini", "{toctree}", "{literalinclude}"}
 PAGE_S = 900.0
 """Time limit of a page, s: ten times what the slowest one takes on an idle machine."""
 TRAP = "trap 'code=$?; [ $code -eq 4 ] || { echo \"exit code $code: $BASH_COMMAND\" >&2; exit $code; }' ERR\n"

@@ -224,6 +224,11 @@ class History:
         found = self._read(_of(robot, cell).where(runs.c.converged).limit(1))
         return found[0] if found else None
 
+    def of_recording(self, robot: str, sha256: str) -> HistoryRun | None:
+        """Return the identification of a recording by the SHA-256 of its samples."""
+        found = self._read(_of(robot, None).where(runs.c.sha256 == sha256).limit(1))
+        return found[0] if found else None
+
     def runs(self, robot: str | None = None, cell: str | None = None) -> list[HistoryRun]:
         """Return identifications in the order of their recordings, of all robots and cells by default.
 

@@ -20,9 +20,13 @@ class ReidentifyOptions:
     store: str = option("SQLAlchemy URL of the history.", "sqlite:///history.sqlite", envvar="ARMIDENT_HISTORY")
     out: Path | None = option("Folder of recordings and results. [default: that of the session or recording]", None)
     false_alarms: float = option("Probability of a false alarm per run.", 1e-4, min=1e-12, max=0.5)
-    recordings: str | None = option("Identify these recordings (a quoted pattern) instead of moving an arm.", None)
+    recordings: str | None = option(
+        "Identify these recordings instead of moving an arm: a quoted pattern of files, or of objects as s3://B/*.mcap.",
+        None,
+    )
     scheduler: str | None = option("Dask scheduler for --recordings, as tcp://HOST:8786.", None)
     workers: int | None = option("With --recordings and no scheduler: number of local processes.", None, min=1)
+    results: Path | None = option("With --recordings: folder of a table of the results (Parquet).", None)
     material: float | None = option(
         "Least change of a joint's torque by a finding of the diagnosis, percent. [default: that of diagnose]",
         None,

@@ -96,7 +96,11 @@ def reidentify_command(asked: ReidentifyOptions, *, as_json: bool) -> int:
 
     Raises ConfigError, DataError or ArmidentError if an input is wrong, or motion or identification fail.
     """
-    for option, given in (("--scheduler", asked.scheduler), ("--workers", asked.workers)):
+    for option, given in (
+        ("--scheduler", asked.scheduler),
+        ("--workers", asked.workers),
+        ("--results", asked.results),
+    ):
         if given is not None:
             raise ConfigError(f"{option}: needs --recordings")
     if asked.config is None:
