@@ -61,7 +61,7 @@ def test_the_questions_of_the_documentation_are_answered_by_the_table(
 ) -> None:
     folder, figures = outcome
     monkeypatch.chdir(folder)
-    changed, failed, moved = (duckdb.sql(text).fetchall() for text in sql_blocks())
+    changed, failed, moved = (duckdb.connect().execute(text).fetchall() for text in sql_blocks())
     assert [(row[0], row[1]) for row in changed] == [("cell_1", "emps")]
     assert "fv1" in changed[0][3] or "fc1" in changed[0][3]
     assert failed == [(str(folder / "recordings" / REST), figures.failed[REST])]

@@ -177,7 +177,8 @@ def _fetched(future: Any) -> Identified | ArmidentError:
     from distributed import KilledWorker
 
     try:
-        return future.result()  # type: ignore[no-any-return]
+        found: Identified = future.result()
+        return found
     except KilledWorker as error:
         times = error.allowed_failures + 1
         return ArmidentError(f"{times} workers ended while it was identified (killed, or out of memory): given up")
