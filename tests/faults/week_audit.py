@@ -1,4 +1,4 @@
-"""What a listener beside the plant of `tests.faults.week` hears, and the audit of files, results, messages and logs."""
+"""Listener beside the plant of `tests.faults.week`, and the audit of files, results, messages and logs."""
 
 import json
 import re

@@ -92,7 +92,7 @@ def cell(made: Path) -> Iterator[Path]:
 
 
 def seen(cell: Path) -> CellView:
-    """What is known of the cell."""
+    """State of the cell for the readings."""
     found = Plant(cells_in([cell.parent], None, None), listens=False)
     found.read_files()
     return found.view("press_4")
