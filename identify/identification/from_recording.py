@@ -253,6 +253,13 @@ def joint_torques(stream: Stream, robot: RobotConfig) -> Array:
             continue
         values = _finite(stream, name, robot)
         if quantity != "torque":
+            if quantity != wanted:
+                raise DataError(
+                    f"stream {stream.name!r} has a {quantity} of each motor, but drive.signal of {robot.name} is "
+                    f"{wanted}: record that, or set drive.signal: {quantity} and the gain of each motor, "
+                    f"{'N m/A' if quantity == 'current' else 'N m/V'}, in the robot configuration, and give it by "
+                    "--config"
+                )
             values = values * np.array([joint.drive.gain for joint in robot.joints])
         elif stream.fields[name].side == "joint":
             return np.ascontiguousarray(values)

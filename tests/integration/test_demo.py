@@ -19,7 +19,7 @@ from armident.virtual_robot.twin import ParameterChoice, load_twin
 
 LONGEST_S = 280
 REPOSITORY = Path(__file__).resolve().parents[2]
-PICKER = REPOSITORY / "docs" / "examples" / "integration_test" / "picker.yaml"
+PICKER = REPOSITORY / "configs" / "examples" / "integration_test" / "picker.yaml"
 
 
 @pytest.mark.slow

@@ -11,6 +11,7 @@ programme. A command may exit with 4 ("changed" or "unexplained"). Comments in a
 
 import os
 import re
+import shutil
 import subprocess
 import sys
 from dataclasses import dataclass
@@ -22,7 +23,7 @@ REPOSITORY = Path(__file__).resolve().parents[2]
 GENERATED = "docs/reference"
 PAGES = sorted(
     page
-    for path in (REPOSITORY / "docs").rglob("*.md")
+    for path in (*(REPOSITORY / "docs").rglob("*.md"), *(REPOSITORY / "configs" / "examples").glob("*/README.md"))
     if not str(page := path.relative_to(REPOSITORY)).startswith(GENERATED)
 )
 """Pages with blocks; the others consist of directives."""
@@ -79,6 +80,8 @@ RUNNING = [page for page in PAGES if (read := read_page(REPOSITORY / page)).comm
 @pytest.mark.parametrize("page", RUNNING, ids=str)
 def test_the_blocks_of_a_page_run(page: Path, tmp_path: Path) -> None:
     blocks = read_page(REPOSITORY / page)
+    if page.name == "README.md":  # of an example, whose folder was copied
+        shutil.copytree(REPOSITORY / page.parent, tmp_path, dirs_exist_ok=True)
     environment = {
         **os.environ,
         "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}",

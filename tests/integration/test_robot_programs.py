@@ -13,12 +13,12 @@ import pytest
 import armident
 from armident.configs.schema.robot import Effect
 
-EXAMPLES = Path(__file__).resolve().parents[2] / "docs" / "examples"
+EXAMPLES = Path(__file__).resolve().parents[2] / "configs" / "examples"
 
 
 def program(name: str) -> dict[str, Any]:
     """Names that a program defines; it moves nothing unless it is the main one."""
-    return runpy.run_path(str(EXAMPLES / name))
+    return runpy.run_path(str(next(EXAMPLES.glob(f"*/{name}"))))
 
 
 @pytest.mark.slow
@@ -29,11 +29,11 @@ def test_the_torques_of_the_mujoco_arm_are_those_of_its_parameters(tmp_path: Pat
     np.savetxt(tmp_path / "motion.csv", np.column_stack([t, q]), delimiter=",", header="t,qr1,qr2", comments="")
     command = [
         sys.executable,
-        *map(str, (EXAMPLES / "mujoco_robot.py", tmp_path / "motion.csv", tmp_path / "answer.csv")),
+        *map(str, (EXAMPLES / "mujoco" / "mujoco_robot.py", tmp_path / "motion.csv", tmp_path / "answer.csv")),
     ]
     subprocess.run(command, check=True)
     # Without what the configuration does not know of, the spring of 6 N m/rad is missing.
-    robot = armident.load_robot(EXAMPLES / "mujoco_arm.yaml")
+    robot = armident.load_robot(EXAMPLES / "mujoco" / "mujoco_arm.yaml")
     recording = armident.import_recording(tmp_path / "answer.csv", robot)
     spring = Effect.model_validate({"effect": "joint_spring", "joint": "elbow"})
     fitted = armident.identify(recording, robot.model_copy(update={"effects": (spring,)}))

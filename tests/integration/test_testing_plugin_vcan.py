@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 REPOSITORY = Path(__file__).resolve().parents[2]
-EXAMPLE = REPOSITORY / "docs" / "examples" / "integration_test"
+EXAMPLE = REPOSITORY / "configs" / "examples" / "integration_test"
 
 pytestmark = pytest.mark.vcan
 

@@ -20,7 +20,7 @@ from armident.virtual_robot.twin import complete
 
 pytestmark = pytest.mark.slow
 
-PICKER = complete(load_robot("docs/examples/integration_test/picker.yaml"))[0]
+PICKER = complete(load_robot("configs/examples/integration_test/picker.yaml"))[0]
 """A lift, a shoulder and an elbow, with masses in the URDF and the drives that a virtual arm assumes."""
 PERIOD = 1e-3
 ELBOW = 2

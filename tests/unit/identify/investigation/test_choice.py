@@ -16,7 +16,7 @@ from armident.identify.investigation.choice import Chosen, excluded, first_motio
 from armident.identify.investigation.investigate import _no_motion
 from armident.identify.report.investigation_report import investigation_report
 
-ARM = Path(__file__).resolve().parents[4] / "docs" / "examples" / "mujoco_arm.yaml"
+ARM = Path(__file__).resolve().parents[4] / "configs" / "examples" / "mujoco" / "mujoco_arm.yaml"
 MASS, VISCOUS, DRY = 95.0, 200.0, 20.0
 """Parameters of the EMPS, kg, N s/m, N (Janot, Gautier, Brunot 2019)."""
 
