@@ -16,7 +16,7 @@ from armident.daq.interchange.text_files import listed, shortened
 NAMES: Mapping[str, tuple[str, ...]] = {
     "time": ("t", "time", "times", "timestamp", "timestamps", "__time", "stamp", "elapsed"),
     "position": ("q", "qm", "position", "positions", "actual_q"),
-    "torque": ("tau", "torque", "torques", "effort", "efforts"),
+    "torque": ("tau", "torque", "torques", "effort", "efforts", "actual_current_as_torque"),
     "current": ("current", "currents", "actual_current"),
     "voltage": ("voltage", "vir"),
     "demand": ("qr", "qg"),
