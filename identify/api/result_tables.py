@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from armident.configs import ConfigError
 from armident.identify.documents.identification import Parameter
+from armident.identify.documents.rounding import alike
 from armident.identify.effects.effect import Effect
 
 if TYPE_CHECKING:
@@ -47,7 +48,7 @@ class Table(Sequence[Mapping[str, Any]]):
         return pandas.DataFrame(self.rows, columns=list(self.columns)).set_index(self.columns[0])
 
     def __str__(self) -> str:
-        cells = [self.columns, *(tuple(_text(value) for value in row) for row in self.rows)]
+        cells = [self.columns, *map(self._texts, self.rows)]
         widths = [max(len(row[k]) for row in cells) for k in range(len(self.columns))]
         numbers = [any(isinstance(row[k], float) for row in self.rows) for k in range(len(self.columns))]
         lines = [
@@ -59,13 +60,21 @@ class Table(Sequence[Mapping[str, Any]]):
         ]
         return "\n".join([self.title, *lines] if self.title else lines)
 
+    def _texts(self, row: Sequence[Any]) -> Sequence[str]:
+        """Return the cells of a row as text; a value has the last digit of its standard deviation."""
+        texts = dict(zip(self.columns, map(_text, row), strict=True))
+        if {"value", "std"} <= texts.keys():
+            values = dict(zip(self.columns, row, strict=True))
+            texts["value"], texts["std"] = alike(values["value"], values["std"])
+        return tuple(texts.values())
+
     def __repr__(self) -> str:
         return str(self)
 
     def _repr_html_(self) -> str:
         head = "".join(f"<th>{escape(name)}</th>" for name in self.columns)
         body = "".join(
-            "<tr>" + "".join(f"<td>{escape(_text(value))}</td>" for value in row) + "</tr>" for row in self.rows
+            "<tr>" + "".join(f"<td>{escape(text)}</td>" for text in self._texts(row)) + "</tr>" for row in self.rows
         )
         caption = f"<caption>{escape(self.title)}</caption>" if self.title else ""
         return f"<table>{caption}<thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"

@@ -12,6 +12,7 @@ from armident.configs import RobotConfig
 from armident.identify.cli.print_table import print_table
 from armident.identify.documents.diagnosis import DiagnosisDocument
 from armident.identify.documents.identification import IdentificationDocument
+from armident.identify.documents.rounding import alike, plus_minus
 from armident.identify.effects.terms import arm_model
 
 if TYPE_CHECKING:
@@ -29,7 +30,7 @@ def design_table(robot: RobotConfig, theta: NDArray[np.float64] | None, std: NDA
             table.add_row(name, f"{deviation:.4g}")
     for name, value, deviation in () if theta is None else zip(names, theta, std, strict=True):
         relative = "" if value == 0 else f"{100 * deviation / abs(value):.1f}"
-        table.add_row(name, f"{value:.4f}", f"{deviation:.4f}", relative)
+        table.add_row(name, *alike(value, deviation), relative)
     print_table(table)
 
 
@@ -74,8 +75,8 @@ def identification_table(document: IdentificationDocument) -> None:
         if not p.essential:
             continue
         relative = "" if p.relative_std_pct is None else f"{p.relative_std_pct:.2f}"
-        row = [p.name, f"{p.value:.4f}", f"{p.std:.4f}", relative, p.unit]
-        table.add_row(*row, *([f"{beside[p.name].value:.4f}"] if beside else []))
+        row = [p.name, *alike(p.value, p.std), relative, p.unit]
+        table.add_row(*row, *([alike(beside[p.name].value, p.std)[0]] if beside else []))
     console = Console()
     print_table(table, console)
     essential = sum(p.essential for p in document.parameters)
@@ -105,9 +106,7 @@ def diagnosis_table(document: DiagnosisDocument) -> None:
             table.add_column(heading)
         for f in document.findings:
             std = f.evidence.get("std", {})
-            values = ", ".join(
-                f"{k} {v:.4g}" + (f" ± {std[k]:.2g}" if k in std else "") for k, v in f.parameters.items()
-            )
+            values = ", ".join(f"{k} {plus_minus(v, std.get(k))}" for k, v in f.parameters.items())
             where = f.joint if f.other is None else f"{f.joint}, {f.other}"
             closed = f"{f.gap_before:.2f} % → {f.gap_after:.2f} %"
             table.add_row(where, f.effect, values, f.probability, closed)

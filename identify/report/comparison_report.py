@@ -6,6 +6,7 @@ import numpy as np
 
 from armident.identify.documents.comparison import LEVEL_95, ComparedParameter, ComparisonDocument
 from armident.identify.documents.identification import IdentificationDocument
+from armident.identify.documents.rounding import plus_minus
 from armident.identify.report.glossary import base_entries, in_words
 from armident.identify.report.page import MODEL, MUTED, RESIDUAL, render
 from armident.identify.report.plots import Plot, Series, plots_html
@@ -47,6 +48,7 @@ def _plot(joint: str, parameters: Sequence[ComparedParameter]) -> Plot:
         limits,
         names=tuple(p.name for p in parameters),
         readings=tuple(map(_reading, parameters)),
+        signed_log=True,
     )
 
 
@@ -54,5 +56,5 @@ def _reading(p: ComparedParameter) -> str:
     """Return both values of a parameter with 95 % intervals, in words and with its unit."""
     words = in_words(p.name)
     values = (("before", p.before, p.before_std), ("now", p.now, p.now_std))
-    estimates = ", ".join(f"{when} {value:.4g} ± {LEVEL_95 * std:.2g}" for when, value, std in values)
+    estimates = ", ".join(f"{when} {plus_minus(value, LEVEL_95 * std)}" for when, value, std in values)
     return f"{p.name}{f' ({words})' if words else ''}: {estimates} {p.unit}"

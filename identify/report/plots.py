@@ -34,7 +34,8 @@ class Plot:
     """Curves over a common ascending axis ``x`` (M,); ``limits`` are horizontal lines with names.
 
     ``names``: of the points at integer ``x`` from 0, or empty for numbers. ``readings``: text that is read at each
-    point, or empty for the values of the curves.
+    point, or empty for the values of the curves. ``signed_log``: vertical axis that is linear about zero and
+    logarithmic beyond 1, in both directions.
     """
 
     title: str
@@ -45,6 +46,7 @@ class Plot:
     x_unit: str = "s"
     names: tuple[str, ...] = ()
     readings: tuple[str, ...] = ()
+    signed_log: bool = False
 
 
 def plots_html(plots: Sequence[Plot]) -> Markup:
@@ -81,6 +83,7 @@ def _data(plot: Plot) -> dict[str, object]:
         "limits": [{"name": name, "y": _number(value)} for name, value in plot.limits if np.isfinite(value)],
         "names": list(plot.names),
         "readings": list(plot.readings),
+        "signed_log": plot.signed_log,
     }
 
 

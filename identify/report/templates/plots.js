@@ -16,6 +16,15 @@ function ticks(low, high, count) {
   return found;
 }
 
+/** Round numbers between two values of an axis that is logarithmic beyond 1 in both directions. */
+function signedTicks(low, high) {
+  const most = Math.max(Math.abs(low), Math.abs(high));
+  const steps = most < 100 ? [1, 2, 5] : [1];
+  const found = [0];
+  for (let power = 1; power <= most; power *= 10) steps.forEach((factor) => found.push(factor * power, -factor * power));
+  return found.filter((value) => value >= low && value <= high);
+}
+
 /** A number with three to four significant digits. */
 function text(value) {
   if (value === null || value === undefined || !isFinite(value)) return "–";
@@ -181,7 +190,8 @@ class Plot {
     const [first, last] = span(this.data.x, ...this.group.range);
     const [low, high] = extent(this.data, this.shown, first, last);
     const inside = HEIGHT - MARGIN.top - MARGIN.bottom;
-    const toY = (value) => MARGIN.top + ((high - value) / (high - low)) * inside;
+    const scaled = this.data.signed_log ? Math.asinh : (value) => value;
+    const toY = (value) => MARGIN.top + ((scaled(high) - scaled(value)) / (scaled(high) - scaled(low))) * inside;
     this.axes(pen, low, high, toY);
     pen.save();
     pen.beginPath();
@@ -203,7 +213,7 @@ class Plot {
     pen.strokeStyle = "#eceff3";
     pen.textAlign = "right";
     pen.textBaseline = "middle";
-    ticks(low, high, 5).forEach((value) => {
+    (this.data.signed_log ? signedTicks(low, high) : ticks(low, high, 5)).forEach((value) => {
       this.stroke(pen, MARGIN.left, toY(value), MARGIN.left + this.width, toY(value));
       pen.fillText(text(value), MARGIN.left - 6, toY(value));
     });
@@ -316,5 +326,5 @@ function build() {
   return groups;
 }
 
-if (typeof module !== "undefined") module.exports = { ticks, text, span, nearest, extent, build };
+if (typeof module !== "undefined") module.exports = { ticks, signedTicks, text, span, nearest, extent, build };
 else build();

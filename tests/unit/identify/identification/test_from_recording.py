@@ -167,7 +167,7 @@ def test_a_joint_that_stands_still_is_named(tx40: RobotConfig) -> None:
 def test_currents_are_no_torques_of_a_robot_without_torque_constants() -> None:
     robot = load_robot("ur5e.yaml")  # drive.signal: torque
     recording = recording_of(robot)
-    with pytest.raises(DataError, match="has a current of each motor, but drive.signal of ur5e is torque"):
+    with pytest.raises(DataError, match=r"has a current of each motor, but drive\.signal of ur5e is torque"):
         experiments_from_recording(recording, robot)
 
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from armident.identify.diagnosis.diagnose import DiagnosisResult
+from armident.identify.documents.rounding import alike
 from armident.identify.report.diagnosis_report import SHOWN, diagnosis_report, followed_variable, telling_stretch
 from tests.fixtures import diagnoses
 from tests.fixtures.diagnoses import WORN_AND_SPRUNG
@@ -47,7 +48,7 @@ def test_every_finding_has_a_picture_of_its_own_in_a_page_that_needs_no_other_fi
     assert len(set(pictures)) == len(WORN_AND_SPRUNG)
     for finding in diagnosis.document.findings:
         for name, value in finding.parameters.items():
-            assert f'<td>{name}</td><td class="n">{value:.4g}</td>' in page
+            assert f'<td>{name}</td><td class="n">{alike(value, finding.evidence["std"].get(name))[0]}</td>' in page
 
 
 @pytest.mark.slow

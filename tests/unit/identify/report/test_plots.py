@@ -91,6 +91,27 @@ def test_ticks_are_round_and_inside() -> None:
 
 
 @needs_node
+def test_a_signed_logarithmic_axis_has_ticks_near_zero_and_far_from_it() -> None:
+    found = node("console.log(JSON.stringify(p.signedTicks(-3, 84).sort((a, b) => a - b)))")
+    assert found == [-2, -1, 0, 1, 2, 5, 10, 20, 50]
+
+
+@needs_node
+def test_a_difference_of_eighty_hides_none_of_one() -> None:
+    half = np.full(2, 0.5)
+    plot = Plot("joint", "std", np.arange(2.0), (Series("now", np.array([1.0, 80.0]), "#000", 1.0, half),),
+                names=("a", "b"), signed_log=True)  # fmt: skip
+    marks = node(
+        "p.build(); console.log(JSON.stringify(calls.filter((c) => c[0] === 'fillRect').map((c) => c[2])))",
+        content(str(plots_html([plot]))),
+    )
+    assert isinstance(marks, list)
+    near, far = marks
+    assert 15 < near - far < 140  # of 162 pixels: with a linear axis the first one lies 2 above the bottom
+    assert 190 - 22 - near > 15
+
+
+@needs_node
 def test_the_page_draws_reads_and_zooms() -> None:
     code = """
     const group = p.build()[0];

@@ -8,6 +8,7 @@ from markupsafe import escape
 
 from armident.identify.documents.files import load_document
 from armident.identify.documents.identification import IdentificationDocument, VerdictReason
+from armident.identify.documents.rounding import alike
 from armident.identify.identification.identify_recording import IdentificationOutcome
 from armident.identify.report.identification_report import identification_report
 from armident.identify.report.robot_file import write_identification
@@ -43,9 +44,8 @@ def test_every_essential_parameter_stands_in_the_report_with_its_value(
     essential = [p for p in outcome.document.parameters if p.essential]
     assert essential
     for p in essential:
-        assert re.search(rf"<td>{p.name}</td><td class=\"words\">[^<]+</td><td class=\"n\">{p.value:.4f}</td>", page), (
-            p.name
-        )
+        row = '</td><td class="n">'.join(map(re.escape, alike(p.value, p.std)))
+        assert re.search(rf'<td>{p.name}</td><td class="words">[^<]+</td><td class="n">{row}</td>', page), p.name
 
 
 def test_warnings_reach_the_reader(outcome: IdentificationOutcome, page: str) -> None:
