@@ -1,14 +1,17 @@
-"""Measures what an installation brings: packages and megabytes of each set of extras, in clean environments.
+"""Measures what an installation brings: time, packages and megabytes of each set of extras, in clean environments.
 
 ``python -m tests.tools.installed_size`` builds a wheel of the checkout and installs it by pip, so it needs network.
+``--python`` takes another Python. ``--debian`` installs in an empty Debian 12 instead (debootstrap, as root).
 ``--demo`` also runs the demo from the wheel with all extras, in a folder of its own.
 """
 
 import argparse
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -25,13 +28,24 @@ def main(arguments: Sequence[str]) -> None:
     parser.add_argument("--python", default=sys.executable, help="Python of the environments.")
     parser.add_argument("--wheel", type=Path, help="A wheel instead of one of the checkout.")
     parser.add_argument("--demo", action="store_true", help="Run the demo from the wheel, too.")
+    parser.add_argument("--debian", action="store_true", help="Install in an empty Debian 12.")
     options = parser.parse_args(arguments)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         wheel = options.wheel or build(options.python, folder / "wheel")
+        root = empty_debian(folder / "debian") if options.debian else None
+        if root is not None:
+            shutil.copy(wheel, root)
+            wheel = Path("/", wheel.name)
         for number, extras in enumerate(options.extras):
-            packages = install(options.python, folder / str(number), f"{wheel}[{extras}]" if extras else str(wheel))
-            print(f"armident[{extras}]: {size(packages)}", flush=True)
+            begin = time.monotonic()
+            requirement = f"{wheel}[{extras}]" if extras else str(wheel)
+            if root is None:
+                packages = install(options.python, folder / str(number), requirement)
+            else:
+                packages = install_in(root, f"/{number}", requirement)
+            seconds = time.monotonic() - begin
+            print(f"armident[{extras}]: {seconds:.0f} s, {size(packages)}", flush=True)
         if options.demo:
             install(options.python, folder / "demo", f"{wheel}[identify,virtual]")
             run(str(folder / "demo/bin/armident"), "demo", "--out", str(folder / "out"), cwd=folder)
@@ -52,6 +66,31 @@ def install(python: str, folder: Path, requirement: str) -> Path:
     run(python, "-m", "venv", str(folder), cwd=folder.parent)
     run(str(folder / "bin/python"), "-m", "pip", "install", "-q", requirement, cwd=folder)
     (packages,) = (folder / "lib").glob("python3*/site-packages")
+    return packages
+
+
+def empty_debian(root: Path) -> Path:
+    """Make an empty Debian 12 with Python in a folder and return it; it gets the certificates of this machine."""
+    run(
+        "debootstrap",
+        "--variant=minbase",
+        "--include=python3-venv,ca-certificates",
+        "bookworm",
+        str(root),
+        cwd=root.parent,
+    )
+    for file in ("/etc/resolv.conf", "/etc/ssl/certs/ca-certificates.crt"):
+        shutil.copy(file, root / file.lstrip("/"))
+    return root
+
+
+def install_in(root: Path, folder: str, requirement: str) -> Path:
+    """Install into a new environment of another system, run ``armident --version`` there, return its site-packages."""
+    inside = ("chroot", str(root))
+    run(*inside, "python3", "-m", "venv", folder, cwd=root)
+    run(*inside, f"{folder}/bin/python", "-m", "pip", "install", "-q", requirement, cwd=root)
+    run(*inside, f"{folder}/bin/armident", "--version", cwd=root)
+    (packages,) = Path(root, folder.lstrip("/"), "lib").glob("python3*/site-packages")
     return packages
 
 
