@@ -269,7 +269,9 @@ def _clipped(bench: Bench, best: Step, robot: RobotConfig, known: set[str]) -> l
             f"model needs {clip.needed:.2g} times as much there"
         )
         unusable = clip.share >= signals.CLIPPED_UNUSABLE
-        findings.append(SetupFinding("torque_clipped", (name,), 1.0, message, signals.CLIPPED_REMEDY, unusable))
+        findings.append(
+            SetupFinding("torque_clipped", (name,), clip.probability, message, signals.CLIPPED_REMEDY, unusable)
+        )
     return findings
 
 

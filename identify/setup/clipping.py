@@ -1,13 +1,16 @@
 """Clipped torques behind noise: the model needs more than the largest recorded torque wherever that is reached.
 
-Soft saturation is no mistake but an effect (`drive_gain_saturation`): the better fit of both laws decides.
+Soft saturation is no mistake but an effect (`drive_gain_saturation`): the better fit of both laws decides, if it is
+better by more than chance (Vuong, Econometrica 57, 1989, section 5).
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import ndtr
 
 from armident.identify.setup.bench import Bench
 from armident.identify.setup.fit import Hypothesis, equations, fit_rows
@@ -46,18 +49,28 @@ SHARPNESS = (2.0, 4.0)
 SATURATIONS = (0.3, 0.5, 0.7, 0.8, 0.9, 0.95, 0.98)
 """Values of ``|y / s|^p`` at the largest recorded torque y that are tried."""
 
+DECIDED = 1.645
+"""Least statistic of Vuong's test for clipping: at equal fit it is passed in 5 % of the cases."""
+
+BLOCKS = 20
+"""Blocks of rows whose sums give the standard error of that statistic: neighbouring rows are correlated."""
+
+MOST_CERTAIN = 0.99
+"""Largest probability of a clip: the laws of both alternatives are simplified."""
+
 LEVEL_QUANTILE = 0.98
 """Quantile of the magnitude of the torques that stands for the level: single peaks of noise lie above it."""
 
 
 @dataclass(frozen=True)
 class Clip:
-    """A clipped torque: level, N m or N, share of rows there, and median torque that the model needs there."""
+    """A clipped torque: level, N m or N, share of rows there, median torque that the model needs there, probability."""
 
     joint: int
     level: float
     share: float
     needed: float
+    probability: float
 
 
 def clipped_torques(bench: Bench, h: Hypothesis) -> list[Clip]:
@@ -84,14 +97,30 @@ def clipped_torques(bench: Bench, h: Hypothesis) -> list[Clip]:
         flat = _slope(np.abs(x[near, k] @ below), np.abs(y[near, k])) < MOST_SLOPE
         if not (flat and needed > LEAST_EXCESS and residual[0] > LEAST_IMPROVEMENT * residual[1]):
             continue
-        errors = [np.mean((y[:, k] - np.clip(x[:, k] @ below, -top, top)) ** 2) for top in level * LEVELS]
-        if min(errors) < _soft_error(x, y, int(k), physical, bench.moving):
-            found.append(Clip(int(k), level, share, needed))
+        clipped = _least(y[:, k] - np.clip(x[:, k] @ below, -top, top) for top in level * LEVELS)
+        decided = preference(clipped, _soft_errors(x, y, int(k), physical, bench.moving))
+        if decided > DECIDED:
+            found.append(Clip(int(k), level, share, needed, min(float(ndtr(decided)), MOST_CERTAIN)))
     return found
 
 
-def _soft_error(x: Array, y: Array, k: int, physical: Array, moving: NDArray[np.bool_]) -> float:
-    """Mean squared error of torque k if it saturates softly, with the best of some saturations."""
+def _least(errors: Iterable[Array]) -> Array:
+    """Return the errors (N,) with the least mean square."""
+    return min(errors, key=lambda each: float(np.mean(each**2)))
+
+
+def preference(first: Array, second: Array) -> float:
+    """Return Vuong's statistic of two laws by their errors (N,), positive if the first one fits better."""
+    variances = [float(np.mean(errors**2)) for errors in (first, second)]
+    if min(variances) == 0.0:
+        return np.inf * (variances[1] - variances[0]) if max(variances) else 0.0
+    gain = 0.5 * (np.log(variances[1] / variances[0]) + second**2 / variances[1] - first**2 / variances[0])
+    sums = np.array([part.sum() for part in np.array_split(gain, BLOCKS)])
+    return float(sums.sum() / (np.sqrt(BLOCKS) * max(sums.std(ddof=1), 1e-300)))
+
+
+def _soft_errors(x: Array, y: Array, k: int, physical: Array, moving: NDArray[np.bool_]) -> Array:
+    """Return the errors (N,) of torque k if it saturates softly, with the best of some saturations."""
     every = np.ones(y.shape, dtype=np.bool_)
     size = np.abs(y[:, k]) / np.max(np.abs(y[:, k]))
     errors = []
@@ -104,8 +133,8 @@ def _soft_error(x: Array, y: Array, k: int, physical: Array, moving: NDArray[np.
         needed = x[:, k] @ fit_rows(rows, torque, every, physical, moving)
         loss = share / np.max(np.abs(y[:, k])) ** power
         given = needed / (1.0 + loss * np.abs(needed) ** power) ** (1.0 / power)
-        errors.append(float(np.mean((y[:, k] - given) ** 2)))
-    return min(errors)
+        errors.append(y[:, k] - given)
+    return _least(errors)
 
 
 def _leverage(x: Array, used: NDArray[np.bool_], near: NDArray[np.bool_], k: int) -> float:
