@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,6 +52,14 @@ _CLOCK_STEP_NS = 20_000_000
 """Difference of times and SYNC numbers above which a clock was set: masters are late by less on an idle machine, ns."""
 _HOLE_PERIODS = 10
 """Steps longer than this number of usual ones are not counted: SYNCs may be lacking there."""
+_VERIFIED = 0.4
+"""Uncertainty of a SYNC period over that of the session up to which half and double of it are told from it."""
+_WRAPS_NS = (60_000_000_000, 65_536_000_000, 2**32 * 1000)
+"""Times at which clocks of adapters begin again, ns: one minute and 16 bits of ms (SLCAN), 32 bits of us."""
+_LONGEST_PAUSE_NS = 1_000_000_000
+"""Longest pause between two frames at a wrap, ns."""
+_DESCENDING = 20
+"""Number of steps back for each step forward of a file from the newest row to the oldest."""
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -231,6 +240,49 @@ def gaps_and_counters(streams: Mapping[str, Stream]) -> tuple[tuple[Gap, ...], d
     return tuple(gaps), counters
 
 
+def descending(times: NDArray[Any]) -> bool:
+    """Return True if times (N,) come in the order from the last to the first."""
+    steps = np.diff(times)
+    back = int(np.sum(steps < 0))
+    return back >= _FEWEST and back > _DESCENDING * int(np.sum(steps > 0))
+
+
+def newest_first(frames: Frames) -> bool:
+    """Return True if frames (N,) come from the newest to the oldest, by their times or by the SYNC counter."""
+    if descending(frames["t_ns"]):
+        return True
+    syncs = frames[(frames["can_id"] == COB_SYNC) & (frames["length"] > 0)]
+    counts = np.diff(syncs["data"][:, 0].astype(np.int64))
+    if counts.size < _FEWEST or np.mean(counts == -1) < 0.5:
+        return False
+    # Times that increase contradict the counter; equal ones and differences tell nothing.
+    steps = np.diff(frames["t_ns"])
+    return bool(np.sum(steps > 0) <= 2 * np.sum(steps < 0))
+
+
+def continuous(path: Path, frames: Frames, lines: Ints, session: SessionConfig) -> list[str]:
+    """Undo wraps of the times of one bus (N,), in place, and return a note on them; refuse a log of several runs."""
+    raw = frames["t_ns"].copy()
+    syncs = np.flatnonzero(frames["can_id"] == COB_SYNC)
+    counts, turn = frames["data"][:, 0].astype(np.int64), session.sync.counter
+    wraps: list[int] = []
+    for k in np.flatnonzero(np.diff(raw) < -_CLOCK_STEP_NS):
+        after = int(np.searchsorted(syncs, k, side="right"))
+        if turn and 0 < after < syncs.size and np.all(frames["length"][syncs] > 0):
+            last, first = counts[syncs[after - 1]], counts[syncs[after]]
+            if first != last % turn + 1:
+                raise DataError(
+                    f"{path}: line {lines[k + 1]}: times go back by {(raw[k] - raw[k + 1]) * 1e-9:.4g} s here, and the "
+                    f"SYNC counter jumps from {last} to {first}: several runs in one log; write one file for each"
+                )
+        wrap = next((w for w in _WRAPS_NS if raw[k] <= w and 0 <= raw[k + 1] + w - raw[k] <= _LONGEST_PAUSE_NS), 0)
+        frames["t_ns"][k + 1 :] += wrap
+        wraps += [wrap] if wrap else []
+    if not wraps:
+        return []
+    return [f"times begin again after {wraps[0] * 1e-9:.10g} s ({len(wraps)} times): put one after the other"]
+
+
 def clock_steps(numbers: Ints, t_ns: Ints, session: SessionConfig) -> list[str]:
     """Return a sentence if the times of SYNCs, ns, (N,), step where their numbers, (N,), do not."""
     period = session.sync.period_us * 1000
@@ -242,28 +294,43 @@ def clock_steps(numbers: Ints, t_ns: Ints, session: SessionConfig) -> list[str]:
     k = int(steps[0])
     more = f" (and at {steps.size - 1} more)" if steps.size > 1 else ""
     turns = ", or whole turns of the counter are missing there" if session.sync.counter and late[k] > 0 else ""
+    runs = ", or another run begins there: write one file for each" if not session.sync.counter and late[k] < 0 else ""
     return [
         f"times step by {late[k] * 1e-9:+.4g} s at SYNC {numbers[k + 1]}{more}, where the SYNCs go on: "
-        f"the clock was set{turns}"
+        f"the clock was set{turns}{runs}"
     ]
 
 
-def check_sync_period(path: Path, frames: Frames, session: SessionConfig) -> None:
-    """Refuse a log whose SYNCs, among the frames of one bus (N,), come at another period than that of the session."""
+def check_sync_period(path: Path, frames: Frames, session: SessionConfig, stated_hz: float | None) -> list[str]:
+    """Refuse a log whose SYNCs, among the frames of one bus (N,), come at another period than that of the session.
+
+    Times that do not tell the period are refused, unless the rate is ``stated_hz``, which a note then says.
+    """
     syncs = frames[frames["can_id"] == COB_SYNC]
     counted = session.sync.counter and np.all(syncs["length"] > 0)
     steps = np.diff(syncs["data"][:, 0].astype(np.int64)) % session.sync.counter if counted else None
     found = sync_period_ns(syncs["t_ns"], steps)
-    if found is None:
-        return
-    period, uncertainty = found
     expected = session.sync.period_us * 1000
+    configured = f"every {expected * 1e-6:.4g} ms in the session (sync.period_us: {session.sync.period_us})"
+    if stated_hz is not None and abs(stated_hz * expected * 1e-9 - 1.0) > RATE_TOLERANCE:
+        raise ConfigError(f"{path}: --rate {stated_hz:g} contradicts the session: SYNC comes {configured}")
+    if syncs.size < _FEWEST:
+        return []
+    if found is None or found[1] > _VERIFIED * expected:
+        why = "all its times are equal" if not np.ptp(syncs["t_ns"]) else "its times have too few digits, or jump"
+        if stated_hz is None:
+            raise DataError(
+                f"{path}: {why}, so that they do not tell the SYNC period, which is {configured}: record times of the "
+                "adapter or the kernel; or look up the rate of SYNC in the master and state it with --rate"
+            )
+        return [f"{why}: the SYNC rate of {stated_hz:g} Hz is that of --rate, and is not verified"]
+    period, uncertainty = found
     if abs(period - expected) > PERIOD_TOLERANCE * expected + uncertainty:
         raise DataError(
             f"{path}: SYNC comes every {period * 1e-6:.4g} ms ({1e9 / period:.4g} Hz) in this log, "
-            f"but every {expected * 1e-6:.4g} ms in the session (sync.period_us: {session.sync.period_us}): "
-            "use the session that the log was recorded with"
+            f"but {configured}: use the session that the log was recorded with"
         )
+    return []
 
 
 def sync_period_ns(t_ns: Ints, steps: Ints | None) -> tuple[float, float] | None:
@@ -275,9 +342,12 @@ def sync_period_ns(t_ns: Ints, steps: Ints | None) -> tuple[float, float] | None
         return None
     elapsed = np.diff(t_ns).astype(np.float64)
     periods = np.ones(elapsed.size) if steps is None else steps.astype(np.float64)
-    # Coarse time stamps make a median of 0.
-    usual = float(np.median(elapsed)) or float(np.mean(elapsed))
-    counted = (elapsed >= 0) & (elapsed <= _HOLE_PERIODS * max(usual, 1.0)) & (periods > 0) & (periods <= _HOLE_PERIODS)
+    forward = elapsed[elapsed > 0]
+    if not forward.size:
+        return None
+    # Coarse times make a median of 0: most of the others are one unit of theirs.
+    usual = float(np.median(elapsed)) if np.median(elapsed) > 0 else float(np.median(forward))
+    counted = (elapsed >= 0) & (elapsed <= _HOLE_PERIODS * usual) & (periods > 0) & (periods <= _HOLE_PERIODS)
     total = float(periods[counted].sum())
     if counted.sum() < _FEWEST - 1 or not total:
         return None

@@ -51,6 +51,7 @@ def _read_lines(path: Path, parser: LineParser, frames: FrameCollector) -> None:
     with path.open(encoding=encoding_of(path), errors="replace", newline="\n") as file, _progress(path) as advance:
         while line := file.readline(_LONGEST_LINE):
             number += 1
+            frames.line = number
             kind = parser.parse(line.strip())
             if isinstance(kind, tuple):
                 frames.add(*kind)

@@ -32,7 +32,7 @@ class LineParser(Protocol):
         ...
 
 
-_DIGITS = r"(\d+)(?:\.(\d+))?"
+_DIGITS = r"(-?\d+)(?:\.(\d+))?"
 _DATE = r"(\d{4})-(\d\d)-(\d\d)[ T](\d\d):(\d\d):(\d\d)(?:\.(\d+))?"
 _STAMP = re.compile(_DIGITS + "$")
 _STAMP_WITH_DATE = re.compile(_DATE + "$")
@@ -142,7 +142,7 @@ _MONTHS = {
     for name in names.split()
 }  # fmt: skip
 """Beginnings of the names of months: English, German, French, Spanish, Italian, Portuguese."""
-_ASC_EVENT = re.compile(r"(-?)(\d+)(?:[.,](\d+))?\s+(\S+)\s*(.*)$")
+_ASC_EVENT = re.compile(r"(-?\d+)(?:[.,](\d+))?\s+(\S+)\s*(.*)$")
 _ASC_CLOCK = re.compile(r"(\d{1,2}):(\d\d):(\d\d)(?:[.,:](\d+))?(?:\s*([ap])\.?m\.?\b)?", re.IGNORECASE)
 _EDL, _RTR = 0x1000, 0x10
 """Flags of frames of a CAN FD channel: extended data length, which classic frames lack, and remote frame."""
@@ -194,12 +194,11 @@ class AscLines:
         found = _ASC_EVENT.match(line)
         if found is None:
             return self._heading(line)
-        minus, seconds, fraction, what, rest = found.groups()
+        seconds, fraction, what, rest = found.groups()
+        # Times before the trigger are negative, and those since an event of another bus.
         t_ns = nanoseconds(seconds, fraction)
-        # Only the time since the event before may be negative: events of two buses are not in order.
-        if t_ns is None or (minus and not self._relative):
+        if t_ns is None:
             return LineKind.MALFORMED
-        t_ns = -t_ns if minus else t_ns
         if self._relative:
             self._now_ns = t_ns = max(0, min(self._now_ns + t_ns, LATEST_NS - self._start_ns))
         if what.upper() == "CANFD":

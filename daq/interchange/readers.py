@@ -155,7 +155,7 @@ class BusLog(Reader):
     suffixes = (".log", ".asc", ".blf", ".trc")
     reads = "SYNC and TPDOs as the session configuration maps them: candump, Vector ASC and BLF, PEAK TRC"
     writer = "bus_log:write_log"
-    options = frozenset()
+    options = frozenset({"rate_hz"})
     session = True
 
     def read(self, path: Path, config: Any, options: ImportOptions) -> Recording:
@@ -164,7 +164,7 @@ class BusLog(Reader):
         from armident.configs.blanks import LOG
         from armident.daq.interchange.bus_log import recording_from_log
 
-        return recording_from_log(path, config, load_robot(config.robot, LOG))
+        return recording_from_log(path, config, load_robot(config.robot, LOG), options.get("rate_hz"))
 
 
 READERS = tuple(reader() for reader in Reader.__subclasses__())
