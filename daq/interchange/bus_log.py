@@ -1,4 +1,4 @@
-"""Conversion of recordings and logs of CAN tools (candump, Vector ASC and BLF, PEAK TRC, BUSMASTER, CSV) by a session's mapping."""
+"""Conversion of recordings and logs of CAN tools by a session's mapping."""
 
 import hashlib
 import logging

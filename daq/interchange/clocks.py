@@ -148,23 +148,23 @@ def repeated_share(values: Floats) -> float:
     return float(runs[runs <= 2].sum()) / max(1, len(same))
 
 
-def clock_of(times: Floats, rate_hz: float | None, repeated: float = 0.0) -> Clock:
+def clock_of(times: Floats, rate_hz: float | None, repeated: float = 0.0, *, received: bool = False) -> Clock:
     """Return the clock of samples by their times (N,), s; missing samples are missing numbers.
 
-    Raises `JitterError` if steps are too uneven for that, and DataError if the times contradict ``rate_hz``.
+    ``received``: times are those of a receiver, whose jitter is not that of the samples. Raises `JitterError` if steps are too uneven for that, and DataError if the times contradict ``rate_hz``.
     """
     steps = np.diff(times)
     median = float(np.median(steps))
     if times[-1] <= times[0]:
         raise DataError("all times are equal; give the sampling rate with --rate, and omit the times: --map time=-")
     if median <= 0 or np.any(steps <= 0):
-        return _jittering(times, rate_hz, repeated, f"{int(np.sum(steps <= 0))} of {steps.size} steps are 0")
+        return _jittering(times, rate_hz, repeated, received, f"{int(np.sum(steps <= 0))} of {steps.size} steps are 0")
     ratio = steps / median
     advance = np.maximum(np.rint(ratio), 1.0)
     allowed = np.where(advance == 1, EVEN, np.where(advance < _LONG_HOLE, _WHOLE, 0.5))
     uneven = np.flatnonzero(np.abs(ratio - advance) > allowed)
     if uneven.size:
-        return _jittering(times, rate_hz, repeated, f"{uneven.size} of {steps.size} steps")
+        return _jittering(times, rate_hz, repeated, received, f"{uneven.size} of {steps.size} steps")
     single = steps[advance == 1]
     measured = float(single.size / single.sum())
     if advance.sum() > MOST_NUMBERS:
@@ -183,7 +183,7 @@ def clock_of(times: Floats, rate_hz: float | None, repeated: float = 0.0) -> Clo
     return Clock(rate_hz or measured, np.append(0, np.cumsum(advance)).astype(np.int64))
 
 
-def _jittering(times: Floats, rate_hz: float | None, repeated: float, how: str) -> Clock:
+def _jittering(times: Floats, rate_hz: float | None, repeated: float, received: bool, how: str) -> Clock:
     """Return the clock of even samples at a stated rate whose times jitter; refuse anything else."""
     steps = np.diff(times)
     mean = steps.size / float(times[-1] - times[0])
@@ -202,6 +202,10 @@ def _jittering(times: Floats, rate_hz: float | None, repeated: float, how: str) 
     # Missing samples lower the mean; the median of times with few digits is one of two values.
     median = float(np.median(steps))
     typical = two_digits(1.0 / median if 0 < _JITTER * median < steps.max() else mean)
+    if rate_hz is None and received:
+        raise JitterError(
+            f"the times jitter: {spread}; --rate RATE, that of the publisher, if it sends evenly, or set the stamps there"
+        )
     if rate_hz is None:
         raise JitterError(f"the times jitter: {spread}; --resample {typical:g} puts the samples on an even clock")
     on_clock = f"--resample {rate_hz:g} puts the samples on an even clock, with"

@@ -141,7 +141,7 @@ def _from_table(robot: RobotConfig, source: Source, options: ImportOptions, fact
             time_unit=options.get("time_unit"),
         )
     except DataError as error:
-        shown = str(error)
+        shown = "; ".join(part for part in (source.clock, str(error)) if part)
         raise type(error)(shown if shown.startswith(str(path)) else f"{path}: {shown}") from error
     notes = (*source.notes, *rows.notes, *made.notes)
     if not motor_side:

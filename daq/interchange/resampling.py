@@ -103,7 +103,7 @@ def sampled(
                 f"found {listed(list(source.table))}"
             )
         return Sampled(rate_hz, rows.row - rows.row[0], rows.values, notes=(*notes, *polled_note))
-    clock = clock_of(times, rate_hz, repeated)
+    clock = clock_of(times, rate_hz, repeated, received=bool(source.clock))
     missing = int(clock.numbers[-1]) + 1 - clock.numbers.size
     notes += [*clock.notes, *polled_note]
     if missing:
