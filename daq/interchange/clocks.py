@@ -56,6 +56,8 @@ _VERIFIED = 0.4
 """Uncertainty of a SYNC period over that of the session up to which half and double of it are told from it."""
 _WRAPS_NS = (60_000_000_000, 65_536_000_000, 2**32 * 1000)
 """Times at which clocks of adapters begin again, ns: one minute and 16 bits of ms (SLCAN), 32 bits of us."""
+_WRAPS = tuple(2.0**bits * 10.0**-exponent for bits in (16, 32) for exponent in (0, 3, 6))
+"""Times at which counters of 16 and 32 bits begin again, in their own unit, or in one that is larger by 1e3 or 1e6."""
 _LONGEST_PAUSE_NS = 1_000_000_000
 """Longest pause between two frames at a wrap, ns."""
 _DESCENDING = 20
@@ -103,9 +105,11 @@ def in_seconds(
     # A unit that is stated is believed, unless the rate is beyond every recording.
     if implausible and others and (not (stated or named) or step * UNITS[unit] < 1.0 / FASTEST_HZ):
         moved = f" and joints at {100 * share / UNITS[unit]:.2g} % of their velocity limits" if share else ""
+        rates = " and ".join(f"in {each} it would be {1.0 / (step * UNITS[each]):.6g} Hz" for each in others)
+        # An option is advised only if no other unit is plausible.
         raise DataError(
-            f"a step of {step:.6g} {unit} is a rate of {1.0 / (step * UNITS[unit]):.6g} Hz{moved}; in {others[0]} it "
-            f"would be {1.0 / (step * UNITS[others[0]]):.6g} Hz: --time-unit {others[0]} reads it so"
+            f"a step of {step:.6g} {unit} is a rate of {1.0 / (step * UNITS[unit]):.6g} Hz{moved}; {rates}: "
+            + (f"--time-unit {others[0]} reads it so" if len(others) == 1 else "state the unit with --time-unit")
         )
     note = (f"times are in {unit}, the unit in the column name",) if named and named != "s" and not stated else ()
     return (times - times[0]) * UNITS[unit], note
@@ -151,7 +155,8 @@ def repeated_share(values: Floats) -> float:
 def clock_of(times: Floats, rate_hz: float | None, repeated: float = 0.0, *, received: bool = False) -> Clock:
     """Return the clock of samples by their times (N,), s; missing samples are missing numbers.
 
-    ``received``: times are those of a receiver, whose jitter is not that of the samples. Raises `JitterError` if steps are too uneven for that, and DataError if the times contradict ``rate_hz``.
+    ``received``: times are those of a receiver, whose jitter is not that of the samples. Raises `JitterError` if steps
+    are too uneven for that, and DataError if the times contradict ``rate_hz``.
     """
     steps = np.diff(times)
     median = float(np.median(steps))
@@ -204,7 +209,8 @@ def _jittering(times: Floats, rate_hz: float | None, repeated: float, received: 
     typical = two_digits(1.0 / median if 0 < _JITTER * median < steps.max() else mean)
     if rate_hz is None and received:
         raise JitterError(
-            f"the times jitter: {spread}; --rate RATE, that of the publisher, if it sends evenly, or set the stamps there"
+            f"the times jitter: {spread}; --rate RATE, that of the publisher, if it sends evenly; else set the stamps "
+            "where they are published"
         )
     if rate_hz is None:
         raise JitterError(f"the times jitter: {spread}; --resample {typical:g} puts the samples on an even clock")
@@ -251,6 +257,22 @@ def descending(times: NDArray[Any]) -> bool:
     return back >= _FEWEST and back > _DESCENDING * int(np.sum(steps > 0))
 
 
+def without_wraps(times: Floats) -> tuple[Floats, tuple[str, ...]]:
+    """Return times (N,) of a table, in any unit, without wraps of a counter of 16 or 32 bits, and a note on them."""
+    steps = np.diff(times)
+    back = np.flatnonzero(steps < 0)
+    if not back.size or not np.any(steps > 0):
+        return times, ()
+    longest = _HOLE_PERIODS * float(np.median(steps[steps > 0]))
+    made, wraps = times.copy(), []
+    for k in back:
+        ends = (end for end in _WRAPS if times[k] <= end and 0 < times[k + 1] + end - times[k] <= longest)
+        if end := next(ends, 0.0):
+            made[k + 1 :] += end
+            wraps.append(end)
+    return made, (f"times begin again after {wraps[0]:.10g} ({len(wraps)} times): unwrapped",) if wraps else ()
+
+
 def newest_first(frames: Frames) -> bool:
     """Return True if frames (N,) come from the newest to the oldest, by their times or by the SYNC counter."""
     if descending(frames["t_ns"]):
@@ -284,7 +306,7 @@ def continuous(path: Path, frames: Frames, lines: Ints, session: SessionConfig) 
         wraps += [wrap] if wrap else []
     if not wraps:
         return []
-    return [f"times begin again after {wraps[0] * 1e-9:.10g} s ({len(wraps)} times): put one after the other"]
+    return [f"times begin again after {wraps[0] * 1e-9:.10g} s ({len(wraps)} times): unwrapped"]
 
 
 def clock_steps(numbers: Ints, t_ns: Ints, session: SessionConfig) -> list[str]:

@@ -78,7 +78,7 @@ class ImportOptions(TypedDict, total=False):
             "--units",
             parser=pairs,
             metavar="QUANTITY=UNIT,...",
-            help="Units other than SI: position=deg,torque=mnm,current=ma; mm, deg|mm, mv.",
+            help="Units other than SI: position=deg,torque=mnm,current=ma; mm, deg|mm, mv; FILE.json of LeRobot.",
         ),
     ]
 

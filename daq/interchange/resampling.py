@@ -117,8 +117,12 @@ def _times(source: Source, rows: TableRows, robot: RobotConfig, unit: str | None
         return None, []
     backward = np.flatnonzero(np.diff(rows.times) < 0)
     if backward.size:
-        where = source.place(int(rows.row[backward[0] + 1]), rows.time_name)
-        raise DataError(f"{where}: time does not increase")
+        k = int(backward[0])
+        where = source.place(int(rows.row[k + 1]), rows.time_name)
+        raise DataError(
+            f"{where}: time does not increase: it goes back by {rows.times[k] - rows.times[k + 1]:.6g}; another run "
+            "begins here, or the clock was set: write one file for each part"
+        )
     times, notes = in_seconds(rows.times, rows.values["position"], robot, named=rows.time_unit, stated=unit)
     check_resolution(times)
     return times, list(notes)
