@@ -58,6 +58,8 @@ _WRAPS_NS = (60_000_000_000, 65_536_000_000, 2**32 * 1000)
 """Times at which clocks of adapters begin again, ns: one minute and 16 bits of ms (SLCAN), 32 bits of us."""
 _WRAPS = tuple(2.0**bits * 10.0**-exponent for bits in (16, 32) for exponent in (0, 3, 6))
 """Times at which counters of 16 and 32 bits begin again, in their own unit, or in one that is larger by 1e3 or 1e6."""
+_LOST_AT_STEP = 3
+"""Largest advance of the SYNC counter over a step of the times: frames may be lost there."""
 _LONGEST_PAUSE_NS = 1_000_000_000
 """Longest pause between two frames at a wrap, ns."""
 _DESCENDING = 20

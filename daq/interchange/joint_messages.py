@@ -150,6 +150,7 @@ def _decoder() -> Callable[[bytes], Any]:
 
 def _of_ros_1(data: bytes) -> _Message:
     """Return a message of ROS 1: little endian, lengths before texts and arrays, without alignment."""
+    at = 12
 
     def length() -> int:
         nonlocal at
@@ -169,7 +170,6 @@ def _of_ros_1(data: bytes) -> _Message:
         return struct.unpack_from(f"<{count}d", data, at - 8 * count)
 
     _, seconds, nanoseconds = struct.unpack_from("<3I", data)
-    at = 12
     text()
     names = tuple(text() for _ in range(length()))
     positions, _, efforts = numbers(), numbers(), numbers()
