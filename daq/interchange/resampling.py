@@ -115,14 +115,6 @@ def _times(source: Source, rows: TableRows, robot: RobotConfig, unit: str | None
     """Return the times of the rows in s, and notes."""
     if rows.times is None:
         return None, []
-    backward = np.flatnonzero(np.diff(rows.times) < 0)
-    if backward.size:
-        k = int(backward[0])
-        where = source.place(int(rows.row[k + 1]), rows.time_name)
-        raise DataError(
-            f"{where}: time does not increase: it goes back by {rows.times[k] - rows.times[k + 1]:.6g}; another run "
-            "begins here, or the clock was set: write one file for each part"
-        )
     times, notes = in_seconds(rows.times, rows.values["position"], robot, named=rows.time_unit, stated=unit)
     check_resolution(times)
     return times, list(notes)

@@ -93,7 +93,16 @@ def complete_rows(
         "" if time is None else time_unit(source.units.get(time[0], "")),
         tuple(dict.fromkeys(notes)),
     )
-    return _single(_without_odd_times(source, _in_order(_complete(source, _joined(rows)))))
+    rows = _without_odd_times(source, _in_order(_complete(source, _joined(rows))))
+    backward = np.flatnonzero(np.diff(rows.times) < 0) if rows.times is not None else np.zeros(0, np.intp)
+    if rows.times is not None and backward.size:
+        k = int(backward[0])
+        raise DataError(
+            f"{source.place(int(rows.row[k + 1]), rows.time_name)}: time does not increase: it goes back by "
+            f"{rows.times[k] - rows.times[k + 1]:.6g}; another run begins here, or the clock was set: write one file "
+            "for each part"
+        )
+    return _single(rows)
 
 
 def _in_order(rows: TableRows) -> TableRows:
