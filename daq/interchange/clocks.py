@@ -292,20 +292,22 @@ def continuous(path: Path, frames: Frames, lines: Ints, session: SessionConfig) 
     """Undo wraps of the times of one bus (N,), in place, and return a note on them; refuse a log of several runs."""
     raw = frames["t_ns"].copy()
     syncs = np.flatnonzero(frames["can_id"] == COB_SYNC)
-    counts, turn = frames["data"][:, 0].astype(np.int64), session.sync.counter
+    counts = frames["data"][syncs, 0].astype(np.int64)
+    turn = session.sync.counter if np.all(frames["length"][syncs] > 0) else 0
     wraps: list[int] = []
     for k in np.flatnonzero(np.diff(raw) < -_CLOCK_STEP_NS):
         after = int(np.searchsorted(syncs, k, side="right"))
-        if turn and 0 < after < syncs.size and np.all(frames["length"][syncs] > 0):
-            last, first = counts[syncs[after - 1]], counts[syncs[after]]
-            if first != last % turn + 1:
+        if turn and 0 < after < syncs.size:
+            last, first = counts[after - 1], counts[after]
+            if not 0 < (first - last) % turn <= _LOST_AT_STEP:
                 raise DataError(
                     f"{path}: line {lines[k + 1]}: times go back by {(raw[k] - raw[k + 1]) * 1e-9:.4g} s here, and the "
                     f"SYNC counter jumps from {last} to {first}: several runs in one log; write one file for each"
                 )
         wrap = next((w for w in _WRAPS_NS if raw[k] <= w and 0 <= raw[k + 1] + w - raw[k] <= _LONGEST_PAUSE_NS), 0)
-        frames["t_ns"][k + 1 :] += wrap
-        wraps += [wrap] if wrap else []
+        if wrap:
+            frames["t_ns"][k + 1 :] += wrap
+            wraps.append(wrap)
     if not wraps:
         return []
     return [f"times begin again after {wraps[0] * 1e-9:.10g} s ({len(wraps)} times): unwrapped"]

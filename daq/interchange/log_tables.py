@@ -73,6 +73,7 @@ class CsvLines:
 
     def _is_heading(self, line: str) -> bool:
         """Take the columns of a line that names time, identifier and data; return ``True`` for such a line."""
+        line = line.lstrip("#% ")
         if not line.lstrip('"')[:1].isalpha():
             return False
         delimiter = delimiter_of(line)
