@@ -28,6 +28,8 @@ UNSURE = (
 """Note on positions that are stated to be in degrees."""
 _COUNTS = 4096
 """Counts per turn of the servos of LeRobot's arms (STS3215, XL330, XL430)."""
+_MOST = 1 << 31
+"""Counts that no range reaches."""
 _BETWEEN_S = 1.0
 """Gap between two episodes, s: the time between them is not recorded."""
 _SUFFIX = re.compile(r"[._](pos|position|goal|eff|effort|torque|tau|current)$", re.IGNORECASE)
@@ -135,7 +137,7 @@ def calibrated(
         name = next((each for each in (label.split("/")[0], joint.source_name, joint.name) if each in motors), None)
         entry = motors.get(name)
         ends = [entry.get(end) for end in ("range_min", "range_max")] if isinstance(entry, dict) else []
-        if len(ends) != 2 or not all(isinstance(end, int) for end in ends) or ends[0] >= ends[1]:
+        if len(ends) != 2 or not all(isinstance(end, int) and abs(end) < _MOST for end in ends) or ends[0] >= ends[1]:
             raise ConfigError(f"{file}: no range_min below range_max of {joint.name}; found {listed(list(motors))}")
         gripper = name == "gripper"
         factors[j] = (ends[1] - ends[0]) / (FULL if gripper else 2 * FULL) * 2 * np.pi / _COUNTS

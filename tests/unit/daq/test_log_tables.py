@@ -111,7 +111,10 @@ def test_the_contents_of_a_text_file_tell_a_log_from_a_table(tmp_path: Path) -> 
     with pytest.raises(ConfigError, match="configuration of the session"):
         import_recording(log, None)
     command = ["import", str(motion_table), "--config", "tx40_cell.yaml", "--out", str(tmp_path / "a.mcap")]
-    assert CliRunner().invoke(application(["import"]), command).exit_code == 2
+    refused = CliRunner().invoke(application(["import"]), command)
+    assert refused.exit_code == 2
+    assert "a robot file is wanted" in refused.stderr.replace("\n", " ")
+    assert "is a CSV, not a bus log, whose text has columns for time" in " ".join(refused.stderr.split())
 
 
 HEAD = """***BUSMASTER Ver 3.2.2***
