@@ -96,7 +96,14 @@ def import_(
     if config is None and not reader.own:
         raise ConfigError(f"{file}: --config is missing, the {'session' if reader.session else 'robot'} configuration")
     load = partial(load_session, command=LOG) if reader.session else partial(load_robot, command="import")
-    recording = import_recording(file, None if config is None else load(config), **options)
+    try:
+        configuration = None if config is None else load(config)
+    except ConfigError as error:
+        if not str(error).endswith("is wanted"):
+            raise
+        of_log = "" if reader.session else ", not a bus log, whose text has columns for time, identifier and data"
+        raise ConfigError(f"{error}: {file} is a {reader.name}{of_log}") from error
+    recording = import_recording(file, configuration, **options)
     write_recording(recording, out)
     rows, gaps = recording.samples.sync.size, recording.counters.get("samples.in_gaps", 0)
     lost = f"{gaps} in gaps, " if gaps or reader.session else ""

@@ -57,9 +57,11 @@ def examine(path: Path, robot: RobotConfig, stated: Mapping[str, Any]) -> Record
     if is_recording(path):
         return _facts(path, read_recording(path), robot, {})
     options: dict[str, Any] = dict(given(stated))
-    _, rows = read_rows(path, robot, **given(options, _OF_ROWS))
+    source, rows = read_rows(path, robot, **given(options, _OF_ROWS))
     if not options.get("units"):
-        options["units"] = suspected(rows, robot)
+        units = suspected(rows, robot)
+        # Positions of LeRobot may be shares of a range: the import names both units.
+        options["units"] = {name: unit for name, unit in units.items() if not (source.lerobot and name == "position")}
     if not options.get("time_unit") and rows.times is not None:
         options["time_unit"] = _time_unit(in_si(rows, robot, options["units"]), robot, rows.time_unit)
     with _quiet():

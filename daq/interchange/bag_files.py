@@ -22,6 +22,7 @@ from mcap.records import Channel, Chunk, McapRecord, Message, Schema
 from mcap.stream_reader import breakup_chunk
 
 from armident.configs import ConfigError, DataError
+from armident.daq.interchange.joint_messages import CDR, ROS1
 from armident.daq.interchange.readers import RosBag
 from armident.daq.interchange.text_files import listed as listed_names
 from armident.daq.interchange.text_files import shortened
@@ -34,7 +35,6 @@ ROS_1 = ".bag"
 SUFFIXES = tuple(suffix for suffix in RosBag.suffixes if suffix != ROS_1)
 """Suffixes of the files of a bag."""
 
-_CDR = "cdr"
 _NUMBER_AT_END = re.compile(r"[-_.]?\d+$")
 """Number that rosbag2 adds to the name of a bag for each of its files."""
 _LARGEST = 1 << 30
@@ -48,11 +48,12 @@ _DAMAGED = (sqlite3.Error, UnicodeDecodeError)
 
 
 class BagMessage(NamedTuple):
-    """Message of a bag, recorded at ``logged_ns``, ns UTC; ``data`` is its content in CDR, uncompressed."""
+    """Message of a bag, recorded at ``logged_ns``, ns UTC; ``data`` is its content in CDR or ``ros1``, uncompressed."""
 
     topic: str
     logged_ns: int
     data: bytes
+    encoding: str = CDR
 
 
 def bag_files(path: Path) -> tuple[list[Path], list[str]]:
@@ -120,7 +121,7 @@ class BagReader:
         self._read: Counter[str] = Counter()
 
     def __iter__(self) -> Iterator[BagMessage]:
-        """Yield the messages in CDR of the type, of every topic."""
+        """Yield the messages of the type, of every topic."""
         files, absent = bag_files(self._path)
         self.losses += [f"{name}, which {METADATA} lists, is missing" for name in absent]
         unusable: list[DataError] = []
@@ -196,8 +197,8 @@ class BagReader:
                     self._add(part, schemas.get(part.schema_id))
                 elif isinstance(part, Message) and part.channel_id in channels:
                     channel = channels[part.channel_id]
-                    if channel.message_encoding == _CDR and self.topics.get(channel.topic) == self._type:
-                        yield BagMessage(channel.topic, part.log_time, _plain(part.data))
+                    if self.topics.get(channel.topic) == self._type:
+                        yield BagMessage(channel.topic, part.log_time, _plain(part.data), channel.message_encoding)
         if not finished:
             self.losses.append(
                 f"{where}the file is torn: the recorder did not finish it, and its last {len(data) - end} bytes are no "
@@ -218,14 +219,18 @@ class BagReader:
             self._add(channel, summary.schemas.get(channel.schema_id))
         if summary.statistics is not None:
             for number, count in summary.statistics.channel_message_counts.items():
-                if number in summary.channels and summary.channels[number].message_encoding == _CDR:
+                if number in summary.channels and self.topics.get(summary.channels[number].topic) == self._type:
                     self._expected[summary.channels[number].topic] += count
         return dict(summary.channels)
 
     def _add(self, channel: Channel, schema: Schema | None) -> None:
-        encoded = "" if channel.message_encoding == _CDR else f" in {channel.message_encoding or 'unknown encoding'}"
+        encoding, name = channel.message_encoding, "" if schema is None else schema.name
+        if encoding == ROS1:
+            # Types of ROS 1 are named without a folder: sensor_msgs/JointState.
+            name = re.sub(r"^(\w+)/(\w+)$", r"\1/msg/\2", name)
         if schema is not None:
-            self.topics[channel.topic] = schema.name + encoded
+            encoded = "" if encoding in (CDR, ROS1) else f" in {encoding or 'unknown encoding'}"
+            self.topics[channel.topic] = name + encoded
 
     def _database(self, file: Path, where: str) -> Iterator[BagMessage]:
         """Yield the messages of a SQLite file in the order of writing, up to the first damaged page."""
@@ -251,8 +256,8 @@ class BagReader:
             raise DataError("not a readable bag in SQLite: damaged, or without its table of topics") from error
         chosen: dict[int, str] = {}
         for number, topic, kind, encoding in rows:
-            self.topics[str(topic)] = str(kind) + ("" if encoding == _CDR else f" in {encoding}")
-            if kind == self._type and encoding == _CDR:
+            self.topics[str(topic)] = str(kind) + ("" if encoding == CDR else f" in {encoding}")
+            if kind == self._type and encoding == CDR:
                 chosen[number] = str(topic)
         return chosen
 

@@ -1,4 +1,4 @@
-"""Conversion of recordings and logs of CAN tools (candump, Vector ASC and BLF, PEAK TRC) by a session's mapping."""
+"""Conversion of recordings and logs of CAN tools by a session's mapping."""
 
 import hashlib
 import logging
@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armident.configs import ConfigError, DataError, RobotConfig, SessionConfig
-from armident.daq.interchange.clocks import check_sync_period, clock_steps
+from armident.daq.interchange.clocks import check_sync_period, clock_steps, continuous
 from armident.daq.interchange.log_file import read_log
 from armident.daq.interchange.log_frames import LogFrames
 from armident.daq.matching.assembler import Assembler, Batch
@@ -27,25 +27,31 @@ NOTES = "source_remarks"
 """Key of the metadata with everything that an import left out or interpreted."""
 
 
-def recording_from_log(path: Path, session: SessionConfig, robot: RobotConfig) -> Recording:
+def recording_from_log(
+    path: Path, session: SessionConfig, robot: RobotConfig, rate_hz: float | None = None
+) -> Recording:
     """Return the recording of a log: its frames, matched by the mapping of a session.
 
-    With several buses the log has the names of the session's. Raises ConfigError if it lacks one, or they carry CAN FD;
-    DataError if it holds no SYNC, or its SYNC period or TPDO lengths are not those of the session.
+    With several buses the log has the names of the session's. ``rate_hz``: of SYNC, stated for a log whose times do not
+    tell it. Raises ConfigError if a bus is absent, buses carry CAN FD, or ``rate_hz`` is not that of the session;
+    DataError if the log holds no SYNC or several runs, or its SYNC period or TPDO lengths are not those of the session.
     """
     _check_classic(session, str(path))
     streams = captured_streams(session, robot)
     log = read_log(path)
     names, chosen = _buses(log, session, streams)
-    read = [log.of(path, name, len(session.all_buses) > 1) for name in names]
-    for bus, frames_of_it in zip(session.all_buses, read, strict=True):
+    masks = [log.of(path, name, len(session.all_buses) > 1) for name in names]
+    read = [log.frames[mask] for mask in masks]
+    clock: list[str] = []
+    for bus, frames_of_it, mask in zip(session.all_buses, read, masks, strict=True):
         if not np.any(frames_of_it["can_id"] == COB_SYNC):
             where = f" of {bus.channel}" if len(read) > 1 else ""
             raise DataError(
                 f"{path}: no SYNC ({COB_SYNC:X}h) among its {frames_of_it.size} frames{where}: "
                 "samples cannot be matched"
             )
-        check_sync_period(path, frames_of_it, session)
+        clock += continuous(path, frames_of_it, log.lines[mask], session)
+        clock += check_sync_period(path, frames_of_it, session, rate_hz)
     wrong = _wrong_lengths(path, read, streams, robot)
     assembler = Assembler(
         [stream.bus for stream in streams],
@@ -64,7 +70,7 @@ def recording_from_log(path: Path, session: SessionConfig, robot: RobotConfig) -
         raise DataError(f"{path}: no SYNC was answered by all drives; the session expects TPDOs {wanted}{silent}")
     phase = None if assembler.has_counter else unknown_phase(session)
     stepped = clock_steps(found["samples"].sync, found["samples"].t_ns, session)
-    notes = (*log.notes, *chosen, *wrong, *stepped, *([phase] if phase else []))
+    notes = (*log.notes, *chosen, *dict.fromkeys(clock), *wrong, *stepped, *([phase] if phase else []))
     for note in notes:
         logging.getLogger(__name__).warning("%s: %s", path, note)
     gaps: list[Gap] = [gap for part in parts for gap in part.gaps]

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,6 +52,18 @@ _CLOCK_STEP_NS = 20_000_000
 """Difference of times and SYNC numbers above which a clock was set: masters are late by less on an idle machine, ns."""
 _HOLE_PERIODS = 10
 """Steps longer than this number of usual ones are not counted: SYNCs may be lacking there."""
+_VERIFIED = 0.4
+"""Uncertainty of a SYNC period over that of the session up to which half and double of it are told from it."""
+_WRAPS_NS = (60_000_000_000, 65_536_000_000, 2**32 * 1000)
+"""Times at which clocks of adapters begin again, ns: one minute and 16 bits of ms (SLCAN), 32 bits of us."""
+_WRAPS = tuple(2.0**bits * 10.0**-exponent for bits in (16, 32) for exponent in (0, 3, 6))
+"""Times at which counters of 16 and 32 bits begin again, in their own unit, or in one that is larger by 1e3 or 1e6."""
+_LOST_AT_STEP = 3
+"""Largest advance of the SYNC counter over a step of the times: frames may be lost there."""
+_LONGEST_PAUSE_NS = 1_000_000_000
+"""Longest pause between two frames at a wrap, ns."""
+_DESCENDING = 20
+"""Number of steps back for each step forward of a file from the newest row to the oldest."""
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -94,9 +107,11 @@ def in_seconds(
     # A unit that is stated is believed, unless the rate is beyond every recording.
     if implausible and others and (not (stated or named) or step * UNITS[unit] < 1.0 / FASTEST_HZ):
         moved = f" and joints at {100 * share / UNITS[unit]:.2g} % of their velocity limits" if share else ""
+        rates = " and ".join(f"in {each} it would be {1.0 / (step * UNITS[each]):.6g} Hz" for each in others)
+        # An option is advised only if no other unit is plausible.
         raise DataError(
-            f"a step of {step:.6g} {unit} is a rate of {1.0 / (step * UNITS[unit]):.6g} Hz{moved}; in {others[0]} it "
-            f"would be {1.0 / (step * UNITS[others[0]]):.6g} Hz: --time-unit {others[0]} reads it so"
+            f"a step of {step:.6g} {unit} is a rate of {1.0 / (step * UNITS[unit]):.6g} Hz{moved}; {rates}: "
+            + (f"--time-unit {others[0]} reads it so" if len(others) == 1 else "state the unit with --time-unit")
         )
     note = (f"times are in {unit}, the unit in the column name",) if named and named != "s" and not stated else ()
     return (times - times[0]) * UNITS[unit], note
@@ -139,23 +154,24 @@ def repeated_share(values: Floats) -> float:
     return float(runs[runs <= 2].sum()) / max(1, len(same))
 
 
-def clock_of(times: Floats, rate_hz: float | None, repeated: float = 0.0) -> Clock:
+def clock_of(times: Floats, rate_hz: float | None, repeated: float = 0.0, *, received: bool = False) -> Clock:
     """Return the clock of samples by their times (N,), s; missing samples are missing numbers.
 
-    Raises `JitterError` if steps are too uneven for that, and DataError if the times contradict ``rate_hz``.
+    ``received``: times are those of a receiver, whose jitter is not that of the samples. Raises `JitterError` if steps
+    are too uneven for that, and DataError if the times contradict ``rate_hz``.
     """
     steps = np.diff(times)
     median = float(np.median(steps))
     if times[-1] <= times[0]:
         raise DataError("all times are equal; give the sampling rate with --rate, and omit the times: --map time=-")
     if median <= 0 or np.any(steps <= 0):
-        return _jittering(times, rate_hz, repeated, f"{int(np.sum(steps <= 0))} of {steps.size} steps are 0")
+        return _jittering(times, rate_hz, repeated, received, f"{int(np.sum(steps <= 0))} of {steps.size} steps are 0")
     ratio = steps / median
     advance = np.maximum(np.rint(ratio), 1.0)
     allowed = np.where(advance == 1, EVEN, np.where(advance < _LONG_HOLE, _WHOLE, 0.5))
     uneven = np.flatnonzero(np.abs(ratio - advance) > allowed)
     if uneven.size:
-        return _jittering(times, rate_hz, repeated, f"{uneven.size} of {steps.size} steps")
+        return _jittering(times, rate_hz, repeated, received, f"{uneven.size} of {steps.size} steps")
     single = steps[advance == 1]
     measured = float(single.size / single.sum())
     if advance.sum() > MOST_NUMBERS:
@@ -174,7 +190,7 @@ def clock_of(times: Floats, rate_hz: float | None, repeated: float = 0.0) -> Clo
     return Clock(rate_hz or measured, np.append(0, np.cumsum(advance)).astype(np.int64))
 
 
-def _jittering(times: Floats, rate_hz: float | None, repeated: float, how: str) -> Clock:
+def _jittering(times: Floats, rate_hz: float | None, repeated: float, received: bool, how: str) -> Clock:
     """Return the clock of even samples at a stated rate whose times jitter; refuse anything else."""
     steps = np.diff(times)
     mean = steps.size / float(times[-1] - times[0])
@@ -193,6 +209,11 @@ def _jittering(times: Floats, rate_hz: float | None, repeated: float, how: str) 
     # Missing samples lower the mean; the median of times with few digits is one of two values.
     median = float(np.median(steps))
     typical = two_digits(1.0 / median if 0 < _JITTER * median < steps.max() else mean)
+    if rate_hz is None and received:
+        raise JitterError(
+            f"the times jitter: {spread}; --rate RATE, that of the publisher, if it sends evenly; else set the stamps "
+            "where they are published"
+        )
     if rate_hz is None:
         raise JitterError(f"the times jitter: {spread}; --resample {typical:g} puts the samples on an even clock")
     on_clock = f"--resample {rate_hz:g} puts the samples on an even clock, with"
@@ -231,6 +252,67 @@ def gaps_and_counters(streams: Mapping[str, Stream]) -> tuple[tuple[Gap, ...], d
     return tuple(gaps), counters
 
 
+def descending(times: NDArray[Any]) -> bool:
+    """Return True if times (N,) come in the order from the last to the first."""
+    steps = np.diff(times)
+    back = int(np.sum(steps < 0))
+    return back >= _FEWEST and back > _DESCENDING * int(np.sum(steps > 0))
+
+
+def without_wraps(times: Floats) -> tuple[Floats, tuple[str, ...]]:
+    """Return times (N,) of a table, in any unit, without wraps of a counter of 16 or 32 bits, and a note on them."""
+    steps = np.diff(times)
+    back = np.flatnonzero(steps < 0)
+    if not back.size or not np.any(steps > 0):
+        return times, ()
+    longest = _HOLE_PERIODS * float(np.median(steps[steps > 0]))
+    made, wraps = times.copy(), []
+    for k in back:
+        ends = (end for end in _WRAPS if times[k] <= end and 0 < times[k + 1] + end - times[k] <= longest)
+        if end := next(ends, 0.0):
+            made[k + 1 :] += end
+            wraps.append(end)
+    return made, (f"times begin again after {wraps[0]:.10g} ({len(wraps)} times): unwrapped",) if wraps else ()
+
+
+def newest_first(frames: Frames) -> bool:
+    """Return True if frames (N,) come from the newest to the oldest, by their times or by the SYNC counter."""
+    if descending(frames["t_ns"]):
+        return True
+    syncs = frames[(frames["can_id"] == COB_SYNC) & (frames["length"] > 0)]
+    counts = np.diff(syncs["data"][:, 0].astype(np.int64))
+    if counts.size < _FEWEST or np.mean(counts == -1) < 0.5:
+        return False
+    # Times that increase contradict the counter; equal ones and differences tell nothing.
+    steps = np.diff(frames["t_ns"])
+    return bool(np.sum(steps > 0) <= 2 * np.sum(steps < 0))
+
+
+def continuous(path: Path, frames: Frames, lines: Ints, session: SessionConfig) -> list[str]:
+    """Undo wraps of the times of one bus (N,), in place, and return a note on them; refuse a log of several runs."""
+    raw = frames["t_ns"].copy()
+    syncs = np.flatnonzero(frames["can_id"] == COB_SYNC)
+    counts = frames["data"][syncs, 0].astype(np.int64)
+    turn = session.sync.counter if np.all(frames["length"][syncs] > 0) else 0
+    wraps: list[int] = []
+    for k in np.flatnonzero(np.diff(raw) < -_CLOCK_STEP_NS):
+        after = int(np.searchsorted(syncs, k, side="right"))
+        if turn and 0 < after < syncs.size:
+            last, first = counts[after - 1], counts[after]
+            if not 0 < (first - last) % turn <= _LOST_AT_STEP:
+                raise DataError(
+                    f"{path}: line {lines[k + 1]}: times go back by {(raw[k] - raw[k + 1]) * 1e-9:.4g} s here, and the "
+                    f"SYNC counter jumps from {last} to {first}: several runs in one log; write one file for each"
+                )
+        wrap = next((w for w in _WRAPS_NS if raw[k] <= w and 0 <= raw[k + 1] + w - raw[k] <= _LONGEST_PAUSE_NS), 0)
+        if wrap:
+            frames["t_ns"][k + 1 :] += wrap
+            wraps.append(wrap)
+    if not wraps:
+        return []
+    return [f"times begin again after {wraps[0] * 1e-9:.10g} s ({len(wraps)} times): unwrapped"]
+
+
 def clock_steps(numbers: Ints, t_ns: Ints, session: SessionConfig) -> list[str]:
     """Return a sentence if the times of SYNCs, ns, (N,), step where their numbers, (N,), do not."""
     period = session.sync.period_us * 1000
@@ -242,28 +324,43 @@ def clock_steps(numbers: Ints, t_ns: Ints, session: SessionConfig) -> list[str]:
     k = int(steps[0])
     more = f" (and at {steps.size - 1} more)" if steps.size > 1 else ""
     turns = ", or whole turns of the counter are missing there" if session.sync.counter and late[k] > 0 else ""
+    runs = ", or another run begins there: write one file for each" if not session.sync.counter and late[k] < 0 else ""
     return [
         f"times step by {late[k] * 1e-9:+.4g} s at SYNC {numbers[k + 1]}{more}, where the SYNCs go on: "
-        f"the clock was set{turns}"
+        f"the clock was set{turns}{runs}"
     ]
 
 
-def check_sync_period(path: Path, frames: Frames, session: SessionConfig) -> None:
-    """Refuse a log whose SYNCs, among the frames of one bus (N,), come at another period than that of the session."""
+def check_sync_period(path: Path, frames: Frames, session: SessionConfig, stated_hz: float | None) -> list[str]:
+    """Refuse a log whose SYNCs, among the frames of one bus (N,), come at another period than that of the session.
+
+    Times that do not tell the period are refused, unless the rate is ``stated_hz``, which a note then says.
+    """
     syncs = frames[frames["can_id"] == COB_SYNC]
     counted = session.sync.counter and np.all(syncs["length"] > 0)
     steps = np.diff(syncs["data"][:, 0].astype(np.int64)) % session.sync.counter if counted else None
     found = sync_period_ns(syncs["t_ns"], steps)
-    if found is None:
-        return
-    period, uncertainty = found
     expected = session.sync.period_us * 1000
+    configured = f"every {expected * 1e-6:.4g} ms in the session (sync.period_us: {session.sync.period_us})"
+    if stated_hz is not None and abs(stated_hz * expected * 1e-9 - 1.0) > RATE_TOLERANCE:
+        raise ConfigError(f"{path}: --rate {stated_hz:g} contradicts the session: SYNC comes {configured}")
+    if syncs.size < _FEWEST:
+        return []
+    if found is None or found[1] > _VERIFIED * expected:
+        why = "all its times are equal" if not np.ptp(syncs["t_ns"]) else "its times have too few digits, or jump"
+        if stated_hz is None:
+            raise DataError(
+                f"{path}: {why}, so that they do not tell the SYNC period, which is {configured}: record times of the "
+                "adapter or the kernel; or look up the rate of SYNC in the master and state it with --rate"
+            )
+        return [f"{why}: the SYNC rate of {stated_hz:g} Hz is that of --rate, and is not verified"]
+    period, uncertainty = found
     if abs(period - expected) > PERIOD_TOLERANCE * expected + uncertainty:
         raise DataError(
             f"{path}: SYNC comes every {period * 1e-6:.4g} ms ({1e9 / period:.4g} Hz) in this log, "
-            f"but every {expected * 1e-6:.4g} ms in the session (sync.period_us: {session.sync.period_us}): "
-            "use the session that the log was recorded with"
+            f"but {configured}: use the session that the log was recorded with"
         )
+    return []
 
 
 def sync_period_ns(t_ns: Ints, steps: Ints | None) -> tuple[float, float] | None:
@@ -275,9 +372,12 @@ def sync_period_ns(t_ns: Ints, steps: Ints | None) -> tuple[float, float] | None
         return None
     elapsed = np.diff(t_ns).astype(np.float64)
     periods = np.ones(elapsed.size) if steps is None else steps.astype(np.float64)
-    # Coarse time stamps make a median of 0.
-    usual = float(np.median(elapsed)) or float(np.mean(elapsed))
-    counted = (elapsed >= 0) & (elapsed <= _HOLE_PERIODS * max(usual, 1.0)) & (periods > 0) & (periods <= _HOLE_PERIODS)
+    forward = elapsed[elapsed > 0]
+    if not forward.size:
+        return None
+    # Coarse times make a median of 0: most of the others are one unit of theirs.
+    usual = float(np.median(elapsed)) if np.median(elapsed) > 0 else float(np.median(forward))
+    counted = (elapsed >= 0) & (elapsed <= _HOLE_PERIODS * usual) & (periods > 0) & (periods <= _HOLE_PERIODS)
     total = float(periods[counted].sum())
     if counted.sum() < _FEWEST - 1 or not total:
         return None

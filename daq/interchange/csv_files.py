@@ -117,7 +117,7 @@ def _head(path: Path, lines: Iterator[str]) -> _Head:
         if not text or text.lower().startswith("sep="):
             continue
         comment = text.startswith(_COMMENTS)
-        delimiter = _delimiter(text)
+        delimiter = delimiter_of(text)
         cells = cells_of(text, delimiter)
         words = None if comment else _text_columns(cells)
         if (head := _after_words(mixed, cells, words)) is not None:
@@ -148,7 +148,7 @@ def _no_values(before: Sequence[tuple[int, str, bool]]) -> str:
     if len(before) == 1:
         return f": only line {before[0][0]}, {excerpt(before[0][1])}"
     number, text, _ = before[1]
-    odd = next((cell for cell in cells_of(text, _delimiter(text)) if cell and _number(cell) is None), text)
+    odd = next((cell for cell in cells_of(text, delimiter_of(text)) if cell and _number(cell) is None), text)
     dates = "; dates are read in the form 2026-03-25T10:00:00.5" if _OTHER_DATE.search(text) else ""
     return f": line {number} has {excerpt(odd)}, expected numbers{dates}"
 
@@ -188,7 +188,8 @@ def _widths(columns: int) -> tuple[int, int]:
     return columns, columns + 1
 
 
-def _delimiter(text: str) -> str | None:
+def delimiter_of(text: str) -> str | None:
+    """Return the separator of the cells of a line; ``None``: spaces."""
     return next((each for each in _DELIMITERS if each in text), None)
 
 

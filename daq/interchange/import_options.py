@@ -34,7 +34,11 @@ class ImportOptions(TypedDict, total=False):
     motor_side: Annotated[bool, typer.Option("--motor-side", help="Values are on the motor side, not the joint side.")]
     rate_hz: Annotated[
         float | None,
-        typer.Option("--rate", help="Sampling rate, Hz; default: column t. A recording is resampled to it.", min=0.001),
+        typer.Option(
+            "--rate",
+            help="Sampling rate, Hz; default: column t, or the session of a log. A recording is resampled to it.",
+            min=0.001,
+        ),
     ]
     names: Annotated[
         Mapping[str, str] | None,
@@ -78,7 +82,7 @@ class ImportOptions(TypedDict, total=False):
             "--units",
             parser=pairs,
             metavar="QUANTITY=UNIT,...",
-            help="Units other than SI: position=deg,torque=mnm,current=ma; mm, deg|mm, mv.",
+            help="Units other than SI: position=deg,torque=mnm,current=ma; mm, deg|mm, mv; FILE.json of LeRobot.",
         ),
     ]
 

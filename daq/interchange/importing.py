@@ -13,9 +13,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from armident.configs import ConfigError, DataError, RobotConfig, SessionConfig
 from armident.daq.interchange.bag_files import bag_files
-from armident.daq.interchange.clocks import UNITS, gaps_and_counters
+from armident.daq.interchange.clocks import UNITS, descending, gaps_and_counters
 from armident.daq.interchange.import_options import ImportOptions
-from armident.daq.interchange.lerobot import data_files
+from armident.daq.interchange.lerobot import FULL, UNSURE, data_files, position_hint
 from armident.daq.interchange.readers import check_options, reader_of
 from armident.daq.interchange.resampling import Sampled, at_rate, sampled
 from armident.daq.interchange.si_checks import OMITTED, check_units, limit_notes, si_unit_of
@@ -82,6 +82,8 @@ def recording_of_arrays(
                     f"each time and one column for each joint of {robot.name}"
                 )
     _check_rates(None, False, resample_hz)
+    if descending(table["t"]):
+        raise DataError("t: time does not increase: give all arrays from the oldest row to the newest")
     try:
         return _from_table(robot, Source(Path("arrays"), table), {"resample_hz": resample_hz}, {"source": "arrays"})
     except DataError as error:
@@ -111,7 +113,11 @@ def _from_table(robot: RobotConfig, source: Source, options: ImportOptions, fact
     polled, motor_side = options.get("polled", False), options.get("motor_side", False)
     rows = table_rows(source, robot, options)
     _refuse_sign_bits(source, rows)
-    rows = in_si(rows, robot, options.get("units") or {})
+    hint = position_hint(rows.values["position"]) if source.lerobot else ""
+    units = options.get("units") or {}
+    if source.lerobot and units.get("position") == "deg" and np.abs(rows.values["position"]).max() <= FULL:
+        rows = replace(rows, notes=(*rows.notes, UNSURE))
+    rows = in_si(rows, robot, units)
     _refuse_immense(source, rows)
     side: Side = "motor" if motor_side else "joint"
     rows, repairs = _repaired(rows, robot, side, options)
@@ -123,7 +129,7 @@ def _from_table(robot: RobotConfig, source: Source, options: ImportOptions, fact
         for name in rows.values
     }
     known = _rows_with_demand(source, rows)
-    check_units(path, robot, fields, {str(name): values for name, values in rows.values.items()}, known)
+    check_units(path, robot, fields, {str(name): values for name, values in rows.values.items()}, known, hint)
     if (polled or resample_hz is not None) and known != slice(0, rows.row.size):
         option = "--polled" if polled else "--resample"
         raise DataError(
@@ -141,7 +147,7 @@ def _from_table(robot: RobotConfig, source: Source, options: ImportOptions, fact
             time_unit=options.get("time_unit"),
         )
     except DataError as error:
-        shown = str(error)
+        shown = "; ".join(part for part in (source.clock, str(error)) if part)
         raise type(error)(shown if shown.startswith(str(path)) else f"{path}: {shown}") from error
     notes = (*source.notes, *rows.notes, *made.notes)
     if not motor_side:
@@ -269,17 +275,16 @@ def _refuse_immense(source: Source, rows: TableRows) -> None:
 
 
 def _refuse_sign_bits(source: Source, rows: TableRows) -> None:
-    """Refuse efforts that have their sign in a bit: as numbers they are wrong wherever they are negative."""
+    """Refuse efforts that hold negative values in unsigned numbers: they are wrong wherever they are negative."""
     for name in EFFORTS:
         values = rows.values.get(name, np.zeros((0, 0)))
-        bit = next((bit for column in values.T if (bit := sign_bit(column)) is not None), None)
-        if bit is not None:
+        found = next((bit for column in values.T if (bit := sign_bit(column)) is not None), None)
+        if found is not None:
             labels = zip(rows.labels[name], values.T, strict=True)
-            named = [label for label, column in labels if column.max() >= 1 << bit]
+            named = [label for label, column in labels if column.max() >= found.least]
             raise DataError(
-                f"{source.path}: {listed(named)}: whole numbers that are never negative, and jump by {1 << bit} "
-                f"where the motion turns: bit {bit} is the sign; decode it where they are recorded: "
-                f"x if x < {1 << bit} else {1 << bit} - x"
+                f"{source.path}: {listed(named)}: never negative, and values jump by {found.least:g} or more where the "
+                f"motion turns: {found.how}; decode it where they are recorded: {found.formula}"
             )
 
 

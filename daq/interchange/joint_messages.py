@@ -1,9 +1,12 @@
-"""Messages of type sensor_msgs/msg/JointState of one topic, decoded into one table for each list of joint names."""
+"""Messages of type sensor_msgs/msg/JointState of one topic, decoded into one table for each list of joint names.
+
+The encodings are CDR, that of ROS 2, and that of ROS 1, as in bags that were converted to MCAP.
+"""
 
 import struct
 from array import array
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -31,6 +34,10 @@ int32 sec
 uint32 nanosec
 """
 _NS = 1_000_000_000
+CDR, ROS1 = "cdr", "ros1"
+"""Encodings of messages in MCAP."""
+_Message = tuple[int, tuple[str, ...], Sequence[float], Sequence[float]]
+"""Stamp, ns; names; positions; efforts."""
 _MOST_NS = 2**63 - 1
 """Last time that 64 bits hold, ns."""
 
@@ -70,13 +77,11 @@ class TopicMessages:
         self._odd: Counter[str] = Counter()
         self._first_odd: dict[str, int] = {}
 
-    def add(self, logged_ns: int, data: bytes) -> None:
-        """Add a message in CDR, recorded at ``logged_ns``; one that cannot be used is counted."""
+    def add(self, logged_ns: int, data: bytes, encoding: str = CDR) -> None:
+        """Add a message in CDR or ``ros1``, recorded at ``logged_ns``; one that cannot be used is counted."""
         self.count += 1
         try:
-            message = self._decode(data)
-            names, q, tau = tuple(message.name), message.position, message.effort
-            stamp = message.header.stamp.sec * _NS + message.header.stamp.nanosec
+            stamp, names, q, tau = _of_ros_1(data) if encoding == ROS1 else self._of_ros_2(data)
         except (ValueError, struct.error, EOFError, IndexError, MemoryError, OverflowError):
             self._refuse("is damaged")
             return
@@ -99,6 +104,11 @@ class TopicMessages:
         rows.times.extend((self.count, stamp, logged_ns))
         rows.q.extend(q)
         rows.tau.extend(tau)
+
+    def _of_ros_2(self, data: bytes) -> "_Message":
+        message = self._decode(data)
+        stamp = message.header.stamp.sec * _NS + message.header.stamp.nanosec
+        return stamp, tuple(message.name), message.position, message.effort
 
     def names(self) -> list[str]:
         """Return the names of all joints so far, in the order in which they came first."""
@@ -136,3 +146,33 @@ def _decoder() -> Callable[[bytes], Any]:
     decode = DecoderFactory().decoder_for("cdr", schema)
     assert decode is not None
     return decode
+
+
+def _of_ros_1(data: bytes) -> _Message:
+    """Return a message of ROS 1: little endian, lengths before texts and arrays, without alignment."""
+    at = 12
+
+    def length() -> int:
+        nonlocal at
+        at += 4
+        return int(struct.unpack_from("<I", data, at - 4)[0])
+
+    def text() -> str:
+        nonlocal at
+        size = length()
+        at += size
+        return data[at - size : at].decode()
+
+    def numbers() -> tuple[float, ...]:
+        nonlocal at
+        count = length()
+        at += 8 * count
+        return struct.unpack_from(f"<{count}d", data, at - 8 * count)
+
+    _, seconds, nanoseconds = struct.unpack_from("<3I", data)
+    text()
+    names = tuple(text() for _ in range(length()))
+    positions, _, efforts = numbers(), numbers(), numbers()
+    if at != len(data):
+        raise ValueError("another length than that of its arrays")
+    return seconds * _NS + nanoseconds, names, positions, efforts

@@ -2,14 +2,14 @@
 
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from armident.configs import DataError
+from armident.configs import ConfigError, DataError, RobotConfig
 from armident.daq.interchange.bag_files import METADATA, SUFFIXES
 from armident.daq.interchange.text_files import listed
 
@@ -19,6 +19,17 @@ _EFFORTS = {
     "current": ("current", "currents", "joint_current", "motor_current"),
 }
 """Last words of the columns of observations that are an effort."""
+FULL = 100.0
+"""Ends of a calibrated range in the default unit of positions; those of a gripper are 0 and 100."""
+UNSURE = (
+    "degrees are right only if the arm was recorded with use_degrees: no position passes 100, and LeRobot's default is "
+    "-100 to 100 of the calibrated range"
+)
+"""Note on positions that are stated to be in degrees."""
+_COUNTS = 4096
+"""Counts per turn of the servos of LeRobot's arms (STS3215, XL330, XL430)."""
+_MOST = 1 << 31
+"""Counts that no range reaches."""
 _BETWEEN_S = 1.0
 """Gap between two episodes, s: the time between them is not recorded."""
 _SUFFIX = re.compile(r"[._](pos|position|goal|eff|effort|torque|tau|current)$", re.IGNORECASE)
@@ -95,6 +106,43 @@ def lerobot_table(path: Path, arrays: Mapping[str, Any]) -> tuple[dict[str, NDAr
             raise DataError(f"{path}: {EPISODE} has values that are no numbers, or not one for every timestamp")
         table["t"] = _one_clock(times, episode, notes)
     return table, notes
+
+
+def position_hint(position: NDArray[np.float64]) -> str:
+    """Return the units that positions (N, n) of a data set may have, and the options that read them, for a message."""
+    if np.abs(position).max() > FULL:
+        return "; values beyond 100 are degrees (use_degrees) in a data set of LeRobot: --units position=deg reads them"
+    return (
+        "; LeRobot records -100 to 100 of each joint's calibrated range unless use_degrees was set: --units "
+        "position=FILE.json, the calibration of this arm, converts them; --units position=deg only with use_degrees"
+    )
+
+
+def calibrated(
+    file: Path, labels: Sequence[str], robot: RobotConfig
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return factors and offsets (n,) from -100 to 100 of calibrated ranges to rad from their middles, by a file.
+
+    The file is that of ``lerobot-calibrate``. ``labels``: columns of the positions, in the robot's order.
+    """
+    try:
+        motors = json.loads(file.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigError(f"{file}: cannot be read: {error.strerror or 'an error of the file system'}") from error
+    except (ValueError, RecursionError) as error:
+        raise ConfigError(f"{file}: not JSON, as a calibration of LeRobot is") from error
+    motors = motors if isinstance(motors, dict) else {}
+    factors, offsets = np.ones(robot.n), np.zeros(robot.n)
+    for j, (label, joint) in enumerate(zip(labels, robot.joints, strict=True)):
+        name = next((each for each in (label.split("/")[0], joint.source_name, joint.name) if each in motors), None)
+        entry = motors.get(name)
+        ends = [entry.get(end) for end in ("range_min", "range_max")] if isinstance(entry, dict) else []
+        if len(ends) != 2 or not all(isinstance(end, int) and abs(end) < _MOST for end in ends) or ends[0] >= ends[1]:
+            raise ConfigError(f"{file}: no range_min below range_max of {joint.name}; found {listed(list(motors))}")
+        gripper = name == "gripper"
+        factors[j] = (ends[1] - ends[0]) / (FULL if gripper else 2 * FULL) * 2 * np.pi / _COUNTS
+        offsets[j] = -factors[j] * FULL / 2 if gripper else 0.0
+    return factors, offsets
 
 
 def _one_clock(times: NDArray[np.float64], episode: NDArray[np.float64], notes: list[str]) -> NDArray[np.float64]:

@@ -1,7 +1,7 @@
 """Reading of bus logs: whole lines and objects are kept, others are counted and named."""
 
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -13,29 +13,51 @@ from armident.configs.yaml_loader import is_file
 from armident.daq.interchange.blf import read_blf
 from armident.daq.interchange.log_frames import FrameCollector, LogFrames
 from armident.daq.interchange.log_lines import AscLines, CandumpLines, LineKind, LineParser, TrcLines
+from armident.daq.interchange.log_tables import BusmasterLines, CsvLines
 from armident.daq.interchange.text_files import encoding_of, excerpt
 
 _SHOW_EVERY = 4096
+_HEAD = 60
+"""Lines that tell the format of a log."""
 _LONGEST_LINE = 4096
 """Lines of text logs have some hundred characters; longer ones are no lines of a log."""
 
 
+_BY_SUFFIX: Mapping[str, type[LineParser]] = {".log": CandumpLines, ".asc": AscLines, ".trc": TrcLines}
+_PARSERS: tuple[type[LineParser], ...] = (CsvLines, BusmasterLines, CandumpLines, AscLines, TrcLines)
+
+
+def is_text_log(path: Path) -> bool:
+    """Return ``True`` if a text file, whatever its suffix, begins like a bus log."""
+    try:
+        return _parser_of(path) is not None
+    except OSError:
+        return False
+
+
+def _parser_of(path: Path) -> type[LineParser] | None:
+    """Return the parser that finds a frame in the first lines of a file."""
+    with path.open(encoding=encoding_of(path), errors="replace", newline="\n") as file:
+        lines = [file.readline(_LONGEST_LINE).strip() for _ in range(_HEAD)]
+    for each in _PARSERS:
+        parser = each()
+        if any(isinstance(kind := parser.parse(line), tuple) or kind is LineKind.WITHOUT_TIME for line in lines):
+            return each
+    return None
+
+
 def read_log(path: Path) -> LogFrames:
-    """Return the frames of a bus log, by its suffix; DataError if it is no such log or has no frames."""
+    """Return the frames of a bus log, by its suffix or contents; DataError if it is no such log or has no frames."""
     if not is_file(path):
         raise ConfigError(f"{path}: no such file")
-    parsers: dict[str, type[CandumpLines] | type[AscLines] | type[TrcLines]] = {
-        ".log": CandumpLines,
-        ".asc": AscLines,
-        ".trc": TrcLines,
-    }
     frames = FrameCollector()
     suffix = path.suffix.lower()
     try:
         if suffix == ".blf":
             read_blf(path, frames)
             return frames.finish(path, added_up=False)
-        parser: LineParser = parsers[suffix]()
+        usual = _BY_SUFFIX.get(suffix, CandumpLines)
+        parser = (usual if suffix in (".asc", ".trc") else _parser_of(path) or usual)()
         _read_lines(path, parser, frames)
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror or 'an error of the file system'}") from error
@@ -51,6 +73,7 @@ def _read_lines(path: Path, parser: LineParser, frames: FrameCollector) -> None:
     with path.open(encoding=encoding_of(path), errors="replace", newline="\n") as file, _progress(path) as advance:
         while line := file.readline(_LONGEST_LINE):
             number += 1
+            frames.line = number
             kind = parser.parse(line.strip())
             if isinstance(kind, tuple):
                 frames.add(*kind)

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armident.configs import ConfigError, DataError
+from armident.daq.interchange.clocks import newest_first
 from armident.drivers.can.frames import FRAME, Frames
 
 _BATCH = 65536
@@ -20,29 +21,30 @@ LATEST_NS = 9_000_000_000 * 1_000_000_000
 
 @dataclass(frozen=True)
 class LogFrames:
-    """Classic data frames (N,) with 11-bit identifiers, times in ns, in the order of the log, and their buses (N,).
+    """Classic data frames (N,) with 11-bit identifiers, times in ns, the oldest first, and their buses (N,).
 
-    ``foreign``: number of CAN FD, extended, remote and error frames; ``skipped``: number of lines or objects left out.
+    ``lines`` (N,): line of each frame in a text log, else its number. ``foreign``: number of CAN FD, extended, remote
+    and error frames; ``skipped``: number of lines or objects left out.
     """
 
     frames: Frames
     bus: NDArray[np.int64]
+    lines: NDArray[np.int64]
     buses: tuple[str, ...]
     foreign: int
     notes: tuple[str, ...] = ()
     skipped: int = 0
 
-    def of(self, path: Path, bus: str, several: bool) -> Frames:
-        """Return the frames of one bus; if the session has only one, those of the only bus in the log."""
+    def of(self, path: Path, bus: str, several: bool) -> NDArray[np.bool_]:
+        """Return the mask (N,) of the frames of one bus; if the session has one, that of the only bus in the log."""
         if len(self.buses) < 2 and not (self.buses and several):
-            return self.frames
+            return np.ones(self.frames.size, np.bool_)
         if bus not in self.buses:
             raise ConfigError(
                 f"{path}: holds the buses {', '.join(self.buses)}; the session's is {bus}: "
                 "name the one to read as its channel (bus.channel)"
             )
-        chosen: Frames = self.frames[self.bus == self.buses.index(bus)]
-        return chosen
+        return np.asarray(self.bus == self.buses.index(bus), np.bool_)
 
     def buses_with(self, identifiers: Sequence[int]) -> list[str]:
         """Return the names of the buses with frames of all identifiers."""
@@ -58,9 +60,11 @@ class FrameCollector:
     foreign: int = 0
     skipped: int = 0
     notes: list[str] = field(default_factory=list)
+    line: int = 0
+    """Line that is read, in a text log."""
     _numbers: dict[str, int] = field(default_factory=dict)
-    _rows: list[tuple[int, int, bytes, int]] = field(default_factory=list)
-    _parts: list[tuple[Frames, NDArray[np.int64]]] = field(default_factory=list)
+    _rows: list[tuple[int, int, bytes, int, int]] = field(default_factory=list)
+    _parts: list[tuple[Frames, NDArray[np.int64], NDArray[np.int64]]] = field(default_factory=list)
     _done: int = 0
 
     @property
@@ -71,7 +75,7 @@ class FrameCollector:
     def add(self, t_ns: int, can_id: int, data: bytes, channel: str) -> None:
         """Add a classic data frame with an 11-bit identifier and at most eight bytes."""
         number = self._numbers.setdefault(channel, len(self._numbers))
-        self._rows.append((t_ns, can_id, data, number))
+        self._rows.append((t_ns, can_id, data, number, self.line or self.count + 1))
         if len(self._rows) >= _BATCH:
             self._flush()
 
@@ -90,8 +94,8 @@ class FrameCollector:
     def drop_last(self) -> None:
         """Leave out the last frame."""
         self._flush()
-        frames, bus = self._parts[-1]
-        self._parts[-1] = (frames[:-1], bus[:-1])
+        frames, bus, lines = self._parts[-1]
+        self._parts[-1] = (frames[:-1], bus[:-1], lines[:-1])
 
     def finish(self, path: Path, added_up: bool | None = None) -> LogFrames:
         """Return the frames; DataError without any. ``added_up``: each time is the time since the frame before."""
@@ -99,11 +103,15 @@ class FrameCollector:
         if not self._parts or not sum(part[0].size for part in self._parts):
             others = f", only {self.foreign} CAN FD, extended, remote or error frames" if self.foreign else ""
             raise DataError(f"{path}: no data frames with 11-bit identifiers in it{others}")
-        frames = np.concatenate([part[0] for part in self._parts])
-        bus = np.concatenate([part[1] for part in self._parts])
+        frames, bus, lines = (np.concatenate(parts) for parts in zip(*self._parts, strict=True))
+        if newest_first(frames):
+            frames, bus, lines = frames[::-1].copy(), bus[::-1], lines[::-1]
+            self.notes.append("the newest frame comes first: read from the last line to the first")
         if added_up is None and _are_differences(frames["t_ns"]):
             frames["t_ns"] = np.cumsum(frames["t_ns"])
             self.notes.append("times are those since the frame before (candump -td): added up")
+        # Times before a trigger are negative.
+        frames["t_ns"] -= min(0, int(frames["t_ns"].min()))
         odd = _odd_times(frames["t_ns"])
         if odd.any():
             first, count = int(np.flatnonzero(odd)[0]) + 1, int(odd.sum())
@@ -111,18 +119,18 @@ class FrameCollector:
                 f"frames left out because their time is far from that of both neighbours: {count}, the first is {first}"
             )
             self.skipped += count
-            frames, bus = frames[~odd], bus[~odd]
-        return LogFrames(frames, bus, tuple(self._numbers), self.foreign, tuple(self.notes), self.skipped)
+            frames, bus, lines = frames[~odd], bus[~odd], lines[~odd]
+        return LogFrames(frames, bus, lines, tuple(self._numbers), self.foreign, tuple(self.notes), self.skipped)
 
     def _flush(self) -> None:
         if not self._rows:
             return
         batch = np.zeros(len(self._rows), FRAME)
-        t_ns, can_id, data, number = zip(*self._rows, strict=True)
+        t_ns, can_id, data, number, lines = zip(*self._rows, strict=True)
         batch["t_ns"], batch["can_id"] = t_ns, can_id
         batch["length"] = [len(octets) for octets in data]
         batch["data"] = np.frombuffer(b"".join(octets.ljust(8, b"\0") for octets in data), np.uint8).reshape(-1, 8)
-        self._parts.append((batch, np.array(number, np.int64)))
+        self._parts.append((batch, np.array(number, np.int64), np.array(lines, np.int64)))
         self._done += len(self._rows)
         self._rows.clear()
 
@@ -154,5 +162,5 @@ def _odd_times(t_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
 
 def nanoseconds(seconds: str, fraction: str | None) -> int | None:
     """Return a time in ns from its digits before and after the decimal point; ``None`` if it is impossible."""
-    t_ns = int(seconds[:11]) * 1_000_000_000 + int((fraction or "0")[:9].ljust(9, "0"))
-    return t_ns if t_ns < LATEST_NS else None
+    t_ns = int(seconds.lstrip("-")[:11]) * 1_000_000_000 + int((fraction or "0")[:9].ljust(9, "0"))
+    return None if t_ns >= LATEST_NS else -t_ns if seconds.startswith("-") else t_ns

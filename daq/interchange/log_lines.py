@@ -32,7 +32,7 @@ class LineParser(Protocol):
         ...
 
 
-_DIGITS = r"(\d+)(?:\.(\d+))?"
+_DIGITS = r"(-?\d+)(?:\.(\d+))?"
 _DATE = r"(\d{4})-(\d\d)-(\d\d)[ T](\d\d):(\d\d):(\d\d)(?:\.(\d+))?"
 _STAMP = re.compile(_DIGITS + "$")
 _STAMP_WITH_DATE = re.compile(_DATE + "$")
@@ -41,7 +41,7 @@ _SCREEN_LINE = re.compile(
     r"(?:\(([^()]*)\)\s+)?(\S+)\s+(?:[RT]X\s+[-B]\s+[-E]\s+)?([0-9A-Fa-f]{8}|[0-9A-Fa-f]{3})"
     r"\s+(?:\[(\d{1,2})\]|\{([0-9A-Fa-f])\})\s*(.*)$"
 )
-_MOST_BYTES = 8
+MOST_BYTES = 8
 
 
 def _stamp(text: str) -> int | None:
@@ -49,11 +49,12 @@ def _stamp(text: str) -> int | None:
     if found := _STAMP.match(text.strip()):
         return nanoseconds(found[1], found[2])
     if found := _STAMP_WITH_DATE.match(text.strip()):
-        return _date_ns([int(part) for part in found.groups()[:6]], found[7])
+        return date_ns([int(part) for part in found.groups()[:6]], found[7])
     return None
 
 
-def _date_ns(parts: list[int], fraction: str | None) -> int | None:
+def date_ns(parts: list[int], fraction: str | None) -> int | None:
+    """Return year, month, day, hour, minute and second in this computer's zone in ns; ``None`` if they are no date."""
     try:
         year, month, day, hour, minute, second = parts
         seconds = int(datetime(year, month, day, hour, minute, second).timestamp())
@@ -62,7 +63,7 @@ def _date_ns(parts: list[int], fraction: str | None) -> int | None:
     return nanoseconds(str(seconds), fraction) if seconds >= 0 else None
 
 
-def _octets(words: list[str], count: int, base: int = 16) -> bytes | None:
+def octets_of(words: list[str], count: int, base: int = 16) -> bytes | None:
     """Return the first ``count`` data bytes; ``None`` if there are fewer, or one is no byte."""
     if len(words) < count:
         return None
@@ -93,8 +94,8 @@ class CandumpLines:
         if found := _SCREEN_LINE.match(line):
             time, channel, identifier, length, _, rest = found.groups()
             fd = length is not None and len(length) == 2
-            count = min(_MOST_BYTES, int(length)) if length is not None else _MOST_BYTES
-            data: bytes | LineKind | None = _octets(rest.split(), count)
+            count = min(MOST_BYTES, int(length)) if length is not None else MOST_BYTES
+            data: bytes | LineKind | None = octets_of(rest.split(), count)
             if rest.startswith("remote"):
                 data = LineKind.FOREIGN
             return self._frame(time, channel, identifier, fd, data)
@@ -106,13 +107,13 @@ class CandumpLines:
             return LineKind.FOREIGN
         data, underscore, raw = digits.partition("_")
         # A classic frame with a DLC of 9 to 15 has eight bytes (ISO 11898-1); candump adds this DLC.
-        if underscore and not (len(data) == 2 * _MOST_BYTES and re.fullmatch("[9A-Fa-f]", raw)):
+        if underscore and not (len(data) == 2 * MOST_BYTES and re.fullmatch("[9A-Fa-f]", raw)):
             return None
         try:
             octets = bytes.fromhex(data.replace(".", ""))
         except ValueError:
             return None
-        return octets if len(octets) <= _MOST_BYTES else None
+        return octets if len(octets) <= MOST_BYTES else None
 
     @staticmethod
     def _frame(
@@ -142,7 +143,7 @@ _MONTHS = {
     for name in names.split()
 }  # fmt: skip
 """Beginnings of the names of months: English, German, French, Spanish, Italian, Portuguese."""
-_ASC_EVENT = re.compile(r"(-?)(\d+)(?:[.,](\d+))?\s+(\S+)\s*(.*)$")
+_ASC_EVENT = re.compile(r"(-?\d+)(?:[.,](\d+))?\s+(\S+)\s*(.*)$")
 _ASC_CLOCK = re.compile(r"(\d{1,2}):(\d\d):(\d\d)(?:[.,:](\d+))?(?:\s*([ap])\.?m\.?\b)?", re.IGNORECASE)
 _EDL, _RTR = 0x1000, 0x10
 """Flags of frames of a CAN FD channel: extended data length, which classic frames lack, and remote frame."""
@@ -174,7 +175,7 @@ def asc_date_ns(text: str) -> int | None:
     hour = int(clock[1])
     if clock[5]:
         hour = hour % 12 + (12 if clock[5].lower() == "p" else 0)
-    return _date_ns([year, month, day, hour, int(clock[2]), int(clock[3])], clock[4])
+    return date_ns([year, month, day, hour, int(clock[2]), int(clock[3])], clock[4])
 
 
 class AscLines:
@@ -194,12 +195,11 @@ class AscLines:
         found = _ASC_EVENT.match(line)
         if found is None:
             return self._heading(line)
-        minus, seconds, fraction, what, rest = found.groups()
+        seconds, fraction, what, rest = found.groups()
+        # Times before the trigger are negative, and those since an event of another bus.
         t_ns = nanoseconds(seconds, fraction)
-        # Only the time since the event before may be negative: events of two buses are not in order.
-        if t_ns is None or (minus and not self._relative):
+        if t_ns is None:
             return LineKind.MALFORMED
-        t_ns = -t_ns if minus else t_ns
         if self._relative:
             self._now_ns = t_ns = max(0, min(self._now_ns + t_ns, LATEST_NS - self._start_ns))
         if what.upper() == "CANFD":
@@ -248,7 +248,7 @@ class AscLines:
             return LineKind.FOREIGN if words[2].lower() == "r" and not extended else LineKind.MALFORMED
         if extended or words[2].lower() == "r":
             return LineKind.FOREIGN
-        data = _octets(words[4:], min(_MOST_BYTES, length), self._base)
+        data = octets_of(words[4:], min(MOST_BYTES, length), self._base)
         if data is None or words[2].lower() != "d" or not 0 <= can_id <= 0x7FF:
             return LineKind.MALFORMED
         return t_ns, can_id, data, str(int(channel[:9]) - 1)
@@ -266,8 +266,8 @@ class AscLines:
             dlc = int(words[5], 16)
         except (ValueError, IndexError):
             return LineKind.FOREIGN
-        data = _octets(words[7:], length, self._base)
-        if flags & (_EDL | _RTR) or can_id > 0x7FF or data is None or length != min(_MOST_BYTES, dlc):
+        data = octets_of(words[7:], length, self._base)
+        if flags & (_EDL | _RTR) or can_id > 0x7FF or data is None or length != min(MOST_BYTES, dlc):
             return LineKind.FOREIGN
         return t_ns, can_id, data, str(channel)
 
@@ -349,7 +349,7 @@ class TrcLines:
     ) -> FrameLine | LineKind:
         if len(identifier) > 4 or data.startswith("RTR"):
             return LineKind.FOREIGN
-        octets = _octets(data.split(), min(_MOST_BYTES, int(length[:3])))
+        octets = octets_of(data.split(), min(MOST_BYTES, int(length[:3])))
         t_ns = nanoseconds(whole, fraction)
         if octets is None or t_ns is None or int(identifier, 16) > 0x7FF:
             return LineKind.MALFORMED

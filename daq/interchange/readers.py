@@ -70,6 +70,14 @@ class Csv(Reader):
     reader, writer = "table_files:read_columns", "exporting:export_csv"
     options = _OF_TABLES | {"effort"}
 
+    def matches(self, path: Path) -> bool:
+        """Return True for a text file that is not a bus log."""
+        return super().matches(path) and not _is_text_log(path)
+
+
+def _is_text_log(path: Path) -> bool:
+    return bool(_function("log_file:is_text_log")(path))
+
 
 class Npz(Reader):
     """Archives of numpy."""
@@ -153,10 +161,17 @@ class BusLog(Reader):
 
     name = "bus log"
     suffixes = (".log", ".asc", ".blf", ".trc")
-    reads = "SYNC and TPDOs as the session configuration maps them: candump, Vector ASC and BLF, PEAK TRC"
+    reads = (
+        "SYNC and TPDOs as the session configuration maps them: candump, Vector ASC and BLF, PEAK TRC, BUSMASTER; "
+        "CSV of SavvyCAN, python-can and others (`.csv`, `.txt`)"
+    )
     writer = "bus_log:write_log"
-    options = frozenset()
+    options = frozenset({"rate_hz"})
     session = True
+
+    def matches(self, path: Path) -> bool:
+        """Return True for a bus log, by its suffix or, of other text files, by its first lines."""
+        return super().matches(path) or (path.name.lower().endswith(Csv.suffixes) and _is_text_log(path))
 
     def read(self, path: Path, config: Any, options: ImportOptions) -> Recording:
         """Return the recording of a log, whose robot is that of the session."""
@@ -164,7 +179,7 @@ class BusLog(Reader):
         from armident.configs.blanks import LOG
         from armident.daq.interchange.bus_log import recording_from_log
 
-        return recording_from_log(path, config, load_robot(config.robot, LOG))
+        return recording_from_log(path, config, load_robot(config.robot, LOG), options.get("rate_hz"))
 
 
 READERS = tuple(reader() for reader in Reader.__subclasses__())

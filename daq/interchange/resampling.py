@@ -103,7 +103,7 @@ def sampled(
                 f"found {listed(list(source.table))}"
             )
         return Sampled(rate_hz, rows.row - rows.row[0], rows.values, notes=(*notes, *polled_note))
-    clock = clock_of(times, rate_hz, repeated)
+    clock = clock_of(times, rate_hz, repeated, received=bool(source.clock))
     missing = int(clock.numbers[-1]) + 1 - clock.numbers.size
     notes += [*clock.notes, *polled_note]
     if missing:
@@ -115,10 +115,6 @@ def _times(source: Source, rows: TableRows, robot: RobotConfig, unit: str | None
     """Return the times of the rows in s, and notes."""
     if rows.times is None:
         return None, []
-    backward = np.flatnonzero(np.diff(rows.times) < 0)
-    if backward.size:
-        where = source.place(int(rows.row[backward[0] + 1]), rows.time_name)
-        raise DataError(f"{where}: time does not increase")
     times, notes = in_seconds(rows.times, rows.values["position"], robot, named=rows.time_unit, stated=unit)
     check_resolution(times)
     return times, list(notes)

@@ -35,12 +35,16 @@ SIMULATED_S = 1e8
 
 @dataclass(frozen=True)
 class JointStates:
-    """Positions and efforts of a robot, SI units, (N, n), in the robot's order, at increasing times (N,), ns."""
+    """Positions and efforts of a robot, SI units, (N, n), in the robot's order, at increasing times (N,), ns.
+
+    ``clock``: sentence on the times if they are not the stamps, else empty.
+    """
 
     t_ns: NDArray[np.int64]
     q: NDArray[np.float64]
     tau: NDArray[np.float64]
     remarks: tuple[str, ...] = ()
+    clock: str = ""
 
 
 def read_joint_states(
@@ -59,14 +63,15 @@ def read_joint_states(
     reader = BagReader(path, MESSAGE_TYPE)
     found: dict[str, TopicMessages] = {}
     for message in reader:
-        found.setdefault(message.topic, TopicMessages(printable(message.topic))).add(message.logged_ns, message.data)
+        topic_messages = found.setdefault(message.topic, TopicMessages(printable(message.topic)))
+        topic_messages.add(message.logged_ns, message.data, message.encoding)
     try:
         chosen, match, remarks = _choose(reader, found, robot, topic, joints, by_position)
-        t_ns, q, tau, passed = _samples(chosen, match, robot)
+        t_ns, q, tau, clock, passed = _samples(chosen, match, robot)
     except DataError as error:
         lost = f" ({'; '.join(reader.losses)})" if reader.losses else ""
         raise DataError(f"{path}: {error}{lost}") from error
-    return JointStates(t_ns, q, tau, (*match.remarks, *remarks, *passed, *chosen.remarks(), *reader.losses))
+    return JointStates(t_ns, q, tau, (*match.remarks, *remarks, *passed, *chosen.remarks(), *reader.losses), clock)
 
 
 def joint_state_table(path: Path, robot: RobotConfig, options: ImportOptions) -> Source:
@@ -74,7 +79,9 @@ def joint_state_table(path: Path, robot: RobotConfig, options: ImportOptions) ->
     chosen = {name: options.get(name) for name in ("topic", "joints", "by_position") if options.get(name)}
     states = read_joint_states(path, robot, **chosen)  # type: ignore[arg-type]
     times = (states.t_ns - states.t_ns[0]) / 1e9
-    return Source(path, {"t": times, "q": states.q, "tau": states.tau}, notes=states.remarks, t_ns=states.t_ns)
+    return Source(
+        path, {"t": times, "q": states.q, "tau": states.tau}, notes=states.remarks, t_ns=states.t_ns, clock=states.clock
+    )
 
 
 def _choose(
@@ -120,8 +127,8 @@ def _choose(
 
 def _samples(
     messages: TopicMessages, match: JointMatch, robot: RobotConfig
-) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64], list[str]]:
-    """Return times (N,), positions and efforts (N, n) of the stamps with all joints, and remarks on the others."""
+) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64], str, list[str]]:
+    """Return times (N,), positions and efforts (N, n) of the stamps with all joints, their clock, and remarks."""
     tables = messages.tables()
     ours = [table for table in tables if set(table.names) & set(match.names)]
     others = [table for table in tables if table not in ours]
@@ -133,8 +140,8 @@ def _samples(
     for what, given in (("positions", [t.q for t in ours]), ("efforts", [t.tau for t in ours])):
         if all(values is None for values in given):
             raise DataError(f"the messages on {messages.topic} have no {what} of {', '.join(match.names)}")
-    times, remark = _times(messages.topic, ours)
-    remarks += remark
+    times, clock = _times(messages.topic, ours)
+    remarks += [clock] * bool(clock)
     stamps = np.unique(np.concatenate(times))
     shape = (2, stamps.size, robot.n)
     values, known = np.zeros(shape), np.zeros(shape, dtype=bool)
@@ -156,18 +163,18 @@ def _samples(
             f"{int((~whole).sum())} stamps without all joints are left out, the first "
             f"{(stamps[first] - stamps[0]) / _NS:.6g} s after the begin: without {', '.join(lacks)}"
         )
-    return stamps[whole], values[0, whole], values[1, whole], remarks
+    return stamps[whole], values[0, whole], values[1, whole], clock, remarks
 
 
-def _times(topic: str, tables: Sequence[MessageTable]) -> tuple[list[NDArray[np.int64]], list[str]]:
-    """Return the times of the messages of each table, and a remark if they are not the stamps."""
+def _times(topic: str, tables: Sequence[MessageTable]) -> tuple[list[NDArray[np.int64]], str]:
+    """Return the times of the messages of each table, and a sentence if they are not the stamps."""
     stamps = np.concatenate([table.stamp for table in tables])
     logged = np.concatenate([table.logged for table in tables])
     number = np.concatenate([table.number for table in tables])
-    remarks: list[str] = []
+    clock = ""
     unset = int((stamps == 0).sum())
     if unset == stamps.size:
-        stamps, remarks = logged, [f"stamps on {topic} are not set: times are those of recording"]
+        stamps, clock = logged, f"stamps on {topic} are not set: times are those of recording"
     elif unset and stamps.max() > SIMULATED_S * _NS:
         raise DataError(f"{unset} of {stamps.size} messages on {topic} have no stamp: their times are unknown")
     else:
@@ -186,7 +193,7 @@ def _times(topic: str, tables: Sequence[MessageTable]) -> tuple[list[NDArray[np.
         )
     _refuse_jump(topic, stamps[order], logged[order], number[order])
     ends = np.cumsum([table.number.size for table in tables])[:-1]
-    return np.split(stamps, ends), remarks
+    return np.split(stamps, ends), clock
 
 
 def _refuse_other_unit(topic: str, stamps: NDArray[np.int64], logged: NDArray[np.int64]) -> None:

@@ -49,8 +49,12 @@ def check_units(
     fields: Mapping[str, Field],
     raw: Mapping[str, NDArray[np.float64]],
     known: slice,
+    position_hint: str = "",
 ) -> None:
-    """Refuse positions and torques (N, n) far beyond SI limits, or a demand (``known`` rows) that none followed."""
+    """Refuse positions and torques (N, n) far beyond SI limits, or a demand (``known`` rows) that none followed.
+
+    ``position_hint``: units of positions of the tool, in place of the usual ones.
+    """
     transmission = robot.transmission_matrix
     for name, values in raw.items():
         values = values[known] if name == "demand" else values
@@ -68,24 +72,29 @@ def check_units(
         peaks = np.abs(joint).max(axis=0)
         for axis, peak, limit in zip(robot.joints, peaks, limits, strict=True):
             if not peak <= factor * limit:
+                other = position_hint if name != "torque" else ""
                 raise DataError(
                     f"{path}: {name} of {axis.name} reaches {peak:.4g}, its limit is {limit:.4g}: expected {hint}"
-                    f"{_other_unit(name, axis.type, peaks / np.array(limits))}"
+                    f"{other or _other_unit(name, axis.type, peaks / np.array(limits))}"
                 )
     if "demand" in raw:
         _check_demand(path, robot, raw["demand"][known], raw["position"][known])
 
 
 def _other_unit(name: str, kind: str, shares: NDArray[np.float64]) -> str:
-    """Return the option that reads another unit, if all values (shares of the limits, (n,)) are plausible in it."""
-    unit, factor = {
-        ("torque", "revolute"): ("torque=mnm", 1e-3),
-        ("position", "revolute"): ("position=deg", np.pi / 180.0),
-        ("position", "prismatic"): ("position=mm", 1e-3),
-    }.get((name, kind), ("", 1.0))
-    return (
-        f"; --units {unit} if they are in {unit.split('=')[1]}" if unit and factor * shares.max() <= _PLAUSIBLE else ""
-    )
+    """Return the units that have to be converted, with the option for one in which all values are plausible.
+
+    ``shares`` (n,): largest values over the limits. Magnitudes alone cannot tell degrees from counts.
+    """
+    option, factor, others = {
+        ("torque", "revolute"): ("torque=mnm", 1e-3, "shares of the rated torque"),
+        ("position", "revolute"): ("position=deg", np.pi / 180.0, "shares of a range"),
+        ("position", "prismatic"): ("position=mm", 1e-3, "shares of a range"),
+    }.get((name, kind), ("", 1.0, ""))
+    if not option or factor * shares.max() > _PLAUSIBLE:
+        return ""
+    unit = option.split("=")[1]
+    return f"; --units {option} if they are in {unit}; counts and {others} have to be converted where they are recorded"
 
 
 def limit_notes(

@@ -2,12 +2,14 @@
 
 from collections.abc import Mapping
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from armident.configs import ConfigError, RobotConfig
+from armident.configs import ConfigError, DataError, RobotConfig
 from armident.daq.interchange.column_units import SCALES
+from armident.daq.interchange.lerobot import FULL, calibrated
 from armident.daq.interchange.table_rows import TableRows
 from armident.daq.recording.model import Quantity
 
@@ -18,6 +20,7 @@ CHOICES: Mapping[str, tuple[str, ...]] = {
     "voltage": ("mv",),
 }
 """Units that an option can state, besides SI; a demand has the unit of the positions."""
+_POSITIONS: tuple[Quantity, ...] = ("position", "demand")
 
 MOST = {"position": 1.2, "torque": 1.5}
 """Largest values over the limit of a joint that are plausible; limits of position are often rounded, peak torques above
@@ -33,15 +36,26 @@ Floats = NDArray[np.float64]
 
 
 def in_si(rows: TableRows, robot: RobotConfig, units: Mapping[str, str]) -> TableRows:
-    """Rows in SI units, from those by quantity (`CHOICES`); ``deg`` is of revolute, ``mm`` of prismatic joints."""
+    """Rows in SI units, from those by quantity (`CHOICES`); ``deg`` is of revolute, ``mm`` of prismatic joints.
+
+    The unit of positions may be a file: the calibration of LeRobot whose ranges they are shares of.
+    """
     values = dict(rows.values)
     notes = list(rows.notes)
     for quantity, unit in units.items():
+        if quantity == "position" and unit.lower().endswith(".json"):
+            factors, offsets = calibrated(Path(unit), rows.labels["position"], robot)
+            most = float(np.abs(rows.values["position"]).max())
+            if most > FULL:
+                raise DataError(f"--units position={unit}: positions reach {most:.4g}, but shares of a range only 100")
+            values |= {name: values[name] * factors + offsets for name in _POSITIONS if name in values}
+            notes.append(f"position taken as shares of the ranges in {Path(unit).name} (--units): 0 is their middle")
+            continue
         if unit not in CHOICES.get(quantity, ()):
             known = "; ".join(f"{name}={' or '.join(choices)}" for name, choices in CHOICES.items())
-            raise ConfigError(f"--units: no unit {quantity}={unit}; expected {known}")
+            raise ConfigError(f"--units: no unit {quantity}={unit}; expected {known}; position=FILE.json of LeRobot")
         factors = _factors(robot, unit)
-        concerned: tuple[Quantity, ...] = ("position", "demand") if quantity == "position" else (_quantity(quantity),)
+        concerned = _POSITIONS if quantity == "position" else (_quantity(quantity),)
         for name in concerned:
             if name in values:
                 values[name] = values[name] * factors

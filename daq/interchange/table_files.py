@@ -27,6 +27,7 @@ class Source:
     """Named arrays of a file, (N,) or (N, n), with the units that it states for them.
 
     ``lines`` (N,): line of each row in a text file, else ``None``. ``t_ns`` (N,): stamps of the messages of a bag, ns.
+    ``clock``: sentence on the times of a bag if they are not the stamps. ``lerobot``: it is a data set of LeRobot.
     """
 
     path: Path
@@ -35,6 +36,8 @@ class Source:
     units: Mapping[str, str] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     t_ns: NDArray[np.int64] | None = None
+    clock: str = ""
+    lerobot: bool = False
 
     def place(self, row: int, name: str) -> str:
         """Return the position of a value in the file, for messages; rows count from 0."""
@@ -109,7 +112,7 @@ def from_arrays(path: Path, arrays: Mapping[str, Any]) -> Source:
     arrays = {printable(name): values for name, values in arrays.items()}
     if is_lerobot(arrays):
         table, notes = lerobot_table(path, arrays)
-        return Source(path, table, notes=tuple(notes))
+        return Source(path, table, notes=tuple(notes), lerobot=True)
     return _converted(Source(path, _numeric(arrays)), [])
 
 

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armident.configs import DataError, RobotConfig
+from armident.daq.interchange.clocks import descending, without_wraps
 from armident.daq.interchange.column_units import check_unit, time_unit
 from armident.daq.interchange.si_checks import OMITTED
 from armident.daq.interchange.table_columns import TableColumns, find_columns, find_time, unused_demand
@@ -92,7 +93,29 @@ def complete_rows(
         "" if time is None else time_unit(source.units.get(time[0], "")),
         tuple(dict.fromkeys(notes)),
     )
-    return _single(_without_odd_times(source, _complete(source, _joined(rows))))
+    rows = _without_odd_times(source, _in_order(_complete(source, _joined(rows))))
+    backward = np.flatnonzero(np.diff(rows.times) < 0) if rows.times is not None else np.zeros(0, np.intp)
+    if rows.times is not None and backward.size:
+        k = int(backward[0])
+        raise DataError(
+            f"{source.place(int(rows.row[k + 1]), rows.time_name)}: time does not increase: it goes back by "
+            f"{rows.times[k] - rows.times[k + 1]:.6g}; another run begins here, or the clock was set: write one file "
+            "for each part"
+        )
+    return _single(rows)
+
+
+def _in_order(rows: TableRows) -> TableRows:
+    """Return the rows from the oldest to the newest, and their times without wraps."""
+    if rows.times is None:
+        return rows
+    notes: tuple[str, ...] = ()
+    if descending(rows.times):
+        rows = rows.taken(np.arange(rows.times.size)[::-1])
+        notes = ("the newest row comes first: read from the last row to the first",)
+    assert rows.times is not None
+    times, wrapped = without_wraps(rows.times)
+    return replace(rows, times=times, notes=(*rows.notes, *notes, *wrapped))
 
 
 def _found(

@@ -28,12 +28,13 @@ def _shuffled() -> list[tuple[str, ...]]:
 
 
 def _mcap_seeds() -> list[bytes]:
-    """Plain bag, one with compressed messages, and one whose joints come in two orders."""
+    """Plain bag, one with compressed messages, one whose joints come in two orders, and one of ROS 1."""
     mixed = states()[:60] + states(_shuffled()[1], range(5, -1, -1))[60:]
     return [
         _written(lambda path: mcap_bag(path, states()), "a.mcap"),
         _written(lambda path: mcap_bag(path, states(), pack=zstd), "a.mcap"),
         _written(lambda path: mcap_bag(path, mixed), "a.mcap"),
+        _written(lambda path: mcap_bag(path, states(), ros_1=True), "a.mcap"),
     ]
 
 

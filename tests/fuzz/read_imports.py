@@ -8,6 +8,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import can
 import numpy as np
 
 from armident.configs import RobotConfig, SessionConfig, load_robot, load_session
@@ -17,9 +18,13 @@ from armident.daq.recording import Recording, read_recording, write_recording
 from tests.fuzz.harness import FOREIGN_WORDS, MisreadError, Target
 from tests.fuzz.mutate import Mutator, either, forge_blf, forge_parquet, forge_zip, spoil_bytes, spoil_text
 from tests.unit.daq.formats import EXAMPLES, example
+from tests.unit.daq.test_log_files import messages
+from tests.unit.daq.test_log_tables import SAVVYCAN, busmaster, savvycan, table
 from tests.unit.daq.test_recording import make_recording
 
 ROWS = 60
+SHORT = 300
+"""Frames of a log."""
 OPTIONS: tuple[dict[str, Any], ...] = (
     {}, {}, {"rate_hz": 5000.0}, {"resample_hz": 5000.0}, {"rate_hz": 2500.0, "polled": True}, {"by_position": True},
     {"motor_side": True, "time_unit": "ms"},
@@ -87,18 +92,33 @@ def _cell() -> tuple[SessionConfig, RobotConfig]:
     return session, load_robot("tx40.yaml")
 
 
-def _target(reader: Reader, suffix: str) -> Target:
-    seeds = _seeds(reader, suffix)
-
+def _target(name: str, suffix: str, seeds: Callable[[], list[bytes]], *, session: bool) -> Target:
     def check(data: bytes, folder: Path) -> bool:
         path = folder / f"x{suffix}"
         path.write_bytes(data)
         choice = hashlib.sha256(data).digest()[0] % len(OPTIONS) if data not in seeds() else 0
-        options = {} if reader.session else OPTIONS[choice]
-        check_consistent(import_recording(path, _cell()[0 if reader.session else 1], **options), folder)
+        options = {} if session else OPTIONS[choice]
+        check_consistent(import_recording(path, _cell()[0 if session else 1], **options), folder)
         return True
 
-    return Target(f"import{suffix.replace('.', '-')}", seeds, MUTATORS.get(suffix, spoil_bytes), check)
+    return Target(name, seeds, MUTATORS.get(suffix, spoil_bytes), check)
+
+
+def _csv_logs() -> list[bytes]:
+    """Bus logs in CSV of SavvyCAN and of python-can."""
+    with tempfile.TemporaryDirectory() as folder:
+        written = Path(folder, "a.csv")
+        with can.CSVWriter(written) as writer:
+            for message in messages()[:SHORT]:
+                writer.on_message_received(message)
+        ours = table(Path(folder, "b.csv"), SAVVYCAN, map(savvycan, messages()[:SHORT]))
+        return [ours.read_bytes(), written.read_bytes()]
+
+
+def _busmaster_logs() -> list[bytes]:
+    with tempfile.TemporaryDirectory() as folder:
+        modes = ("SYSTEM", "HEX"), ("RELATIVE", "DEC")
+        return [busmaster(Path(folder, "a.log"), mode, base).read_bytes() for mode, base in modes]
 
 
 MUTATORS: dict[str, Mutator] = {
@@ -109,4 +129,11 @@ MUTATORS: dict[str, Mutator] = {
 }
 """Ways to spoil a format by its suffix; others are spoiled byte by byte."""
 
-TARGETS = tuple(_target(reader, suffix) for reader, suffix in EXAMPLES)
+TARGETS = (
+    *(
+        _target(f"import{suffix.replace('.', '-')}", suffix, _seeds(reader, suffix), session=reader.session)
+        for reader, suffix in EXAMPLES
+    ),
+    _target("import-log-csv", ".csv", _csv_logs, session=True),
+    _target("import-log-busmaster", ".log", _busmaster_logs, session=True),
+)

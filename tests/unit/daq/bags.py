@@ -61,18 +61,21 @@ def mcap_bag(
     compression: CompressionType = CompressionType.ZSTD,
     pack: Callable[[bytes], bytes] = lambda data: data,
     message_type: str = MESSAGE_TYPE,
+    ros_1: bool = False,
 ) -> Path:
-    """Write messages to an MCAP file in the order of recording."""
+    """Write messages to an MCAP file in the order of recording. ``ros_1``: as `mcap convert` does of a bag of ROS 1."""
+    name, encoded = ("ros1", of_ros_1) if ros_1 else ("cdr", cdr)
     with path.open("wb") as file:
         writer = McapWriter(file, chunk_size=chunk_size, compression=compression)
-        writer.start(profile="ros2", library="test")
-        schema = writer.register_schema(message_type, "ros2msg", DEFINITION.encode())
+        writer.start(profile="ros1" if ros_1 else "ros2", library="test")
+        type_name, kind = (message_type.replace("/msg/", "/"), "ros1msg") if ros_1 else (message_type, "ros2msg")
+        schema = writer.register_schema(type_name, kind, DEFINITION.encode())
         channels = {
-            topic: writer.register_channel(topic, "cdr", schema) for topic in dict.fromkeys(m.topic for m in messages)
+            topic: writer.register_channel(topic, name, schema) for topic in dict.fromkeys(m.topic for m in messages)
         }
         for message in sorted(messages, key=lambda m: m.at + m.delay):
             at = message.at + message.delay
-            writer.add_message(channels[message.topic], at, pack(cdr(message)), at)
+            writer.add_message(channels[message.topic], at, pack(encoded(message)), at)
         writer.finish()
     return path
 
@@ -122,6 +125,21 @@ def cdr(message: State) -> bytes:
         if len(values):
             body = _aligned(body, 8) + np.asarray(values, dtype="<f8").tobytes()
     return b"\x00\x01\x00\x00" + body
+
+
+def of_ros_1(message: State) -> bytes:
+    """Return the content of a message as ROS 1 serializes it: a number first, no alignment."""
+    stamp = message.at if message.stamped else 0
+    body = struct.pack("<3I", 7, stamp // 10**9, stamp % 10**9)
+    for text in ("base", None, *message.names):
+        body += (
+            struct.pack("<I", len(message.names))
+            if text is None
+            else struct.pack("<I", len(text.encode())) + text.encode()
+        )
+    for values in (message.q, (), message.tau):
+        body += struct.pack("<I", len(values)) + np.asarray(values, dtype="<f8").tobytes()
+    return body
 
 
 def _string(text: str) -> bytes:

@@ -188,6 +188,27 @@ def test_a_sign_in_a_bit_is_refused_with_the_way_to_decode_it(tx40: RobotConfig,
     assert sign_bit(np.abs(size[:, 0])) is None
 
 
+@pytest.mark.parametrize("bits", [8, 16, 32])
+def test_negative_efforts_in_unsigned_numbers_are_refused_with_the_way_to_decode_them(
+    tx40: RobotConfig, bits: int
+) -> None:
+    t, q, tau = motion(np.random.default_rng(bits), 500.0)
+    size = np.rint(100 * (tau - tau.mean(axis=0)) / np.abs(tau - tau.mean(axis=0)).max(axis=0))
+    top = 1 << bits
+    with pytest.raises(DataError, match=f"negative numbers of {bits} bits.* x if x < {top // 2} else x - {top}$"):
+        recording_of_arrays(t, q, np.where(size < 0, size + top, size), tx40)
+
+
+@pytest.mark.parametrize("scale", [0.1, 0.00313])
+def test_a_sign_bit_is_found_in_numbers_that_were_scaled(tx40: RobotConfig, scale: float) -> None:
+    t, q, tau = motion(np.random.default_rng(3), 500.0)
+    size = np.rint(800 * (tau - tau.mean(axis=0)) / np.abs(tau - tau.mean(axis=0)).max(axis=0))
+    with pytest.raises(DataError, match=rf"bit 10 is the sign.* x if x < {1024 * scale:g}"):
+        recording_of_arrays(t, q, scale * np.where(size < 0, 1024 - size, size), tx40)
+    assert sign_bit(np.abs(scale * tau[:, 0])) is None
+    assert sign_bit(np.round(300 + 200 * np.sin(t), 2)) is None
+
+
 def test_drives_that_were_off_are_not_used(tx40: RobotConfig) -> None:
     t, q, tau = motion(np.random.default_rng(5), 500.0)
     tau[1000:2000] = 0.0

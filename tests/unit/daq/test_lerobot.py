@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from armident.configs import DataError
+from armident.configs import ConfigError, DataError
 from armident.daq.interchange.importing import import_recording
+from armident.daq.interchange.lerobot import calibrated
 from tests.unit.daq.tables import N, lerobot, motion, same
 from tests.unit.daq.test_importing import TX40
 
@@ -125,3 +126,82 @@ def test_columns_of_a_lerobot_data_set_with_odd_values_are_refused_in_one_line(
     with pytest.raises(DataError, match=words) as caught:
         import_recording(tmp_path / "a", TX40)
     assert "\n" not in str(caught.value)
+
+
+NAMES = [f"joint_{j + 1}.pos" for j in range(N)]
+MOTORS = {f"joint_{j + 1}": {"id": j + 1, "drive_mode": 0, "range_min": 800 + j, "range_max": 3000} for j in range(N)}
+
+
+def shares(folder: Path, size: float = 90.0) -> tuple[Path, np.ndarray]:
+    """Write a data set whose positions are shares of the ranges in `MOTORS`; return it and its positions in rad."""
+    import pyarrow
+    import pyarrow.parquet
+
+    data = lerobot(folder, NAMES)
+    table = pyarrow.parquet.read_table(data)
+    state = np.array(table["observation.state"].to_pylist())
+    recorded = size * state / np.abs(state).max(axis=0)
+    # A count of a STS3215 is 2 pi / 4096; -100 and 100 are the ends of the range.
+    ends = np.array([(motor["range_min"], motor["range_max"]) for motor in MOTORS.values()])
+    counts = ends[:, 0] + (recorded + 100) / 200 * (ends[:, 1] - ends[:, 0])
+    for column in ("observation.state", "action"):
+        place = table.column_names.index(column)
+        table = table.set_column(place, column, pyarrow.array(recorded.tolist()))
+    pyarrow.parquet.write_table(table, data)
+    return folder, (counts - ends.mean(axis=1)) * 2 * np.pi / 4096
+
+
+def test_shares_of_a_range_are_named_and_converted_by_the_calibration(tmp_path: Path) -> None:
+    folder, q = shares(tmp_path / "set")
+    with pytest.raises(
+        DataError, match=r"-100 to 100 of each joint's calibrated range.*FILE\.json.*deg only with use_deg"
+    ):
+        import_recording(folder, TX40)
+    calibration = tmp_path / "my_arm.json"
+    calibration.write_text(json.dumps(MOTORS))
+    found = import_recording(folder, TX40, units={"position": str(calibration)})
+    np.testing.assert_allclose(found.samples.raw["position"], q, atol=1e-9)
+    np.testing.assert_allclose(found.samples.raw["demand"], q, atol=1e-9)
+    assert "shares of the ranges in my_arm.json (--units): 0 is their middle" in found.metadata["source_remarks"]
+    degrees = import_recording(folder, TX40, units={"position": "deg"})
+    assert "right only if the arm was recorded with use_degrees" in degrees.metadata["source_remarks"]
+
+
+def test_a_gripper_is_recorded_from_0_to_100(tmp_path: Path) -> None:
+    gripper = TX40.model_copy(update={"joints": (TX40.joints[0].model_copy(update={"name": "gripper"}),)})
+    calibration = tmp_path / "my_arm.json"
+    calibration.write_text(json.dumps({"gripper": {"range_min": 2000, "range_max": 3024}}))
+    factors, offsets = calibrated(calibration, ["gripper/position"], gripper)
+    np.testing.assert_allclose(np.array([0, 50, 100]) * factors + offsets, np.pi / 2 * np.array([-0.5, 0, 0.5]))
+
+
+def test_degrees_alone_are_advised_only_where_shares_are_impossible(tmp_path: Path) -> None:
+    folder, _ = shares(tmp_path / "set", 130.0)
+    with pytest.raises(DataError, match=r"values beyond 100 are degrees .*--units position=deg reads them"):
+        import_recording(folder, TX40)
+    calibration = tmp_path / "my_arm.json"
+    calibration.write_text(json.dumps(MOTORS))
+    with pytest.raises(DataError, match="positions reach 130, but shares of a range only 100"):
+        import_recording(folder, TX40, units={"position": str(calibration)})
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (None, "cannot be read: No such file"),
+        ("{", "not JSON, as a calibration of LeRobot is"),
+        ("[]", "no range_min below range_max of joint_1; found"),
+        (json.dumps(MOTORS | {"joint_3": {"range_min": 5, "range_max": 5}}), "no range_min below range_max of joint_3"),
+        (
+            json.dumps(MOTORS | {"joint_2": {"range_min": "5", "range_max": 9}}),
+            "no range_min below range_max of joint_2",
+        ),
+    ],
+)
+def test_a_calibration_that_does_not_fit_is_refused_in_one_line(tmp_path: Path, text: str | None, words: str) -> None:
+    folder, _ = shares(tmp_path / "set")
+    calibration = tmp_path / "my_arm.json"
+    if text is not None:
+        calibration.write_text(text)
+    with pytest.raises(ConfigError, match=words):
+        import_recording(folder, TX40, units={"position": str(calibration)})

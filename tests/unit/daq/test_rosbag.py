@@ -40,6 +40,41 @@ def test_joints_are_found_by_name_among_others(tmp_path: Path, stamped: bool) ->
     assert ("times are those of recording" in recording.metadata.get("source_remarks", "")) is not stamped
 
 
+def test_messages_of_ros_1_in_mcap_are_read(tmp_path: Path) -> None:
+    names = [*reversed(NAMES), "gripper"]
+    path = mcap_bag(tmp_path / "a.mcap", states(names, [5, 4, 3, 2, 1, 0, 0]), ros_1=True)
+    recording = import_recording(path, TX40)
+    assert_motion(recording)
+    assert "source_remarks" not in recording.metadata
+
+
+def test_damaged_messages_of_ros_1_are_left_out_and_counted(tmp_path: Path) -> None:
+    count = iter(range(ROWS))
+    path = mcap_bag(
+        tmp_path / "a.mcap", states(), ros_1=True, pack=lambda data: data[:-3] if next(count) in (50, 90) else data
+    )
+    found = read_joint_states(path, TX40)
+    assert_motion(found, np.delete(np.arange(ROWS), [50, 90]))
+    assert "message 51 on /joint_states is damaged, and 1 more" in found.remarks
+
+
+def test_without_stamps_jitter_is_that_of_the_recording_and_is_not_resampled(tmp_path: Path) -> None:
+    late = np.random.default_rng(1).integers(0, 300_000, ROWS)
+    sent = [replace(each, delay=int(delay)) for each, delay in zip(states(stamped=False), late, strict=True)]
+    path = mcap_bag(tmp_path / "a.mcap", sent)
+    with pytest.raises(
+        DataError, match=r"stamps on /joint_states are not set: times are those of recording; the times jitter"
+    ):
+        import_recording(path, TX40)
+    with pytest.raises(DataError, match=r"--rate RATE, that of the publisher, if it sends evenly") as refused:
+        import_recording(path, TX40)
+    assert "--resample" not in str(refused.value)
+    assert_motion(import_recording(path, TX40, rate_hz=500.0))
+    stamped = mcap_bag(tmp_path / "b.mcap", [replace(each, at=each.at + each.delay, stamped=True) for each in sent])
+    with pytest.raises(DataError, match=r"the times jitter.*; --resample 500 puts the samples"):
+        import_recording(stamped, TX40)
+
+
 def test_names_of_another_case_are_matched_and_said(tmp_path: Path) -> None:
     names = [NAMES[k].capitalize() for k in EXCHANGED]
     found = read_joint_states(mcap_bag(tmp_path / "a.mcap", states(names, EXCHANGED)), TX40)

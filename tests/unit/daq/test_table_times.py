@@ -213,3 +213,37 @@ def test_polled_rows_with_times_are_put_on_the_clock_of_the_controller(tmp_path:
     assert "polled samples put on a clock of 1000 Hz" in found.metadata["source_remarks"]
     with pytest.raises(DataError, match=r"the motion takes .* at the 250 Hz of --resample, but .* by the time column"):
         import_recording(path, PANDA, resample_hz=250.0)
+
+
+def test_a_table_from_the_newest_to_the_oldest_row_is_turned_round(tmp_path: Path) -> None:
+    found = import_recording(written(tmp_path / "a.tsv", motion()[::-1], sep="\t"), TX40)
+    assert same(found, motion())
+    assert "the newest row comes first" in found.metadata["source_remarks"]
+    assert not found.gaps
+
+
+def test_a_second_run_in_a_table_is_named_with_its_line(tmp_path: Path) -> None:
+    twice = np.concatenate([motion(200), motion(200)])
+    with pytest.raises(
+        DataError, match=r"line 202, column t: .* goes back by 0\.199; another run begins here.*one file"
+    ):
+        import_recording(written(tmp_path / "a.csv", twice), TX40)
+
+
+@pytest.mark.parametrize(("unit", "wrap"), [("us", 2**32), ("ms", 2**16), ("ms", 2**32)])
+def test_times_of_a_counter_that_wraps_go_on(tmp_path: Path, unit: str, wrap: int) -> None:
+    values = motion()
+    values[:, 0] = (np.rint(values[:, 0] * {"us": 1e6, "ms": 1e3}[unit]) - 150 + wrap) % wrap
+    found = import_recording(written(tmp_path / "a.csv", values, cell="{:.12g}"), TX40, time_unit=unit)
+    assert same(found, motion())
+    assert f"times begin again after {wrap} (1 times): unwrapped" in found.metadata["source_remarks"]
+
+
+def test_a_unit_of_times_is_advised_only_if_no_other_is_plausible(tmp_path: Path) -> None:
+    values = motion()
+    values[:, 0] *= 2e4
+    values[:, 1 : N + 1] = values[0, 1 : N + 1]
+    with pytest.raises(
+        DataError, match=r"in ms it would be 50 Hz and in us it would be 50000 Hz: state the unit with --time-unit$"
+    ):
+        import_recording(written(tmp_path / "a.csv", values), TX40)
