@@ -32,9 +32,19 @@ def export_model(
             "--nearest", help="Write the nearest physical arm although the estimate differs from it significantly."
         ),
     ] = False,
+    verify: Annotated[
+        Path | None,
+        typer.Option(
+            "--verify",
+            help="Recording or trajectory along which the torques of the file are measured by the program that reads it. "
+            "[default: a motion within the identified range]",
+        ),
+    ] = None,
     json: Annotated[bool, typer.Option("--json", help="Print files and limits as one JSON document.")] = False,
 ) -> None:
     """Write an identified model for a simulator or a controller, with a sheet of what the format cannot hold.
+
+    The sheet states by how much the torques of the file differ from those of the model, in the program that reads it.
 
     The parameters in the file belong to a physical arm. A result that no physical arm has is refused with exit code 3.
 
@@ -49,11 +59,13 @@ def export_model(
     from armident.identify.model_export.exported_model import load_exported_model
     from armident.identify.model_export.formats import check_format
     from armident.identify.model_export.formats import export_model as write
+    from armident.identify.model_export.verification import motion_of
 
     check_format(format_name)
     with progress(f"export-model {result.name}") as report:
         model = load_exported_model(result, robot, urdf, nearest=nearest, progress=report)
-    files, sheet = write(model, format_name, out or model.source.parent)
+        motion = motion_of(model, verify)
+        files, sheet = write(model, format_name, out or model.source.parent, motion)
     if json:
         sys.stdout.write(dumps({"files": [str(file) for file in files], **sheet.document()}, indent=1) + "\n")
         return

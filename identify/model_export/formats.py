@@ -1,12 +1,13 @@
 """Formats of an exported model, and the export itself."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from armident.configs import ConfigError
 from armident.identify.documents.files import write_atomically
 from armident.identify.model_export.code_writer import write_c, write_python
+from armident.identify.model_export.consumers import GivenMotion
 from armident.identify.model_export.csv_writer import write_csv
 from armident.identify.model_export.exported_model import ExportedModel
 from armident.identify.model_export.fmu_writer import write_fmu
@@ -15,6 +16,7 @@ from armident.identify.model_export.pinocchio_writer import write_pinocchio
 from armident.identify.model_export.sdf_writer import write_sdf
 from armident.identify.model_export.sheet import LimitationSheet
 from armident.identify.model_export.urdf_writer import write_urdf
+from armident.identify.model_export.verification import measure
 
 
 @dataclass(frozen=True)
@@ -45,10 +47,13 @@ def check_format(format_name: str) -> None:
         raise ConfigError(f"--format: {format_name!r} is not one of {', '.join(FORMATS)}")
 
 
-def export_model(model: ExportedModel, format_name: str, out: Path) -> tuple[list[Path], LimitationSheet]:
+def export_model(
+    model: ExportedModel, format_name: str, out: Path, motion: GivenMotion | None = None
+) -> tuple[list[Path], LimitationSheet]:
     """Write a model in a format, and the sheet of its limits beside it; return the files, sheet last, and the sheet.
 
-    ``out``: main file, or a folder in which it is named after the robot.
+    ``out``: main file, or a folder in which it is named after the robot. ``motion``: motion along which the torques of
+    the file are measured by the program that reads it; ``None``: they are not measured.
     """
     check_format(format_name)
     chosen = FORMATS[format_name]
@@ -56,6 +61,8 @@ def export_model(model: ExportedModel, format_name: str, out: Path) -> tuple[lis
     try:
         main.parent.mkdir(parents=True, exist_ok=True)
         files, sheet = chosen.write(model, main)
+        if motion is not None:
+            sheet = replace(sheet, measured=measure(model, format_name, files, motion))
         stem = main.name.removesuffix(chosen.suffix).removesuffix(main.suffix)
         page = main.with_name(f"{stem}_{format_name}_limits.md")
         write_atomically(page, sheet.markdown(f"{model.robot.name} as {chosen.title}"))

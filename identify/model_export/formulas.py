@@ -7,7 +7,8 @@ formula is accepted if it has the effect's values along a random motion. Effects
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cache, cached_property
+from types import CodeType
 from typing import Any
 
 import numpy as np
@@ -170,6 +171,18 @@ FUNCTIONS: dict[str, Callable[..., float]] = {
 """Functions of formulas by name; all but ``hat`` are in Python's ``math`` and in C's ``math.h``."""
 
 
+def evaluate(text: str, signals: Mapping[str, Any]) -> float:
+    """Return the value of a formula. ``signals``: values of its symbols by name and joint."""
+    # The text is made of numbers, symbols and names of `FUNCTIONS` by the class above.
+    value: float = eval(_code(text), {"__builtins__": {}, **FUNCTIONS}, dict(signals))
+    return value
+
+
+@cache
+def _code(text: str) -> CodeType:
+    return compile(text, "formula", "eval")
+
+
 class _Instant(Motion):
     """Motion whose one sample consists of symbols."""
 
@@ -287,10 +300,7 @@ def _agrees(arm: ArmModel, term: Term, values: Floats, formulas: Mapping[int, st
         signals |= {"torque": motion.torque, "load": motion.transmitted}
     found = np.zeros((SAMPLES, arm.n))
     for j, text in formulas.items():
-        code = compile(text, "formula", "eval")
         for k in range(SAMPLES):
-            row = {name: values[k].tolist() for name, values in signals.items()}
-            # The text is made of numbers, symbols and names of `FUNCTIONS` by the class above.
-            found[k, j] = eval(code, {"__builtins__": {}, **FUNCTIONS}, row)
+            found[k, j] = evaluate(text, {name: values[k].tolist() for name, values in signals.items()})
     scale = max(float(np.abs(expected).max()), 1e-300)
     return bool(np.abs(found - expected).max() <= AGREEMENT * scale)
