@@ -9,7 +9,7 @@ import typer
 def export_model(
     result: Annotated[Path, typer.Argument(help="identification.json, diagnosis.json, or the folder of one of them.")],
     format_name: Annotated[
-        str, typer.Option("--format", help="urdf, mjcf, sdf, pinocchio, python, c, csv or fmu.", show_default=False)
+        str, typer.Option("--format", help="urdf, mjcf, sdf, pinocchio, python, c, csv, fmu, drives or lerobot.", show_default=False)
     ],
     out: Annotated[
         Path | None, typer.Option("--out", help="File or folder to write. [default: the folder of RESULT]")

@@ -19,6 +19,7 @@ from armident.identify.identification.robot_model import RobotModel
 from armident.identify.model_export.code_writer import code_of
 from armident.identify.model_export.exported_model import ExportedModel
 from armident.identify.model_export.fmu_writer import compiled
+from armident.identify.model_export.sdf_writer import joint_name
 from armident.identify.robot.chain import Floats
 
 PRESCRIBED = 1e6
@@ -26,6 +27,9 @@ PRESCRIBED = 1e6
 
 PACED = 1000
 """Calls of the C source that are timed at 1 kHz."""
+
+LEROBOT_S = 0.02
+"""Period of a loop of LeRobot with a follower arm, s: its recordings have 30 to 60 Hz."""
 
 
 class NoProgramError(Exception):
@@ -50,18 +54,22 @@ class GivenMotion:
 
 @dataclass(frozen=True, eq=False)
 class ProgramRun:
-    """Torques (N, n) that a program computes, N m or N; ``remark``: what else was measured."""
+    """Torques (N, n) that a program computes at every ``every``-th instant, N m or N; ``remark``: what else it found."""
 
     program: str
     torque: Floats
     remark: str = ""
+    every: int = 1
 
 
 def run_python(model: ExportedModel, files: Sequence[Path], motion: GivenMotion) -> ProgramRun:
     """Call the Python module."""
-    module = ModuleType(files[0].stem)
-    exec(compile(files[0].read_text(encoding="utf-8"), str(files[0]), "exec"), vars(module))
-    torque = [module.inverse_dynamics(*(x.tolist() for x in row)) for row in motion.rows]
+    module = _module(files[0])
+    memory, torque = [0.0] * len(code_of(model, "python").content["memory"]), []
+    for row in motion.rows:
+        q, qd, qdd = (x.tolist() for x in row)
+        memory = module.advance(memory, qd, motion.dt) if memory else memory
+        torque.append(module.inverse_dynamics(q, qd, qdd, *([memory] if memory else ())))
     return ProgramRun(f"Python {versions()['python']}", np.array(torque))
 
 
@@ -92,10 +100,39 @@ def run_csv(model: ExportedModel, files: Sequence[Path], motion: GivenMotion) ->
     return ProgramRun("armident", torque)
 
 
+def run_drives(model: ExportedModel, files: Sequence[Path], motion: GivenMotion) -> ProgramRun:
+    """Add up what the drives are given along the motion."""
+    with files[1].open(encoding="utf-8") as stream:
+        rows = [[float(row[f"{joint.name}_total"]) for joint in model.joints] for row in csv.DictReader(stream)]
+    rated = np.array([joint.drive.gain * joint.drive.rated / 1000.0 for joint in model.robot.joints])
+    return ProgramRun("drives", np.array(rows) * rated @ model.robot.transmission_matrix)
+
+
+def run_lerobot(model: ExportedModel, files: Sequence[Path], motion: GivenMotion) -> ProgramRun:
+    """Call the module with positions alone, in degrees and at the rate of a loop of LeRobot."""
+    module, torque = _module(files[0]), []
+    every = max(round(LEROBOT_S / motion.dt), 1)
+    feed = module.FeedForward(every * motion.dt)
+    units = [1.0 if joint.type == "prismatic" else 180.0 / np.pi for joint in model.joints]
+    for q in (motion.q * units)[::every].tolist():
+        found = feed({f"{joint.name}.pos": value for joint, value in zip(model.joints, q, strict=True)})
+        torque.append([found[f"{joint.name}.torque"] for joint in model.joints])
+    remark = f"the module was given positions alone, at {1.0 / (every * motion.dt):.0f} Hz"
+    return ProgramRun(f"Python {versions()['python']}", np.array(torque), remark, every)
+
+
+def _module(file: Path) -> ModuleType:
+    """Execute a Python file as a module."""
+    module = ModuleType(file.stem)
+    exec(compile(file.read_text(encoding="utf-8"), str(file), "exec"), vars(module))
+    return module
+
+
 def run_fmu(model: ExportedModel, files: Sequence[Path], motion: GivenMotion, torque: Floats) -> ProgramRun:
     """Give the unit motion and ``torque`` (N, n): wrong accelerations times the mass matrix are its error."""
     fmpy, fmi2 = _package("fmpy"), _package("fmpy.fmi2", "fmpy")
     n, mass, wrong = model.arm.n, model.arm.mass_matrix(model.theta, motion.q), np.zeros_like(torque)
+    remembers = bool(code_of(model, "fmu").content["memory"])
     description = fmpy.read_model_description(str(files[0]))
     with tempfile.TemporaryDirectory() as folder:
         unit = fmi2.FMU2Slave(
@@ -113,7 +150,8 @@ def run_fmu(model: ExportedModel, files: Sequence[Path], motion: GivenMotion, to
             unit.setReal(states, [*q, *qd])
             unit.setReal(taus, torque[k].tolist())
             wrong[k] = mass[k] @ (qdd - unit.getReal(accelerations))
-            unit.doStep(currentCommunicationPoint=k * motion.dt, communicationStepSize=motion.dt)
+            if remembers:  # nothing else is carried from one instant to the next
+                unit.doStep(currentCommunicationPoint=k * motion.dt, communicationStepSize=motion.dt)
         unit.terminate()
         unit.freeInstance()
     return ProgramRun(f"FMPy {version('fmpy')}", torque + wrong)
@@ -176,7 +214,7 @@ def run_sdf(model: ExportedModel, files: Sequence[Path], motion: GivenMotion) ->
     plant.mutable_gravity_field().set_gravity_vector(model.frames.gravity)
     plant.Finalize()
     context, rows = plant.CreateDefaultContext(), []
-    order = [plant.GetJointByName(name).velocity_start() for name in model.frames.joints]
+    order = [plant.GetJointByName(joint_name(model, k)).velocity_start() for k in range(model.arm.n)]
     for row in motion.rows:
         q, qd, qdd = np.zeros((3, len(order)))
         q[order], qd[order], qdd[order] = row

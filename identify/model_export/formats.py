@@ -6,9 +6,10 @@ from pathlib import Path
 
 from armident.configs import ConfigError
 from armident.identify.documents.files import write_atomically
-from armident.identify.model_export.code_writer import write_c, write_python
+from armident.identify.model_export.code_writer import write_c, write_lerobot, write_python
 from armident.identify.model_export.consumers import GivenMotion
 from armident.identify.model_export.csv_writer import write_csv
+from armident.identify.model_export.drives_writer import write_drives
 from armident.identify.model_export.exported_model import ExportedModel
 from armident.identify.model_export.fmu_writer import write_fmu
 from armident.identify.model_export.mjcf_writer import write_mjcf
@@ -16,16 +17,20 @@ from armident.identify.model_export.pinocchio_writer import write_pinocchio
 from armident.identify.model_export.sdf_writer import write_sdf
 from armident.identify.model_export.sheet import LimitationSheet
 from armident.identify.model_export.urdf_writer import write_urdf
-from armident.identify.model_export.verification import measure
+from armident.identify.model_export.verification import measure, motion_of
 
 
 @dataclass(frozen=True)
 class Format:
-    """A format of exported models; ``write`` returns all files, the main one first, and the sheet."""
+    """A format of exported models; ``write`` returns all files, the main one first, and the sheet.
+
+    ``along_motion``: it also takes the motion whose torques the file holds.
+    """
 
     suffix: str
     title: str
-    write: Callable[[ExportedModel, Path], tuple[list[Path], LimitationSheet]]
+    write: Callable[..., tuple[list[Path], LimitationSheet]]
+    along_motion: bool = False
 
 
 FORMATS: dict[str, Format] = {
@@ -36,6 +41,8 @@ FORMATS: dict[str, Format] = {
     "c": Format(".c", "C source", write_c),
     "csv": Format(".csv", "table of parameters", write_csv),
     "fmu": Format(".fmu", "FMU (FMI 2.0 for Co-Simulation)", write_fmu),
+    "lerobot": Format("_lerobot.py", "Python module for LeRobot", write_lerobot),
+    "drives": Format("_drives.csv", "feed-forward terms of the drives", write_drives, along_motion=True),
     "pinocchio": Format(".pinocchio.xml", "Pinocchio model", write_pinocchio),
 }
 """Formats by name."""
@@ -60,7 +67,8 @@ def export_model(
     main = out / f"{model.robot.name}{chosen.suffix}" if out.is_dir() or not out.suffix else out
     try:
         main.parent.mkdir(parents=True, exist_ok=True)
-        files, sheet = chosen.write(model, main)
+        further = (motion or motion_of(model),) if chosen.along_motion else ()
+        files, sheet = chosen.write(model, main, *further)
         if motion is not None:
             sheet = replace(sheet, measured=measure(model, format_name, files, motion))
         stem = main.name.removesuffix(chosen.suffix).removesuffix(main.suffix)

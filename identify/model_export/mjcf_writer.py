@@ -82,7 +82,7 @@ def _add_friction(model: ExportedModel, passive: Passive) -> set[int]:
     held, replaced = add_effects(model, passive)
     dry = zip(model.joints, replaced, strict=True)
     model = replace(model, joints=tuple(replace(joint, coulomb=joint.coulomb - part) for joint, part in dry))
-    laws, contained = friction_laws(model, instant_model(model.arm, model.theta).torques)
+    laws, contained = friction_laws(model, instant_model(model.arm, model.theta, model.recorded_s).torques)
     for k, (joint, law) in enumerate(zip(model.joints, laws, strict=True)):
         passive.friction(joint.name, law, top_speed(model, k))
     return held | contained

@@ -19,7 +19,7 @@ from armident.identify.model_export.sheet import Measured
 from armident.identify.robot.chain import Floats
 from armident.identify.signals.bandwidth import motion_bandwidth
 
-DURATION_S, PERIOD_S = 4.0, 0.001
+DURATION_S, PERIOD_S = 2.5, 0.001
 """Duration and sampling period of the motion that is made here, s."""
 
 RANGE = 0.8
@@ -42,6 +42,8 @@ RUNNERS: dict[str, Runner] = {
     "csv": consumers.run_csv,
     "fmu": lambda model, files, motion: consumers.run_fmu(model, files, motion, identified_torque(model, motion)),
     "pinocchio": consumers.run_pinocchio,
+    "drives": consumers.run_drives,
+    "lerobot": consumers.run_lerobot,
 }
 """Program that reads each format."""
 
@@ -52,8 +54,8 @@ def measure(model: ExportedModel, format_name: str, files: Sequence[Path], motio
         run = RUNNERS[format_name](model, files, motion)
     except NoProgramError as error:
         return Measured(missing=str(error))
-    settled = round(SETTLED_S / motion.dt)
-    expected = identified_torque(model, motion)[settled:]
+    settled = round(SETTLED_S / motion.dt / run.every)
+    expected = identified_torque(model, motion)[:: run.every][settled:]
     errors, sizes = (np.linalg.norm(x, axis=0) for x in (run.torque[settled:] - expected, expected))
     by_joint = 100.0 * errors / np.maximum(sizes, 1e-300)
     return Measured(
@@ -71,14 +73,8 @@ def identified_torque(model: ExportedModel, motion: GivenMotion) -> Floats:
     torque = arm.inverse_dynamics(theta, motion.q, motion.qd, motion.qdd)
     if arm.e == 0:
         return torque
-    moved = replace(arm.motion(motion.q, motion.qd, motion.qdd, motion.dt), duration=recorded_s(model))
+    moved = replace(arm.motion(motion.q, motion.qd, motion.qdd, motion.dt), duration=model.recorded_s)
     return torque + arm.term_torque(moved, theta[theta.size - arm.e :])
-
-
-def recorded_s(model: ExportedModel) -> float:
-    """Return the duration of all recordings of the identification, s."""
-    used = (model.document.recording, *(model.document.further_recordings or ()))
-    return float(sum(each.samples / each.sample_rate_hz for each in used))
 
 
 def motion_of(model: ExportedModel, file: Path | None = None) -> GivenMotion:
@@ -115,7 +111,7 @@ def _own_motion(model: ExportedModel) -> GivenMotion:
         speed = min(joint.limits.velocity, SPEED)
         if joint.name in known:
             (low, high), speed = known[joint.name].position_range, known[joint.name].velocity_limit
-        waves = 2.0 * np.pi * rng.uniform(0.15, 1.2, 3)
+        waves = 2.0 * np.pi * rng.uniform(0.3, 1.5, 3)
         shape = (np.sin(t[:, None] * waves + rng.uniform(0.0, 2.0 * np.pi, 3)) / waves).sum(axis=1)
         fade = np.minimum(t / SETTLED_S, 1.0)
         shape *= fade**3 * (10.0 - 15.0 * fade + 6.0 * fade**2)
