@@ -105,7 +105,7 @@ def run_drives(model: ExportedModel, files: Sequence[Path], motion: GivenMotion)
     with files[1].open(encoding="utf-8") as stream:
         rows = [[float(row[f"{joint.name}_total"]) for joint in model.joints] for row in csv.DictReader(stream)]
     rated = np.array([joint.drive.gain * joint.drive.rated / 1000.0 for joint in model.robot.joints])
-    return ProgramRun("drives", np.array(rows) * rated @ model.robot.transmission_matrix)
+    return ProgramRun("the table for the drives", np.array(rows) * rated @ model.robot.transmission_matrix)
 
 
 def run_lerobot(model: ExportedModel, files: Sequence[Path], motion: GivenMotion) -> ProgramRun:

@@ -244,7 +244,7 @@ _MEMORIES: tuple[tuple[str, str, str, str], ...] = (
     (r"bristle\(q\[(\d+)\], ([^()]+)\)", "memory[{k}]", "fabs(dq[{0}]) / {1}", "(dq[{0}] > 0.0) - (dq[{0}] < 0.0)"),
     (r"expm1\(-time / ([^()]+)\)", "(-memory[{k}])", "1.0 / {0}", "1.0"),
     (
-        r"expm1\(\(-([^()]+)\) \* \(dt \* pow\(dq\[(\d+)\], 2\.0\)\)\)",
+        r"expm1\(\(-([^()]+)\) \* dt \* pow\(dq\[(\d+)\], 2\.0\)\)",
         "(-memory[{k}])",
         "{0} * dq[{1}] * dq[{1}]",
         "1.0",
@@ -331,7 +331,7 @@ def _formulas(
 ) -> dict[int, str] | None:
     """Return the torque of a term by joint, with new states in ``memory``; ``None`` if it has no formula."""
     q, dq, ddq = (_symbols(name, arm.n) for name in ("q", "dq", "ddq"))
-    period: Any = Formula("dt")
+    period: Any = np.array([Formula("dt")], dtype=object)
     motion = _Instant(arm, q, dq, ddq, dt=period, theta=arm.anchor, duration=duration)
     states = list(memory)
     try:

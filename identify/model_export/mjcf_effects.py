@@ -23,6 +23,9 @@ SHAFT_KG, SHAFT_KG_M2 = 1e-6, 1e-9
 STOP = {"solreflimit": "0.002 1", "solimplimit": "0.99 0.9999 1e-5"}
 """Ends of a backlash gap: without rebound, as in the model; the time constant is that of two steps, s."""
 
+NO_GAIN = "1e-9"
+"""Gain of an actuator whose input is not used."""
+
 
 @dataclass
 class Passive:
@@ -52,8 +55,10 @@ class Passive:
             constant, most = numbers(np.sqrt(damper.slope)), numbers([damper.high, 0.0, 0.0])
             self._motor(name, {**where, "saturation": most}, constant)
             return
-        law = {"biastype": "affine", "biasprm": numbers([0.0, 0.0, -damper.slope]), "gainprm": "0"}
-        ET.SubElement(self.element, "general", {"name": name, **where, **law}, forcerange=numbers([damper.low, damper.high]))
+        # With a gain of zero, MuJoCo would read a positive third number as a damping ratio.
+        law = {"biastype": "affine", "gainprm": NO_GAIN}
+        limits = {"biasprm": numbers([0.0, 0.0, -damper.slope]), "forcerange": numbers([damper.low, damper.high])}
+        ET.SubElement(self.element, "general", {"name": name, **where, **law, **limits})
         self.unused.append(name)
 
     def _motor(self, name: str, attributes: dict[str, str], constant: str = "0") -> None:

@@ -6,14 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from armident.identify.effects.free_shapes import hats
 from armident.identify.model_export.exported_model import ExportedModel, JointCoupling
 from armident.identify.model_export.formulas import evaluate
 from armident.identify.robot.chain import Floats
 
 TOLERANCE = 0.01
-"""Largest error of the sum, relative to the largest friction: the mean error is half of it, and friction is a part of
-the torque."""
+"""Error of the sum where the law is curved, relative to the largest friction; at inflections it is twice as large."""
 
 SLOWEST = 1e-6
 """Least velocity of the grid, relative to the highest one."""
@@ -23,6 +21,9 @@ GRID = 1500
 
 FASTEST = 10.0
 """Highest velocity of a joint without a limit, rad/s or m/s."""
+
+NEGLIGIBLE = 1e-4
+"""Torque of a damper that is left out, relative to the largest friction."""
 
 
 @dataclass(frozen=True)
@@ -49,24 +50,30 @@ def saturated_dampers(friction: Callable[[Floats], Floats], top: float) -> list[
 
 
 def _chords(v: Floats, friction: Floats, size: float) -> Iterator[tuple[float, float]]:
-    """Slope and limit of each damper: changes of slope of the polygon that fits friction at the velocities v."""
-    corners, first = [0], 0
-    while first < v.size - 1:
-        low, high = first + 1, v.size
-        while high - low > 1:  # the longest chord that keeps the tolerance, by halving
+    """Slope and limit of each damper: changes of slope of a polygon close to the friction at the velocities v."""
+    allowed, corners, sides = 2.0 * TOLERANCE * size, [0], [0.0]
+    while corners[-1] < v.size - 1:
+        first, low, high = corners[-1], corners[-1] + 1, v.size
+        while high - low > 1:  # the longest chord that is close enough, by halving
             middle = (low + high) // 2
-            line = np.interp(v[first : middle + 1], v[[first, middle]], friction[[first, middle]])
-            # The fit puts the corners between both sides of the law, which halves the error.
-            close = np.abs(line - friction[first : middle + 1]).max() <= 2.0 * TOLERANCE * size
+            close = np.abs(_above(v, friction, first, middle)).max() <= allowed
             low, high = (middle, high) if close else (low, middle)
         corners.append(low)
-        first = low
-    at = v[corners]
-    heights = np.concatenate([[0.0], np.linalg.lstsq(hats(v, at)[:, 1:], friction, rcond=None)[0]])
-    slopes = np.append(np.diff(heights) / np.diff(at), 0.0)
-    for slope, end in zip(slopes[:-1] - slopes[1:], at[1:], strict=True):
-        if abs(slope * end) > 1e-9 * size:
+        sides.append(float(np.sign(_above(v, friction, first, low).sum())))
+    # Corners move to the side of the law, which halves the error, unless its curvature changes there.
+    moved = [a if a == b else 0.0 for a, b in zip(sides[1:], [*sides[2:], sides[-1]], strict=True)]
+    heights = np.concatenate([[0.0], friction[corners[1:]] + 0.5 * allowed * np.array(moved)])
+    slopes = np.append(np.diff(heights) / np.diff(v[corners]), 0.0)
+    for slope, end in zip(-np.diff(slopes), v[corners[1:]], strict=True):
+        if abs(slope * end) > NEGLIGIBLE * size:
             yield float(slope), float(slope * end)
+
+
+def _above(v: Floats, friction: Floats, first: int, last: int) -> Floats:
+    """Return the friction above the chord between two velocities, at those in between."""
+    ends = [first, last]
+    above: Floats = friction[first : last + 1] - np.interp(v[first : last + 1], v[ends], friction[ends])
+    return above
 
 
 def friction_laws(

@@ -5,6 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from scipy.signal import butter, sosfiltfilt
 
 from armident.configs import load_trajectory
 from armident.daq.recording import read_recording
@@ -27,6 +28,10 @@ RANGE = 0.8
 
 SETTLED_S = 0.5
 """Time in which elastic joints and bristles come from rest to the motion; its torques are not compared, s."""
+
+IMPACT_BAND_HZ = 50.0
+"""Band in which torques of an arm with backlash are compared: an impact is one sample of the model, and filters of an
+identification leave nothing above, Hz."""
 
 ANGLE, SPEED = 1.0, 2.0
 """Half a range of positions (rad or m), and a velocity per s, of a joint without known ones."""
@@ -55,12 +60,17 @@ def measure(model: ExportedModel, format_name: str, files: Sequence[Path], motio
     except NoProgramError as error:
         return Measured(missing=str(error))
     settled = round(SETTLED_S / motion.dt / run.every)
-    expected = identified_torque(model, motion)[:: run.every][settled:]
-    errors, sizes = (np.linalg.norm(x, axis=0) for x in (run.torque[settled:] - expected, expected))
+    expected = identified_torque(model, motion)[:: run.every]
+    compared, title = (run.torque - expected, expected), motion.title
+    if any(effect.effect == "backlash" for effect in model.effects) and IMPACT_BAND_HZ < 0.5 / motion.dt:
+        low_pass = butter(4, IMPACT_BAND_HZ, fs=1.0 / (motion.dt * run.every), output="sos")
+        compared = tuple(sosfiltfilt(low_pass, torque, axis=0) for torque in compared)
+        title += f", below {IMPACT_BAND_HZ:g} Hz"
+    errors, sizes = (np.linalg.norm(torque[settled:], axis=0) for torque in compared)
     by_joint = 100.0 * errors / np.maximum(sizes, 1e-300)
     return Measured(
         run.program,
-        motion.title,
+        title,
         float(100.0 * np.linalg.norm(errors) / max(float(np.linalg.norm(sizes)), 1e-300)),
         {joint.name: float(value) for joint, value in zip(model.joints, by_joint, strict=True)},
         run.remark,
