@@ -9,7 +9,10 @@ import typer
 def export_model(
     result: Annotated[Path, typer.Argument(help="identification.json, diagnosis.json, or the folder of one of them.")],
     format_name: Annotated[
-        str, typer.Option("--format", help="urdf, mjcf, sdf, pinocchio, python, c, csv, fmu, drives or lerobot.", show_default=False)
+        str,
+        typer.Option(
+            "--format", help="urdf, mjcf, sdf, pinocchio, python, c, csv, fmu, drives or lerobot.", show_default=False
+        ),
     ],
     out: Annotated[
         Path | None, typer.Option("--out", help="File or folder to write. [default: the folder of RESULT]")
@@ -36,7 +39,7 @@ def export_model(
         Path | None,
         typer.Option(
             "--verify",
-            help="Recording or trajectory along which the torques of the file are measured by the program that reads it. "
+            help="Recording or trajectory along which the program that reads the file computes its torques. "
             "[default: a motion within the identified range]",
         ),
     ] = None,

@@ -54,7 +54,7 @@ class GivenMotion:
 
 @dataclass(frozen=True, eq=False)
 class ProgramRun:
-    """Torques (N, n) that a program computes at every ``every``-th instant, N m or N; ``remark``: what else it found."""
+    """Torques (N, n) that a program computes at every ``every``-th instant, N m or N; ``remark``: further findings."""
 
     program: str
     torque: Floats
@@ -206,9 +206,7 @@ def _pinocchio(pin: Any, arm: Any, motion: GivenMotion) -> ProgramRun:
 
 def run_sdf(model: ExportedModel, files: Sequence[Path], motion: GivenMotion) -> ProgramRun:
     """Let Drake compute the torques, gravity set."""
-    parsing, plants, tree = (
-        _package(f"pydrake.multibody.{part}", "drake") for part in ("parsing", "plant", "tree")
-    )
+    parsing, plants, tree = (_package(f"pydrake.multibody.{part}", "drake") for part in ("parsing", "plant", "tree"))
     plant = plants.MultibodyPlant(time_step=0.0)
     parsing.Parser(plant).AddModels(str(files[0]))
     plant.mutable_gravity_field().set_gravity_vector(model.frames.gravity)

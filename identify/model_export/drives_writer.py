@@ -16,7 +16,7 @@ from armident.identify.model_export.sheet import LimitationSheet, limitation_she
 from armident.identify.robot.chain import Floats
 
 COLUMNS = ("motor", "term", "joint", "value", "unit", "least", "most")
-"""Heads of the table of constants; ``least`` and ``most``: over the workspace, where the term depends on the posture."""
+"""Heads of the table of constants; ``least`` and ``most``: over the workspace, of terms that depend on the posture."""
 
 TERMS = ("gravity", "inertia", "friction", "total")
 """Parts of the torque along a motion; inertia includes Coriolis and centrifugal torques, friction all effects."""
@@ -41,9 +41,9 @@ def write_drives(model: ExportedModel, path: Path, motion: GivenMotion) -> tuple
     write_atomically(along, stream.getvalue())
     effects = [effect for effect in model.effects if not effect.of_recording]
     remarks = (
-        "values are per mille of the rated effort of each drive (6075h or 6076h), as 6071h and 60B2h take them; velocities "
-        "and accelerations are in counts of the motor per s and s^2 where the configuration has counts_per_unit and the "
-        "motor moves one joint, otherwise in units of the joint",
+        "values are per mille of the rated effort of each drive (6075h or 6076h), as 6071h and 60B2h take them",
+        "velocities and accelerations are in counts of the motor per s and s^2, where the configuration has "
+        "counts_per_unit and the motor moves one joint, otherwise in units of the joint",
         f"{along.name}: torques of the motors along {motion.title}",
         "gravity depends on the posture: the constant is that of all joints at zero",
     )

@@ -1,4 +1,4 @@
-"""Friction and named effects in MJCF: passive actuators, and a second hinge of an elastic joint or one with backlash."""
+"""Friction and named effects in MJCF: passive actuators, and second hinges for elasticity and backlash."""
 
 import xml.etree.ElementTree as ET
 from collections.abc import Callable
@@ -67,9 +67,9 @@ class Passive:
 
 
 def add_effects(model: ExportedModel, passive: Passive) -> tuple[set[int], list[float]]:
-    """Add bristles and ripples; return the numbers of their effects, and the smoothed Coulomb friction that they replace.
+    """Add bristles and ripples; return the numbers of their effects, and the friction of each joint that they replace.
 
-    The replaced friction is that of each joint, N m or N.
+    That is Coulomb friction with the smoothed sign, N m or N.
     """
     held, replaced = set(), [0.0] * len(model.joints)
     for number, effect in enumerate(model.effects):

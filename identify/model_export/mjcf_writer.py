@@ -73,7 +73,9 @@ def write_mjcf(model: ExportedModel, out: Path) -> tuple[list[Path], LimitationS
     write_xml(root, out)
     unused = (f"MuJoCo has no control-free form of actuators {', '.join(passive.unused)}: their controls do nothing",)
     remarks = ((TENDONS,) if len(tendons) else ()) + (unused if passive.unused else ()) + (PASSIVE,) + REMARKS
-    sheet = limitation_sheet(model, "mjcf", HOLDS, effects=[model.effects[k] for k in held], parts=parts, remarks=remarks)
+    sheet = limitation_sheet(
+        model, "mjcf", HOLDS, effects=[model.effects[k] for k in held], parts=parts, remarks=remarks
+    )
     return [out], replace(sheet, omitted=(*sheet.omitted, *omitted))
 
 

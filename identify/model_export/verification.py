@@ -62,9 +62,10 @@ def measure(model: ExportedModel, format_name: str, files: Sequence[Path], motio
     settled = round(SETTLED_S / motion.dt / run.every)
     expected = identified_torque(model, motion)[:: run.every]
     compared, title = (run.torque - expected, expected), motion.title
-    if any(effect.effect == "backlash" for effect in model.effects) and IMPACT_BAND_HZ < 0.5 / motion.dt:
-        low_pass = butter(4, IMPACT_BAND_HZ, fs=1.0 / (motion.dt * run.every), output="sos")
-        compared = tuple(sosfiltfilt(low_pass, torque, axis=0) for torque in compared)
+    rate = 1.0 / (motion.dt * run.every)
+    if any(effect.effect == "backlash" for effect in model.effects) and rate > 2.0 * IMPACT_BAND_HZ:
+        low_pass = butter(4, IMPACT_BAND_HZ, fs=rate, output="sos")
+        compared = (sosfiltfilt(low_pass, compared[0], axis=0), sosfiltfilt(low_pass, compared[1], axis=0))
         title += f", below {IMPACT_BAND_HZ:g} Hz"
     errors, sizes = (np.linalg.norm(torque[settled:], axis=0) for torque in compared)
     by_joint = 100.0 * errors / np.maximum(sizes, 1e-300)

@@ -1,6 +1,6 @@
 """Torque differences of every export format for every named effect: the table of docs/export-model.md.
 
-    .venv/bin/python -m tests.tools.export_figures [--effects NAME,...] [--formats NAME,...]
+.venv/bin/python -m tests.tools.export_figures [--effects NAME,...] [--formats NAME,...]
 """
 
 import argparse
@@ -64,7 +64,11 @@ def model_with(name: str) -> ExportedModel:
     theta[len(arm.names) - arm.e :] = 0.0
     if values and math.isnan(values[0]):
         rotors = np.array([each.startswith("ia") for each in arm.names])
-        mean = float(arm.mass_matrix(np.where(rotors, 0.0, theta), np.random.default_rng(1).uniform(-3, 3, (64, 6)))[:, 1, 1].mean())
+        mean = float(
+            arm.mass_matrix(np.where(rotors, 0.0, theta), np.random.default_rng(1).uniform(-3, 3, (64, 6)))[
+                :, 1, 1
+            ].mean()
+        )
         values = (1.0 / (mean * (2.0 * np.pi * RESONANCE_HZ) ** 2),)
     theta[len(arm.names) - arm.e :] = values
     return exported(robot, theta)

@@ -142,7 +142,9 @@ def test_drives_are_given_what_they_report(tmp_path: Path) -> None:
     row = rows["joint_4", "viscous friction", "joint_4"]
     counts = 48.0 * 65536 / (2.0 * np.pi)
     assert row["unit"] == "per mille s/counts"
-    assert float(row["value"]) == pytest.approx(1000.0 * joint.viscous / (48.0 * drive.gain * drive.rated) / counts, rel=1e-5)
+    assert float(row["value"]) == pytest.approx(
+        1000.0 * joint.viscous / (48.0 * drive.gain * drive.rated) / counts, rel=1e-5
+    )
     # Motor 6 also moves with joint 5, and motor 5 bears a part of the friction of joint 6.
     assert rows["joint_5", "Coulomb friction", "joint_6"]["unit"] == "per mille"
     assert rows["joint_6", "viscous friction", "joint_6"]["unit"] == "per mille s/rad"
