@@ -160,7 +160,10 @@ def run_fmu(model: ExportedModel, files: Sequence[Path], motion: GivenMotion, to
 def run_mjcf(model: ExportedModel, files: Sequence[Path], motion: GivenMotion) -> ProgramRun:
     """Let MuJoCo compute the inputs of the actuators; what turns behind a gear moves freely."""
     mujoco = _package("mujoco")
-    arm, moved = (mujoco.MjModel.from_xml_path(str(files[0])) for _ in range(2))
+    try:
+        arm, moved = (mujoco.MjModel.from_xml_path(str(files[0])) for _ in range(2))
+    except ValueError as error:  # of an older version
+        raise NoProgramError(f"MuJoCo {mujoco.__version__} cannot read it: {str(error).splitlines()[0]}") from error
     arm.opt.timestep = moved.opt.timestep = motion.dt
     dofs = [arm.joint(joint.name).dofadr[0] for joint in model.joints]
     moved.dof_armature[dofs] = PRESCRIBED

@@ -29,6 +29,9 @@ RANGE = 0.8
 SETTLED_S = 0.5
 """Time in which elastic joints and bristles come from rest to the motion; its torques are not compared, s."""
 
+MOST_SAMPLES = 20_000
+"""Samples of a recording that are used: the slowest program, Python, takes some seconds for them."""
+
 IMPACT_BAND_HZ = 50.0
 """Band in which torques of an arm with backlash are compared: an impact is one sample of the model, and filters of an
 identification leave nothing above, Hz."""
@@ -109,7 +112,9 @@ def motion_of(model: ExportedModel, file: Path | None = None) -> GivenMotion:
     used = (model.document.recording, *(model.document.further_recordings or ()))
     held_out = all(reference(recording).sha256 != each.sha256 for each in used)
     title = f"{file.name} ({'held out' if held_out else 'a recording of the identification'})"
-    return GivenMotion(signals.q, signals.qd, signals.qdd, experiments[0].dt, title)
+    if signals.q.shape[0] > MOST_SAMPLES:
+        title = f"the first {MOST_SAMPLES} samples of {title}"
+    return GivenMotion(*(x[:MOST_SAMPLES] for x in (signals.q, signals.qd, signals.qdd)), experiments[0].dt, title)
 
 
 def _own_motion(model: ExportedModel) -> GivenMotion:
