@@ -1,6 +1,5 @@
 """Exported files in the programs that read them: the torques that each computes along a motion."""
 
-import csv
 import subprocess
 import tempfile
 from collections.abc import Sequence
@@ -15,7 +14,6 @@ import numpy as np
 
 from armident.configs import ConfigError
 from armident.identify.documents.base import versions
-from armident.identify.identification.robot_model import RobotModel
 from armident.identify.model_export.code_writer import code_of
 from armident.identify.model_export.exported_model import ExportedModel
 from armident.identify.model_export.fmu_writer import compiled
@@ -90,22 +88,6 @@ def run_c(model: ExportedModel, files: Sequence[Path], motion: GivenMotion) -> P
     middle, late = np.quantile(rows[:PACED, -1], [0.5, 0.999])
     timed = f"a call at 1 kHz takes {middle:.0f} ns (median), and 99.9 % of the calls take less than {late:.0f} ns"
     return ProgramRun("C99", rows[:, :-1], timed)
-
-
-def run_csv(model: ExportedModel, files: Sequence[Path], motion: GivenMotion) -> ProgramRun:
-    """Compute the torques with the parameters of the table."""
-    with files[0].open(encoding="utf-8") as stream:
-        theta = [float(row["value"]) for row in csv.DictReader(stream)]
-    torque = RobotModel(model.robot, theta).inverse_dynamics(motion.q, motion.qd, motion.qdd, dt=motion.dt)
-    return ProgramRun("armident", torque)
-
-
-def run_drives(model: ExportedModel, files: Sequence[Path], motion: GivenMotion) -> ProgramRun:
-    """Add up what the drives are given along the motion."""
-    with files[1].open(encoding="utf-8") as stream:
-        rows = [[float(row[f"{joint.name}_total"]) for joint in model.joints] for row in csv.DictReader(stream)]
-    rated = np.array([joint.drive.gain * joint.drive.rated / 1000.0 for joint in model.robot.joints])
-    return ProgramRun("the table for the drives", np.array(rows) * rated @ model.robot.transmission_matrix)
 
 
 def run_lerobot(model: ExportedModel, files: Sequence[Path], motion: GivenMotion) -> ProgramRun:

@@ -17,7 +17,7 @@ from armident.identify.model_export.pinocchio_writer import write_pinocchio
 from armident.identify.model_export.sdf_writer import write_sdf
 from armident.identify.model_export.sheet import LimitationSheet
 from armident.identify.model_export.urdf_writer import write_urdf
-from armident.identify.model_export.verification import measure, motion_of
+from armident.identify.model_export.verification import RUNNERS, measure, motion_of
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ def export_model(
     """Write a model in a format, and the sheet of its limits beside it; return the files, sheet last, and the sheet.
 
     ``out``: main file, or a folder in which it is named after the robot. ``motion``: motion along which the torques of
-    the file are measured by the program that reads it; ``None``: they are not measured.
+    the file are measured by the program that reads it, if one does; ``None``: they are not measured.
     """
     check_format(format_name)
     chosen = FORMATS[format_name]
@@ -69,7 +69,7 @@ def export_model(
         main.parent.mkdir(parents=True, exist_ok=True)
         further = (motion or motion_of(model),) if chosen.along_motion else ()
         files, sheet = chosen.write(model, main, *further)
-        if motion is not None:
+        if motion is not None and format_name in RUNNERS:
             sheet = replace(sheet, measured=measure(model, format_name, files, motion))
         stem = main.name.removesuffix(chosen.suffix).removesuffix(main.suffix)
         page = main.with_name(f"{stem}_{format_name}_limits.md")
