@@ -47,7 +47,7 @@ def error_pct(model: ExportedModel, format_name: str, folder: Path) -> float:
     return sheet.measured.error_pct
 
 
-@pytest.mark.parametrize("format_name", ("mjcf", "c", "python", "fmu"))
+@pytest.mark.parametrize("format_name", ["mjcf", "c", "python", "fmu"])
 def test_formats_with_the_law_of_friction_have_the_torques_of_the_model(
     format_name: str, emps: ExportedModel, tmp_path: Path
 ) -> None:
