@@ -31,7 +31,7 @@ class Omission:
 
 @dataclass(frozen=True)
 class Measured:
-    """Figures of a file: program, motion, torque difference in total and by joint (percent), and a remark.
+    """Figures of a file: program, motion, torque difference in total and by joint (percent), and remarks.
 
     ``missing``: reason for which there are no figures; empty if there are.
     """
@@ -40,7 +40,7 @@ class Measured:
     motion: str = ""
     error_pct: float | None = None
     error_pct_by_joint: dict[str, float] | None = None
-    remark: str = ""
+    remarks: Sequence[str] = ()
     missing: str = ""
 
     def lines(self) -> list[str]:
@@ -48,15 +48,15 @@ class Measured:
         if self.error_pct is None:
             return [f"not measured: {self.missing}"]
         each = ", ".join(f"{name} {value:.2g} %" for name, value in (self.error_pct_by_joint or {}).items())
-        found = [
+        found = (
             f"{self.program} computes torques that differ by {self.error_pct:.2g} % from those of the identified model "
             f"({each}) along {self.motion}"
-        ]
-        return [*found, self.remark] if self.remark else found
+        )
+        return [found, *self.remarks]
 
     def document(self) -> dict[str, Any]:
         """Return the figures for JSON."""
-        return {name: value for name, value in vars(self).items() if value not in ("", None)}
+        return {name: value for name, value in vars(self).items() if value not in ("", None, ())}
 
 
 @dataclass(frozen=True)

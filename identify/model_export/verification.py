@@ -68,19 +68,26 @@ def measure(model: ExportedModel, format_name: str, files: Sequence[Path], motio
         compared = (butterworth(compared[0], period, IMPACT_BAND_HZ), butterworth(compared[1], period, IMPACT_BAND_HZ))
         title += f", below {IMPACT_BAND_HZ:g} Hz"
     errors, sizes = (np.linalg.norm(torque[settled:], axis=0) for torque in compared)
+    moved = identified_torque(model, motion, model.theta)[:: run.every] - expected
+    physical = 100.0 * float(np.linalg.norm(moved) / max(float(np.linalg.norm(expected)), 1e-300))
+    remarks = [run.remark, f"the step to a physical arm alone changes them by {physical:.2g} %"]
     by_joint = 100.0 * errors / np.maximum(sizes, 1e-300)
     return Measured(
         run.program,
         title,
         float(100.0 * np.linalg.norm(errors) / max(float(np.linalg.norm(sizes)), 1e-300)),
         {joint.name: float(value) for joint, value in zip(model.joints, by_joint, strict=True)},
-        run.remark,
+        [remark for remark in remarks if remark],
     )
 
 
-def identified_torque(model: ExportedModel, motion: GivenMotion) -> Floats:
-    """Return the torques (N, n) of the identified model with its effects, N m or N, before it was made physical."""
-    arm, theta = model.arm.anchored(model.theta_base), model.theta_base
+def identified_torque(model: ExportedModel, motion: GivenMotion, theta: Floats | None = None) -> Floats:
+    """Return the torques (N, n) of the identified model with its effects, N m or N.
+
+    ``theta``: parameters, by default those before the arm was made physical.
+    """
+    theta = model.theta_base if theta is None else theta
+    arm = model.arm.anchored(theta)
     torque = arm.inverse_dynamics(theta, motion.q, motion.qd, motion.qdd)
     if arm.e == 0:
         return torque

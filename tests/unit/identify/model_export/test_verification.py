@@ -93,7 +93,7 @@ def test_code_and_fmu_remember_bristles_and_slow_changes(name: str, tmp_path: Pa
 def test_a_recording_is_the_motion_and_is_said_to_be_held_out(emps: ExportedModel, tmp_path: Path) -> None:
     arms.recording("emps", "emps_1", 2).save(tmp_path / "held_out.mcap")
     motion = motion_of(emps, tmp_path / "held_out.mcap")
-    assert motion.title == "held_out.mcap (held out)"
+    assert motion.title == "the first 10000 samples of held_out.mcap (held out)"
     _, sheet = export_model(emps, "python", tmp_path, motion)
     assert sheet.measured is not None
     assert sheet.document()["measured"]["motion"] == motion.title
