@@ -29,8 +29,9 @@ TENDONS = (
 )
 
 PASSIVE = (
-    "dry friction and effects are passive actuators without input, which MuJoCo 3.12 or newer reads: add their forces "
-    "(qfrc_actuator) to mj_inverse; with the smoothed sign of the identification, a loaded joint creeps at standstill"
+    "dry friction and effects are passive actuators without input, which MuJoCo 3.12 or newer reads: subtract their "
+    "forces (qfrc_actuator at zero input) from qfrc_inverse; with the smoothed sign of the identification, a loaded "
+    "joint creeps at standstill"
 )
 
 REMARKS = (
@@ -71,7 +72,9 @@ def write_mjcf(model: ExportedModel, out: Path) -> tuple[list[Path], LimitationS
         root.append(tendons)
     root.append(passive.element)
     write_xml(root, out)
-    unused = (f"MuJoCo has no control-free form of actuators {', '.join(passive.unused)}: their controls do nothing",)
+    unused = (
+        f"MuJoCo has no form without input for the actuators {', '.join(passive.unused)}: their controls do nothing",
+    )
     remarks = ((TENDONS,) if len(tendons) else ()) + (unused if passive.unused else ()) + (PASSIVE,) + REMARKS
     sheet = limitation_sheet(
         model, "mjcf", HOLDS, effects=[model.effects[k] for k in held], parts=parts, remarks=remarks
