@@ -34,7 +34,7 @@ def identification_of(robot: RobotConfig, theta: Floats, relative_std: float = 0
             "verdict": "trustworthy",
             "robot": robot.name,
             "configuration": robot.model_dump(mode="json", by_alias=True),
-            "recording": RecordingReference(path=None, sha256="0" * 64, sample_rate_hz=1000.0, samples=1000),
+            "recording": RecordingReference(path=None, sha256="0" * 64, sample_rate_hz=1000.0, samples=20_000),
             "method": "idim-ls",
             "options": {},
             "parameters": entries,

@@ -149,11 +149,12 @@ class Identification(Result):
         from armident.identify.model_export.exported_model import exported_model
         from armident.identify.model_export.formats import export_model
         from armident.identify.model_export.source_urdf import source_for
+        from armident.identify.model_export.verification import motion_of
 
         model = exported_model(self.model, nearest=nearest)
         if urdf is not None:
             model = model.in_frames_of(source_for(self.robot, Path(urdf)))
-        return tuple(export_model(model, format, Path(path))[0])
+        return tuple(export_model(model, format, Path(path), motion_of(model))[0])
 
     def _html(self) -> str:
         from armident.identify.report.identification_report import identification_report

@@ -311,12 +311,20 @@ class PreslidingFriction(Effect):
         return (float(motion.span[place.joint]) * np.geomspace(0.0002, 0.1, 12),)
 
 
-@compiled("f8[:], f8", "f8[::1], f8", **ARITHMETIC)
 def dahl(q: Array, displacement: float) -> Array:
     """Return Dahl's friction over its level, shape (N,), integrated exactly between samples ``q`` (N,).
 
     ``dz/dq = (1 - z sign(qd)) / displacement``: after a reversal it approaches its level exponentially.
     """
+    if q.dtype == object:
+        # Symbols in place of numbers: a formula is derived, see `armident.identify.model_export.formulas`.
+        return np.array([symbol.bristle(displacement) for symbol in q])
+    state: Array = _dahl(q, displacement)
+    return state
+
+
+@compiled("f8[:], f8", "f8[::1], f8", **ARITHMETIC)
+def _dahl(q: Array, displacement: float) -> Array:
     z = np.empty(q.size)
     state = 0.0
     z[0] = state

@@ -4,7 +4,7 @@ import json
 import keyword
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from textwrap import wrap
 from typing import Any
@@ -53,8 +53,16 @@ class Code:
 def write_python(model: ExportedModel, path: Path) -> tuple[list[Path], LimitationSheet]:
     """Write a Python module that needs only ``math``; see `armident.identify.model_export.formats.Format.write`."""
     code = code_of(model, "python")
-    write_atomically(path, code.render("model.py.jinja"))
+    write_atomically(path, code.render("model.py.jinja", feed_forward=False))
     return [path], code.sheet
+
+
+def write_lerobot(model: ExportedModel, path: Path) -> tuple[list[Path], LimitationSheet]:
+    """Write the Python module with feed-forward torques for actions of LeRobot, which reads no dynamic model itself."""
+    code = code_of(model, "lerobot")
+    remark = "LeRobot has no file for such terms: a loop that commands torques imports the module"
+    write_atomically(path, code.render("model.py.jinja", feed_forward=True))
+    return [path], replace(code.sheet, remarks=(*code.sheet.remarks, remark))
 
 
 def write_c(model: ExportedModel, path: Path) -> tuple[list[Path], LimitationSheet]:
@@ -68,7 +76,7 @@ def write_c(model: ExportedModel, path: Path) -> tuple[list[Path], LimitationShe
 
 def code_of(model: ExportedModel, format_name: str) -> Code:
     """Return names, tables and formulas of a model. ``format_name``: format for the sheet."""
-    instant = instant_model(model.arm, model.theta)
+    instant = instant_model(model.arm, model.theta, model.recorded_s)
     values, chain = model.arm.values(instant.theta), model.arm.chain
     friction = zip(values.ia, values.fv, values.fc, values.off, values.smoothing, strict=True)
     couplings = [
@@ -81,6 +89,7 @@ def code_of(model: ExportedModel, format_name: str) -> Code:
         for number, torques in sorted(instant.torques.items())
     ]
     formulas = [text for torques in instant.torques.values() for text in torques.values()]
+    formulas += [each.rate for each in instant.memory] + ["expm1("] * bool(instant.memory)
     sheet = limitation_sheet(
         model,
         format_name,
@@ -101,6 +110,7 @@ def code_of(model: ExportedModel, format_name: str) -> Code:
         "friction": list(friction),
         "couplings": couplings,
         "effects": effects,
+        "memory": instant.memory,
         "functions": sorted(
             {"atan", "cos", "pi", "sin"} | {f for f in FUNCTIONS if any(f"{f}(" in t for t in formulas)}
         ),

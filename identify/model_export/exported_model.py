@@ -199,6 +199,12 @@ class ExportedModel:
         return RobotModel(self.robot, self.theta)
 
     @property
+    def recorded_s(self) -> float:
+        """Duration of all recordings of the identification, s: the time unit of slow changes."""
+        used = (self.document.recording, *(self.document.further_recordings or ()))
+        return float(sum(each.samples / each.sample_rate_hz for each in used))
+
+    @property
     def undetermined(self) -> dict[str, str]:
         """Standard parameters that the recordings did not determine by themselves, with the reason."""
         essential = {p.name: p.essential for p in self.document.parameters}

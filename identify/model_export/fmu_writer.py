@@ -6,6 +6,7 @@ import subprocess
 import tempfile
 import uuid
 import zipfile
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -100,22 +101,24 @@ def shared_library(sources: dict[str, str], name: str) -> bytes:
     """Compile C sources by file name to a shared library; ConfigError without compiler or 64-bit Linux."""
     if (platform.system(), platform.machine()) != MACHINE:
         raise ConfigError(f"--format fmu: needs {' '.join(MACHINE)}; on other machines use --format c")
+    with tempfile.TemporaryDirectory() as folder:
+        try:
+            return compiled(sources, Path(folder), f"{name}.so", OPTIONS).read_bytes()
+        except ConfigError as error:
+            raise ConfigError(f"--format fmu: {error}, or use --format c") from error
+
+
+def compiled(sources: dict[str, str], folder: Path, name: str, options: Sequence[str]) -> Path:
+    """Compile C sources by file name in a folder; return the file; ConfigError without compiler, or if it fails."""
     compiler = shutil.which("gcc") or shutil.which("cc")
     if compiler is None:
-        raise ConfigError("--format fmu: needs a C compiler: install gcc, or use --format c")
-    with tempfile.TemporaryDirectory() as folder:
-        for file, text in sources.items():
-            (Path(folder) / file).write_text(text, encoding="utf-8")
-        files = [file for file in sources if file.endswith(".c")]
-        library = Path(folder) / f"{name}.so"
-        done = subprocess.run(
-            [compiler, *OPTIONS, *files, "-o", library.name, "-lm"],
-            cwd=folder,
-            capture_output=True,
-            text=True,
-            check=False,
-        )
-        if done.returncode != 0:
-            first = next((line for line in done.stderr.splitlines() if "error" in line), "no message")
-            raise ConfigError(f"--format fmu: {compiler} fails: {first}; use --format c")
-        return library.read_bytes()
+        raise ConfigError("needs a C compiler: install gcc")
+    for file, text in sources.items():
+        (folder / file).write_text(text, encoding="utf-8")
+    files = [file for file in sources if file.endswith(".c")]
+    command = [compiler, *options, *files, "-o", name, "-lm"]
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+    if done.returncode != 0:
+        first = next((line for line in done.stderr.splitlines() if "error" in line), "no message")
+        raise ConfigError(f"{compiler} fails: {first}")
+    return folder / name

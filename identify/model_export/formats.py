@@ -1,13 +1,15 @@
 """Formats of an exported model, and the export itself."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from armident.configs import ConfigError
 from armident.identify.documents.files import write_atomically
-from armident.identify.model_export.code_writer import write_c, write_python
+from armident.identify.model_export.code_writer import write_c, write_lerobot, write_python
+from armident.identify.model_export.consumers import GivenMotion
 from armident.identify.model_export.csv_writer import write_csv
+from armident.identify.model_export.drives_writer import write_drives
 from armident.identify.model_export.exported_model import ExportedModel
 from armident.identify.model_export.fmu_writer import write_fmu
 from armident.identify.model_export.mjcf_writer import write_mjcf
@@ -15,15 +17,20 @@ from armident.identify.model_export.pinocchio_writer import write_pinocchio
 from armident.identify.model_export.sdf_writer import write_sdf
 from armident.identify.model_export.sheet import LimitationSheet
 from armident.identify.model_export.urdf_writer import write_urdf
+from armident.identify.model_export.verification import RUNNERS, measure, motion_of
 
 
 @dataclass(frozen=True)
 class Format:
-    """A format of exported models; ``write`` returns all files, the main one first, and the sheet."""
+    """A format of exported models; ``write`` returns all files, the main one first, and the sheet.
+
+    ``along_motion``: it also takes the motion whose torques the file holds.
+    """
 
     suffix: str
     title: str
-    write: Callable[[ExportedModel, Path], tuple[list[Path], LimitationSheet]]
+    write: Callable[..., tuple[list[Path], LimitationSheet]]
+    along_motion: bool = False
 
 
 FORMATS: dict[str, Format] = {
@@ -34,6 +41,8 @@ FORMATS: dict[str, Format] = {
     "c": Format(".c", "C source", write_c),
     "csv": Format(".csv", "table of parameters", write_csv),
     "fmu": Format(".fmu", "FMU (FMI 2.0 for Co-Simulation)", write_fmu),
+    "lerobot": Format("_lerobot.py", "Python module for LeRobot", write_lerobot),
+    "drives": Format("_drives.csv", "feed-forward terms of the drives", write_drives, along_motion=True),
     "pinocchio": Format(".pinocchio.xml", "Pinocchio model", write_pinocchio),
 }
 """Formats by name."""
@@ -45,17 +54,23 @@ def check_format(format_name: str) -> None:
         raise ConfigError(f"--format: {format_name!r} is not one of {', '.join(FORMATS)}")
 
 
-def export_model(model: ExportedModel, format_name: str, out: Path) -> tuple[list[Path], LimitationSheet]:
+def export_model(
+    model: ExportedModel, format_name: str, out: Path, motion: GivenMotion | None = None
+) -> tuple[list[Path], LimitationSheet]:
     """Write a model in a format, and the sheet of its limits beside it; return the files, sheet last, and the sheet.
 
-    ``out``: main file, or a folder in which it is named after the robot.
+    ``out``: main file, or a folder in which it is named after the robot. ``motion``: motion along which the torques of
+    the file are measured by the program that reads it, if one does; ``None``: they are not measured.
     """
     check_format(format_name)
     chosen = FORMATS[format_name]
     main = out / f"{model.robot.name}{chosen.suffix}" if out.is_dir() or not out.suffix else out
     try:
         main.parent.mkdir(parents=True, exist_ok=True)
-        files, sheet = chosen.write(model, main)
+        further = (motion or motion_of(model),) if chosen.along_motion else ()
+        files, sheet = chosen.write(model, main, *further)
+        if motion is not None and format_name in RUNNERS:
+            sheet = replace(sheet, measured=measure(model, format_name, files, motion))
         stem = main.name.removesuffix(chosen.suffix).removesuffix(main.suffix)
         page = main.with_name(f"{stem}_{format_name}_limits.md")
         write_atomically(page, sheet.markdown(f"{model.robot.name} as {chosen.title}"))

@@ -1,13 +1,16 @@
 """Torques of effects as formulas of one instant, in the notation that Python and C share.
 
 An effect's columns are evaluated with symbols that record each operation, as elements of numpy's object arrays. A
-formula is accepted if it has the effect's values along a random motion. Effects with memory (backlash) have none.
+formula is accepted if it has the effect's values along a random motion. Bristles and slow changes are states that relax
+(`Memory`); other effects with memory (backlash) have no formula.
 """
 
 import math
-from collections.abc import Callable, Mapping
+import re
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cache, cached_property
+from types import CodeType
 from typing import Any
 
 import numpy as np
@@ -23,6 +26,9 @@ from armident.identify.robot.motion import Motion
 
 SAMPLES = 24
 """Instants of the random motion at which a formula is compared with its effect."""
+
+PERIOD = 0.01
+"""Sampling period of that motion, s: it passes bends of tables and the displacements of bristles."""
 
 AGREEMENT = 1e-10
 """Largest difference between formula and effect, relative to the largest torque of the effect: rounding."""
@@ -101,6 +107,10 @@ class Formula:
             for k in range(knots.size)
         ]
 
+    def bristle(self, displacement: float) -> "Formula":
+        """Return Dahl's friction over its level at this position."""
+        return Formula(f"bristle({self.text}, {_of(displacement).text})")
+
     # Functions that numpy looks up as methods of the elements of an array of objects.
     def sin(self) -> "Formula":
         """Return the sine."""
@@ -170,6 +180,18 @@ FUNCTIONS: dict[str, Callable[..., float]] = {
 """Functions of formulas by name; all but ``hat`` are in Python's ``math`` and in C's ``math.h``."""
 
 
+def evaluate(text: str, signals: Mapping[str, Any]) -> float:
+    """Return the value of a formula. ``signals``: values of its symbols by name and joint."""
+    # The text is made of numbers, symbols and names of `FUNCTIONS` by the class above.
+    value: float = eval(_code(text), {"__builtins__": {}, **FUNCTIONS}, dict(signals))
+    return value
+
+
+@cache
+def _code(text: str) -> CodeType:
+    return compile(text, "formula", "eval")
+
+
 class _Instant(Motion):
     """Motion whose one sample consists of symbols."""
 
@@ -188,10 +210,20 @@ class _Instant(Motion):
         """Smoothed signs of the velocities."""
         return _symbols("sign", self.n)
 
+    @cached_property
+    def t(self) -> Any:
+        """Time since the beginning."""
+        return np.array([Formula("time")], dtype=object)
+
+    @property
+    def whole_time(self) -> float:
+        """Duration of the recordings of the identification, s."""
+        return self.duration
+
     def _unknown(self, *_: Any, **__: Any) -> Any:
         raise NotAFormula
 
-    t = top_speed = span = whole_time = standard = links = property(_unknown)
+    top_speed = span = standard = links = property(_unknown)
     rate = slopes = response = _unknown
 
 
@@ -200,26 +232,66 @@ def _symbols(name: str, n: int) -> Any:
     return np.array([[Formula(f"{name}[{j}]") for j in range(n)]], dtype=object)
 
 
+@dataclass(frozen=True)
+class Memory:
+    """State of an effect, zero at the beginning: it approaches ``target`` at ``rate`` (1/s), formulas of ``dq``."""
+
+    rate: str
+    target: str
+
+
+_MEMORIES: tuple[tuple[str, str, str, str], ...] = (
+    (r"bristle\(q\[(\d+)\], ([^()]+)\)", "memory[{k}]", "fabs(dq[{0}]) / {1}", "(dq[{0}] > 0.0) - (dq[{0}] < 0.0)"),
+    (r"expm1\(-time / ([^()]+)\)", "(-memory[{k}])", "1.0 / {0}", "1.0"),
+    (
+        r"expm1\(\(-([^()]+)\) \* dt \* pow\(dq\[(\d+)\], 2\.0\)\)",
+        "(-memory[{k}])",
+        "{0} * dq[{1}] * dq[{1}]",
+        "1.0",
+    ),
+)
+"""Patterns of states in formulas (bristle, progress with time, progress with work), their symbol, rate and target."""
+
+
+def _with_memory(text: str, memory: list[Memory]) -> str:
+    """Return a formula with its states as ``memory[k]``; new ones are appended to ``memory``."""
+    for pattern, symbol, rate, target in _MEMORIES:
+
+        def state(found: re.Match[str], symbol: str = symbol, rate: str = rate, target: str = target) -> str:
+            each = Memory(rate.format(*found.groups()), target.format(*found.groups()))
+            if each not in memory:
+                memory.append(each)
+            return symbol.format(k=memory.index(each))
+
+        text = re.sub(pattern, state, text)
+    return text
+
+
 @dataclass(frozen=True, eq=False)
 class InstantModel:
     """Dynamics of one instant: standard parameters (p,), gravity (3,) in the base frame, and effects as formulas.
 
     ``torques``: formulas by number of the effect and joint, N m or N. Symbols: ``q``, ``dq``, ``ddq``; ``sign``, the
     smoothed sign of the velocity; ``load``, torque of the links; ``torque``, that of links, rotors, couplings and
-    friction. ``held``: numbers of the effects that the model contains.
+    friction; ``memory``, the states. ``held``: numbers of the effects that the model contains.
     """
 
     theta: Floats
     gravity: Floats
     torques: dict[int, dict[int, str]]
     held: frozenset[int]
+    memory: tuple[Memory, ...]
 
 
-def instant_model(arm: ArmModel, theta: Floats) -> InstantModel:
-    """Return the dynamics of an arm at one instant, with those of its effects that have no memory."""
+def instant_model(arm: ArmModel, theta: Floats, duration: float) -> InstantModel:
+    """Return the dynamics of an arm at one instant, with its effects that have formulas.
+
+    ``duration``: that of the recordings of the identification, s.
+    """
     theta, gravity = theta.copy(), arm.chain.gravity.copy()
     torques: dict[int, dict[int, str]] = {}
     held: set[int] = set()
+    memory: list[Memory] = []
     known = replace(arm, anchor=theta.copy())
     first = len(arm.names) - arm.e
     for number, term in _numbered_terms(arm):
@@ -240,12 +312,12 @@ def instant_model(arm: ArmModel, theta: Floats) -> InstantModel:
                 torque = sum(float(value) * functions[k - len(GravityDirection.linear)] for k, value in rest)
                 torques[number] = {0: _of(torque).text}
         else:
-            found = _formulas(known, term, values)
+            found = _formulas(known, term, values, duration, memory)
             if found is None:
                 continue
             torques[number] = found
         held.add(number)
-    return InstantModel(theta, gravity, torques, frozenset(held))
+    return InstantModel(theta, gravity, torques, frozenset(held), tuple(memory))
 
 
 def _numbered_terms(arm: ArmModel) -> list[tuple[int, Term]]:
@@ -254,10 +326,14 @@ def _numbered_terms(arm: ArmModel) -> list[tuple[int, Term]]:
     return list(zip(numbers, effect_terms(arm), strict=True))
 
 
-def _formulas(arm: ArmModel, term: Term, values: Floats) -> dict[int, str] | None:
-    """Return the torque of a term by joint; ``None`` if it has no formula."""
+def _formulas(
+    arm: ArmModel, term: Term, values: Floats, duration: float, memory: list[Memory]
+) -> dict[int, str] | None:
+    """Return the torque of a term by joint, with new states in ``memory``; ``None`` if it has no formula."""
     q, dq, ddq = (_symbols(name, arm.n) for name in ("q", "dq", "ddq"))
-    motion = _Instant(arm, q, dq, ddq, dt=math.nan, theta=arm.anchor)
+    period: Any = np.array([Formula("dt")], dtype=object)
+    motion = _Instant(arm, q, dq, ddq, dt=period, theta=arm.anchor, duration=duration)
+    states = list(memory)
     try:
         with np.errstate(invalid="ignore"):
             columns = term.effect.columns(motion, term.place, {**term.effect.defaults, **term.shapes})
@@ -267,30 +343,36 @@ def _formulas(arm: ArmModel, term: Term, values: Floats) -> dict[int, str] | Non
         for j, of_joint in zip(joints, row, strict=True):
             torque = sum(value * of_joint[k] for k, value in zip(term.kept, values, strict=True) if value != 0.0)
             if not _is(torque, 0.0):
-                found[j] = _of(torque).text
-        right = _agrees(arm, term, values, found)
+                found[j] = _with_memory(_of(torque).text, states)
+        right = _agrees(arm, term, values, found, states, duration)
     except (NotAFormula, NumbaError, TypeError, ValueError, AttributeError, IndexError, NameError):
         # Effects of other packages may do anything with symbols; what is no formula is named as left out.
         return None
+    if right:
+        memory[:] = states
     return found if right else None
 
 
-def _agrees(arm: ArmModel, term: Term, values: Floats, formulas: Mapping[int, str]) -> bool:
-    """Return True if the formulas have the torques of the term along a random motion."""
+def _agrees(
+    arm: ArmModel, term: Term, values: Floats, formulas: Mapping[int, str], memory: Sequence[Memory], duration: float
+) -> bool:
+    """Return True if the formulas have the torques of the term along a random motion from rest."""
     rng = np.random.default_rng(0)
-    q, dq, ddq = (rng.uniform(-scale, scale, (SAMPLES, arm.n)) for scale in (2.0, 2.0, 8.0))
-    motion = arm.motion(q, dq, ddq, dt=1e-3)
+    dq, ddq = (rng.uniform(-scale, scale, (SAMPLES, arm.n)) for scale in (2.0, 8.0))
+    dq[0] = 0.0
+    q = rng.uniform(-1.5, 1.5, arm.n) + PERIOD * np.cumsum(dq, axis=0)
+    motion = replace(arm.motion(q, dq, ddq, dt=PERIOD), duration=duration)
     expected = np.zeros((SAMPLES, arm.n))
     term.add_torque(motion, values, expected)
     signals = {"q": q, "dq": dq, "ddq": ddq, "sign": motion.sign}
     if term.depends_on_torque:
         signals |= {"torque": motion.torque, "load": motion.transmitted}
-    found = np.zeros((SAMPLES, arm.n))
-    for j, text in formulas.items():
-        code = compile(text, "formula", "eval")
-        for k in range(SAMPLES):
-            row = {name: values[k].tolist() for name, values in signals.items()}
-            # The text is made of numbers, symbols and names of `FUNCTIONS` by the class above.
-            found[k, j] = eval(code, {"__builtins__": {}, **FUNCTIONS}, row)
+    found, state = np.zeros((SAMPLES, arm.n)), np.zeros(len(memory))
+    for k in range(SAMPLES):
+        row = {name: values[k].tolist() for name, values in signals.items()}
+        for m, each in enumerate(memory if k else ()):
+            state[m] -= (evaluate(each.target, row) - state[m]) * math.expm1(-PERIOD * evaluate(each.rate, row))
+        for j, text in formulas.items():
+            found[k, j] = evaluate(text, {**row, "memory": state})
     scale = max(float(np.abs(expected).max()), 1e-300)
     return bool(np.abs(found - expected).max() <= AGREEMENT * scale)

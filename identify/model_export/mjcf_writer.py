@@ -1,4 +1,7 @@
-"""MJCF, the format of MuJoCo: bodies, friction, rotor inertias, couplings (as tendons), offsets, springs, gravity."""
+"""MJCF, the format of MuJoCo: bodies, friction, rotor inertias, couplings (as tendons), offsets, springs, gravity.
+
+Friction and named effects are passive actuators without input: `Passive` writes them.
+"""
 
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator
@@ -8,7 +11,10 @@ from pathlib import Path
 import numpy as np
 
 from armident.identify.model_export.exported_model import ExportedModel, JointCoupling, LinkBody
+from armident.identify.model_export.formulas import instant_model
+from armident.identify.model_export.mjcf_effects import Passive, add_effects, motor_inertia, on_shaft, second_hinges
 from armident.identify.model_export.rigid_effects import SPRINGS, springs, with_rigid_effects
+from armident.identify.model_export.saturated_dampers import coupling_law, friction_laws, top_speed
 from armident.identify.model_export.sheet import PARTS, LimitationSheet, Omission, limitation_sheet
 from armident.identify.model_export.xml_text import numbers, write_xml
 
@@ -22,10 +28,19 @@ TENDONS = (
     "MuJoCo 3.3.1 or newer reads them"
 )
 
+PASSIVE = (
+    "dry friction and effects are passive actuators without input, which MuJoCo 3.12 or newer reads: subtract their "
+    "forces (qfrc_actuator at zero input) from qfrc_inverse; with the smoothed sign of the identification, a loaded "
+    "joint creeps at standstill"
+)
+
 REMARKS = (
     "the input of each actuator is the torque that the drive reports: the actuator subtracts the offset",
     "capsules show the links; they have no mass and no contacts, and meshes of a URDF are not copied",
 )
+
+OPTIONS = {"timestep": "0.001", "integrator": "implicitfast"}
+"""Steep friction at standstill is stable with the integrator that is implicit in the velocity."""
 
 
 def write_mjcf(model: ExportedModel, out: Path) -> tuple[list[Path], LimitationSheet]:
@@ -33,36 +48,56 @@ def write_mjcf(model: ExportedModel, out: Path) -> tuple[list[Path], LimitationS
     model, parts = with_rigid_effects(model)
     root = ET.Element("mujoco", model=model.robot.name)
     ET.SubElement(root, "compiler", angle="radian", autolimits="true", inertiafromgeom="false")
-    ET.SubElement(root, "option", gravity=numbers(model.frames.gravity))
+    ET.SubElement(root, "option", gravity=numbers(model.frames.gravity), **OPTIONS)
     parent = ET.SubElement(ET.SubElement(root, "worldbody"), "body", name=model.frames.free_base)
-    stiffness = springs(model)
-    own = {name: [getattr(joint, name) for joint in model.joints] for name in ("rotor_inertia", "viscous", "coulomb")}
-    tendons = ET.Element("tendon")
-    omitted = [part for coupling in model.couplings for part in _add_tendons(tendons, coupling, own, model)]
+    stiffness, hinges = springs(model), second_hinges(model)
+    own = {name: [getattr(joint, name) for joint in model.joints] for name in ("rotor_inertia", "viscous")}
+    tendons, passive = ET.Element("tendon"), Passive(_actuators(model))
+    omitted = [part for coupling in model.couplings for part in _add_tendons(tendons, coupling, own, model, passive)]
+    held = _add_friction(model, passive) | {model.effects.index(effect) for effect in hinges.values()}
     for k, body in enumerate(model.links):
-        parent = _add_body(parent, body, model, k)
-        element = _joint(model, k)
-        element.set("armature", numbers(own["rotor_inertia"][k]))
-        element.set("damping", numbers(own["viscous"][k]))
-        element.set("frictionloss", numbers(own["coulomb"][k]))
+        joint = _joint(model, k)
+        armature = own["rotor_inertia"][k]
+        joint.set("armature", numbers(motor_inertia(model, k, armature) if k in hinges else armature))
+        joint.set("damping", numbers(own["viscous"][k]))
         if k in stiffness:
-            element.set("stiffness", numbers(stiffness[k]))
-            element.set("springref", "0")
-        parent.insert(0, element)
+            joint.set("stiffness", numbers(stiffness[k]))
+            joint.set("springref", "0")
+        element = _body(body, model, k)
+        outer = on_shaft(element, joint, hinges[k]) if k in hinges else element
+        outer.insert(0, joint)
+        parent.append(outer)
+        parent = element
     if len(tendons):
         root.append(tendons)
-    root.append(_actuators(model))
+    root.append(passive.element)
     write_xml(root, out)
-    remarks = ((TENDONS,) if len(tendons) else ()) + REMARKS
-    sheet = limitation_sheet(model, "mjcf", HOLDS, parts=parts, remarks=remarks)
+    unused = (
+        f"MuJoCo has no form without input for the actuators {', '.join(passive.unused)}: their controls do nothing",
+    )
+    remarks = ((TENDONS,) if len(tendons) else ()) + (unused if passive.unused else ()) + (PASSIVE,) + REMARKS
+    sheet = limitation_sheet(
+        model, "mjcf", HOLDS, effects=[model.effects[k] for k in held], parts=parts, remarks=remarks
+    )
     return [out], replace(sheet, omitted=(*sheet.omitted, *omitted))
 
 
-def _add_body(parent: ET.Element, body: LinkBody, model: ExportedModel, k: int) -> ET.Element:
-    """Add the body of link k below its parent, with a capsule to the next joint."""
+def _add_friction(model: ExportedModel, passive: Passive) -> set[int]:
+    """Add dry friction and the effects that passive actuators have; return the numbers of these effects."""
+    held, replaced = add_effects(model, passive)
+    dry = zip(model.joints, replaced, strict=True)
+    model = replace(model, joints=tuple(replace(joint, coulomb=joint.coulomb - part) for joint, part in dry))
+    laws, contained = friction_laws(model, instant_model(model.arm, model.theta, model.recorded_s).torques)
+    for k, (joint, law) in enumerate(zip(model.joints, laws, strict=True)):
+        passive.friction(joint.name, law, top_speed(model, k))
+    return held | contained
+
+
+def _body(body: LinkBody, model: ExportedModel, k: int) -> ET.Element:
+    """Return the body of link k, with a capsule to the next joint."""
     placement = model.frames.placements[k]
     axes = np.concatenate([placement[:3, 0], placement[:3, 1]])
-    element = ET.SubElement(parent, "body", name=body.name, pos=numbers(placement[:3, 3]), xyaxes=numbers(axes))
+    element = ET.Element("body", name=body.name, pos=numbers(placement[:3, 3]), xyaxes=numbers(axes))
     # Principal axes: MuJoCo's own decomposition of a full inertia is exact to 1e-7 only in older versions.
     moments, principal = np.linalg.eigh(body.central_inertia)
     inertial = {"pos": numbers(body.centre), "mass": numbers(body.mass), "diaginertia": numbers(moments)}
@@ -98,7 +133,11 @@ def _actuators(model: ExportedModel) -> ET.Element:
 
 
 def _add_tendons(
-    tendons: ET.Element, coupling: JointCoupling, own: dict[str, list[float]], model: ExportedModel
+    tendons: ET.Element,
+    coupling: JointCoupling,
+    own: dict[str, list[float]],
+    model: ExportedModel,
+    passive: Passive,
 ) -> Iterator[Omission]:
     """Add the tendons of a coupling and take their share from the joints; return the parts that are impossible."""
     i, j = coupling.joints
@@ -115,11 +154,15 @@ def _add_tendons(
             )
             continue
         coefficient, strength = share
+        if not strength:
+            continue
         own[key][i] -= strength * coefficient**2
         own[key][j] -= strength
         _add_tendon(tendons, f"{coupling.name}_{attribute}", model, (i, j), (coefficient, 1.0), {attribute: strength})
-    loss = {"frictionloss": coupling.coulomb}
-    _add_tendon(tendons, f"{coupling.name}_frictionloss", model, (i, j), (1.0, 1.0), loss)
+    if coupling.coulomb:
+        name = f"{coupling.name}_both"
+        _add_tendon(tendons, name, model, (i, j), (1.0, 1.0), {})
+        passive.friction(name, coupling_law(model, coupling), top_speed(model, i) + top_speed(model, j), "tendon")
 
 
 def _tendon(first: float, second: float, shared: float) -> tuple[float, float] | None:
@@ -142,9 +185,7 @@ def _add_tendon(
     coefficients: tuple[float, float],
     strength: dict[str, float],
 ) -> None:
-    """Add a fixed tendon over two joints, if it has any strength."""
-    if not any(strength.values()):
-        return
+    """Add a fixed tendon over two joints."""
     element = ET.SubElement(tendons, "fixed", {"name": name} | {k: numbers(v) for k, v in strength.items()})
     for k, coefficient in zip(joints, coefficients, strict=True):
         ET.SubElement(element, "joint", joint=model.joints[k].name, coef=numbers(coefficient))

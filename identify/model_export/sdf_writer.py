@@ -1,4 +1,4 @@
-"""SDFormat, the format of Gazebo and Drake: bodies, friction and springs."""
+"""SDFormat, the format of Gazebo and Drake: bodies, friction, springs, and rotor inertias for Drake."""
 
 import xml.etree.ElementTree as ET
 from pathlib import Path
@@ -11,7 +11,10 @@ from armident.identify.model_export.sheet import LimitationSheet, limitation_she
 from armident.identify.model_export.xml_text import numbers, roll_pitch_yaw, write_xml
 from armident.identify.robot.chain import Floats
 
-HOLDS = ("viscous friction", "Coulomb friction", SPRINGS)
+HOLDS = ("rotor inertia", "viscous friction", "Coulomb friction", SPRINGS)
+
+DRAKE = "drake.mit.edu"
+"""Namespace of the elements that Drake adds to the format."""
 
 VERSION = "1.7"
 """First version of SDFormat with ``relative_to``."""
@@ -20,7 +23,7 @@ VERSION = "1.7"
 def write_sdf(model: ExportedModel, out: Path) -> tuple[list[Path], LimitationSheet]:
     """Write an SDF file with one model, fixed to the world; return it and the limits of the format."""
     model, parts = with_rigid_effects(model)
-    root = ET.Element("sdf", version=VERSION)
+    root = ET.Element("sdf", {"version": VERSION, "xmlns:drake": DRAKE})
     arm = ET.SubElement(root, "model", name=model.robot.name)
     parent = model.frames.free_base
     ET.SubElement(arm, "link", name=parent)
@@ -31,7 +34,10 @@ def write_sdf(model: ExportedModel, out: Path) -> tuple[list[Path], LimitationSh
         _add_joint(arm, model, k, parent, stiffness.get(k, 0.0))
         parent = body.name
     write_xml(root, out)
-    remarks = ("the base is fixed to the world; meshes are not copied",)
+    remarks = (
+        "the base is fixed to the world; meshes are not copied",
+        "Drake has no Coulomb friction; Gazebo has no rotor inertia",
+    )
     return [out], limitation_sheet(model, "sdf", HOLDS, parts=parts, remarks=remarks)
 
 
@@ -52,9 +58,10 @@ def _add_joint(arm: ET.Element, model: ExportedModel, k: int, parent: str, stiff
     """Add joint k, whose frame is that of its link."""
     joint, limits = model.joints[k], model.robot.joints[k].limits
     kind = "continuous" if model.frames.endless[k] else joint.type
-    # Links and joints share their names in SDF.
-    name = f"{joint.name}_joint" if joint.name in (model.frames.free_base, *model.frames.links) else joint.name
-    axis = ET.SubElement(_joint(arm, name, kind, parent, model.links[k].name), "axis")
+    element = _joint(arm, joint_name(model, k), kind, parent, model.links[k].name)
+    _text(element, "drake:rotor_inertia", joint.rotor_inertia)
+    _text(element, "drake:gear_ratio", 1.0)
+    axis = ET.SubElement(element, "axis")
     _text(axis, "xyz", model.frames.axes[k])
     bounds = dict(zip(("lower", "upper"), model.position_limits(k) or (), strict=False))
     element = ET.SubElement(axis, "limit")
@@ -67,6 +74,12 @@ def _add_joint(arm: ET.Element, model: ExportedModel, k: int, parent: str, stiff
     if stiffness:
         _text(dynamics, "spring_reference", 0.0)
         _text(dynamics, "spring_stiffness", stiffness)
+
+
+def joint_name(model: ExportedModel, k: int) -> str:
+    """Return the name of joint k: links and joints share their names in SDF."""
+    name = model.joints[k].name
+    return f"{name}_joint" if name in (model.frames.free_base, *model.frames.links) else name
 
 
 def _joint(arm: ET.Element, name: str, kind: str, parent: str, child: str) -> ET.Element:

@@ -30,14 +30,45 @@ class Omission:
 
 
 @dataclass(frozen=True)
+class Measured:
+    """Figures of a file: program, motion, torque difference in total and by joint (percent), and remarks.
+
+    ``missing``: reason for which there are no figures; empty if there are.
+    """
+
+    program: str = ""
+    motion: str = ""
+    error_pct: float | None = None
+    error_pct_by_joint: dict[str, float] | None = None
+    remarks: Sequence[str] = ()
+    missing: str = ""
+
+    def lines(self) -> list[str]:
+        """Return the figures as sentences."""
+        if self.error_pct is None:
+            return [f"not measured: {self.missing}"]
+        each = ", ".join(f"{name} {value:.2g} %" for name, value in (self.error_pct_by_joint or {}).items())
+        found = (
+            f"{self.program} computes torques that differ by {self.error_pct:.2g} % from those of the identified model "
+            f"({each}) along {self.motion}"
+        )
+        return [found, *self.remarks]
+
+    def document(self) -> dict[str, Any]:
+        """Return the figures for JSON."""
+        return {name: value for name, value in vars(self).items() if value not in ("", None, ())}
+
+
+@dataclass(frozen=True)
 class LimitationSheet:
-    """Limits of an exported file: parts held and omitted, undetermined parameters with the reason, remarks."""
+    """Limits of an exported file: parts held and omitted, undetermined parameters with the reason, remarks, figures."""
 
     format_name: str
     held: tuple[str, ...]
     omitted: tuple[Omission, ...] = ()
     undetermined: dict[str, str] = field(default_factory=dict)
     remarks: tuple[str, ...] = ()
+    measured: Measured | None = None
 
     def markdown(self, title: str) -> str:
         """Return the sheet as a Markdown page. ``title``: first heading."""
@@ -56,6 +87,8 @@ class LimitationSheet:
     def _sections(self) -> Iterator[tuple[str, Sequence[str]]]:
         """Return heading and entries of each section that has entries."""
         omitted = [f"{o.part}{'. ' + o.reason if o.reason else ''}" for o in self.omitted]
+        if self.measured is not None:
+            yield "Measured", self.measured.lines()
         yield "In the file", self.held
         yield "Not in the file", omitted or ["nothing is left out"]
         yield "Not determined by the recordings", _by_reason(self.undetermined) or ["every parameter was determined"]
@@ -70,6 +103,7 @@ class LimitationSheet:
             "omitted": [{"part": o.part, "reason": o.reason} for o in self.omitted],
             "undetermined": dict(self.undetermined),
             "remarks": list(self.remarks),
+            **({} if self.measured is None else {"measured": self.measured.document()}),
         }
 
 

@@ -29,14 +29,20 @@ Floats = NDArray[np.float64]
 TOLERANCE = 1e-12
 """Largest difference of torques, relative to the largest of the joint: rounding of another order of operations."""
 
-MEMORY = {
-    "presliding_friction", "friction_drift", "friction_drift/work", "joint_elasticity", "backlash", "time_delay",
-    "actuator_bandwidth", "encoder_eccentricity", "unnamed/time", "unnamed/time_and_direction",
+NO_FORMULA = {
+    "joint_elasticity", "backlash", "time_delay", "actuator_bandwidth", "encoder_eccentricity", "unnamed/time",
+    "unnamed/time_and_direction",
 }  # fmt: skip
-"""Effects with memory, or with derivatives of the torque."""
+"""Effects whose memory is no state that relaxes, or with derivatives of the torque."""
 
-MEMORYLESS = {key for key, effect in catalogue().items() if not isinstance(effect, SignalMistake)} - MEMORY
+STATES = {"presliding_friction", "friction_drift", "friction_drift/work"}
+"""Effects with a state that relaxes."""
+
+MEMORYLESS = {key for key, effect in catalogue().items() if not isinstance(effect, SignalMistake)} - NO_FORMULA - STATES
 """All others: their torque depends on the present instant alone."""
+
+RECORDED_S = 20.0
+"""Duration of the recordings of the identification, s."""
 
 
 def with_effect(robot: RobotConfig, key: str, *others: str) -> RobotConfig:
@@ -131,14 +137,26 @@ def test_generated_forward_dynamics_are_those_of_the_model(model: ExportedModel,
 def test_an_effect_without_memory_has_formulas(key: str) -> None:
     robot = with_effect(load_robot("tx40"), key)
     arm = arm_model(robot)
-    assert instant_model(arm, parameters(robot, np.random.default_rng(5))).held == {0}
+    found = instant_model(arm, parameters(robot, np.random.default_rng(5)), RECORDED_S)
+    assert (found.held, found.memory) == ({0}, ())
 
 
-@pytest.mark.parametrize("key", sorted(MEMORY))
-def test_an_effect_with_memory_has_none(key: str) -> None:
+@pytest.mark.parametrize("key", sorted(NO_FORMULA))
+def test_an_effect_with_another_memory_has_none(key: str) -> None:
     robot = with_effect(load_robot("tx40"), key)
-    found = instant_model(arm_model(robot), parameters(robot, np.random.default_rng(5)))
+    found = instant_model(arm_model(robot), parameters(robot, np.random.default_rng(5)), RECORDED_S)
     assert (found.held, found.torques) == (frozenset(), {})
+
+
+def test_bristles_and_slow_changes_are_states_that_relax() -> None:
+    robot = with_effect(load_robot("tx40"), *sorted(STATES), "stribeck_friction")
+    bristle = robot.effects[-1].model_copy(update={"parameters": {"velocity": 0.5, "displacement": 0.001}})
+    robot = robot.model_copy(update={"effects": (*robot.effects[:-1], bristle)})
+    found = instant_model(arm_model(robot), parameters(robot, np.random.default_rng(5)), RECORDED_S)
+    assert (found.held, len(found.memory)) == ({0, 1, 2, 3}, 4)
+    assert [state.rate for state in found.memory] == [
+        "1.0 / 0.5", "0.5 * dq[1] * dq[1]", "fabs(dq[1]) / 0.5", "fabs(dq[1]) / 0.001"
+    ]  # fmt: skip
 
 
 @pytest.mark.slow
@@ -167,13 +185,13 @@ def test_code_with_effects_has_the_torques_of_the_model(keys: list[str], tmp_pat
 
 
 def test_what_code_cannot_hold_stands_on_the_sheet_and_in_the_file(tmp_path: Path) -> None:
-    robot = with_effect(load_robot("tx40"), "presliding_friction", "joint_spring")
+    robot = with_effect(load_robot("tx40"), "backlash", "joint_spring")
     model = exported(robot, parameters(robot, np.random.default_rng(5)))
     files, sheet = export_model(model, "python", tmp_path / "model.py")
-    assert ["presliding" in each.part for each in sheet.omitted] == [True]
+    assert ["backlash" in each.part for each in sheet.omitted] == [True]
     assert any("spring" in part for part in sheet.held)
     head = files[0].read_text().split('"""')[1]
-    assert "Not in this file: presliding friction" in " ".join(head.split())
+    assert "Not in this file: backlash" in " ".join(head.split())
     assert "SHA-256" in head
 
 

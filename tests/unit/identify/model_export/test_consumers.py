@@ -158,8 +158,9 @@ def test_mujoco_computes_our_torques_from_the_urdf(model: ExportedModel, motion:
 def test_drake_computes_our_torques_from_the_sdf(model: ExportedModel, motion: Motion, tmp_path: Path) -> None:
     file = written(model, "sdf", tmp_path)
     viscous = [name for name in model.arm.names if name.startswith("fv") and name[2:].isdigit()]
+    rotors = [name for name in model.arm.names if name.startswith("ia") and name[2:].isdigit()]
     found = drake_torque(file, motion, model.frames)
-    assert relative_error(found, rigid_torque(model, motion, *viscous)) < TOLERANCE
+    assert relative_error(found, rigid_torque(model, motion, *viscous, *rotors)) < TOLERANCE
     # Drake has no dry friction; Gazebo reads it from this tag.
     tags = [joint.findtext("axis/dynamics/friction") for joint in ET.parse(file).iter("joint")]
     assert [float(tag) for tag in tags if tag] == pytest.approx([joint.coulomb for joint in model.joints])
