@@ -73,6 +73,13 @@ def read_inertials(file: Path, base: str | None = None, tip: str | None = None) 
     )
 
 
+def held_joints(file: Path, base: str | None = None, tip: str | None = None) -> tuple[str, ...]:
+    """Names of the moving joints after a chain of a URDF: what they move is a load, with these joints at zero."""
+    tree = read_tree(file)
+    links = carried_links(tree, tree.path(base, tip)[0], [joint.name for joint in read_chain(file, base, tip)])
+    return tuple(joint for _, _, _, joint in links if joint is not None)
+
+
 def carried_links(tree: UrdfTree, base: str, chain: list[str]) -> Iterator[tuple[str, int, Floats, str | None]]:
     """Links below the base: name, index of the joint that moves it (-1: none), placement, joint that is held still."""
     todo: list[tuple[str, int, Floats]] = [(base, -1, np.eye(4))]

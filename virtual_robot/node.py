@@ -293,7 +293,7 @@ class Drive(canopen.LocalNode):
         for index in range(TPDO_COMMUNICATION, TPDO_COMMUNICATION + MAPPING):
             if index not in self.object_dictionary:
                 break
-            if INHIBIT_TIME in self.object_dictionary[index].subindices:
+            if self.object_dictionary.get_variable(index, INHIBIT_TIME) is not None:
                 out[self._number(index, 1) & 0x7FF] = self._number(index, INHIBIT_TIME) * 1e-4
         return out
 
