@@ -12,6 +12,7 @@ from armident.configs import ConfigError, DataError, RobotConfig, load_robot
 from armident.daq.interchange.exporting import export_recording, exported_columns
 from armident.daq.interchange.importing import import_recording
 from armident.daq.recording import Field, Recording, Stream, read_recording, write_recording
+from armident.daq.recording.model import Quantity
 
 TX40 = load_robot("tx40.yaml")
 HEADER = ",".join(["t", *(f"q{j}" for j in range(1, 7)), *(f"tau{j}" for j in range(1, 7))])
@@ -74,9 +75,9 @@ def stamped(robot: RobotConfig, start_ns: int) -> Recording:
     rng = np.random.default_rng(1)
     sync = np.arange(3, 53)
     q = 0.1 * np.sin(0.02 * sync[:, None] + np.arange(2))
-    values = {"position": q, "torque": rng.uniform(-5, 5, (50, 2)), "demand": q + 1e-3}
+    values: dict[Quantity, np.ndarray] = {"position": q, "torque": rng.uniform(-5, 5, (50, 2)), "demand": q + 1e-3}
     fields = {name: Field(name, name, "", "joint", (1.0, 1.0)) for name in values}
-    stream = Stream("samples", 1, sync, start_ns + sync * 1_000_000, fields, values)
+    stream = Stream("samples", 1, sync, start_ns + sync * 1_000_000, dict(fields), dict(values))
     return Recording(None, robot, None, 1000.0, {"samples": stream})
 
 
