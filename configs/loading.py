@@ -128,16 +128,18 @@ def _robot(path: Path) -> RobotConfig:
         raise ConfigError(f"{path}: expected rad and m: {'; '.join(suspected[:3])}{_others(len(suspected) - 3)}")
     if given is None:
         return robot
-    return robot.with_urdf_facts(_limit_places(robot, given, path), _first_moments(given, path))
+    return robot.with_urdf_facts(_limit_places(robot, given, path), *_first_moments(given, path))
 
 
-def _first_moments(given: UrdfGeometry, path: Path) -> dict[str, float]:
-    """Masses and first moments of a URDF, as `RobotConfig.first_moments` has them; none where they are wrong."""
+def _first_moments(given: UrdfGeometry, path: Path) -> tuple[dict[str, float], dict[str, float]]:
+    """Masses and first moments of a URDF, and those with centres in its base frame; none where they are wrong."""
     try:
         found = read_inertials(urdf_file(given, path), given.urdf.base, given.urdf.tip)
     except ConfigError:
-        return {}  # only those who need the masses say what is wrong with them
-    return {} if found.massless else {name: v for name, v in found.standard.items() if name.startswith("m")}
+        return {}, {}  # only those who need the masses say what is wrong with them
+    if found.massless:
+        return {}, {}
+    return {name: v for name, v in found.standard.items() if name.startswith("m")}, found.of_base
 
 
 def _limit_places(robot: RobotConfig, given: UrdfGeometry, path: Path) -> tuple[str, ...]:

@@ -28,10 +28,12 @@ class UrdfInertials:
 
     ``standard`` (``xx1`` to ``m6``) is in MDH frames; ``friction`` (``fv1``, ``fc1``) has the positive values. Joints
     ``massless``, from 1, move no mass before the next joint. No body has the moments of ``impossible`` links. Joints
-    ``held`` after the tip carry a rigid load.
+    ``held`` after the tip carry a rigid load. ``of_base``: masses and first moments (``m1``, ``mx1``) if all centres of
+    mass of the file are given in the frame of the base link.
     """
 
     standard: dict[str, float]
+    of_base: dict[str, float]
     friction: dict[str, float]
     massless: tuple[int, ...]
     impossible: tuple[str, ...]
@@ -48,7 +50,7 @@ def read_inertials(file: Path, base: str | None = None, tip: str | None = None) 
     tree = read_tree(file)
     first, path = tree.path(base, tip)
     names = [joint.name for joint in joints]
-    bodies = np.zeros((len(joints), 4, 4))
+    bodies, moments_of_base = np.zeros((len(joints), 4, 4)), np.zeros((len(joints), 4))
     impossible: list[str] = []
     held: list[str] = []
     for link, owner, placement, held_joint in carried_links(tree, first, names):
@@ -59,18 +61,32 @@ def read_inertials(file: Path, base: str | None = None, tip: str | None = None) 
         impossible += [] if possible else [link]
         frame = np.linalg.solve(frames[owner], placement)
         bodies[owner] += frame @ moments @ frame.T
+        moments_of_base[owner] += np.linalg.solve(frames[owner], moments[:, 3])
     standard: dict[str, float] = {}
     for k, body in enumerate(bodies, start=1):
         inertia = np.trace(body[:3, :3]) * np.eye(3) - body[:3, :3]
         values = (*inertia[np.triu_indices(3)], *body[:3, 3], body[3, 3])
         standard |= {f"{name}{k}": float(value) for name, value in zip(INERTIAL, values, strict=True)}
+    of_base = {
+        f"{name}{k}": float(value)
+        for k, moments in enumerate(moments_of_base, start=1)
+        for name, value in zip(("mx", "my", "mz", "m"), moments, strict=True)
+    }
     return UrdfInertials(
         standard=standard,
+        of_base=of_base,
         friction=_friction(tree, path, names),
         massless=tuple(k for k, body in enumerate(bodies, start=1) if not body[3, 3] > 0.0),
         impossible=tuple(impossible),
         held=tuple(held),
     )
+
+
+def held_joints(file: Path, base: str | None = None, tip: str | None = None) -> tuple[str, ...]:
+    """Names of the moving joints after a chain of a URDF: what they move is a load, with these joints at zero."""
+    tree = read_tree(file)
+    links = carried_links(tree, tree.path(base, tip)[0], [joint.name for joint in read_chain(file, base, tip)])
+    return tuple(joint for _, _, _, joint in links if joint is not None)
 
 
 def carried_links(tree: UrdfTree, base: str, chain: list[str]) -> Iterator[tuple[str, int, Floats, str | None]]:

@@ -6,7 +6,6 @@ import xml.etree.ElementTree as ET
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
-from itertools import pairwise
 from pathlib import Path
 from typing import Any, Literal
 
@@ -65,7 +64,8 @@ def read_chain(file: Path, base: str | None = None, tip: str | None = None) -> t
 def serial_tips(file: Path, base: str | None = None) -> dict[str, tuple[str, ...]]:
     """Names of the moving joints to each link at which a serial chain can end: ends of branches, and their forks.
 
-    Chains that cannot be identified are left out. Raises ConfigError if the file is no URDF or not a tree.
+    Chains that cannot be identified are left out, and all but one with the same joints. Raises ConfigError if the file
+    is no URDF or not a tree.
     """
     tree = read_tree(file)
     found: dict[str, tuple[str, ...]] = {}
@@ -76,7 +76,9 @@ def serial_tips(file: Path, base: str | None = None) -> dict[str, tuple[str, ...
         todo += [end_link(element, "child") for element in ways]
         if len(ways) != 1 and link != base:
             with suppress(ConfigError):
-                found[link] = tuple(joint.name for joint in read_chain(file, base, link))
+                joints = tuple(joint.name for joint in read_chain(file, base, link))
+                if joints not in found.values():
+                    found[link] = joints
     return found
 
 
@@ -150,7 +152,7 @@ class UrdfTree:
         return base, self.path_to(base, self.known(tip, "urdf.tip"))
 
     def path_to(self, base: str, tip: str) -> list[ET.Element]:
-        """Joints from base to tip; ConfigError if the base does not move the tip or a moving joint branches off."""
+        """Joints from base to tip; ConfigError if the base does not move the tip, or a joint branches off between."""
         path: list[ET.Element] = []
         link = tip
         while link != base:
@@ -159,12 +161,11 @@ class UrdfTree:
                 raise ConfigError(f"{self.file}: link {tip!r} (urdf.tip) is not moved by link {base!r}")
             path.insert(0, element)
             link = end_link(element, "parent")
-        carried = False
-        for element, following in pairwise(path):
-            carried = carried or self.type_of(element) != "fixed"
-            link = end_link(element, "child")
-            if carried:
-                self._refuse_branch(link, [following, *(j for j in self.below[link] if j is not following)])
+        moving = [k for k, element in enumerate(path) if self.type_of(element) != "fixed"]
+        # Branches before the first moving joint carry nothing of the chain, those after the last one are its load.
+        for following in path[moving[0] + 1 : moving[-1] + 1] if moving else ():
+            link = end_link(following, "parent")
+            self._refuse_branch(link, [following, *(j for j in self.below[link] if j is not following)])
         return path
 
     def only_way(self, base: str) -> Iterator[ET.Element]:
@@ -185,7 +186,7 @@ class UrdfTree:
             names = " and ".join(repr(element.get("name")) for element in [joints[0], *others])
             raise ConfigError(
                 f"{self.file}: link {link!r} branches into joints {names}; only serial chains can be identified "
-                "(urdf.base and urdf.tip choose a part)"
+                "(urdf.base and urdf.tip choose a part; joints that stand still can be fixed ones in the URDF)"
             )
 
     def moves(self, element: ET.Element) -> bool:

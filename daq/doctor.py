@@ -27,6 +27,7 @@ from armident.configs import (
     load_trajectory,
 )
 from armident.configs.blanks import blank_lines, needed, pattern
+from armident.configs.implausible import implausible_values
 from armident.configs.loading import is_session
 from armident.configs.schema.session import Bus
 from armident.daq.capture.recording_files import chunk_duration_ns
@@ -75,6 +76,7 @@ def checks_for(config: str | Path, command: Command) -> list[Check]:
     missing = (*needed(of_session, command), *robot.blanks_for(command))
     checks = [Check("configuration", "ok", f"{config}: robot {robot.name}, {robot.n} joints")]
     checks += [Check("blank", "failed", line) for line in blank_lines(missing)]
+    checks += [Check("robot", "warning", line) for line in implausible_values(robot)]
     if command == "trajectory" and not missing:
         try:
             robot.check_movable(str(path))
@@ -104,6 +106,7 @@ def run_checks(config: str | Path) -> list[Check]:
     except ArmidentError as error:
         return [Check("configuration", "failed", str(error)), *_data_sheets(session), _installation(), _clock()]
     checks = [Check("configuration", "ok", f"{config}: cell {session.cell}, robot {robot.name}")]
+    checks += [Check("robot", "warning", line) for line in implausible_values(robot)]
     foreign = session.sync.role == "consumer" and not session.sync.counter
     phase = unknown_phase(session) if foreign else None
     if phase is not None:
@@ -112,7 +115,7 @@ def run_checks(config: str | Path) -> list[Check]:
     for bus in session.all_buses:
         checks += _interface(bus)
     checks += [_installation(), _clock()]
-    checks += [*_disk(session, robot), _zenoh(session), *_keys(session)]
+    checks += [*_disk(session, robot), *_zenoh(session), *_metrics(session), *_keys(session)]
     return checks
 
 
@@ -311,27 +314,53 @@ def _speed(times: list[float], span_s: float) -> Check:
     return Check("disk", "ok", found)
 
 
-def _zenoh(session: SessionConfig) -> Check:
-    """Check the configuration of Zenoh, and that the port of the capture is free."""
+def _zenoh(session: SessionConfig) -> Iterator[Check]:
+    """Check the configuration of Zenoh, and that the ports on which the capture listens are free."""
     try:
         config = configuration(session, "capture")
         unreadable = unreadable_files(config)
     except ConfigError as error:
-        return Check("zenoh", "failed", str(error))
+        yield Check("zenoh", "failed", str(error))
+        return
     if unreadable:
-        return Check("zenoh", "failed", f"{session.zenoh.config or 'keys'}: cannot be read: {', '.join(unreadable)}")
-    if session.zenoh.config is not None or session.zenoh.listen:
-        return Check("zenoh", "ok", "configured by the session")
+        where = session.zenoh.config or "keys"
+        yield Check("zenoh", "failed", f"{where}: cannot be read: {', '.join(unreadable)}")
+        return
+    if session.zenoh.config is not None:
+        yield Check("zenoh", "ok", "configured by the session")
+        return
     if config.get_json("mode") == '"client"':
-        return Check("zenoh", "ok", f"client of {', '.join(session.zenoh.connect)} by mutual TLS")
-    host, _, port = endpoints(session)["capture"].removeprefix("tcp/").rpartition(":")
-    with socket.socket() as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            probe.bind((host, int(port)))
-        except OSError as error:
-            return Check("zenoh", "warning", f"{host}:{port}: {error.strerror}; is a capture of this cell running?")
-    return Check("zenoh", "ok", f"peers on loopback, port {port}")
+        yield Check("zenoh", "ok", f"client of {', '.join(session.zenoh.connect)} by mutual TLS")
+        return
+    places = session.zenoh.listen or (endpoints(session)["capture"],)
+    addresses = [place.partition("/")[2] for place in places if place.startswith(("tcp/", "tls/"))]
+    taken = {address: reason for address in addresses if (reason := _taken(address)) is not None}
+    for address, reason in taken.items():
+        yield Check("zenoh", "warning", f"{address}: {reason}; is a capture of this cell running?")
+    if not taken:
+        default = f"peers on loopback, port {addresses[0].rpartition(':')[2]}" if not session.zenoh.listen else None
+        yield Check("zenoh", "ok", default or f"listens at {', '.join(places)}")
+
+
+def _metrics(session: SessionConfig) -> Iterator[Check]:
+    """Check that the port of the metrics is free."""
+    options = session.metrics
+    address = f"{options.address}:{options.port}"
+    if options.port and (reason := _taken(address)) is not None:
+        yield Check("metrics", "failed", f"{address}: {reason}; is a capture running? metrics.port chooses another")
+
+
+def _taken(address: str) -> str | None:
+    """Return the reason why no program can listen on a TCP port, ``HOST:PORT``; ``None`` if it is free."""
+    host, _, port = address.rpartition(":")
+    try:
+        family, kind, _, _, place = socket.getaddrinfo(host.strip("[]"), port, type=socket.SOCK_STREAM)[0]
+        with socket.socket(family, kind) as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            probe.bind(place)
+    except OSError as error:
+        return error.strerror or str(error)
+    return None
 
 
 def _keys(session: SessionConfig) -> Iterator[Check]:

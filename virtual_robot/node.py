@@ -23,6 +23,7 @@ from armident.drivers.canopen.objects import (
     FD_PDO_BYTES,
     HEARTBEAT_PRODUCER,
     IDENTITY,
+    INHIBIT_TIME,
     INTERPOLATION_PERIOD,
     MAPPED_OBJECTS,
     MODE_DISPLAY,
@@ -251,6 +252,8 @@ class Drive(canopen.LocalNode):
             supported = 1 <= value <= 240 or value in EVENT_DRIVEN or (base == RPDO_COMMUNICATION and value == 0)
             if not supported:
                 raise SdoAbortedError(ABORT_VALUE_RANGE)
+        elif subindex == INHIBIT_TIME and not self._number(index, 1) & PDO_NOT_VALID:
+            raise SdoAbortedError(ABORT_DEVICE_STATE)
 
     def _check_mapping(self, base: int, index: int, subindex: int, value: int) -> None:
         if not self._number(index - MAPPING, 1) & PDO_NOT_VALID:
@@ -283,6 +286,16 @@ class Drive(canopen.LocalNode):
         allowed = mapped.readable if base == TPDO_COMMUNICATION else mapped.writable
         if not mapped.pdo_mappable or not allowed or len(mapped) != entry & 0xFF or len(mapped) % 8:
             raise SdoAbortedError(ABORT_NOT_MAPPABLE)
+
+    def inhibit_times(self) -> dict[int, float]:
+        """Inhibit time (180xh:3) of each TPDO that has this sub-index, s, by COB-ID."""
+        out = {}
+        for index in range(TPDO_COMMUNICATION, TPDO_COMMUNICATION + MAPPING):
+            if index not in self.object_dictionary:
+                break
+            if self.object_dictionary.get_variable(index, INHIBIT_TIME) is not None:
+                out[self._number(index, 1) & 0x7FF] = self._number(index, INHIBIT_TIME) * 1e-4
+        return out
 
     def pdos(self, base: int) -> list[tuple[int, int, list[tuple[int, int, int]]]]:
         """Enabled PDOs from record 1400h or 1800h on: COB-ID, type, objects (index, subindex, bytes) in order."""

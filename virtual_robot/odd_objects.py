@@ -97,6 +97,25 @@ class PdoFixed(Oddity):
         return data
 
 
+class TimersSet(Oddity):
+    """Inhibit time (100 us) and event timer (ms) of all TPDOs at power-on; ``fixed``: read-only."""
+
+    def __init__(self, drive: Drive, inhibit: int, event_ms: int, fixed: bool) -> None:
+        self._drive, self._values, self._fixed = drive, {od.INHIBIT_TIME: inhibit, od.EVENT_TIMER: event_ms}, fixed
+
+    def preset(self) -> None:
+        """Set both timers of all TPDOs."""
+        for index in range(od.TPDO_COMMUNICATION, od.TPDO_COMMUNICATION + 4):
+            for sub, value in self._values.items():
+                self._drive.preset(index, sub, value)
+
+    def write(self, index: int, subindex: int, data: bytes) -> bytes:
+        """Refuse to change a timer that is read-only."""
+        if self._fixed and od.TPDO_COMMUNICATION <= index < od.TPDO_MAPPING and subindex in self._values:
+            raise SdoAbortedError(ABORT_READ_ONLY)
+        return data
+
+
 class CobFixed(Oddity):
     """Read-only COB-IDs of PDOs. ``session``: session whose streams and set points have the COB-IDs."""
 

@@ -16,6 +16,7 @@ from armident.virtual_robot.odd_objects import (
     ModeLate,
     PdoFixed,
     TargetFollows,
+    TimersSet,
     WriteLate,
 )
 from armident.virtual_robot.odd_services import (
@@ -67,6 +68,18 @@ ODDITIES: Mapping[str, tuple[str, Callable[[Drive, SessionConfig], Oddity]]] = {
         lambda drive, session: PdoFixed(drive, None),
     ),
     "cob_fixed": ("COB-IDs of PDOs are read-only, and are those of the session", CobFixed),
+    "tpdo_timers": (
+        "TPDOs have an inhibit time (180xh:3) of 50 ms and an event timer (180xh:5) of 100 ms",
+        lambda drive, session: TimersSet(drive, 500, 100, fixed=False),
+    ),
+    "tpdo_timers_fixed": (
+        "inhibit time (180xh:3) of TPDOs is read-only, and is 50 ms",
+        lambda drive, session: TimersSet(drive, 500, 0, fixed=True),
+    ),
+    "no_inhibit_time": (
+        "no inhibit time (1800h:3)",
+        lambda drive, session: Absent(od.TPDO_COMMUNICATION, od.INHIBIT_TIME),
+    ),
     "write_late": ("a written value reads back only 50 ms later", lambda drive, session: WriteLate(drive, 0.05)),
     "mode_when_enabled": (
         "mode of operation (6061h) is 0 until 50 ms after enabling",

@@ -1,5 +1,6 @@
 """Compiled PDO exchange of all drives: RPDOs to set points and live values to TPDOs."""
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -50,14 +51,15 @@ HISTORY = 64
 
 @compiled(
     "u4[:], u1[:], u1[:, :], i8, i8, i8, f8, i4[::1], i4[::1], i2[::1], i4[::1], i8[:, ::1], i8[:, :, ::1], "
-    "i8[::1], i8[::1], i8[::1], i8[::1], i8[::1], i8[::1], i8[::1], u4[::1], u1[::1], u4[:], u1[:], u1[:, :], "
+    "i8[::1], i8[::1], i8[::1], i8[::1], i8[::1], i8[::1], i8[::1], i8[::1], i8[::1], u4[::1], u1[::1], u4[:], u1[:], "
+    "u1[:, :], "
     "i8[::1], i8[::1], i8[::1], i8[::1], i8[::1], i8[::1], i8[::1], i8[::1], u1[:, ::1], b1[::1], i8[::1], "
     "i4[::1], b1[::1], i8[::1], i8[::1]",
     **PLAIN,
 )
 def _exchange(  # type: ignore[no-untyped-def]
     ids, lengths, data, start, stop, sequence, period, position, before, current, demand, values, history,
-    tx_kinds, tx_first, tx_row, tx_drive, tx_offset, tx_size, tx_back, tx_ids, tx_lengths,
+    tx_kinds, tx_pause, tx_sent, tx_first, tx_row, tx_drive, tx_offset, tx_size, tx_back, tx_ids, tx_lengths,
     out_ids, out_lengths, out_data,
     rx_kinds, rx_first, rx_what, rx_drive, rx_offset, rx_size, table, need, stored, fresh, short,
     targets, targets_fresh, control, result,
@@ -66,7 +68,7 @@ def _exchange(  # type: ignore[no-untyped-def]
 
     ``sequence``: counter of a SYNC without one. ``result`` (3,): frames to send, bits for set points (1) and
     controlwords (2) that take effect now, and SYNCs. ``history`` keeps live values; an entry sends those of ``tx_back``
-    SYNCs ago.
+    SYNCs ago. A TPDO is dropped within ``tx_pause`` SYNCs after the one of SYNC ``tx_sent``.
     """
     at = stop
     for k in range(start, stop):
@@ -100,8 +102,9 @@ def _exchange(  # type: ignore[no-untyped-def]
             history[result[2] % HISTORY, row, j] = values[row, j]
     count = 0
     for p in range(tx_kinds.size):
-        if counter % tx_kinds[p]:
+        if counter % tx_kinds[p] or result[2] - tx_sent[p] < tx_pause[p]:
             continue
+        tx_sent[p] = result[2]
         out_ids[count] = tx_ids[p]
         out_lengths[count] = tx_lengths[p]
         for e in range(tx_first[p], tx_first[p + 1]):
@@ -156,11 +159,13 @@ class Exchange:
         n = self._motion.position.size
         constants: list[NDArray[np.int64]] = []
         tx: list[Pdo] = []
+        pauses: list[int] = []
         rx: list[Pdo] = []
         for drive in self._drives:
             j = drive.index
             if not drive.nmt.operational:
                 continue
+            inhibited = drive.inhibit_times()
             for cob_id, kind, mapped in drive.pdos(TPDO_COMMUNICATION):
                 if not 1 <= kind <= 240:
                     continue
@@ -177,6 +182,7 @@ class Exchange:
                     entries.append((row, j, offset, size, back))
                     offset += size
                 tx.append((cob_id, kind, entries))
+                pauses.append(math.ceil(inhibited.get(cob_id, 0.0) / self._period - 1e-6))
             for cob_id, kind, mapped in drive.pdos(RPDO_COMMUNICATION):
                 entries, offset = [], 0
                 for index, _, size in mapped:
@@ -184,6 +190,8 @@ class Exchange:
                     offset += size
                 rx.append((cob_id, kind, entries))
         self._tx_kinds, self._tx_first, self._tx = _flat(tx, 5)
+        self._tx_pause = np.array(pauses, np.int64)
+        self._tx_sent = self._result[2] - self._tx_pause
         self._tx_ids = np.array([cob_id for cob_id, _, _ in tx], np.uint32)
         sizes = [sum(e[3] for e in entries) for _, _, entries in tx]
         self._tx_lengths = np.array([fd_length(size) if self.fd else size for size in sizes], np.uint8)
@@ -216,7 +224,7 @@ class Exchange:
         motion, out = self._motion, self._out
         self._arguments = (
             self._period, motion.position, self._before, motion.current, motion.demand, self.values, self._history,
-            self._tx_kinds, self._tx_first, *self._tx, self._tx_ids, self._tx_lengths,
+            self._tx_kinds, self._tx_pause, self._tx_sent, self._tx_first, *self._tx, self._tx_ids, self._tx_lengths,
             out["can_id"], out["length"], out["data"],
             self._rx_kinds, self._rx_first, *self._rx, self._table, self._need, self._stored, self._fresh, self._short,
             self._targets, self._targets_fresh, self._control, self._result,

@@ -275,6 +275,7 @@ class RobotConfig(WithBlanks):
     collision: Collision | None = None
     _limit_places: tuple[str, ...] = PrivateAttr(())
     _first_moments: dict[str, float] = PrivateAttr(default_factory=dict)
+    _first_moments_of_base: dict[str, float] = PrivateAttr(default_factory=dict)
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
@@ -330,7 +331,17 @@ class RobotConfig(WithBlanks):
         """Masses and first moments ``mx1`` to ``m6`` of the URDF, kg and kg m; empty without a mass in every link."""
         return self._first_moments
 
-    def with_urdf_facts(self, limit_places: tuple[str, ...], first_moments: dict[str, float] | None = None) -> Self:
+    @property
+    def first_moments_of_base(self) -> dict[str, float]:
+        """The same if the URDF has its centres of mass in the frame of its base, as some files do."""
+        return self._first_moments_of_base
+
+    def with_urdf_facts(
+        self,
+        limit_places: tuple[str, ...],
+        first_moments: dict[str, float] | None = None,
+        of_base: dict[str, float] | None = None,
+    ) -> Self:
         """Return the robot with facts of its URDF that no document of it contains.
 
         Parameters
@@ -339,9 +350,12 @@ class RobotConfig(WithBlanks):
             File and line of the limits of each joint, (n,).
         first_moments
             Masses, kg, and first moments, kg m, in the frames of the model; ``None``: not every link has a mass.
+        of_base
+            The same with the centres of mass of the file taken in the frame of its base.
         """
         made = self.model_copy()
         made._limit_places, made._first_moments = limit_places, first_moments or {}
+        made._first_moments_of_base = of_base or {}
         return made
 
     @property

@@ -129,7 +129,10 @@ def with_sent_streams(session: SessionConfig, buses: list[BusStatistics]) -> Ses
         objects, every = ", ".join(first.objects), max(first.every, first.pack)
         log.info("TPDO%d is %s: %s on every %d. SYNC, %s", tpdo, name, objects, every, source)
     if "samples" not in streams or streams["samples"].every != 1:
-        raise ConfigError("no drive sends a TPDO on every SYNC; a recording needs one for its samples")
+        raise ConfigError(
+            "no drive sends a TPDO on every SYNC; a recording needs one for its samples. An inhibit time (180xh:3) "
+            "longer than the period of SYNC has this effect"
+        )
     return session.model_copy(update={"streams": streams})
 
 

@@ -15,6 +15,7 @@ from armident.configs.loading import checked_robot
 from armident.configs.schema.robot import Mdh
 from armident.configs.urdf import UrdfGeometry, UrdfSource, geometry_from_urdf, joint_names
 from armident.configs.urdf_file import limit_places
+from armident.configs.urdf_inertials import held_joints
 from armident.configs.urdf_tree import coarse_right_angles, moving_links, orientation, robot_name, serial_tips
 from armident.configs.yaml_loader import is_file, read_yaml
 
@@ -137,7 +138,10 @@ def _of_chain(file: Path, out: Path, base: str | None, tip: str | None) -> Geome
     if base is not None:
         down = orientation(part_file, base).T @ UPRIGHT
         content["gravity"] = [float(f"{g:.9g}") + 0.0 for g in np.where(np.abs(down) < 1e-9, 0.0, down)]
-    notes = [f"chain {ends}; what moves beyond it counts as its load"] if ends else []
+    notes = [f"chain {ends}"] if ends else []
+    held = held_joints(part_file, base, tip)
+    if held:
+        notes.append(f"load of the last joint, all at zero: what {', '.join(held)} move")
     if base is not None:
         notes.append(f"gravity is that of an upright root of the URDF with the joints before link {base} at zero")
     coarse = sorted(coarse_right_angles(part_file))

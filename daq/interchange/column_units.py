@@ -56,6 +56,10 @@ _SHOWN: Mapping[str, str] = {
 }
 
 
+SINCE = " since "
+"""Between the unit of times and the date from which they count, ISO 8601 (UDUNITS, CF conventions)."""
+
+
 def plain_unit(text: str) -> str:
     """Return a unit in lower case without spaces and signs of multiplication; empty if the text is no unit."""
     word = unicodedata.normalize("NFKC", text.replace("º", "°")).casefold().replace("μ", "u")
@@ -65,7 +69,8 @@ def plain_unit(text: str) -> str:
 
 def time_unit(text: str) -> str:
     """Return ``s``, ``ms``, ``us`` or ``ns`` for a unit of times in any spelling, and other units as they are."""
-    return _TIMES.get(plain_unit(text), plain_unit(text))
+    unit = plain_unit(text.partition(SINCE)[0])
+    return _TIMES.get(unit, unit)
 
 
 def check_unit(column: str, quantity: str, unit: str) -> None:

@@ -1,15 +1,23 @@
 """Export of recordings in SI units at the joints, and as bus logs."""
 
+import csv
+import io
 import os
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from armident.configs import ConfigError, DataError
+from armident.configs import ConfigError, DataError, RobotConfig
+from armident.daq.interchange.column_units import SINCE
 from armident.daq.interchange.readers import writer_of
+from armident.daq.interchange.table_columns import find_columns
 from armident.daq.recording import Recording, Stream
 from armident.extras import install_line
+
+CLOCK_SET_NS = 10**18
+"""Time, ns UTC (September 2001), from which on the stamps of a recording are those of a clock; others count from 0."""
 
 
 def exported_columns(recording: Recording) -> dict[str, NDArray[np.float64]]:
@@ -70,11 +78,47 @@ def _numbered(base: str, values: NDArray[np.float64]) -> dict[str, NDArray[np.fl
     return {f"{base}{j + 1}": np.ascontiguousarray(values[:, j]) for j in range(values.shape[1])}
 
 
+def titled_columns(recording: Recording) -> dict[tuple[str, str], NDArray[np.float64]]:
+    """Return the `exported_columns` by name and unit, such as ``elbow/position`` and ``rad``.
+
+    The unit of ``t`` has the date of ``t`` = 0 if it is known. Columns keep their numbers (``q1``) where an import
+    would not find the joints of the robot in their names.
+    """
+    table, samples, robot = exported_columns(recording), recording.samples, recording.robot
+    names, units = {"t": "t"}, {"t": "s"}
+    for k, joint in enumerate(robot.joints, start=1):
+        revolute = joint.type == "revolute"
+        for base, word in (("q", "position"), ("tau", "torque"), ("qr", "demand")):
+            names[f"{base}{k}"] = f"{joint.source_name or joint.name}/{word}"
+            units[f"{base}{k}"] = ("N m" if revolute else "N") if word == "torque" else "rad" if revolute else "m"
+    start_ns = int(samples.t_ns[0]) - round(int(samples.sync[0]) * 1e9 / recording.sample_rate_hz)
+    if start_ns > CLOCK_SET_NS:
+        units["t"] = f"s{SINCE}{np.datetime64(start_ns, 'ns')}Z"
+    found = _titles_found(robot, [names[key] for key in table])
+    return {(names[key] if found else key, units[key]): values for key, values in table.items()}
+
+
+def _titles_found(robot: RobotConfig, titles: Sequence[str]) -> bool:
+    """Return True if an import finds the joints of a robot, in their order, in the titles of their columns."""
+    probe = {title: np.zeros(1) for title in titles}
+    try:
+        for word in ("position", "torque", "demand"):
+            wanted = tuple(title for title in titles if title.endswith(f"/{word}"))
+            found = find_columns(probe, word, robot)
+            if wanted != (() if found is None else found.labels):
+                return False
+    except DataError:
+        return False
+    return True
+
+
 def export_csv(recording: Recording, path: Path) -> None:
-    """Write the `exported_columns` of a recording as text."""
-    table = exported_columns(recording)
+    """Write the `titled_columns` of a recording as text."""
+    table = titled_columns(recording)
+    header = io.StringIO()
+    csv.writer(header, lineterminator="").writerow(f"{name} [{unit}]" for name, unit in table)
     values = np.stack(list(table.values()), axis=1)
-    np.savetxt(path, values, fmt="%.17g", delimiter=",", header=",".join(table), comments="")
+    np.savetxt(path, values, fmt="%.17g", delimiter=",", header=header.getvalue(), comments="", encoding="utf-8")
 
 
 def export_npz(recording: Recording, path: Path) -> None:
@@ -84,13 +128,22 @@ def export_npz(recording: Recording, path: Path) -> None:
 
 
 def export_parquet(recording: Recording, path: Path) -> None:
-    """Write the `exported_columns` of a recording as a table of Apache Parquet."""
+    """Write the `titled_columns` of a recording as a table of Apache Parquet, with units in the metadata of its fields.
+
+    Metadata of the schema: ``robot``, ``sample_rate_hz`` and ``utc``, the date of ``t`` = 0.
+    """
     try:
         import pyarrow
         import pyarrow.parquet
     except ImportError as error:
         raise ConfigError(install_line(f"{path}: Parquet", ["parquet"])) from error
-    pyarrow.parquet.write_table(pyarrow.table(exported_columns(recording)), path)
+    table = titled_columns(recording)
+    start = next(iter(table))[1].partition(SINCE)[2]
+    about = {"robot": recording.robot.name, "sample_rate_hz": f"{recording.sample_rate_hz:.17g}"}
+    about |= {"utc": start} if start else {}
+    fields = [pyarrow.field(name, pyarrow.float64(), metadata={"unit": unit}) for name, unit in table]
+    made = pyarrow.table(list(table.values()), schema=pyarrow.schema(fields, metadata=about))
+    pyarrow.parquet.write_table(made, path)
 
 
 def export_mat(recording: Recording, path: Path) -> None:

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from armident.configs import ConfigError, DataError, RobotConfig, SessionConfig
 from armident.daq.interchange.bag_files import bag_files
 from armident.daq.interchange.clocks import UNITS, descending, gaps_and_counters
+from armident.daq.interchange.column_units import SINCE
 from armident.daq.interchange.import_options import ImportOptions
 from armident.daq.interchange.lerobot import FULL, UNSURE, data_files, position_hint
 from armident.daq.interchange.readers import check_options, reader_of
@@ -155,7 +156,8 @@ def _from_table(robot: RobotConfig, source: Source, options: ImportOptions, fact
     for note in notes:
         logging.getLogger(__name__).warning("%s: %s", path, note)
     remarks = {NOTES: "; ".join(notes)} if notes else {}
-    recording = _recording(robot, fields, made, known, {**facts, **made.facts, **remarks})
+    begin_ns = _begin_ns(source, rows)
+    recording = _recording(robot, fields, made, known, {**facts, **made.facts, **remarks}, begin_ns)
     if resample_hz is None or abs(made.rate_hz / resample_hz - 1.0) < 1e-9:
         return recording
     return at_rate(recording, resample_hz)
@@ -220,13 +222,25 @@ def _check_rates(rate_hz: float | None, polled: bool, resample_hz: float | None)
         raise ConfigError(f"--rate {rate_hz:g} and --resample {resample_hz:g} contradict each other; give one of them")
 
 
+def _begin_ns(source: Source, rows: TableRows) -> int:
+    """Return the time of the first row, ns UTC, if the unit of the times has the date from which they count; else 0."""
+    date = source.units.get(rows.time_name, "").partition(SINCE)[2]
+    try:
+        start = int(np.datetime64(date.removesuffix("Z"), "ns").astype(np.int64)) if date else 0
+    except ValueError:
+        start = 0
+    if not 0 < start < 2**62 or rows.times is None:
+        return 0
+    return start + round(float(rows.times[0]) * UNITS.get(rows.time_unit, 1.0) * 1e9)
+
+
 def _recording(
-    robot: RobotConfig, fields: Mapping[str, Field], made: Sampled, known: slice, facts: dict[str, str]
+    robot: RobotConfig, fields: Mapping[str, Field], made: Sampled, known: slice, facts: dict[str, str], begin_ns: int
 ) -> Recording:
     raw: dict[str, NDArray[Any]] = {str(name): values for name, values in made.values.items()}
     own = dict(fields)
     sync, rate = made.numbers, made.rate_hz
-    t_ns = np.round(sync * (1e9 / rate)).astype(np.int64)
+    t_ns = begin_ns + np.round((sync - sync[0]) * (1e9 / rate)).astype(np.int64)
     streams: dict[str, Stream] = {}
     if known != slice(0, sync.size) and not made.resampled:
         demand, field = raw.pop("demand")[known], own.pop("demand")

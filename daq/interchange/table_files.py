@@ -156,9 +156,15 @@ def parquet_arrays(path: Path, *_: Any) -> dict[str, Any]:
         raise ConfigError(install_line(f"{path}: Parquet", ["parquet"])) from error
     try:
         table = pyarrow.parquet.read_table(path)
-        return {name: table.column(name).to_numpy() for name in table.column_names}
+        return {_with_unit(field): column.to_numpy() for field, column in zip(table.schema, table.columns, strict=True)}
     except Exception as error:  # pyarrow raises various errors for damaged files
         raise DataError(f"{path}: not a readable Parquet file: damaged, or cut off") from error
+
+
+def _with_unit(field: Any) -> str:
+    """Return the name of a field of a Parquet file, with the unit that its metadata have."""
+    unit = (field.metadata or {}).get(b"unit", b"").decode(errors="replace")
+    return f"{field.name} [{unit}]" if unit and not field.name.endswith("]") else str(field.name)
 
 
 def mat_arrays(path: Path, *_: Any) -> dict[str, Any]:

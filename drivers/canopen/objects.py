@@ -49,6 +49,8 @@ RPDO_COMMUNICATION = 0x1400
 RPDO_MAPPING = 0x1600
 TPDO_COMMUNICATION = 0x1800
 TPDO_MAPPING = 0x1A00
+INHIBIT_TIME, EVENT_TIMER = 3, 5
+"""Sub-indices of a TPDO's communication parameters, in 100 us and in ms (CiA 301 section 7.5.2.37)."""
 PDOS = 0x200
 """Maximum number of TPDOs, and of RPDOs, of a node (CiA 301 section 7.5.2.35)."""
 ERROR_CODE = 0x603F

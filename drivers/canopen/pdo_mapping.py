@@ -1,5 +1,7 @@
 """PDO mapping of one drive over SDO: the TPDOs of the streams, and the RPDOs of set points and stop."""
 
+from contextlib import suppress
+
 from armident.configs.errors import ConfigError
 from armident.configs.schema.session import SessionConfig
 from armident.drivers.canopen import objects as od
@@ -8,11 +10,18 @@ from armident.drivers.canopen.sdo import DriveSdo, SdoRefusedError
 ROUNDING_US = 0.5
 """Difference of interpolation times that is an error of rounding, us: half of the unit of a session."""
 
+TIMERS = {
+    od.INHIBIT_TIME: ("inhibit time", 0.1, "a TPDO that follows the one before sooner may be lost"),
+    od.EVENT_TIMER: ("event timer", 1.0, "it may send TPDOs that answer no SYNC"),
+}
+"""Name, unit in ms and effect on TPDOs that answer SYNC, by sub-index of their communication parameters."""
+
 
 def map_drive(sdo: DriveSdo, session: SessionConfig) -> None:
     """Write the session's TPDOs and the RPDO of its set points to a pre-operational drive, and read them back.
 
     A PDO that is right already is not written; other TPDOs are disabled. A ConfigError names the refused object.
+    Inhibit time and event timer of the TPDOs become 0; a drive that keeps them is reported by a remark.
     """
     node = sdo.drive.node_id
     streams = {s.tpdo: (name, s) for name, s in session.streams.items()}
@@ -81,7 +90,8 @@ def _map_pdo(sdo: DriveSdo, communication: int, mapping: int, cob: int, entries:
     before = sdo.read(communication, 1, "I")
     mapped = read_mapping(sdo, mapping)
     right = mapped == entries and not (before ^ cob) & ~od.NO_RTR
-    if right and sdo.read(communication, 2, "B") == every:
+    timers = _timers(sdo, communication) if communication >= od.TPDO_COMMUNICATION else {}
+    if right and not timers and sdo.read(communication, 2, "B") == every:
         return
     cob |= before & od.NO_RTR
     try:
@@ -96,9 +106,34 @@ def _map_pdo(sdo: DriveSdo, communication: int, mapping: int, cob: int, entries:
             raise SdoRefusedError(f"{error}; {_difference(mapping, mapped, entries)}", error.code) from error
         # The COB-ID is read-only, and right.
         sdo.write(communication, 2, every, "B")
+        _clear_timers(sdo, communication, timers)
         return
     sdo.write(communication, 2, every, "B")
+    _clear_timers(sdo, communication, timers)
     _write_cob(sdo, communication, cob)
+
+
+def _timers(sdo: DriveSdo, communication: int) -> dict[int, int]:
+    """Return inhibit time and event timer of a TPDO by sub-index, as far as the drive has them and they are not 0."""
+    found = {}
+    for sub in TIMERS:
+        # Some drives do not refuse a sub-index that they lack by the code for that.
+        with suppress(SdoRefusedError):
+            found[sub] = sdo.read(communication, sub, "H")
+    return {sub: value for sub, value in found.items() if value}
+
+
+def _clear_timers(sdo: DriveSdo, communication: int, timers: dict[int, int]) -> None:
+    """Write 0 to timers of a disabled TPDO, which delay or add frames, and say what was found."""
+    for sub, value in timers.items():
+        name, unit_ms, effect = TIMERS[sub]
+        what = f"{name} of {value * unit_ms:g} ms in TPDO{communication - od.TPDO_COMMUNICATION + 1}"
+        try:
+            left = sdo.write_rounded(communication, sub, 0, "H")
+            reason = f"object {communication:04X}h:{sub} reads {left:X}h after writing 0h"
+        except SdoRefusedError as error:
+            left, reason = value, str(error)
+        sdo.remark(f"keeps an {what}: {reason}; {effect}" if left else f"had an {what}: 0 is written")
 
 
 def _write_cob(sdo: DriveSdo, communication: int, cob: int) -> None:

@@ -11,7 +11,15 @@ from armident.identify.documents.diagnosis import Finding, Gap, Unexplained
 from armident.identify.identification.from_recording import MIN_PIECE_S
 from armident.identify.setup.calibration import NAMED
 from armident.identify.setup.check import check_setup
-from armident.identify.setup.result import CONVENTIONS, WIRED, SetupCheck, SetupFinding, Span, with_torque_shift
+from armident.identify.setup.result import (
+    ABOUT_URDF,
+    CONVENTIONS,
+    WIRED,
+    SetupCheck,
+    SetupFinding,
+    Span,
+    with_torque_shift,
+)
 from armident.identify.signals.experiments import Experiment
 
 EACH = {"position_sign": "sign_error", "torque_sign": "sign_error", "time_shift": "time_delay", "change_in_time": ""}
@@ -25,6 +33,7 @@ REMARKS = (
     "position_held",
     "position_resolution",
     "unusual_weight",
+    *ABOUT_URDF,
 )
 """Kinds of finding that become warnings: they limit the recordings and are no mistake of the model."""
 

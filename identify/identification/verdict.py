@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from armident.identify.estimators.reason import LEVELS, Kind, Level, Reason
-from armident.identify.setup.result import SetupCheck, SetupFinding
+from armident.identify.setup.result import ABOUT_URDF, SetupCheck, SetupFinding
 
 AT_REST = ("standstill", "joint_at_rest")
 """Findings of the set-up that are a matter of the excitation."""
@@ -64,7 +64,7 @@ def _merged(reasons: Sequence[Reason], setup: SetupCheck | None) -> list[Reason]
 
 
 def _setup_reasons(findings: Sequence[SetupFinding]) -> list[Reason]:
-    """Return a reason for every finding of the set-up."""
+    """Return a reason for every finding of the set-up that concerns the result."""
     return [
         Reason(
             "unusable" if finding.decisive else "doubtful",
@@ -74,6 +74,7 @@ def _setup_reasons(findings: Sequence[SetupFinding]) -> list[Reason]:
             "setup",
         )
         for finding in findings
+        if finding.kind not in ABOUT_URDF
     ]
 
 

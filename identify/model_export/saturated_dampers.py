@@ -106,7 +106,8 @@ def _law(model: ExportedModel, joints: tuple[int, ...], coulomb: float, text: st
     def law(v: Floats) -> Floats:
         sign = model.arm.smooth_sign(v, joints)
         rows = zip(v, sign, strict=True)
-        return coulomb * sign + np.array([evaluate(text or "0.0", {"dq": {k: x}, "sign": {k: s}}) for x, s in rows])
+        more = [evaluate(text or "0.0", {"dq": {k: x}, "sign": {k: s}}) for x, s in rows]
+        return np.asarray(coulomb * sign + np.array(more), dtype=np.float64)
 
     return law
 

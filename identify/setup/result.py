@@ -34,6 +34,10 @@ WIRED = ("position_sign", "torque_sign", "joint_order")
 """Kinds of findings that exchange or turn signals: every joint concerned is explained better by a right one."""
 
 
+ABOUT_URDF = ("urdf_centres", "urdf_masses")
+"""Kinds of findings about masses of the URDF, which no identification uses."""
+
+
 @dataclass(frozen=True)
 class SetupFinding:
     """One mistake of the set-up.
@@ -42,7 +46,8 @@ class SetupFinding:
     ``gear_ratio``, ``side``, ``gravity_direction``, ``gravity_missing``, ``time_shift``, ``torque_clipped``,
     ``rate_too_slow``, ``standstill``, ``joint_at_rest``, ``one_direction``, ``position_step``, ``position_resolution``,
     ``torque_held``, ``position_held``, ``position_offset``, ``torque_too_small``, ``torque_without_sign``,
-    ``unusual_weight`` or ``change_in_time``. ``probability``: that it is right. ``remedy``: correcting configuration
+    ``unusual_weight``, ``urdf_centres``, ``urdf_masses`` or ``change_in_time``.
+    ``probability``: that it is right. ``remedy``: correcting configuration
     line or option, or the next step. ``decisive``: results are unusable without it. ``correction``: the remedy is
     certain enough to be copied; False for the best of what was tried.
     """

@@ -42,6 +42,8 @@ SAID: dict[str, str | None] = {
     "bit30_kept": None,
     "bit30_demanded": None,
     "pdo_fixed": "is stopped by SDO, not by RPDO2",
+    "tpdo_timers": "had an inhibit time of 50 ms in TPDO1: 0 is written",
+    "no_inhibit_time": None,
     "write_late": None,
     "mode_when_enabled": None,
     "mode_unknown": None,
@@ -215,4 +217,4 @@ def test_sync_without_a_counter_needs_no_odd_drive(vcan_bus: str, tmp_path: Path
 
 
 def test_every_oddity_has_its_test() -> None:
-    assert set(SAID) | {"emcy_burst", "pdo_fixed_other", "cob_fixed"} == set(ODDITIES)
+    assert set(SAID) | {"emcy_burst", "pdo_fixed_other", "cob_fixed", "tpdo_timers_fixed"} == set(ODDITIES)

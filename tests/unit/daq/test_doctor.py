@@ -11,9 +11,11 @@ import pytest
 import yaml
 from typer.testing import CliRunner
 
+from armident.configs import load_robot
+from armident.configs.implausible import implausible_values
 from armident.configs.loading import HERE
 from armident.daq.cli import application
-from armident.daq.doctor import Check, run_checks
+from armident.daq.doctor import Check, checks_for, run_checks
 from armident.daq.identity.plant import enrol, make_authority
 from armident.systemd import Notifier
 from tests.integration.test_capture_vcan import session_file
@@ -154,6 +156,86 @@ def test_a_running_capture_is_detected(tmp_path: Path) -> None:
     port = int(checks_of(path)["zenoh"].message.rsplit(" ", 1)[1])
     with socket.create_server(("127.0.0.1", port)):
         assert checks_of(path)["zenoh"].verdict == "warning"
+
+
+def test_ports_in_use_are_found(tmp_path: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        checks = checks_of(cell(tmp_path, zenoh={"listen": [f"tcp/127.0.0.1:{port}"]}, metrics={"port": port}))
+    assert checks["zenoh"].verdict == "warning"
+    assert checks["zenoh"].message.startswith(f"127.0.0.1:{port}: Address already in use; ")
+    # A capture does not start without its metrics.
+    assert checks["metrics"].verdict == "failed"
+    assert checks["metrics"].message.startswith(f"127.0.0.1:{port}: Address already in use; ")
+    free = checks_of(cell(tmp_path, zenoh={"listen": [f"tcp/127.0.0.1:{port}"]}, metrics={"port": port}))
+    assert free["zenoh"].verdict == "ok"
+    assert "metrics" not in free
+
+
+def implausible(folder: Path, place: str, value: Any, name: str = "tx40") -> list[str]:
+    """Warnings about the robot of a session with another value at a place such as ``joints.2.drive``."""
+    data = yaml.safe_load((HERE / "robots" / f"{name}.yaml").read_text())
+    keys = [int(key) if key.isdecimal() else key for key in place.split(".")]
+    within = data
+    for key in keys[:-1]:
+        within = within[key]
+    within[keys[-1]] = value
+    (folder / "robot.yaml").write_text(yaml.safe_dump(data))
+    config = cell(folder, robot="robot.yaml") if name == "tx40" else folder / "robot.yaml"
+    checks = run_checks(config) if name == "tx40" else checks_for(config, "identify")
+    assert checks[0].verdict == "ok"
+    found = [check for check in checks if check.name == "robot"]
+    assert {check.verdict for check in found} <= {"warning"}
+    return [check.message for check in found]
+
+
+@pytest.mark.parametrize(
+    ("place", "value", "said"),
+    [
+        ("gravity", [0.0, 0.0, -1.0], "gravity: [0.0, 0.0, -1.0] has a size of 1 m/s^2; on Earth this direction is"),
+        ("gravity", [0.0, -98.1, 0.0], "[0.0, -9.81, 0.0]"),
+        ("transmission.2.2", 0.0125, "transmission[2]: the motor of joint_3 turns 0.0125 times per turn of the joint"),
+        ("transmission.2.2", 0.0125, "a reducer of 80 to 1 has 80"),
+        ("joints.0.limits.velocity", 3000.0, "as 1/min of the motor it is 9.817 rad/s at the joint"),
+        ("joints.0.limits.velocity", 180.0, "as degrees/s it is 3.142 rad/s"),
+        ("joints.1.drive.counts_per_unit", 17, "17 counts per turn of the motor; as bits of the encoder it is 131072"),
+        ("joints.1.drive.counts_per_unit", 2**33, "32 bits (6064h) hold less than one turn"),
+        ("joints.1.drive.rated", 2500.0, "joints[1].drive.rated: 2500 A; as mA it is 2.5 A"),
+        ("joints.1.drive.gain", 400.0, "give joint_2 a rated torque of 3.2e+04, its limit is 110"),
+        ("joints.1.drive.gain", 0.0, "every torque would be 0"),
+    ],
+)
+def test_values_that_no_arm_has_are_warnings(tmp_path: Path, place: str, value: Any, said: str) -> None:
+    messages = implausible(tmp_path, place, value)
+    assert any(said in message for message in messages), messages
+    assert all(message.startswith((place.split(".", 1)[0], "joints[")) for message in messages)
+
+
+@pytest.mark.parametrize(
+    ("place", "value", "said"),
+    [
+        ("joints.0.limits.velocity", 500.0, ["joints[0].limits.velocity: 500 m/s; as mm/s it is 0.5 m/s"]),
+        ("joints.0.drive.counts_per_unit", 200.0, ["joints[0].drive.counts_per_unit: 200 counts per m; "]),
+        ("joints.0.drive.rated", 10_000.0, ["joints[0].drive.rated: 10000 V; as mV it is 10 V"]),
+    ],
+)
+def test_values_that_no_linear_axis_has_are_warnings(tmp_path: Path, place: str, value: float, said: list[str]) -> None:
+    messages = implausible(tmp_path, place, value, "emps")
+    assert [message[: len(text)] for message, text in zip(messages, said, strict=True)] == said
+
+
+def test_positions_in_degrees_fail(tmp_path: Path) -> None:
+    data = yaml.safe_load((HERE / "robots" / "tx40.yaml").read_text())
+    data["joints"][0]["limits"]["position"] = [-180, 180]
+    (tmp_path / "robot.yaml").write_text(yaml.safe_dump(data))
+    check = checks_of(cell(tmp_path, robot="robot.yaml"))["configuration"]
+    assert check.verdict == "failed"
+    assert "looks like degrees (in rad: [-3.142, 3.142])" in check.message
+
+
+@pytest.mark.parametrize("path", sorted((HERE / "robots").glob("*.yaml")), ids=lambda path: path.stem)
+def test_shipped_robots_are_plausible(path: Path) -> None:
+    assert list(implausible_values(load_robot(path))) == []
 
 
 def test_the_exit_code_is_2_if_a_capture_would_not_run(tmp_path: Path) -> None:

@@ -1,15 +1,18 @@
 """Import and export: numbers survive the round trip, and every error has one clear line."""
 
+import csv
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from pyarrow import parquet
 
-from armident.configs import ConfigError, DataError, load_robot
+from armident.configs import ConfigError, DataError, RobotConfig, load_robot
 from armident.daq.interchange.exporting import export_recording, exported_columns
 from armident.daq.interchange.importing import import_recording
-from armident.daq.recording import Recording, read_recording, write_recording
+from armident.daq.recording import Field, Recording, Stream, read_recording, write_recording
+from armident.daq.recording.model import Quantity
 
 TX40 = load_robot("tx40.yaml")
 HEADER = ",".join(["t", *(f"q{j}" for j in range(1, 7)), *(f"tau{j}" for j in range(1, 7))])
@@ -41,6 +44,79 @@ def test_export_and_import_are_inverse(tmp_path: Path, kind: str) -> None:
     export_recording(recording, tmp_path / f"b.{kind}")
     again = import_recording(tmp_path / f"b.{kind}", TX40)
     assert again.sha256 == recording.sha256
+
+
+ARM = TX40.model_copy(
+    update={
+        "joints": tuple(
+            joint.model_copy(update={"name": f"axis_{k}", "source_name": name, "type": kind})
+            for joint, k, name, kind in zip(
+                TX40.joints[:2], (1, 2), ('rail, "x"', "Schwenk-Achse"), ("prismatic", "revolute"), strict=True
+            )
+        ),
+        "transmission": None,
+        "couplings": (),
+        "initial_parameters": {},
+    }
+)
+TITLES = {
+    "t": "s since 2026-03-25T10:00:00.123456789Z",
+    'rail, "x"/position': "m",
+    "Schwenk-Achse/position": "rad",
+    'rail, "x"/torque': "N",
+    "Schwenk-Achse/torque": "N m",
+    'rail, "x"/demand': "m",
+    "Schwenk-Achse/demand": "rad",
+}
+
+
+def stamped(robot: RobotConfig, start_ns: int) -> Recording:
+    """Two joints with a demand, whose first sample is that of SYNC 3; ``start_ns``: stamp of SYNC 0."""
+    rng = np.random.default_rng(1)
+    sync = np.arange(3, 53)
+    q = 0.1 * np.sin(0.02 * sync[:, None] + np.arange(2))
+    values: dict[Quantity, np.ndarray] = {"position": q, "torque": rng.uniform(-5, 5, (50, 2)), "demand": q + 1e-3}
+    fields = {name: Field(name, name, "", "joint", (1.0, 1.0)) for name in values}
+    stream = Stream("samples", 1, sync, start_ns + sync * 1_000_000, dict(fields), dict(values))
+    return Recording(None, robot, None, 1000.0, {"samples": stream})
+
+
+@pytest.mark.parametrize("kind", ["csv", "parquet"])
+def test_tables_have_joints_units_and_dates_that_an_import_reads(tmp_path: Path, kind: str) -> None:
+    start_ns = 1_774_432_800_123_456_789
+    recording = stamped(ARM, start_ns)
+    path = tmp_path / f"a.{kind}"
+    export_recording(recording, path)
+    if kind == "csv":
+        with path.open(newline="") as file:
+            assert next(csv.reader(file)) == [f"{name} [{unit}]" for name, unit in TITLES.items()]
+    else:
+        schema = parquet.read_schema(path)
+        assert {each.name: each.metadata[b"unit"].decode() for each in schema} == TITLES
+        about = {b"robot": b"tx40", b"sample_rate_hz": b"1000", b"utc": b"2026-03-25T10:00:00.123456789Z"}
+        assert about.items() <= schema.metadata.items()
+    # The joints in the other order: names decide, not places.
+    turned = ARM.model_copy(update={"joints": ARM.joints[::-1]})
+    for robot, order in ((ARM, [0, 1]), (turned, [1, 0])):
+        again = import_recording(path, robot)
+        for name in ("position", "torque", "demand"):
+            assert np.array_equal(again.samples.raw[name], recording.samples.raw[name][:, order])
+        assert again.samples.t_ns[0] == start_ns + 3_000_000
+        assert np.abs(again.samples.t_ns - recording.samples.t_ns).max() <= 1
+        assert "source_remarks" not in again.metadata
+
+
+def test_names_that_an_import_takes_for_other_columns_are_numbers(tmp_path: Path) -> None:
+    """Joints called ``reference`` and ``torque_joint``, in a recording whose stamps are those of no clock."""
+    joints = zip(ARM.joints, ("reference", "torque_joint"), strict=True)
+    update = {"joints": tuple(joint.model_copy(update={"source_name": name}) for joint, name in joints)}
+    recording = stamped(ARM.model_copy(update=update), 0)
+    export_recording(recording, tmp_path / "a.csv")
+    header = (tmp_path / "a.csv").read_text().splitlines()[0]
+    assert header == "t [s],q1 [m],q2 [rad],tau1 [N],tau2 [N m],qr1 [m],qr2 [rad]"
+    again = import_recording(tmp_path / "a.csv", recording.robot)
+    assert np.array_equal(again.samples.raw["demand"], recording.samples.raw["demand"])
+    assert again.samples.t_ns[0] == 0
 
 
 def test_export_converts_the_coupled_wrist_to_the_joints(tmp_path: Path) -> None:

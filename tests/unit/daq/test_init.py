@@ -82,6 +82,9 @@ def table(path: Path, *, rate: float = 500.0, unit: float = 1.0, time: float = 1
 @pytest.mark.nightly
 def test_urdf_and_csv_become_a_model_without_an_edit(tmp_path: Path, arm: Path) -> None:
     recorded = arms.recording("tx40", "tx40_excitation", 1, period=arms.FAST)
+    named = zip(recorded.robot.joints, AXES, strict=True)
+    joints = tuple(joint.model_copy(update={"source_name": axis}) for joint, axis in named)
+    recorded = replace(recorded, robot=recorded.robot.model_copy(update={"joints": joints}))
     export_recording(recorded, tmp_path / "data.csv")
     made = run("init", str(arm), "--recording", str(tmp_path / "data.csv"), "--out", str(tmp_path / "cell"))
     assert made.exit_code == 0, made.output

@@ -16,7 +16,7 @@ from armident.drivers.canopen import objects as od
 from armident.drivers.canopen.cia402_enable import enable_drive, hold_position
 from armident.drivers.canopen.drive_setup import await_mode, check_drive, set_heartbeat, set_sync_counter
 from armident.drivers.canopen.pdo_mapping import map_drive, mapping_differs
-from armident.drivers.canopen.sdo import DriveSdo
+from armident.drivers.canopen.sdo import DriveSdo, SdoRefusedError
 from armident.drivers.canopen.sdo_client import SdoNode
 from armident.virtual_robot.arm import Arm
 from armident.virtual_robot.inertias import rest_posture
@@ -35,6 +35,17 @@ CONFIGURED = {
     ],
     "bit30_kept": [],
     "bit30_demanded": [],
+    "tpdo_timers": [
+        f"had an {timer} in TPDO{k}: 0 is written"
+        for k in (1, 2)
+        for timer in ("inhibit time of 50 ms", "event timer of 100 ms")
+    ],
+    "tpdo_timers_fixed": [
+        f"keeps an inhibit time of 50 ms in TPDO{k + 1}: node 3 (joint_3): refuses object 180{k}h:3 = 0h: attempt to "
+        "write a read only object (SDO abort 06010002h); a TPDO that follows the one before sooner may be lost"
+        for k in (0, 1)
+    ],
+    "no_inhibit_time": [],
     "write_late": [],
     "mode_when_enabled": [],
     "target_follows": [],
@@ -129,6 +140,18 @@ def test_a_mapping_that_is_right_is_not_written_again(robot: RobotConfig, sessio
         drive.add_write_callback(lambda index, **_: written.append(index))
         map_drive(sdo, session)
         assert [index for index in written if index != od.INTERPOLATION_PERIOD] == []
+
+
+def test_an_inhibit_time_is_refused_while_its_tpdo_is_valid(robot: RobotConfig, session: SessionConfig) -> None:
+    with odd_drive(robot, session) as (drive, sdo, _):
+        map_drive(sdo, session)
+        with pytest.raises(SdoRefusedError, match="08000022h"):
+            sdo.write(od.TPDO_COMMUNICATION, od.INHIBIT_TIME, 7, "H")
+        # Set inside the drive, it is found and cleared although the mapping is right.
+        drive.preset(od.TPDO_COMMUNICATION, od.INHIBIT_TIME, 7)
+        map_drive(sdo, session)
+        assert sdo.read(od.TPDO_COMMUNICATION, od.INHIBIT_TIME, "H") == 0
+        assert mapping_differs(sdo, session) is None
 
 
 def test_a_drive_in_another_mode_is_refused(
