@@ -25,7 +25,7 @@ Floats = NDArray[np.float64]
 
 PULSES_FILE = "DATA_EMPS_PULSES.mat"
 WHERE = (
-    "get DATA_EMPS.mat and DATA_EMPS_PULSES.mat from nonlinearbenchmark.org (Janot, Gautier, Brunot 2019), put them into "
+    "get DATA_EMPS.mat and DATA_EMPS_PULSES.mat from nonlinearbenchmark.org (Janot, Gautier, Brunot 2019), put them in "
     "FOLDER/emps and repeat with --data FOLDER"
 )
 KP, KV, LIMIT_V = 160.18, 243.45, 10.0
@@ -186,7 +186,15 @@ def closed_loop_error_pct(values: Mapping[str, float], axis: Axis) -> float:
 
 def level_on(values: Mapping[str, float], axis: Axis) -> dict[str, float]:
     """Return the model with its friction multiplied by the one factor that suits a recording best."""
-    friction = ("viscous_up", "viscous_down", "coulomb_up", "coulomb_down", "curvature_up", "curvature_down", "stribeck")
+    friction = (
+        "viscous_up",
+        "viscous_down",
+        "coulomb_up",
+        "coulomb_down",
+        "curvature_up",
+        "curvature_down",
+        "stribeck",
+    )
 
     def at(level: float) -> dict[str, float]:
         return {name: value * (level if name in friction else 1.0) for name, value in values.items()}
@@ -212,7 +220,9 @@ def load(folder: Path, name: str) -> Axis:
 def report(folder: Path) -> str:
     """Return the tables of the exam. Raises ConfigError if a recording is missing."""
     training, held = load(folder, EMPS_FILE), load(folder, PULSES_FILE)
-    cycles = [training.part(slice(int(rows[0]), int(rows[-1]) + 1)) for rows in np.array_split(range(training.q.size), CYCLES)]
+    cycles = [
+        training.part(slice(int(rows[0]), int(rows[-1]) + 1)) for rows in np.array_split(range(training.q.size), CYCLES)
+    ]
     start, candidates = chosen(cycles)
     plain, model = fitted(PUBLISHED, [training]), fitted(start, [training])
     level = level_on(model, held)
@@ -224,7 +234,10 @@ def report(folder: Path) -> str:
         ("published parameters of IDIM-LS, asymmetric friction", PUBLISHED),
         ("asymmetric friction, output error", plain),
         ("chosen on left-out cycles, output error", model),
-        (f"no result: friction of the last line times {level['viscous_up'] / model['viscous_up']:.3f}, of PULSES", level),
+        (
+            f"no result: friction of the last line times {level['viscous_up'] / model['viscous_up']:.3f}, of PULSES",
+            level,
+        ),
     ):
         rows.append([
             title, f"{rmse_mm(values, training):.2f}", f"{rmse_mm(values, held):.2f}",
