@@ -10,8 +10,8 @@ time of the files. Case 4 was recorded by a program whose clock ran twice as fas
 """
 
 from collections.abc import Mapping, Sequence
-from itertools import product
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 
 import numpy as np
