@@ -97,7 +97,8 @@ class Audit:
 
     def add(self, cell: Cell, listener: Listener, plant: WeekPlant, history: str) -> None:
         """Audit the files of a cell, their results, announcements, signatures, and entries in the history."""
-        entries = Ledger(cell.results / FILE, "witness").entries()
+        ledger = Ledger(cell.results / FILE, "witness")
+        entries = ledger.entries()
         results: Counter[str] = Counter()
         for path in cell.results.glob("*.identification/identification.json"):
             content = read_json(path)
@@ -109,9 +110,7 @@ class Audit:
             self.figures["documents"] += 1
             if signer != f"worker.{cell.name}":
                 self.wrong.append(f"{path.parent.name}: {signer}")
-        of_files = {
-            key for fed in [*cell.fed, *_captures(cell)] for key in self._file(cell.name, fed, entries, results)
-        }
+        of_files = {key for fed in [*cell.fed, *_captures(cell)] for key in self._file(cell.name, fed, ledger, results)}
         self.wrong += [f"{cell.name}: {entry.name} is of no file" for entry in entries if entry.sha256 not in of_files]
         self._announcements(cell.name, entries, listener)
         done = Counter(entry.sha256 for entry in entries if entry.state == "done")
@@ -141,15 +140,17 @@ class Audit:
         if memory_then > 1.2 * memory + 20 or files_then > files + 8:
             self.wrong.append(f"{name}: {text}")
 
-    def _file(self, cell: str, fed: Fed, entries: list[LedgerEntry], results: Counter[str]) -> list[str]:
+    def _file(self, cell: str, fed: Fed, ledger: Ledger, results: Counter[str]) -> list[str]:
         """Find the one result or the one reason of a file, by its content, or by its name if that was never read.
 
-        Returns the keys of its entries.
+        Captures of an arm at rest may have the same samples. Returns the keys of its entries.
         """
-        path = fed.path.resolve()
+        path, entries = fed.path.resolve(), ledger.entries()
         found = [entry for entry in entries if fed.sha256 and entry.digest == fed.sha256] or [
             entry for entry in entries if path in _paths(entry) and not (fed.sha256 and entry.digest)
         ]
+        if not found and fed.kind == "capture" and fed.path in ledger.files():
+            found = [entry for entry in entries if entry.sha256 == ledger.key_of(fed.path)]
         self.figures["files"] += 1
         if not found and fed.withdrawn:
             self.figures["deleted or replaced before they were read"] += 1

@@ -227,7 +227,10 @@ def test_a_file_that_is_replaced_before_it_is_identified_has_one_result_with_the
     assert load_document(written, IdentificationDocument).recording.sha256 == second.sha256
 
 
-def test_copies_of_a_recording_have_one_result(session: SessionConfig, tmp_path: Path) -> None:
+def test_copies_of_a_recording_have_one_result(
+    session: SessionConfig, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO)
     made = recorded(session, "a", 1)
     for name in "bc":
         shutil.copy(tmp_path / "emps-a.mcap", tmp_path / f"emps-{name}.mcap")
@@ -236,6 +239,7 @@ def test_copies_of_a_recording_have_one_result(session: SessionConfig, tmp_path:
         assert worker.result(6.0) is None
         assert audience.results == {made.sha256: 1}
     assert len(entries(tmp_path)) == 1
+    assert len([line for line in caplog.messages if "its samples are those of emps-" in line]) == 2
 
 
 def test_a_file_that_is_being_copied_is_identified_when_it_is_complete(

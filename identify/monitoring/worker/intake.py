@@ -131,6 +131,8 @@ class Intake:
         digest = recording.sha256
         _compare(entry.paths[0], self._streamed.pop(entry.sha256, digest), digest)
         if not ledger.settle(entry, digest):
+            if (known := ledger.entry(digest)) is not None:
+                log.info("%s: its samples are those of %s, and so is its result", entry.name, known.name)
             return None
         settled = ledger.entry(digest)
         assert settled is not None
