@@ -136,7 +136,7 @@ def calibrated(
     for j, (label, joint) in enumerate(zip(labels, robot.joints, strict=True)):
         name = next((each for each in (label.split("/")[0], joint.source_name, joint.name) if each in motors), None)
         entry = motors.get(name)
-        ends = [entry.get(end) for end in ("range_min", "range_max")] if isinstance(entry, dict) else []
+        ends: list[Any] = [entry.get(end) for end in ("range_min", "range_max")] if isinstance(entry, dict) else []
         if len(ends) != 2 or not all(isinstance(end, int) and abs(end) < _MOST for end in ends) or ends[0] >= ends[1]:
             raise ConfigError(f"{file}: no range_min below range_max of {joint.name}; found {listed(list(motors))}")
         gripper = name == "gripper"
