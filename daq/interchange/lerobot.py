@@ -136,9 +136,8 @@ def calibrated(
     for j, (label, joint) in enumerate(zip(labels, robot.joints, strict=True)):
         name = next((each for each in (label.split("/")[0], joint.source_name, joint.name) if each in motors), None)
         entry = motors.get(name)
-        found = [entry.get(end) for end in ("range_min", "range_max")] if isinstance(entry, dict) else []
-        ends = [end for end in found if isinstance(end, int) and abs(end) < _MOST]
-        if len(ends) != 2 or ends[0] >= ends[1]:
+        ends: list[Any] = [entry.get(end) for end in ("range_min", "range_max")] if isinstance(entry, dict) else []
+        if len(ends) != 2 or not all(isinstance(end, int) and abs(end) < _MOST for end in ends) or ends[0] >= ends[1]:
             raise ConfigError(f"{file}: no range_min below range_max of {joint.name}; found {listed(list(motors))}")
         gripper = name == "gripper"
         factors[j] = (ends[1] - ends[0]) / (FULL if gripper else 2 * FULL) * 2 * np.pi / _COUNTS
