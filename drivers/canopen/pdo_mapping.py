@@ -1,11 +1,11 @@
 """PDO mapping of one drive over SDO: the TPDOs of the streams, and the RPDOs of set points and stop."""
 
-from contextlib import suppress
+import logging
 
 from armident.configs.errors import ConfigError
 from armident.configs.schema.session import SessionConfig
 from armident.drivers.canopen import objects as od
-from armident.drivers.canopen.sdo import DriveSdo, SdoRefusedError
+from armident.drivers.canopen.sdo import DriveSdo, NoAnswerError, SdoRefusedError
 
 ROUNDING_US = 0.5
 """Difference of interpolation times that is an error of rounding, us: half of the unit of a session."""
@@ -15,6 +15,8 @@ TIMERS = {
     od.EVENT_TIMER: ("event timer", 1.0, "it may send TPDOs that answer no SYNC"),
 }
 """Name, unit in ms and effect on TPDOs that answer SYNC, by sub-index of their communication parameters."""
+
+log = logging.getLogger(__name__)
 
 
 def map_drive(sdo: DriveSdo, session: SessionConfig) -> None:
@@ -117,9 +119,13 @@ def _timers(sdo: DriveSdo, communication: int) -> dict[int, int]:
     """Return inhibit time and event timer of a TPDO by sub-index, as far as the drive has them and they are not 0."""
     found = {}
     for sub in TIMERS:
-        # Some drives do not refuse a sub-index that they lack by the code for that.
-        with suppress(SdoRefusedError):
+        try:
             found[sub] = sdo.read(communication, sub, "H")
+        except NoAnswerError:
+            raise
+        except ConfigError as error:
+            # Some drives refuse a sub-index that they lack by another code, or give it another size.
+            log.debug("%s", error)
     return {sub: value for sub, value in found.items() if value}
 
 

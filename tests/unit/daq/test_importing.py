@@ -76,8 +76,9 @@ def stamped(robot: RobotConfig, start_ns: int) -> Recording:
     sync = np.arange(3, 53)
     q = 0.1 * np.sin(0.02 * sync[:, None] + np.arange(2))
     values: dict[Quantity, np.ndarray] = {"position": q, "torque": rng.uniform(-5, 5, (50, 2)), "demand": q + 1e-3}
-    fields = {name: Field(name, name, "", "joint", (1.0, 1.0)) for name in values}
-    stream = Stream("samples", 1, sync, start_ns + sync * 1_000_000, dict(fields), dict(values))
+    fields = {str(name): Field(name, name, "", "joint", (1.0, 1.0)) for name in values}
+    raw = {str(name): array for name, array in values.items()}
+    stream = Stream("samples", 1, sync, start_ns + sync * 1_000_000, fields, raw)
     return Recording(None, robot, None, 1000.0, {"samples": stream})
 
 
