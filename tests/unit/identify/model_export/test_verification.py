@@ -1,6 +1,7 @@
 """Figures of exported files: the program that reads a file computes the torques of the identified model."""
 
 import csv
+import shutil
 import sys
 from pathlib import Path
 
@@ -10,7 +11,6 @@ from numpy.typing import NDArray
 
 from armident.configs import ConfigError, load_robot
 from armident.identify.effects.terms import arm_model
-from armident.identify.model_export import fmu_writer
 from armident.identify.model_export.exported_model import ExportedModel
 from armident.identify.model_export.formats import export_model
 from armident.identify.model_export.saturated_dampers import TOLERANCE, saturated_dampers
@@ -103,7 +103,7 @@ def test_a_missing_program_is_named(emps: ExportedModel, tmp_path: Path, monkeyp
     monkeypatch.setitem(sys.modules, "mujoco", None)
     _, sheet = export_model(emps, "mjcf", tmp_path, motion_of(emps))
     assert "not measured: mujoco is not installed" in (tmp_path / "emps_mjcf_limits.md").read_text()
-    monkeypatch.setattr(fmu_writer.shutil, "which", lambda name: None)
+    monkeypatch.setattr(shutil, "which", lambda name: None)
     _, sheet = export_model(emps, "c", tmp_path, motion_of(emps))
     assert sheet.measured is not None
     assert sheet.measured.lines() == ["not measured: needs a C compiler: install gcc"]
