@@ -48,7 +48,7 @@ def write_mjcf(model: ExportedModel, out: Path) -> tuple[list[Path], LimitationS
     model, parts = with_rigid_effects(model)
     root = ET.Element("mujoco", model=model.robot.name)
     ET.SubElement(root, "compiler", angle="radian", autolimits="true", inertiafromgeom="false")
-    ET.SubElement(root, "option", {"gravity": numbers(model.frames.gravity), **OPTIONS})
+    ET.SubElement(root, "option", {**OPTIONS, "gravity": numbers(model.frames.gravity)})
     parent = ET.SubElement(ET.SubElement(root, "worldbody"), "body", name=model.frames.free_base)
     stiffness, hinges = springs(model), second_hinges(model)
     own = {name: [getattr(joint, name) for joint in model.joints] for name in ("rotor_inertia", "viscous")}

@@ -106,8 +106,9 @@ def _law(model: ExportedModel, joints: tuple[int, ...], coulomb: float, text: st
     def law(v: Floats) -> Floats:
         sign = model.arm.smooth_sign(v, joints)
         rows = zip(v, sign, strict=True)
-        more = [evaluate(text or "0.0", {"dq": {k: x}, "sign": {k: s}}) for x, s in rows]
-        return np.asarray(coulomb * sign + np.array(more), dtype=np.float64)
+        further = [evaluate(text, {"dq": {k: x}, "sign": {k: s}}) if text else 0.0 for x, s in rows]
+        torque: Floats = coulomb * sign + np.array(further)
+        return torque
 
     return law
 
