@@ -34,6 +34,10 @@ KP, KV, LIMIT_V = 160.18, 243.45, 10.0
 NETWORKS_MM, ASYMMETRIC_MM, CLOSED_LOOP_PCT = "74 to 220", "3.76", "8.94"
 """Published: networks and a fit with asymmetric friction, open loop; error of the closed-loop force."""
 CYCLES = 4
+STEP = 1e-3
+"""Relative step of the derivatives: the error is not smooth in the parameters, because the axis stops and starts."""
+CLEAR = 2.0
+"""Standard errors by which an effect has to improve the left-out cycles."""
 SMOOTHING_HZ = 30.0
 """Cutoff of the velocity at which a left-out cycle starts."""
 
@@ -141,7 +145,7 @@ def fitted(start: Mapping[str, float], axes: Sequence[Axis]) -> dict[str, float]
     def residuals(x: Floats) -> Floats:
         return errors_mm(dict(zip(names, x * scale, strict=True)), axes)
 
-    found = least_squares(residuals, np.ones(scale.size), method="lm", ftol=1e-6, xtol=1e-6)
+    found = least_squares(residuals, np.ones(scale.size), method="lm", ftol=1e-6, xtol=1e-6, diff_step=STEP)
     return dict(zip(names, map(float, found.x * scale), strict=True))
 
 
@@ -157,23 +161,21 @@ def left_out(start: Mapping[str, float], cycles: Sequence[Axis]) -> Floats:
 def chosen(cycles: Sequence[Axis]) -> tuple[dict[str, float], list[list[str]]]:
     """Return the values from which the chosen model is fitted, and the rows of the candidates.
 
-    Forward selection: the best candidate is taken while its gain on left-out cycles exceeds one standard error.
+    Forward selection: of the candidates with a clear gain on the left-out cycles, the one with the largest is taken.
     """
     start, rest = dict(PUBLISHED), dict(EFFECTS)
     before = left_out(start, cycles)
     rows = [["asymmetric friction", f"{np.sqrt(before.mean()):.3f}", "", ""]]
     while rest:
         after = {name: left_out({**start, **values}, cycles) for name, values in rest.items()}
-        best = min(after, key=lambda name: float(after[name].mean()))
-        taken = False
+        gains = {name: before - errors for name, errors in after.items()}
+        deviations = {name: float(gain.std(ddof=1)) / np.sqrt(gain.size) for name, gain in gains.items()}
+        clear = [name for name, gain in gains.items() if gain.mean() > CLEAR * deviations[name]]
+        best = max(clear, key=lambda name: float(gains[name].mean()), default=None)
         for name, errors in after.items():
-            gain = before - errors
-            limit = gain.std(ddof=1) / np.sqrt(gain.size)
-            use = name == best and bool(gain.mean() > limit)
-            taken = taken or use
-            cells = (f"+ {name}", f"{np.sqrt(errors.mean()):.3f}", f"{gain.mean():.3f} ± {limit:.3f}")
-            rows.append([*cells, "taken" if use else ""])
-        if not taken:
+            change = f"{gains[name].mean():.3f} ± {deviations[name]:.3f}"
+            rows.append([f"+ {name}", f"{np.sqrt(errors.mean()):.3f}", change, "taken" if name == best else ""])
+        if best is None:
             break
         start |= rest.pop(best)
         before = after[best]
