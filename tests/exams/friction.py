@@ -1,15 +1,16 @@
 """Joint friction of a Franka arm: white-box models of two speeds on the third, beside published networks.
 
-Target of the recordings, by the program that made them: link-side torque of the robot's sensor, minus its own model of
+Target of the recordings, by the program that made them: torque of the robot's link-side sensor, minus its own model of
 gravity, minus the first such difference. So it contains friction behind the sensor, inertial and Coriolis torques, the
-error of the gravity model, and a zero that depends on the friction of the first moment. The published networks learn
-while the recording runs, from the torque that they predict; our parameters come from the other two speeds alone.
+error of the gravity model, and a zero that depends on the friction at the start. All of them are in the model here,
+only the law of friction is chosen, and the parameters come from the other two speeds. In the published program the
+networks learn while they run, from the torque that they predict.
 
 The published figures follow with a zero-phase Butterworth filter of order 4 at 1 Hz on target and prediction, in the
 time of the files. Case 4 was recorded by a program whose clock ran twice as fast.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
@@ -38,61 +39,104 @@ VELOCITY_HZ, ACCELERATION_HZ = 20.0, 3.0
 PRESLIDING_RAD = (1e-4, 1e-3, 3e-3)
 STRIBECK_RAD_S = (0.02, 0.08)
 """Trial values of the presliding distance and of the Stribeck velocity."""
-COULOMB_VISCOUS = ("coulomb", "viscous")
-STRUCTURES = (
-    COULOMB_VISCOUS,
-    (*COULOMB_VISCOUS, "stribeck"),
-    (*COULOMB_VISCOUS, "inertia"),
-    (*COULOMB_VISCOUS, "stribeck", "inertia"),
-    (*COULOMB_VISCOUS, "inertia", "sine", "cosine"),
-    (*COULOMB_VISCOUS, "stribeck", "inertia", "sine", "cosine"),
-)
-"""Candidates. ``sine``, ``cosine``: error of the gravity model over the joint's own angle."""
+PLANAR_CASE, AMPLITUDE_M, EASE_S = "case3", 0.07, 3.0
+"""Case whose program draws an eight in the vertical plane: its half width, and the duration of its smooth start."""
+FREQUENCY_HZ = {"slow": 0.04, "middle": 0.08, "high": 0.16}
+UPPER_ARM_M, FOREARM_M = (0.0825, 0.316), (-0.0825, 0.384)
+"""Next joint before and above the joint (DH parameters of the manufacturer)."""
+START_RAD = (-np.pi / 4, np.pi / 2)
+"""Tilts of upper arm and forearm at the start."""
+LATEST_S = 0.2
+"""Largest delay of the arm behind the program."""
 FIRST = 0.1
 """Part of the recording from which the second zero is taken; it is not judged there."""
 FOLLOWED_S = 1.0
-"""Time constant of the third zero."""
+"""Time constant of the fourth zero."""
 
 
 @dataclass(frozen=True)
 class Record:
-    """One recording (N,): angle rad, velocity rad/s, acceleration rad/s2, target N m; ``dt`` of its time stamps, s.
+    """One recording (N,): angle rad, velocity rad/s, target N m; ``dt`` of its time stamps, s.
 
-    ``period``: mean sampling period, s, with which the velocities are the derivative of the angles.
+    ``period``: mean sampling period, s, with which the velocities are the derivative of the angles. ``forearm``: its
+    tilt, rad, if the arm moves in its vertical plane.
     """
 
     q: Floats
     qd: Floats
-    qdd: Floats
     target: Floats
     dt: float
     period: float
+    forearm: Floats | None
 
     def judged(self, signal: Floats) -> Floats:
         """Return a signal after the filter of the published figures."""
         return butterworth(signal, self.dt, JUDGED_HZ, 4, 15)
 
+    def derivatives(self, angle: Floats) -> tuple[Floats, Floats]:
+        """Return velocity and acceleration of an angle."""
+        qd = central_difference(butterworth(angle, self.period, ACCELERATION_HZ), self.period)
+        return qd, central_difference(qd, self.period)
+
+    def rigid(self) -> Floats:
+        """Return the columns (N, terms) of inertia, Coriolis torques and error of the gravity model.
+
+        In the vertical plane, where the hand does not turn: of two links, with a coupling of two phases. Otherwise the
+        joint moves alone.
+        """
+        qd, qdd = self.derivatives(self.q)
+        if self.forearm is None:
+            return np.column_stack([qdd, np.sin(self.q), np.cos(self.q)])
+        forearm_qd, forearm_qdd = self.derivatives(self.forearm)
+        cosine, sine = np.cos(self.q - self.forearm), np.sin(self.q - self.forearm)
+        both, across = qdd + forearm_qdd, forearm_qd**2 - qd**2
+        return np.column_stack([
+            qdd, forearm_qdd, cosine * both + sine * across, sine * both - cosine * across,
+            np.sin(self.q), np.cos(self.q), np.sin(self.forearm), np.cos(self.forearm),
+        ])  # fmt: skip
+
 
 @dataclass(frozen=True)
 class Choice:
-    """Terms of a model, and the values of its nonlinear parameters."""
+    """Law of friction: distance over which dry friction reverses, rad, and Stribeck velocity, rad/s, or ``None``."""
 
-    terms: tuple[str, ...]
     presliding: float
-    stribeck: float
+    stribeck: float | None
 
-    def columns(self, record: Record) -> Floats:
+    def columns(self, record: Record, *, rigid: bool = True) -> Floats:
         """Return the regressor (N, terms), filtered as the target."""
-        dry = bristles(record.q, self.presliding)
-        every = {
-            "coulomb": dry,
-            "viscous": record.qd,
-            "stribeck": dry * np.exp(-((record.qd / self.stribeck) ** 2)),
-            "inertia": record.qdd,
-            "sine": np.sin(record.q),
-            "cosine": np.cos(record.q),
-        }
-        return record.judged(np.column_stack([every[term] for term in self.terms]))
+        dry = bristles(butterworth(record.q, record.period, VELOCITY_HZ), self.presliding)
+        columns = [dry, record.qd]
+        if self.stribeck is not None:
+            columns.append(dry * np.exp(-((record.qd / self.stribeck) ** 2)))
+        return record.judged(np.column_stack([*columns, record.rigid()] if rigid else columns))
+
+
+def tilts(x: Floats, z: Floats) -> tuple[Floats, Floats]:
+    """Return the tilts of upper arm and forearm, rad, with the wrist moved by ``x`` and ``z`` from the start, m."""
+    links = (UPPER_ARM_M, FOREARM_M)
+    (upper, own), (fore, offset) = ((np.hypot(*link), np.arctan2(*link)) for link in links)
+    for (ahead, above), tilt in zip(links, START_RAD, strict=True):
+        x = x + ahead * np.cos(tilt) + above * np.sin(tilt)
+        z = z - ahead * np.sin(tilt) + above * np.cos(tilt)
+    distance, direction = np.hypot(x, z), np.arctan2(x, z)
+    at_shoulder = np.arccos((upper**2 + distance**2 - fore**2) / (2 * upper * distance))
+    at_wrist = np.arccos((fore**2 + distance**2 - upper**2) / (2 * fore * distance))
+    return direction - at_shoulder - own, direction + at_wrist - offset
+
+
+def forearm_tilt(t: Floats, q: Floats, frequency_hz: float) -> Floats:
+    """Return the tilt of the forearm (N,) along the programmed eight, delayed as the recorded joint 2."""
+    clock = np.arange(0.0, t[-1], 1e-3)
+    eased = np.clip(clock / EASE_S, 0.0, 1.0)
+    ease = eased**3 * (eased * (6 * eased - 15) + 10)
+    rate = 2 * np.pi * frequency_hz
+    x = np.cumsum(AMPLITUDE_M * rate * np.cos(rate * clock) * ease) * 1e-3
+    z = np.cumsum(2 * AMPLITUDE_M * rate * np.cos(2 * rate * clock) * ease) * 1e-3
+    upper, fore = tilts(x, z)
+    delays = np.arange(0.0, LATEST_S, 0.01)
+    misses = [float(np.mean((np.interp(t - delay, clock, upper) - q) ** 2)) for delay in delays]
+    return np.interp(t - delays[int(np.argmin(misses))], clock, fore)
 
 
 @compiled(kept=True)
@@ -110,36 +154,33 @@ class Fit:
     """A model of some recordings: coefficients (terms,), and the zeros of the recordings, N m."""
 
     choice: Choice
+    rigid: bool
     coefficients: Floats
     zeros: Floats
 
     def torque(self, record: Record) -> Floats:
         """Return the predicted target (N,) but for its zero."""
-        return self.choice.columns(record) @ self.coefficients
+        return self.choice.columns(record, rigid=self.rigid) @ self.coefficients
 
 
-def fit(choice: Choice, records: Sequence[Record]) -> Fit:
+def fit(choice: Choice, records: Sequence[Record], *, rigid: bool = True) -> Fit:
     """Return the least-squares model of recordings that have a zero each."""
     zeros = np.repeat(np.eye(len(records)), [record.q.size for record in records], axis=0)
-    columns = np.hstack([np.vstack([choice.columns(record) for record in records]), zeros])
+    columns = np.vstack([choice.columns(record, rigid=rigid) for record in records])
     target = np.concatenate([record.judged(record.target) for record in records])
-    found = np.linalg.lstsq(columns, target, rcond=None)[0]
-    return Fit(choice, found[: len(choice.terms)], found[len(choice.terms) :])
+    found = np.linalg.lstsq(np.hstack([columns, zeros]), target, rcond=None)[0]
+    terms = columns.shape[1]
+    return Fit(choice, rigid, found[:terms], found[terms:])
 
 
 def chosen(records: Sequence[Record]) -> Choice:
-    """Return the model that predicts each of two recordings best from the other, but for its zero."""
+    """Return the law of friction that predicts each of two recordings best from the other, but for its zero."""
 
     def error(choice: Choice) -> float:
         pairs = ((records[0], records[1]), (records[1], records[0]))
         return sum(float(np.var(b.judged(b.target) - fit(choice, [a]).torque(b))) for a, b in pairs)
 
-    choices = [
-        Choice(terms, presliding, stribeck)
-        for terms, presliding in product(STRUCTURES, PRESLIDING_RAD)
-        for stribeck in (STRIBECK_RAD_S if "stribeck" in terms else STRIBECK_RAD_S[:1])
-    ]
-    return min(choices, key=error)
+    return min((Choice(*values) for values in product(PRESLIDING_RAD, (None, *STRIBECK_RAD_S))), key=error)
 
 
 def rms(error: Floats) -> float:
@@ -148,28 +189,31 @@ def rms(error: Floats) -> float:
 
 
 @compiled(kept=True)
-def followed(error: Floats, share: float) -> Floats:
+def followed(error: Floats, start: float, share: float) -> Floats:
     """Return the zero (N,) before each sample, learnt from the errors before it, as the published networks learn."""
-    zero = np.zeros(error.size)
+    zero = np.full(error.size, start)
     for k in range(1, error.size):
         zero[k] = zero[k - 1] + share * (error[k - 1] - zero[k - 1])
     return zero
 
 
-def errors(model: Fit, record: Record) -> tuple[float, float, float]:
-    """Return RMS errors, N m: zero of the other speeds, of the first tenth, and followed."""
+def errors(model: Fit, record: Record) -> tuple[float, float, float, float]:
+    """Return RMS errors, N m: zero of the other speeds, of the first tenth, of the whole recording, and followed."""
     remainder = record.judged(record.target) - model.torque(record)
-    first = round(FIRST * remainder.size)
-    zero = followed(remainder, record.period / FOLLOWED_S)
+    first, start = round(FIRST * remainder.size), float(model.zeros.mean())
     return (
-        rms(remainder - model.zeros.mean()),
+        rms(remainder - start),
         rms(remainder[first:] - remainder[:first].mean()),
-        rms(remainder - zero),
+        rms(remainder - remainder.mean()),
+        rms(remainder - followed(remainder, start, record.period / FOLLOWED_S)),
     )
 
 
-def read(file: Path) -> Record:
-    """Read a recording of one joint; its columns are time, angle, velocity, acceleration, target, predictions."""
+def read(file: Path, frequency_hz: float | None) -> Record:
+    """Read a recording of one joint; its columns are time, angle, velocity, acceleration, target, predictions.
+
+    ``frequency_hz``: of the eight in the vertical plane; ``None``: another motion.
+    """
     try:
         t, q, qd, _, target = np.genfromtxt(file, delimiter=",", skip_header=1, usecols=range(5)).T
     except (OSError, ValueError) as error:
@@ -177,8 +221,8 @@ def read(file: Path) -> Record:
     if not np.isfinite(q + qd + target).all():
         raise DataError(f"{file}: expected finite numbers")
     period = float(np.diff(q) @ qd[1:] / (qd[1:] @ qd[1:]))
-    qd, smooth = butterworth(qd, period, VELOCITY_HZ), butterworth(qd, period, ACCELERATION_HZ)
-    return Record(q, qd, central_difference(smooth, period), target, float(t[-1] - t[0]) / (t.size - 1), period)
+    forearm = None if frequency_hz is None else forearm_tilt(t, q, frequency_hz)
+    return Record(q, butterworth(qd, period, VELOCITY_HZ), target, float(t[-1] - t[0]) / (t.size - 1), period, forearm)
 
 
 def published(file: Path) -> dict[tuple[str, str, str], float]:
@@ -199,24 +243,32 @@ def report(folder: Path | None) -> str:
         raise ConfigError(f"{place}: {WHERE}")
     figures = published(folder / FOLDER / PUBLISHED)
     files = {key: folder / FOLDER / "Franka Robot" / f"{'_'.join(key)}.csv" for key in product(CASES, SPEEDS)}
-    present: Mapping[tuple[str, str], Record] = {key: read(file) for key, file in files.items() if is_file(file)}
-    rows, ours, theirs, terms = [], [], [], []
+    present = {
+        (case, speed): read(file, FREQUENCY_HZ[speed] if case == PLANAR_CASE else None)
+        for (case, speed), file in files.items()
+        if is_file(file)
+    }
+    rows, ours, theirs, laws = [], [], [], []
     for case in CASES:
         records = {speed: present[case, speed] for speed in SPEEDS if (case, speed) in present}
         for speed, record in records.items() if len(records) == len(SPEEDS) else ():
             others = [other for name, other in records.items() if name != speed]
             model = fit(chosen(others), others)
-            simple = fit(Choice(COULOMB_VISCOUS, PRESLIDING_RAD[0], STRIBECK_RAD_S[0]), others)
-            ours.append((*errors(simple, record), *errors(model, record)))
+            simple = fit(Choice(PRESLIDING_RAD[0], None), others, rigid=False)
+            ours.append((errors(simple, record)[2], *errors(model, record)))
             theirs.append([figures[case, speed, name] for name in MODELS])
             rows.append(row(f"{case} {speed}", theirs[-1], ours[-1]))
-            terms.append(f"{case} {speed}: {', '.join(model.choice.terms)}")
+            bell = model.choice.stribeck
+            laws.append(
+                f"{case} {speed}: reversal within {1e3 * model.choice.presliding:g} mrad, "
+                + ("no Stribeck term" if bell is None else f"Stribeck velocity {bell:g} rad/s")
+            )
     if not rows:
         raise ConfigError(f"{folder / FOLDER}: no case has its three speeds: {WHERE}")
     every = [[figures[case, speed, name] for name in MODELS] for case, speed in files]
     rows.append(row("median of these", np.median(theirs, axis=0), np.median(ours, axis=0)))
-    rows.append([*row("median of 12", np.median(every, axis=0), ()), *[""] * 6])
-    zeros = ("zero of the others", "of the first tenth", "followed")
-    headings = ("RMS, N m", *MODELS, *(f"{kind}: {zero}" for kind in ("Coulomb, viscous", "chosen") for zero in zeros))
+    rows.append([*row("median of 12", np.median(every, axis=0), ()), *[""] * 5])
+    zeros = ("zero of the others", "zero of the first tenth", "its own zero", "zero followed")
+    headings = ("RMS, N m", *MODELS, "friction alone, its own zero", *(f"model, {zero}" for zero in zeros))
     count = f"{len(rows) - 2} of {len(files)} recordings are here with all three speeds."
-    return "\n\n".join([count, table(headings, rows), "Terms chosen on the other speeds:\n" + "\n".join(terms)])
+    return "\n\n".join([count, table(headings, rows), "Friction chosen on the other speeds:\n" + "\n".join(laws)])

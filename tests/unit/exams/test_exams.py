@@ -1,0 +1,111 @@
+"""Public exams: the command without recordings, models that are known, and the figures of the EMPS."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from armident.configs import load_robot
+from armident.identify.effects.terms import arm_model
+from armident.identify.robot.controller import DiscreteController
+from armident.identify.robot.simulation import simulate
+from tests.exams import emps, friction
+from tests.tools.command_line import NAME, laboratory
+
+KNOWN = {"mass": 95.0, "viscous_up": 200.0, "viscous_down": 200.0, "coulomb_up": 20.0, "coulomb_down": 20.0}
+SWITCHING = 1e7
+"""Sign smoothing, s/m, that reverses dry friction within 0.1 um/s."""
+
+
+@pytest.mark.parametrize(
+    ("arguments", "place"),
+    [
+        (["emps", "--data", "{folder}"], "nonlinearbenchmark.org"),
+        (["friction", "--data", "{folder}"], friction.REPOSITORY),
+        (["friction"], friction.REPOSITORY),
+    ],
+)
+def test_without_recordings_one_line_says_where_to_get_them(arguments: list[str], place: str, tmp_path: Path) -> None:
+    result = CliRunner().invoke(
+        laboratory("tests.exams.command:exam"), [NAME, *(word.format(folder=tmp_path) for word in arguments)]
+    )
+    assert result.exit_code == 2
+    assert place in result.stderr
+    assert len(result.stderr.strip().splitlines()) == 1
+
+
+def known_axis(seconds: float = 6.0) -> emps.Axis:
+    """A virtual EMPS in its closed loop, by the simulation of the package, which smooths the sign of the friction."""
+    robot = load_robot("emps")
+    robot = robot.model_copy(update={"friction": robot.friction.model_copy(update={"sign_smoothing": SWITCHING})})
+    t = np.arange(round(seconds / emps.EMPS_PERIOD)) * emps.EMPS_PERIOD
+    reference = (0.1 * (1.0 - np.cos(2.0 * t)) + 0.01 * np.sin(9.0 * t) ** 2)[:, None]
+    gain = robot.joints[0].drive.gain
+    loop = DiscreteController.cascade(
+        emps.KP, emps.KV, gain, emps.EMPS_PERIOD, saturation=10 * gain, velocity_samples=2
+    )
+    run = simulate(arm_model(robot), [95.0, 200.0, 20.0, 0.0], loop, reference, emps.EMPS_PERIOD)
+    assert run.diverged_at is None
+    return emps.Axis(run.q[:, 0], run.qd[:, 0], reference[:, 0], run.tau[:, 0], np.zeros(t.size))
+
+
+@pytest.mark.slow
+def test_a_fit_of_the_simulated_position_recovers_a_known_axis() -> None:
+    axis = known_axis()
+    assert emps.rmse_mm(KNOWN, axis) < 0.1  # two integrators; the least error on the real axis is 1.7 mm
+    found = emps.fitted(emps.PUBLISHED, [axis])
+    assert found == pytest.approx(KNOWN, rel=5e-3)
+
+
+@pytest.mark.slow
+def test_an_axis_moves_in_its_closed_loop_as_in_the_simulation_of_the_package() -> None:
+    axis = known_axis()
+    assert emps.closed_loop_error_pct(KNOWN, axis) < 1.0
+    assert emps.closed_loop_error_pct({**KNOWN, "coulomb_up": 24.0, "coulomb_down": 24.0}, axis) > 3.0
+
+
+@pytest.mark.slow
+def test_the_emps_has_the_figures_of_the_results_page(shared_data: Path) -> None:
+    if not (shared_data / "emps" / emps.PULSES_FILE).is_file():
+        pytest.skip("the EMPS is not in the measured data")
+    training, held = (emps.load(shared_data, name) for name in (emps.EMPS_FILE, emps.PULSES_FILE))
+    plain = emps.fitted(emps.PUBLISHED, [training])
+    assert (emps.rmse_mm(plain, training), emps.rmse_mm(plain, held)) == pytest.approx((1.71, 8.55), abs=0.05)
+    assert emps.closed_loop_error_pct(plain, held) == pytest.approx(4.59, abs=0.02)
+    level = emps.level_on(plain, held)
+    assert level["coulomb_up"] == pytest.approx(1.019 * plain["coulomb_up"], rel=2e-3)
+    assert emps.rmse_mm(level, held) < 1.3
+
+
+def known_record(frequency_hz: float, zero: float) -> friction.Record:
+    """A joint of known friction, inertia and error of the gravity model, at one speed, in 1 ms samples."""
+    t = np.arange(10_000) * 1e-3
+    rate = 2.0 * np.pi * frequency_hz
+    q, qd = 0.3 * np.sin(rate * t), 0.3 * rate * np.cos(rate * t)
+    dry = friction.bristles(q, friction.PRESLIDING_RAD[1])
+    target = 0.3 * dry + 0.5 * qd - 0.2 * rate**2 * q + 0.4 * np.cos(q) + zero
+    return friction.Record(q, qd, target, 1e-3, 1e-3, None)
+
+
+@pytest.mark.slow
+def test_a_known_joint_is_predicted_at_the_speed_left_out_but_for_its_zero() -> None:
+    records = [known_record(frequency, zero) for frequency, zero in ((0.2, 0.2), (0.3, -0.1))]
+    held = known_record(0.5, 0.5)
+    choice = friction.chosen(records)
+    model = friction.fit(choice, records)
+    other, _, own, _ = friction.errors(model, held)
+    assert own < 0.05 * np.std(held.target)  # of the ends of the filters
+    assert other == pytest.approx(0.45, abs=0.03)  # 0.5 of its own less 0.05 of the others
+    assert friction.errors(friction.fit(choice, records, rigid=False), held)[2] > 3 * own
+
+
+def test_the_forearm_follows_the_programmed_path_from_the_start_posture() -> None:
+    upper, fore = friction.tilts(np.zeros(1), np.zeros(1))
+    assert (upper[0], fore[0]) == pytest.approx(friction.START_RAD)
+    t = np.arange(0.0, 20.0, 2e-3)
+    moving = friction.forearm_tilt(t, np.full(t.size, upper[0]), 0.16)
+    assert np.ptp(moving) > 0.3
+    record = replace(known_record(0.1, 0.0), forearm=np.zeros(10_000))
+    assert record.rigid().shape == (10_000, 8)
