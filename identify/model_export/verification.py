@@ -118,7 +118,8 @@ def motion_of(model: ExportedModel, file: Path | None = None) -> GivenMotion:
     title = f"{file.name} ({'held out' if held_out else 'a recording of the identification'})"
     if signals.q.shape[0] > MOST_SAMPLES:
         title = f"the first {MOST_SAMPLES} samples of {title}"
-    return GivenMotion(*(x[:MOST_SAMPLES] for x in (signals.q, signals.qd, signals.qdd)), experiments[0].dt, title)
+    q, qd, qdd = (x[:MOST_SAMPLES] for x in (signals.q, signals.qd, signals.qdd))
+    return GivenMotion(q, qd, qdd, experiments[0].dt, title)
 
 
 def _own_motion(model: ExportedModel) -> GivenMotion:
