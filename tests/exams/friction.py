@@ -10,7 +10,7 @@ The published figures follow with a zero-phase Butterworth filter of order 4 at 
 time of the files. Case 4 was recorded by a program whose clock ran twice as fast.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
@@ -136,7 +136,8 @@ def forearm_tilt(t: Floats, q: Floats, frequency_hz: float) -> Floats:
     upper, fore = tilts(x, z)
     delays = np.arange(0.0, LATEST_S, 0.01)
     misses = [float(np.mean((np.interp(t - delay, clock, upper) - q) ** 2)) for delay in delays]
-    return np.interp(t - delays[int(np.argmin(misses))], clock, fore)
+    followed: Floats = np.interp(t - delays[int(np.argmin(misses))], clock, fore)
+    return followed
 
 
 @compiled(kept=True)
@@ -231,7 +232,7 @@ def published(file: Path) -> dict[tuple[str, str, str], float]:
     return {(str(row["Case"]), str(row["Speed"]), str(row["Model"])): float(row["RMS"]) for row in rows}
 
 
-def row(title: str, values: Sequence[float], ours: Sequence[float]) -> list[str]:
+def row(title: str, values: Iterable[float], ours: Iterable[float]) -> list[str]:
     """Return a row of the table."""
     return [title, *(f"{value:.3f}" for value in (*values, *ours))]
 
