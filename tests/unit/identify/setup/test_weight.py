@@ -74,7 +74,9 @@ def with_file(
     """
     rng = np.random.default_rng([seed, 5])
     truth = dict(zip(ArmModel.from_config(arm).names, setups.physical_parameters(arm, 0), strict=True))
-    placement, read, meant = np.eye(4), {}, {}
+    placement = np.eye(4)
+    read: dict[str, float] = {}
+    meant: dict[str, float] = {}
     for k, joint in enumerate(arm.joints, start=1):
         placement = placement @ mdh_transform(joint.mdh)
         moments = np.array([truth[f"{name}{k}"] for name in ("mx", "my", "mz", "m")])
