@@ -108,4 +108,4 @@ def test_the_forearm_follows_the_programmed_path_from_the_start_posture() -> Non
     moving = friction.forearm_tilt(t, np.full(t.size, upper[0]), 0.16)
     assert np.ptp(moving) > 0.3
     record = replace(known_record(0.1, 0.0), forearm=np.zeros(10_000))
-    assert record.rigid().shape == (10_000, 8)
+    assert record.rigid.shape == (10_000, 8)
