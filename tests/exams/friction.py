@@ -12,6 +12,7 @@ time of the files. Case 4 was recorded by a program whose clock ran twice as fas
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import product
 from pathlib import Path
 
@@ -78,27 +79,28 @@ class Record:
         qd = central_difference(butterworth(angle, self.period, ACCELERATION_HZ), self.period)
         return qd, central_difference(qd, self.period)
 
+    @cached_property
     def rigid(self) -> Floats:
-        """Return the columns (N, terms) of inertia, Coriolis torques and error of the gravity model.
+        """Columns (N, terms) of inertia, Coriolis torques and error of the gravity model, filtered as the target.
 
         In the vertical plane, where the hand does not turn: of two links, with a coupling of two phases. Otherwise the
         joint moves alone.
         """
         qd, qdd = self.derivatives(self.q)
         if self.forearm is None:
-            return np.column_stack([qdd, np.sin(self.q), np.cos(self.q)])
+            return self.judged(np.column_stack([qdd, np.sin(self.q), np.cos(self.q)]))
         forearm_qd, forearm_qdd = self.derivatives(self.forearm)
         cosine, sine = np.cos(self.q - self.forearm), np.sin(self.q - self.forearm)
         both, across = qdd + forearm_qdd, forearm_qd**2 - qd**2
-        return np.column_stack([
+        return self.judged(np.column_stack([
             qdd, forearm_qdd, cosine * both + sine * across, sine * both - cosine * across,
             np.sin(self.q), np.cos(self.q), np.sin(self.forearm), np.cos(self.forearm),
-        ])  # fmt: skip
+        ]))  # fmt: skip
 
 
 @dataclass(frozen=True)
 class Choice:
-    """Law of friction: distance over which dry friction reverses, rad, and Stribeck velocity, rad/s, or ``None``."""
+    """A law of friction: distance over which dry friction reverses, rad, and Stribeck velocity, rad/s, or ``None``."""
 
     presliding: float
     stribeck: float | None
@@ -109,7 +111,8 @@ class Choice:
         columns = [dry, record.qd]
         if self.stribeck is not None:
             columns.append(dry * np.exp(-((record.qd / self.stribeck) ** 2)))
-        return record.judged(np.column_stack([*columns, record.rigid()] if rigid else columns))
+        friction = record.judged(np.column_stack(columns))
+        return np.hstack([friction, record.rigid]) if rigid else friction
 
 
 def tilts(x: Floats, z: Floats) -> tuple[Floats, Floats]:
@@ -249,10 +252,15 @@ def report(folder: Path | None) -> str:
         for (case, speed), file in files.items()
         if is_file(file)
     }
-    rows, ours, theirs, laws = [], [], [], []
+    rows: list[list[str]] = []
+    laws: list[str] = []
+    ours: list[tuple[float, ...]] = []
+    theirs: list[list[float]] = []
     for case in CASES:
         records = {speed: present[case, speed] for speed in SPEEDS if (case, speed) in present}
-        for speed, record in records.items() if len(records) == len(SPEEDS) else ():
+        if len(records) < len(SPEEDS):
+            continue
+        for speed, record in records.items():
             others = [other for name, other in records.items() if name != speed]
             model = fit(chosen(others), others)
             simple = fit(Choice(PRESLIDING_RAD[0], None), others, rigid=False)
