@@ -145,7 +145,9 @@ def fitted(start: Mapping[str, float], axes: Sequence[Axis]) -> dict[str, float]
     def residuals(x: Floats) -> Floats:
         return errors_mm(dict(zip(names, x * scale, strict=True)), axes)
 
-    found = least_squares(residuals, np.ones(scale.size), method="lm", ftol=1e-6, xtol=1e-6, diff_step=STEP)
+    found = least_squares(
+        residuals, np.ones(scale.size), method="lm", ftol=1e-6, xtol=1e-6, diff_step=np.full(scale.size, STEP)
+    )
     return dict(zip(names, map(float, found.x * scale), strict=True))
 
 
@@ -196,7 +198,10 @@ def level_on(values: Mapping[str, float], axis: Axis) -> dict[str, float]:
     def at(level: float) -> dict[str, float]:
         return {name: value * (level if name in FRICTION else 1.0) for name, value in values.items()}
 
-    found = least_squares(lambda x: errors_mm(at(float(x[0])), [axis]), [1.0], diff_step=1e-3)
+    def errors(x: Floats) -> Floats:
+        return errors_mm(at(float(x[0])), [axis])
+
+    found = least_squares(errors, [1.0], diff_step=np.array([1e-3]))
     return at(float(found.x[0]))
 
 

@@ -12,6 +12,7 @@ from armident.identify.effects.terms import arm_model
 from armident.identify.robot.controller import DiscreteController
 from armident.identify.robot.simulation import simulate
 from tests.exams import emps, friction
+from tests.reproduction.recordings import EMPS_FILE, EMPS_PERIOD
 from tests.tools.command_line import NAME, laboratory
 
 KNOWN = {"mass": 95.0, "viscous_up": 200.0, "viscous_down": 200.0, "coulomb_up": 20.0, "coulomb_down": 20.0}
@@ -40,13 +41,11 @@ def known_axis(seconds: float = 6.0) -> emps.Axis:
     """A virtual EMPS in its closed loop, by the simulation of the package, which smooths the sign of the friction."""
     robot = load_robot("emps")
     robot = robot.model_copy(update={"friction": robot.friction.model_copy(update={"sign_smoothing": SWITCHING})})
-    t = np.arange(round(seconds / emps.EMPS_PERIOD)) * emps.EMPS_PERIOD
+    t = np.arange(round(seconds / EMPS_PERIOD)) * EMPS_PERIOD
     reference = (0.1 * (1.0 - np.cos(2.0 * t)) + 0.01 * np.sin(9.0 * t) ** 2)[:, None]
     gain = robot.joints[0].drive.gain
-    loop = DiscreteController.cascade(
-        emps.KP, emps.KV, gain, emps.EMPS_PERIOD, saturation=10 * gain, velocity_samples=2
-    )
-    run = simulate(arm_model(robot), [95.0, 200.0, 20.0, 0.0], loop, reference, emps.EMPS_PERIOD)
+    loop = DiscreteController.cascade(emps.KP, emps.KV, gain, EMPS_PERIOD, saturation=10 * gain, velocity_samples=2)
+    run = simulate(arm_model(robot), [95.0, 200.0, 20.0, 0.0], loop, reference, EMPS_PERIOD)
     assert run.diverged_at is None
     return emps.Axis(run.q[:, 0], run.qd[:, 0], reference[:, 0], run.tau[:, 0], np.zeros(t.size))
 
@@ -70,7 +69,7 @@ def test_an_axis_moves_in_its_closed_loop_as_in_the_simulation_of_the_package() 
 def test_the_emps_has_the_figures_of_the_results_page(shared_data: Path) -> None:
     if not (shared_data / "emps" / emps.PULSES_FILE).is_file():
         pytest.skip("the EMPS is not in the measured data")
-    training, held = (emps.load(shared_data, name) for name in (emps.EMPS_FILE, emps.PULSES_FILE))
+    training, held = (emps.load(shared_data, name) for name in (EMPS_FILE, emps.PULSES_FILE))
     plain = emps.fitted(emps.PUBLISHED, [training])
     assert (emps.rmse_mm(plain, training), emps.rmse_mm(plain, held)) == pytest.approx((1.71, 8.55), abs=0.05)
     assert emps.closed_loop_error_pct(plain, held) == pytest.approx(4.59, abs=0.02)
