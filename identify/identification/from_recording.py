@@ -253,7 +253,7 @@ def joint_torques(stream: Stream, robot: RobotConfig) -> Array:
             continue
         values = _finite(stream, name, robot)
         if quantity != "torque":
-            if quantity != wanted:
+            if wanted == "torque":
                 raise DataError(
                     f"stream {stream.name!r} has a {quantity} of each motor, but drive.signal of {robot.name} is "
                     f"{wanted}: record that, or set drive.signal: {quantity} and the gain of each motor, "
