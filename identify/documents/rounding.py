@@ -26,6 +26,12 @@ def alike(value: float, std: float | None) -> tuple[str, str]:
 
 
 def plus_minus(value: float, std: float | None) -> str:
-    """Return ``value ± std`` as `alike` rounds them; the value alone without a deviation."""
+    """Return ``value ± std`` as `alike` rounds them.
+
+    Parameters
+    ----------
+    value, std
+        In one unit. Without a deviation the value stands alone.
+    """
     texts = alike(value, std)
     return " ± ".join(texts) if texts[1] else texts[0]

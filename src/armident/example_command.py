@@ -5,9 +5,7 @@ from typing import Annotated
 
 import typer
 
-import armident.configs
-
-EXAMPLES = Path(armident.configs.__file__).parent / "examples"
+EXAMPLES = Path(__file__).parent / "configs" / "examples"
 """Folder of the worked examples, one folder each."""
 
 
