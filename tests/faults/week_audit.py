@@ -110,7 +110,9 @@ class Audit:
             self.figures["documents"] += 1
             if signer != f"worker.{cell.name}":
                 self.wrong.append(f"{path.parent.name}: {signer}")
-        of_files = {key for fed in [*cell.fed, *_captures(cell)] for key in self._file(cell.name, fed, ledger, results)}
+        of_files = {
+            key for fed in [*cell.fed, *_captures(cell)] for key in self._file(cell.name, fed, ledger, entries, results)
+        }
         self.wrong += [f"{cell.name}: {entry.name} is of no file" for entry in entries if entry.sha256 not in of_files]
         self._announcements(cell.name, entries, listener)
         done = Counter(entry.sha256 for entry in entries if entry.state == "done")
@@ -140,12 +142,14 @@ class Audit:
         if memory_then > 1.2 * memory + 20 or files_then > files + 8:
             self.wrong.append(f"{name}: {text}")
 
-    def _file(self, cell: str, fed: Fed, ledger: Ledger, results: Counter[str]) -> list[str]:
+    def _file(
+        self, cell: str, fed: Fed, ledger: Ledger, entries: list[LedgerEntry], results: Counter[str]
+    ) -> list[str]:
         """Find the one result or the one reason of a file, by its content, or by its name if that was never read.
 
         Captures of an arm at rest may have the same samples. Returns the keys of its entries.
         """
-        path, entries = fed.path.resolve(), ledger.entries()
+        path = fed.path.resolve()
         found = [entry for entry in entries if fed.sha256 and entry.digest == fed.sha256] or [
             entry for entry in entries if path in _paths(entry) and not (fed.sha256 and entry.digest)
         ]
