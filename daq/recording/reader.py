@@ -198,6 +198,8 @@ class _Content:
                 self.gaps.append(gap_from(entries))
             else:
                 self.marks.append(mark_from(entries))
+        except UnicodeDecodeError as error:
+            raise DataError(f"topic {topic}: an invalid event: byte {error.start} is no UTF-8 text") from error
         except (ValueError, RecursionError) as error:
             raise DataError(f"topic {topic}: an invalid event: {_one_line(error)}") from error
 

@@ -114,7 +114,8 @@ def _check(experiments: Sequence[Experiment], robot: RobotConfig) -> SetupCheck:
     of_scale = [finding for finding in setup_findings if finding.kind in ("torque_unit", "side")]
     if not any(finding.decisive for finding in of_scale):
         findings += signals.small_torque_findings(experiments, robot)
-    findings += _clipped(bench, best, robot, {name for finding in findings for name in finding.joints})
+    known = {name for finding in findings for name in finding.joints}
+    findings += _clipped(bench, best, experiments, robot, known)
     doubtful = changed is not None or not all(finding.correction for finding in setup_findings)
     zero = None if doubtful else zero_offset(bench, best.h)
     if zero is not None:
@@ -256,12 +257,14 @@ def _with_shift(step: Step, bench: Bench, more_s: NDArray[np.floating], found: T
     return replace(step, mistakes=tuple(mistakes), shift_std=std, shift_measured=found.instrumented)
 
 
-def _clipped(bench: Bench, best: Step, robot: RobotConfig, known: set[str]) -> list[SetupFinding]:
+def _clipped(
+    bench: Bench, best: Step, experiments: Sequence[Experiment], robot: RobotConfig, known: set[str]
+) -> list[SetupFinding]:
     """Return the torques that are clipped behind noise, and were not found by equal values."""
     findings = []
     for clip in clipped_torques(bench, best.h):
         name = robot.joints[clip.joint].name
-        if name in known:
+        if name in known or not signals.in_fine_steps([e.tau[:, clip.joint] for e in experiments]):
             continue
         unit = "N m" if robot.joints[clip.joint].type == "revolute" else "N"
         message = (

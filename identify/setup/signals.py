@@ -36,6 +36,9 @@ LEAST_RUN = 5
 RUN_RATIO = 3.0
 """Longest run at the extreme over the longest run at any other value while the joint moves."""
 
+LEAST_VALUES = 25
+"""Least number of different values of a clipped torque: rounding by half a step then moves its level by 4 % at most."""
+
 CLIPPED_SHARE = 2e-3
 """Least share of clipped samples for a finding."""
 
@@ -218,13 +221,18 @@ def clipped_findings(
                 findings.append(SetupFinding("torque_clipped", (name,), 1.0, message, remedy, True))
                 break
             share, level = _clipped(torques, [e.q[:, j] for e in experiments])
-            if share >= CLIPPED_SHARE:
+            if share >= CLIPPED_SHARE and in_fine_steps(torques):
                 unit = "N m" if robot.joints[j].type == "revolute" else "N"
                 message = f"the torque of {name} is clipped at {level:.4g} {unit} in {100 * share:.1f} % of the samples"
                 unusable = share >= CLIPPED_UNUSABLE
                 findings.append(SetupFinding("torque_clipped", (name,), 1.0, message, CLIPPED_REMEDY, unusable))
                 break
     return findings
+
+
+def in_fine_steps(torques: Sequence[Array]) -> bool:
+    """Return False for torques (N,) of one joint with so few values that their peaks look clipped."""
+    return np.unique(max(torques, key=len)).size >= LEAST_VALUES
 
 
 def _clipped(torques: Sequence[Array], positions: Sequence[Array]) -> tuple[float, float]:

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armident.daq.recording.faults.jumps import JumpCriteria
+from armident.daq.recording.faults.updates import resolution
 from armident.daq.recording.faults.zeros import NOTHING, runs
 
 Array = NDArray[np.float64]
@@ -26,6 +27,9 @@ SLOW = 0.2
 
 OF_NOISE = -0.25
 """Correlation of changes that follow each other below which an effort is noise from row to row: -0.5 if it is white."""
+
+SPANNED = 0.6
+"""Least share of renewed values of an effort in coarse steps whose noise, half a step or more, renews it anywhere."""
 
 RUN_RATIO = 3.0
 """Time for which an effort stays the same at the end of a recording over the longest such time before."""
@@ -65,7 +69,8 @@ def frozen_efforts(effort: Array, position: Array, criteria: JumpCriteria) -> Ma
         renewed = np.flatnonzero(step)
         if not renewed.size:
             continue
-        noisy = float(change[1:] @ change[:-1]) < OF_NOISE * float(change @ change)
+        wide = renewed.size > SPANNED * step.size or not resolution(x)
+        noisy = wide and float(change[1:] @ change[:-1]) < OF_NOISE * float(change @ change)
         jump = criteria.ratio * float(np.quantile(step, criteria.most))
         chance = np.log(max(1.0 - renewed.size / step.size, 1.0 / step.size))
         longest = max((np.log(MOST_CHANCE) - np.log(step.size)) / min(chance, -1e-12), LEAST_RUN)

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from armident.daq.recording.faults.updates import resolution
 from armident.identify.estimators.reason import Level, Reason
 from armident.identify.identification.checks.judged import Judged
 from armident.identify.identification.identification_criteria import IdentificationCriteria
@@ -17,19 +18,23 @@ CHECK = "check the set-up first: armident check RECORDING; then look for a missi
 def error(judged: Judged, criteria: IdentificationCriteria) -> list[Reason]:
     """Return a reason if the model leaves more than a third of the torque of a joint.
 
-    It is unusable, unless least squares leaves as much and the rest is white: then most of the joint's torque is noise.
+    It is unusable, unless least squares leaves as much and the rest is white, or more of it is rounding than not: then
+    most of the joint's torque is noise. The power of rounding to steps d is d^2 / 12.
     """
     joints, blocks, theta = judged.prepared.model.robot.joints, judged.ls.blocks, judged.found.estimate.theta
     errors, ls_errors = (relative_torque_errors(blocks, at)[1] for at in (theta, judged.ls.estimate.theta))
     step = MOVE if judged.unusable else CHECK
     rest = residuals(blocks, theta)
     limits = np.where(judged.support.moving, criteria.max_joint_error_pct, criteria.max_rest_error_pct)
+    longest = max((e.tau for e in judged.prepared.experiments), key=len)
     wrong: list[int] = []
     noisy: list[int] = []
+    rounded: list[int] = []
     for j in np.flatnonzero(errors > limits).tolist():
-        test = whiteness([e[b.keep[:, j], j] for e, b in zip(rest, blocks, strict=True)])
-        white = test.fraction_outside <= criteria.white_fraction and ls_errors[j] > limits[j]
-        (noisy if white else wrong).append(j)
+        left = [e[b.keep[:, j], j] for e, b in zip(rest, blocks, strict=True)]
+        white = whiteness(left).fraction_outside <= criteria.white_fraction and ls_errors[j] > limits[j]
+        coarse = np.mean(np.concatenate(left) ** 2) < 2.0 * resolution(longest[:, j]) ** 2 / 12.0
+        (noisy if white else rounded if coarse else wrong).append(j)
 
     def reason(level: Level, at: list[int], more: str, step: str = step) -> Reason:
         shares = enumerated([f"{joints[j].name} ({errors[j]:.3g} %)" for j in at])
@@ -45,4 +50,7 @@ def error(judged: Judged, criteria: IdentificationCriteria) -> list[Reason]:
     if noisy:
         longer = "move with more torque at this joint, or record longer"
         reasons.append(reason("doubtful", noisy, "; the rest is white noise", longer))
+    if rounded:
+        finer = "move with more torque at this joint, or record its torque in finer steps"
+        reasons.append(reason("doubtful", rounded, "; most of the rest is rounding of the recorded torque", finer))
     return reasons

@@ -69,8 +69,8 @@ def motion(*targets: list[float]) -> Trajectory:
 
 def judged(method: Method = "idim-piv", **parts: Any) -> Any:
     """Parts of an identification that one check uses."""
-    robot = parts.pop("robot", None)
-    prepared = SimpleNamespace(model=SimpleNamespace(robot=robot), signals=())
+    robot, experiments = parts.pop("robot", None), parts.pop("experiments", ())
+    prepared = SimpleNamespace(model=SimpleNamespace(robot=robot), signals=(), experiments=experiments)
     return SimpleNamespace(options=Options(method), prepared=prepared, unusable=False, solution=None, **parts)
 
 
@@ -388,15 +388,18 @@ def test_weak_instruments_are_named() -> None:
     assert "of all 2 parameters" in instruments_of(every, 2)[0].message
 
 
-def errors_of(rest: np.ndarray, error_pct: float, ls_error_pct: float) -> list[Reason]:
-    """Reasons of one joint whose residual is ``rest`` (M,), with these relative errors."""
+def errors_of(
+    rest: np.ndarray, error_pct: float, ls_error_pct: float, recorded: np.ndarray | None = None
+) -> list[Reason]:
+    """Reasons of one joint whose residual is ``rest`` (M,), with these relative errors; ``recorded``: its torque."""
     torque, size = rest / error_pct * 100, rest.size
     other = torque * ls_error_pct / 100
     x = np.stack([torque - rest, torque - other], axis=1)[:, None, :]
     block = ExperimentEquations(torque[:, None], x, np.ones((size, 1), bool), rest)
     found, ls = (SimpleNamespace(estimate=SimpleNamespace(theta=theta), blocks=[block]) for theta in np.eye(2))
     moving = SimpleNamespace(moving=np.array([True]))
-    return error(judged(robot=load_robot("emps"), found=found, ls=ls, support=moving), CRITERIA)
+    one = SimpleNamespace(tau=(torque if recorded is None else recorded)[:, None])
+    return error(judged(robot=load_robot("emps"), found=found, ls=ls, support=moving, experiments=[one]), CRITERIA)
 
 
 def test_a_torque_that_is_white_noise_is_doubtful_and_a_model_error_unusable() -> None:
@@ -407,6 +410,16 @@ def test_a_torque_that_is_white_noise_is_doubtful_and_a_model_error_unusable() -
     (reason,) = errors_of(noise, 90.0, 5.0)
     assert reason.level == "unusable"
     assert "idim-ls leaves 5 % at most" in reason.message
+
+
+def test_rounding_of_a_small_torque_is_doubtful_and_an_error_of_two_steps_is_not() -> None:
+    true = 1.3 * np.sin(np.arange(20_000) / 90)
+    recorded = 0.01 * np.rint(true)
+    (reason,) = errors_of(recorded - 0.01 * true, 40.0, 40.0, recorded)
+    assert (reason.level, reason.joint) == ("doubtful", "joint_1")
+    assert "rounding of the recorded torque" in reason.message
+    (reason,) = errors_of(0.02 * np.sin(np.arange(20_000) / 90), 40.0, 40.0, recorded)
+    assert reason.level == "unusable"
 
 
 def test_a_joint_is_at_rest_by_its_reference_its_counts_or_the_other_joints(

@@ -12,7 +12,7 @@ from armident.identify.setup.bench import make_bench
 from armident.identify.setup.check import check_setup
 from armident.identify.setup.describe import as_configured
 from armident.identify.setup.search import Search, Step
-from armident.identify.setup.signals import one_way_findings
+from armident.identify.setup.signals import clipped_findings, one_way_findings
 from armident.identify.signals.experiments import Experiment
 from tests.fixtures import setups
 from tests.fixtures.arms import FAST, checked, recording
@@ -341,6 +341,17 @@ def test_clipped_torques_are_named(healthy: list[Experiment], arm: RobotConfig) 
     clipped = [replace(e, tau=np.clip(e.tau, [-1e9, -level, -1e9], [1e9, level, 1e9])) for e in healthy]
     found = check_setup(clipped, arm)
     assert [(f.kind, f.joints) for f in found.findings] == [("torque_clipped", ("axis_2",))]
+
+
+@pytest.mark.parametrize("steps", [1, 3, 10])
+def test_dry_friction_of_a_few_steps_is_not_clipped(steps: int, healthy: list[Experiment], arm: RobotConfig) -> None:
+    coarse = []
+    for e in healthy:
+        speed = np.gradient(e.q[:, 1])
+        tau = e.tau.copy()
+        tau[:, 1] = np.rint(steps * np.tanh(8 * speed / np.abs(speed).max()))
+        coarse.append(replace(e, tau=tau))
+    assert clipped_findings(coarse, arm, np.ones(arm.n, dtype=np.bool_)) == []
 
 
 @pytest.mark.slow
