@@ -110,15 +110,15 @@ class TorqueShift:
 
     @property
     def confirmed(self) -> bool:
-        """True if it exceeds one sample; at least two joints confirm it, none contradicts it.
+        """True if it certainly exceeds one sample; at least two joints confirm it, none contradicts it.
 
         Never without instruments: friction and elasticity that the model lacks look like a shift, too.
         """
         size = abs(self.samples)
         telling = [(own, std) for own, std in self.by_joint.values() if SIGNIFICANT * std <= size]
         agree = all(abs(own - self.samples) <= SIGNIFICANT * std for own, std in telling)
-        significant = size > max(LONGEST, SIGNIFICANT * self.std)
-        return self.instrumented and significant and len(telling) >= 2 and agree
+        exceeds = size > LONGEST + SIGNIFICANT * self.std
+        return self.instrumented and exceeds and len(telling) >= 2 and agree
 
     @property
     def applied(self) -> bool:
