@@ -202,8 +202,9 @@ def check_motion(q: NDArray[np.float64], period: float, robot: RobotConfig, wher
     robot.check_movable(where)
     if q.shape[1] != robot.n:
         raise ConfigError(f"{where}: {q.shape[1]} joints, but {robot.name} has {robot.n}")
-    qd = np.diff(q, axis=0) / period
-    qdd = np.diff(qd, axis=0) / period
+    with np.errstate(over="ignore", invalid="ignore"):  # such a motion is refused below
+        qd = np.diff(q, axis=0) / period
+        qdd = np.diff(qd, axis=0) / period
     for j, joint in enumerate(robot.joints):
         low, high = joint.limits.position
         if q[:, j].min() < low or q[:, j].max() > high:
@@ -216,7 +217,7 @@ def check_motion(q: NDArray[np.float64], period: float, robot: RobotConfig, wher
             ("acceleration", qdd[:, j], joint.limits.acceleration),
         ):
             peak = float(np.abs(values).max(initial=0.0))
-            if peak > limit * (1 + 1e-6):
+            if not np.isfinite(peak) or peak > limit * (1 + 1e-6):
                 raise ConfigError(f"{where}: {joint.name} reaches {label} {peak:.3f}, allowed is {limit:.3f}")
 
 

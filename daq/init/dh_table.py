@@ -109,7 +109,7 @@ def _read(file: Path) -> tuple[list[DhRow], bool, list[str]]:
     wanted = ("alpha", "d", "theta", "r") if khalil else NAMES
     absent = [name for name in wanted if name not in header]
     if absent:
-        raise ConfigError(f"{file}: no column {', '.join(absent)}; found {', '.join(header)}")
+        raise ConfigError(f"{file}: no column {', '.join(absent)}; found {', '.join(header):.160}")
     rows: list[DhRow] = []
     for k, row in cells[1:]:
         if len(row) != len(header):
@@ -118,7 +118,7 @@ def _read(file: Path) -> tuple[list[DhRow], bool, list[str]]:
         values = {name: evaluate(named[name], {}, f"{file}: line {k}, column {name}") * scales[name] for name in wanted}
         kind = _TYPES.get((named.get("type") or "revolute").lower())
         if kind is None:
-            raise ConfigError(f"{file}: line {k}: type {named['type']!r}; expected revolute or prismatic")
+            raise ConfigError(f"{file}: line {k}: type {named['type']!r:.60}; expected revolute or prismatic")
         if khalil:
             values = {"alpha": values["alpha"], "theta": values["theta"], "a": values["d"], "d": values["r"]}
         rows.append(DhRow(named.get("name") or f"joint_{len(rows) + 1}", kind, **values))
@@ -141,7 +141,7 @@ def _header(cells: Sequence[str]) -> tuple[list[str], Mapping[str, float]]:
         name = {"joint": "name", "kind": "type"}.get(name, name)
         unit = found[2].lower() if found else ""
         if unit not in _SCALES:
-            raise ConfigError(f"column {cell!r}: unknown unit; expected rad, deg, m or mm")
+            raise ConfigError(f"column {cell!r:.60}: unknown unit; expected rad, deg, m or mm")
         names.append(name)
         scales[name] = _SCALES[unit]
     return names, scales

@@ -303,6 +303,8 @@ def short_reason(error: Exception) -> str:
         return "nested too deeply"
     if isinstance(error, KeyError):
         return f"no entry {error}"
+    if isinstance(error, UnicodeDecodeError):
+        return f"byte {error.start} is no UTF-8 text"
     if _PYTHON_TYPES.search(str(error)):
         return "an entry of another type than expected"
     return " ".join(str(error).split())[:160]

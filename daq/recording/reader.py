@@ -17,7 +17,7 @@ from armident.configs import ConfigError, DataError, RobotConfig, SessionConfig
 from armident.configs.yaml_loader import is_file
 from armident.daq.recording import mcap_records as mcap
 from armident.daq.recording.growing_rows import GrowingRows
-from armident.daq.recording.layout import StreamLayout
+from armident.daq.recording.layout import StreamLayout, short_reason
 from armident.daq.recording.model import Gap, Mark, Recording, Stream, gap_from, mark_from
 from armident.daq.recording.names import (
     CHECK,
@@ -198,10 +198,8 @@ class _Content:
                 self.gaps.append(gap_from(entries))
             else:
                 self.marks.append(mark_from(entries))
-        except UnicodeDecodeError as error:
-            raise DataError(f"topic {topic}: an invalid event: byte {error.start} is no UTF-8 text") from error
         except (ValueError, RecursionError) as error:
-            raise DataError(f"topic {topic}: an invalid event: {_one_line(error)}") from error
+            raise DataError(f"topic {topic}: an invalid event: {short_reason(error)}") from error
 
 
 def _read(path: Path, mapped: mmap.mmap, *, part: bool) -> Recording:
@@ -254,7 +252,7 @@ def _recording(path: Path, content: _Content) -> Recording:
         rate = float(head["sample_rate_hz"])
         counters = {key: int(value) for key, value in scan.metadata.get(COUNTERS, {}).items()}
     except (KeyError, ValidationError, ValueError) as error:
-        raise DataError(f"{path}: its configuration is invalid: {_one_line(error)}") from error
+        raise DataError(f"{path}: its configuration is invalid: {short_reason(error)}") from error
     joints = tuple(joint.name for joint in robot.joints)
     for layout in scan.layouts.values():
         if layout.joints != joints:
@@ -291,7 +289,3 @@ def _stream(rows: GrowingRows, layout: StreamLayout, rewritten: bool) -> Stream:
             "duplicate messages, or several recordings in one file; give each recording by itself"
         )
     return Stream(layout.name, layout.every, sync, t_ns, {f.name: f for f in layout.fields}, raw)
-
-
-def _one_line(error: Exception) -> str:
-    return str(error).replace("\n", " ")[:200]
