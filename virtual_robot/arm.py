@@ -5,6 +5,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from armident.arrays import Array
 from armident.configs import ConfigError, RobotConfig
 from armident.configs.schema.scenario import Scenario
 from armident.configs.units import counts_per_si
@@ -143,7 +144,7 @@ class Arm:
         if self._signals.acts:
             self._distort(measured, disturbance)
 
-    def _distort(self, noise: NDArray[np.float64], disturbance: NDArray[np.float64]) -> None:
+    def _distort(self, noise: Array, disturbance: Array) -> None:
         """Apply hidden errors of amplifiers, wiring and names between drives, plant and bus."""
         signals, (position, current, demand) = self._signals, self._own
         self._tau[:] = signals.applied(self._current)
@@ -157,7 +158,7 @@ class Arm:
 
 def design_drives(
     robot: RobotConfig,
-    mass: NDArray[np.float64],
+    mass: Array,
     velocity_feedback: bool | None,
     period: float,
     scenario: Scenario | None,

@@ -13,9 +13,9 @@ from typing import Any
 import clarabel as untyped_clarabel
 import numpy as np
 import yaml
-from numpy.typing import NDArray
 from scipy import sparse
 
+from armident.arrays import Array
 from armident.configs import ArmidentError, ConfigError, RobotConfig
 from armident.configs.yaml_loader import is_file
 
@@ -96,7 +96,7 @@ def regrouping() -> dict[str, dict[str, float]]:
     return rows | {name: {name: 1.0} for name in alone}
 
 
-def pseudo_inertia(standard: Mapping[str, float], link: int) -> NDArray[np.float64]:
+def pseudo_inertia(standard: Mapping[str, float], link: int) -> Array:
     """Pseudo-inertia (4, 4) of link 1, ...: positive definite for a real body (Wensing, Kim, Slotine 2018)."""
     xx, xy, xz, yy, yz, zz, mx, my, mz, m = (standard[f"{k}{link}"] for k in INERTIAL)
     inertia = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
@@ -112,7 +112,7 @@ def solve_inertias() -> dict[str, float]:
     names = [f"{k}{j}" for j in range(1, JOINTS + 1) for k in INERTIAL] + [f"ia{j}" for j in range(1, JOINTS + 1)]
     at = {name: k for k, name in enumerate(names)}
 
-    def row(terms: Mapping[str, float]) -> NDArray[np.float64]:
+    def row(terms: Mapping[str, float]) -> Array:
         out = np.zeros(len(names))
         for name, factor in terms.items():
             out[at[name]] = factor
@@ -144,7 +144,7 @@ def solve_inertias() -> dict[str, float]:
     quadratic = np.zeros((len(names), len(names)))
     linear = np.zeros(len(names))
 
-    def prefer(direction: NDArray[np.float64], target: float, scale: float) -> None:
+    def prefer(direction: Array, target: float, scale: float) -> None:
         nonlocal quadratic, linear
         quadratic += np.outer(direction, direction) / scale**2
         linear -= direction * target / scale**2
@@ -172,7 +172,7 @@ def solve_inertias() -> dict[str, float]:
     return {name: float(x) for name, x in zip(names, solution.x, strict=True)}
 
 
-def _triangle(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
+def _triangle(matrix: Array) -> Array:
     """Upper triangle column by column, off-diagonals times sqrt(2): an isometry, as the solver expects."""
     return np.array([matrix[i, j] * (1.0 if i == j else np.sqrt(2.0)) for j in range(4) for i in range(j + 1)])
 

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
+from armident.arrays import Array
 from armident.configs import ConfigError, RobotConfig, Trajectory
 from armident.configs.schema.scenario import Scenario
 from armident.configs.schema.trajectory import check_motion
@@ -29,8 +30,8 @@ COUNTER = 240
 class ReferenceTable:
     """Reference positions as a table: times (N,), s, and positions (N, n), rad or m; cubic between the rows."""
 
-    t: NDArray[np.float64]
-    q: NDArray[np.float64]
+    t: Array
+    q: Array
 
     @classmethod
     def read(cls, path: Path) -> "ReferenceTable":
@@ -53,7 +54,7 @@ class ReferenceTable:
         """Positions of the first row, rad or m, (n,)."""
         return tuple(self.q[0].tolist())
 
-    def sample(self, period: float) -> NDArray[np.float64]:
+    def sample(self, period: float) -> Array:
         """Return the positions (M, n), rad or m, at multiples of a period, s."""
         times = np.arange(round(float(self.t[-1]) / period) + 1) * period
         return np.asarray(CubicSpline(self.t, self.q)(np.minimum(times, self.t[-1])))

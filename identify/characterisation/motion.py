@@ -7,13 +7,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
+from armident.arrays import Array
 from armident.configs import RobotConfig
 from armident.identify.effects.free_shapes import hats
 from armident.identify.identification.equations import aligned_torque
 from armident.identify.signals.differentiate import differentiate
 from armident.identify.signals.experiments import Experiment
-
-Array = NDArray[np.float64]
 
 WINDOW_S = 0.05
 """Time over which a speed is averaged, s: a position known to 0.01 mrad gives it to 0.3 mrad/s."""

@@ -7,13 +7,11 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtrc
 
+from armident.arrays import Array
 from armident.configs import DataError
 from armident.identify.documents.identification import IdentificationDocument
-
-Array = NDArray[np.float64]
 
 RANK_TOLERANCE = 1e-9
 """Eigenvalues of the difference's correlation, relative to the largest, that count as rounding errors."""

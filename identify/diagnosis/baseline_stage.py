@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
-from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.configs import RobotConfig
 from armident.configs.schema.robot import Effect as Entry
 from armident.identify.diagnosis.baseline_comparison import Inconclusive
@@ -29,8 +29,6 @@ from armident.identify.identification.pipeline import identify_experiment
 from armident.identify.identification.residual_statistics import effect_columns
 from armident.identify.identification.sign_smoothing import with_numbers
 from armident.identify.regression.equations import applied, instants
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

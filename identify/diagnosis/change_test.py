@@ -6,9 +6,9 @@ from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtrc, ndtr
 
+from armident.arrays import Array
 from armident.configs import RobotConfig
 from armident.identify.diagnosis.baseline_comparison import Difference, difference_of
 from armident.identify.diagnosis.changed_parameters import Attribution, Competition, ExplainedChange
@@ -23,8 +23,6 @@ from armident.identify.diagnosis.residual_test import (
 )
 from armident.identify.documents.identification import IdentificationDocument, Parameter
 from armident.identify.regression.multiple_testing import holm
-
-Array = NDArray[np.float64]
 
 FALSE_ALARMS = Criteria.change_rate
 """Probability of a false alarm per comparison."""

@@ -14,14 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
+from armident.arrays import Array
 from armident.identify.diagnosis.baseline_comparison import Difference
 from armident.identify.diagnosis.changes import Change
 from armident.identify.diagnosis.criteria import Criteria
 from armident.identify.effects.link import Payload
 from armident.identify.effects.parameter_change import ParameterChange
 from armident.identify.regression.multiple_testing import holm
-
-Array = NDArray[np.float64]
 
 RANK_TOLERANCE = 1e-7
 """Relative singular value below which a direction of normalised changes is dropped: rounding of the covariances."""

@@ -6,13 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import stdtr
 
+from armident.arrays import Array
 from armident.identify.diagnosis.criteria import Criteria
 from armident.identify.diagnosis.model_state import ModelState, acted_on
 from armident.identify.diagnosis.predictive_score import SUMS, block_sums, mean_square
 from armident.identify.effects.effect import SIGN_TOLERANCE
 from armident.identify.regression.equations import applied
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

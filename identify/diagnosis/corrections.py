@@ -3,9 +3,9 @@
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import optimize
 
+from armident.arrays import Array
 from armident.identify.diagnosis.candidates import Candidate, ColumnCache
 from armident.identify.diagnosis.regression import IvFit
 from armident.identify.diagnosis.study import NOISE_ORDER, PERTURBATION
@@ -13,7 +13,6 @@ from armident.identify.effects.drive import Correction, motor_limit
 from armident.identify.regression.ar_noise import ar_models
 from armident.identify.regression.whitening import whitened, whitened_series
 
-Array = NDArray[np.float64]
 Look = tuple[float, float]
 """Largest value of a criterion, and the parameter there."""
 

@@ -13,9 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtrc, chdtri, fdtrc
 
+from armident.arrays import Array
 from armident.identify.signals.periodogram import hann_window, periodogram
-
-Array = NDArray[np.float64]
 
 LEAST_FREQUENCIES = 40
 """Fewest frequencies from which the level of the noise is estimated: its median is known within a quarter then."""

@@ -3,7 +3,6 @@
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from armident.identify.diagnosis.candidate_comparison import Addition, SelectionStep
 from armident.identify.diagnosis.candidates import ColumnCache, Key
@@ -19,8 +18,6 @@ from armident.identify.effects.parameter_change import ParameterChange
 from armident.identify.effects.registry import catalogue, known, of_entry
 from armident.identify.effects.unnamed import NAME as UNNAMED
 from armident.identify.effects.wiring import SignalMistake
-
-Array = NDArray[np.float64]
 
 
 def findings_of(final: ModelState, selected: Sequence[Selected], left: Sequence[Unexplained]) -> list[Finding]:

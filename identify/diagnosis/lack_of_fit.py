@@ -14,6 +14,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.identify.diagnosis.criteria import Criteria
 from armident.identify.diagnosis.excess import (
     Excess,
@@ -34,8 +35,6 @@ from armident.identify.diagnosis.variables import Kind, hint_of, unit_of_variabl
 from armident.identify.regression.whitening import rows_of_joints
 from armident.identify.robot.motion import Motion
 from armident.identify.signals.periodogram import hann_window, periodogram
-
-Array = NDArray[np.float64]
 
 NORMAL = 1.4826
 """Standard deviation of a normal variable over the median of its absolute value."""

@@ -7,6 +7,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.configs import DataError, RobotConfig
 from armident.configs.schema.robot import Effect as Entry
 from armident.identify.diagnosis.candidates import ColumnCache
@@ -19,8 +20,6 @@ from armident.identify.effects.recording_corrections import of_recording
 from armident.identify.effects.terms import Term, arm_model, effect_terms
 from armident.identify.regression.ar_noise import ArModel
 from armident.identify.robot.arm import ArmModel
-
-Array = NDArray[np.float64]
 
 ITERATIONS = 4
 """Most iterations between terms that scale predicted torques and the torques that the fit predicts."""

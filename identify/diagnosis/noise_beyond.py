@@ -7,17 +7,15 @@ Otherwise they whiten the effect away: the weight of a spring, for example, is f
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import fft
 
+from armident.arrays import Array
 from armident.identify.diagnosis.candidates import ColumnCache
 from armident.identify.diagnosis.regression import MAX_AR_ORDER, IvFit
 from armident.identify.diagnosis.study import Study
 from armident.identify.effects.free_shapes import hats
 from armident.identify.regression.ar_noise import ArModel, ar_models, lagged_sums, levinson_durbin, lowest_aic
 from armident.identify.robot.motion import Motion
-
-Array = NDArray[np.float64]
 
 KNOTS = 7
 """Knots of each smooth function of the selection."""

@@ -3,9 +3,9 @@
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtrc
 
+from armident.arrays import Array
 from armident.configs.schema.robot import Effect as Entry
 from armident.identify.diagnosis.candidates import ColumnCache
 from armident.identify.diagnosis.model_state import ModelState
@@ -17,8 +17,6 @@ from armident.identify.effects.registry import of_entry
 from armident.identify.effects.terms import Term
 from armident.identify.regression.ar_noise import ArModel
 from armident.identify.regression.hac import newey_west, newey_west_matrix
-
-Array = NDArray[np.float64]
 
 NEWEY_WEST_LAGS = 20
 RANK = 1e-10

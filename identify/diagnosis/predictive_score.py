@@ -15,14 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import lapack
 
+from armident.arrays import Array
 from armident.identify.diagnosis.regression import MAX_AR_ORDER, IvFit
 from armident.identify.effects.free_shapes import FreeShape
 from armident.identify.effects.terms import effect_terms
 from armident.identify.regression.ar_noise import ArModel, ar_models
 from armident.identify.regression.iv import JointEquations
 from armident.identify.regression.iv_regression import ties
-
-Array = NDArray[np.float64]
 
 BLOCKS = 10
 """Blocks of the training data: each much longer than the memory of the noise."""

@@ -5,8 +5,8 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.configs import DataError
 from armident.identify.diagnosis.model_equations import Equations
 from armident.identify.diagnosis.study import Study
@@ -15,8 +15,6 @@ from armident.identify.regression.equations import joint_variances, residuals, s
 from armident.identify.regression.iv_regression import IvRegression
 from armident.identify.regression.least_squares import Triangle, require_excitation
 from armident.identify.regression.whitening import whitened
-
-Array = NDArray[np.float64]
 
 MAX_AR_ORDER = 30
 """Highest order of noise models: three periods of the closed-loop bandwidth at the rate of the comparison. Akaike's

@@ -8,13 +8,11 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtrc, fdtr, fdtrc
 
+from armident.arrays import Array
 from armident.identify.documents.identification import IdentificationDocument, ResidualStatistics
 from armident.identify.regression.multiple_testing import holm
-
-Array = NDArray[np.float64]
 
 SAME_MOTION = 0.1
 """Largest difference of range and speed of a joint between both runs, as share of them. The model errors of a healthy

@@ -3,13 +3,11 @@
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import optimize
 
+from armident.arrays import Array
 from armident.identify.diagnosis.candidates import Candidate, ColumnCache, Shapes
 from armident.identify.diagnosis.regression import IvFit
-
-Array = NDArray[np.float64]
 
 REFINEMENTS = 12
 """Evaluations of the golden-section search of a continuous shape between its neighbours on the grid."""

@@ -51,8 +51,6 @@ from armident.identify.diagnosis.transitions import with_transitions
 from armident.identify.effects.free_shapes import FreeShape
 from armident.identify.effects.recording_corrections import of_recording
 
-Array = NDArray[np.float64]
-
 
 @dataclass
 class StepwiseSelection:

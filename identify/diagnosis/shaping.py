@@ -6,15 +6,12 @@ The simulated loop lacks the candidate: its columns are right at measured signal
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import optimize
 
 from armident.identify.diagnosis.candidates import Candidate, ColumnCache, Shapes
 from armident.identify.diagnosis.regression import IvFit
 from armident.identify.diagnosis.screening import orthogonal_directions, replaced
 from armident.identify.regression.whitening import whitened
-
-Array = NDArray[np.float64]
 
 FIRST_LOOKS = 6
 """Values over the range of a parameter before the refinement of the best one."""

@@ -4,15 +4,13 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtrc, fdtrc
 
+from armident.arrays import Array
 from armident.identify.diagnosis.stretch import MotionStretch
 from armident.identify.diagnosis.study import Study
 from armident.identify.identification.options import CONTROLLERS
 from armident.identify.signals.periodogram import hann_window, periodogram
-
-Array = NDArray[np.float64]
 
 BLOCK = 128
 """Independent frequencies from whose median the spectrum around a line is estimated."""

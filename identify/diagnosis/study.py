@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.configs import DataError, RobotConfig
 from armident.configs.schema.robot import Effect as Entry
 from armident.identify.diagnosis.criteria import Criteria
@@ -42,8 +43,6 @@ from armident.identify.signals.bandwidth import motion_bandwidth
 from armident.identify.signals.decimate import Decimation, design
 from armident.identify.signals.differentiate import Derivatives, differentiate
 from armident.identify.signals.experiments import Experiment, check_one_rate
-
-Array = NDArray[np.float64]
 
 WORKING_RATE = 20.0
 """Rate at which effects are evaluated, over the frequency up to which model and data are compared: their harmonics up

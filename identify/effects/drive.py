@@ -6,16 +6,14 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.configs import RobotConfig
 from armident.configs.schema.robot import Effect as Entry
 from armident.identify.effects.effect import UNITLESS, Linear, Periodic, Place, Shape, TorqueDependent, Trials
 from armident.identify.robot.motion import Motion
 from armident.identify.signals.experiments import Experiment
 from armident.identify.signals.recursive import recursive_filter
-
-Array = NDArray[np.float64]
 
 LEAST = 0.1
 """Least squared ratio of a recorded torque to the true one in the correction of a saturated report."""

@@ -3,12 +3,10 @@
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.identify.effects.effect import POSITION, VELOCITY, Effect, Linear, Place, Shape, Trials
 from armident.identify.robot.motion import Motion
-
-Array = NDArray[np.float64]
 
 KNOTS = 9
 """Knots of a free shape over the range of its variable."""

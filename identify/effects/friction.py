@@ -3,8 +3,8 @@
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.compiled import ARITHMETIC, compiled
 from armident.identify.effects.effect import (
     POSITION,
@@ -24,8 +24,6 @@ from armident.identify.effects.effect import (
 from armident.identify.effects.free_shapes import TOP_SPEED, FreeShape, OverPosition, hats, table, values
 from armident.identify.effects.rotor import ROTOR, rotors
 from armident.identify.robot.motion import Motion
-
-Array = NDArray[np.float64]
 
 SLOWEST = 0.03
 """Least characteristic speed of a friction law over the joint's top speed: below it laws look like the reversal."""

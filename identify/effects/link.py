@@ -3,15 +3,13 @@
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.identify.effects.effect import TORQUE, Effect, Linear, Place, TorqueDependent
 from armident.identify.effects.free_shapes import OverPosition, table, values
 from armident.identify.effects.parameter_change import ParameterChange
 from armident.identify.robot.chain import INERTIAL
 from armident.identify.robot.motion import Motion
-
-Array = NDArray[np.float64]
 
 
 class JointSpring(Effect):

@@ -3,8 +3,8 @@
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.compiled import ARITHMETIC, compiled
 from armident.identify.effects.effect import (
     POSITION,
@@ -19,8 +19,6 @@ from armident.identify.effects.effect import (
 )
 from armident.identify.effects.rotor import ROTOR, rotors
 from armident.identify.robot.motion import Motion
-
-Array = NDArray[np.float64]
 
 DAMPINGS = (0.1, 0.7)
 """Damping ratios of an elastic joint: by its own damping, and with damping by the controlled motor."""

@@ -2,9 +2,7 @@
 
 from collections.abc import Sequence
 
-import numpy as np
-from numpy.typing import NDArray
-
+from armident.arrays import Array
 from armident.configs import DataError
 from armident.identify.estimators.auxiliary_model import AuxiliaryModel
 from armident.identify.estimators.output_error import output_error
@@ -15,9 +13,9 @@ from armident.identify.regression.iterations import ITERATIONS
 
 def cloe(
     blocks: Sequence[ExperimentEquations],
-    positions: Sequence[NDArray[np.float64]],
+    positions: Sequence[Array],
     auxiliary: AuxiliaryModel,
-    start: NDArray[np.float64],
+    start: Array,
     iterations: int = ITERATIONS,
 ) -> Estimate:
     """Minimise the output error ``q_m - q_s`` (4.1, 4.2).

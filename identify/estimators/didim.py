@@ -3,8 +3,8 @@
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.identify.estimators.auxiliary_model import AuxiliaryModel
 from armident.identify.estimators.problem import Estimator, Solved
 from armident.identify.estimators.sensitivity import torque_sensitivities
@@ -25,7 +25,7 @@ from armident.identify.regression.least_squares import Triangle
 def didim(
     blocks: Sequence[ExperimentEquations],
     auxiliary: AuxiliaryModel,
-    start: NDArray[np.float64],
+    start: Array,
     iterations: int = ITERATIONS,
     *,
     true_sensitivities: bool = False,
@@ -69,7 +69,7 @@ def didim(
 
 
 def solve_didim(
-    blocks: Sequence[ExperimentEquations], auxiliary: AuxiliaryModel, start: NDArray[np.float64], iterations: int
+    blocks: Sequence[ExperimentEquations], auxiliary: AuxiliaryModel, start: Array, iterations: int
 ) -> tuple[Iterations, Sequence[ExperimentEquations]]:
     """Iterations of DIDIM (2.36), and the equations of every experiment simulated at their last theta.
 
@@ -77,7 +77,7 @@ def solve_didim(
     """
     scale = noise = joint_variances(blocks, np.zeros_like(start))
 
-    def step(previous: NDArray[np.float64], _: int) -> tuple[NDArray[np.float64], float]:
+    def step(previous: Array, _: int) -> tuple[Array, float]:
         nonlocal noise
         simulated = auxiliary.equations(blocks, previous)
         estimate = Triangle.of(stacked_parts(simulated, noise)).theta  # 2.36

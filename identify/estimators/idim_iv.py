@@ -2,9 +2,7 @@
 
 from collections.abc import Sequence
 
-import numpy as np
-from numpy.typing import NDArray
-
+from armident.arrays import Array
 from armident.identify.estimators.auxiliary_model import AuxiliaryModel
 from armident.identify.estimators.problem import Estimator, Problem, Solved
 from armident.identify.regression.equations import (
@@ -25,7 +23,7 @@ from armident.identify.signals.streamed import mapped
 def idim_iv(
     blocks: Sequence[ExperimentEquations],
     auxiliary: AuxiliaryModel,
-    start: NDArray[np.float64],
+    start: Array,
     iterations: int = ITERATIONS,
     *,
     serial_order: int = 0,
@@ -54,10 +52,10 @@ def idim_iv(
     auxiliary = auxiliary.fresh()
     scale = noise = joint_variances(blocks, start)
 
-    def products(zeta: Sequence[NDArray[np.float64]]) -> IvProducts:
+    def products(zeta: Sequence[Array]) -> IvProducts:
         return factored_parts(instrumented_parts(instrumented(blocks, zeta), noise), start.size)
 
-    def step(previous: NDArray[np.float64], _: int) -> tuple[NDArray[np.float64], float]:
+    def step(previous: Array, _: int) -> tuple[Array, float]:
         nonlocal noise
         estimate = products(auxiliary.instruments(previous)).theta  # 2.33
         noise = joint_variances(blocks, estimate)

@@ -7,9 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
+from armident.arrays import Array
 from armident.identify.estimators.auxiliary_model import AuxiliaryModel, Response
 from armident.identify.estimators.didim import solve_didim
-from armident.identify.estimators.sensitivity import Array, Arrays, difference_steps, sensitivities, weighted_columns
+from armident.identify.estimators.sensitivity import Arrays, difference_steps, sensitivities, weighted_columns
 from armident.identify.regression.ar_noise import ArModel, ar_models
 from armident.identify.regression.equations import Estimate, ExperimentEquations
 from armident.identify.regression.iterations import TOLERANCE, iterate

@@ -5,8 +5,9 @@ from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from armident.arrays import Array
 from armident.configs import ConfigError, RobotConfig
 from armident.identify.diagnosis.candidates import Shapes
 from armident.identify.effects.effect import Effect, Place
@@ -15,8 +16,6 @@ from armident.identify.effects.registry import known
 from armident.identify.effects.wiring import SignalMistake
 from armident.identify.robot.motion import Motion
 from armident.identify.signals.decimate import Decimation
-
-Array = NDArray[np.float64]
 
 TYPICAL = (0.25, 0.5, 0.75)
 """Assumed values of an unknown nonlinear parameter, as positions in its grid."""

@@ -3,9 +3,9 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import signal
 
+from armident.arrays import Array
 from armident.configs import DataError, RobotConfig
 from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.effects.terms import arm_model
@@ -22,8 +22,8 @@ FREQUENCIES = 4096
 class PreviousEstimate:
     """Earlier base parameters (b,) and torque noise (n,) below the cut-off of the regression, N m or N."""
 
-    theta: NDArray[np.float64]
-    noise: NDArray[np.float64]
+    theta: Array
+    noise: Array
 
 
 def previous_estimate(document: IdentificationDocument, robot: RobotConfig, where: str) -> PreviousEstimate:

@@ -6,8 +6,8 @@ from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.configs import ConfigError, DataError, RobotConfig
 from armident.identify.controller.crc import JointResponse, identify_crc
 from armident.identify.controller.nominal import known_controller, nominal_controller, saturation
@@ -38,8 +38,6 @@ NO_REFERENCE = (
 NOT_LIKE_THE_ROBOT = (
     "The identified controller does not move the simulated arm like the robot. A stiff PD controller is used."
 )
-
-Array = NDArray[np.float64]
 
 
 class ClosedLoop(NamedTuple):

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.configs.schema.robot import Preprocessing
 from armident.identify.regression.equations import ExperimentEquations, filtered_regressor
 from armident.identify.robot.arm import ArmModel
@@ -59,7 +59,7 @@ def sufficient(decimation: Decimation, dt: float, samples: Sequence[int], rows: 
     return found
 
 
-def aligned_torque(tau: NDArray[np.float64], late: float = 0.0) -> NDArray[np.float64]:
+def aligned_torque(tau: Array, late: float = 0.0) -> Array:
     """Mean of the torques (N, n) held before and after each position sample; ``late`` ones, samples, are interpolated.
 
     Sample k is held over ``[k, k + 1)``, so the torque as recorded belongs half a period after the position.

@@ -8,6 +8,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.configs import DataError, Joint, RobotConfig
 from armident.configs.schema.limits import ENDLESS
 from armident.daq.recording import Recording, Stream
@@ -32,8 +33,6 @@ gives ten samples per period of the motion. Longer gaps separate pieces."""
 PIECE = 1_000_000
 """Number of samples whose references are looked up at a time."""
 EFFORTS: tuple[Literal["torque", "current", "voltage"], ...] = ("torque", "current", "voltage")
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.identify.effects.effect import Effect, Place
 from armident.identify.effects.free_shapes import hats
 from armident.identify.effects.registry import catalogue
@@ -25,8 +26,6 @@ from armident.identify.regression.equations import (
 )
 from armident.identify.regression.orders import MAX_AR_ORDER
 from armident.identify.regression.whitening import whitened
-
-Array = NDArray[np.float64]
 
 POSITION_KNOTS = 9
 """Knots of the functions of position over its range: a period of an eighth of the range is still visible."""

@@ -7,6 +7,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.identify.estimators.auxiliary_model import AuxiliaryModel
 from armident.identify.estimators.diagnostics import Diagnostics, diagnose_estimate
 from armident.identify.estimators.methods import Method, estimator
@@ -49,8 +50,6 @@ NOT_FINITE = "infs or NaNs"
 
 FEW_LAGS = 5
 """Lags of the test for serial correlation: the correlation that widens intervals is that of near neighbours."""
-
-Array = NDArray[np.float64]
 
 
 def decimation_of(

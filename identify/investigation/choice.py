@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from armident.arrays import Array
 from armident.configs import ConfigError, RobotConfig, Trajectory
 from armident.daq.recording import Recording
 from armident.identify.diagnosis.model_state import ModelState
@@ -23,7 +24,6 @@ from armident.identify.identification.from_recording import experiments_of
 from armident.identify.investigation.motions import FAMILIES, MARGIN, Reach, reach_of
 from armident.identify.investigation.question import Question, question
 from armident.identify.investigation.rivals import rivals_of, uncertain
-from armident.identify.robot.chain import Floats
 
 EXCITATION = "fast_excitation"
 """Name of the motion of all joints that is designed for the parameters of the model."""
@@ -156,9 +156,9 @@ def too_long(choice: MotionChoice, left_s: float) -> str | None:
 def excluded(
     robot: RobotConfig,
     trajectory: Trajectory,
-    theta: Floats | None,
+    theta: Array | None,
     collision: CollisionModel,
-    covariance: Floats | None = None,
+    covariance: Array | None = None,
 ) -> str | None:
     """Return the limit that a motion violates, in words.
 
@@ -211,7 +211,7 @@ def _of_joint(state: ModelState, reach: Reach, name: str) -> Iterator[tuple[Moti
 def excitation_of(
     robot: RobotConfig,
     reach: Reach,
-    theta: Floats | None,
+    theta: Array | None,
     collision: CollisionModel,
     duration: float = EXCITATION_S,
     seed: int = 0,
@@ -251,7 +251,7 @@ def reach_of_recordings(state: ModelState) -> Reach:
     return reach_of(state.robot, np.round(first, 4), speeds, accelerations)
 
 
-def home_of(robot: RobotConfig) -> Floats:
+def home_of(robot: RobotConfig) -> Array:
     """Return the posture (n,) at which motions begin: zero, or the nearest one within the limits."""
     bounds = np.array([joint.limits.position for joint in robot.joints])
     return np.clip(np.zeros(robot.n), bounds[:, 0], bounds[:, 1])

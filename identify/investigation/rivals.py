@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from armident.arrays import Array
 from armident.configs import DataError, RobotConfig
 from armident.identify.diagnosis.candidates import Candidate, ColumnCache, Shapes, candidates
 from armident.identify.diagnosis.model_state import ModelState, fitted_in_loop_of, with_entries
@@ -15,7 +16,6 @@ from armident.identify.effects.recording_corrections import of_recording
 from armident.identify.effects.registry import known
 from armident.identify.effects.terms import Term, entry_of
 from armident.identify.effects.unnamed import NAME as UNNAMED
-from armident.identify.robot.chain import Floats
 from armident.identify.robot.motion import Motion
 
 LEAST = 0.02
@@ -36,9 +36,9 @@ class Rival:
     name: str
     probability: float
     term: Term | None = None
-    values: Floats | None = None
+    values: Array | None = None
 
-    def columns(self, motion: Motion) -> Floats:
+    def columns(self, motion: Motion) -> Array:
         """Return the torques of all joints per unit of each free parameter, (N, n, k + s).
 
         The first k are the linear parameters, the others first-order changes by each continuous nonlinear one.

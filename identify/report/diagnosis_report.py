@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.identify.diagnosis.criteria import Criteria
 from armident.identify.diagnosis.diagnose import DiagnosisResult
 from armident.identify.diagnosis.lack_of_fit import ResidualDependence
@@ -13,8 +14,6 @@ from armident.identify.documents.diagnosis import VERDICTS, DiagnosisDocument, F
 from armident.identify.report.glossary import finding_entries, parameter_meaning
 from armident.identify.report.identification_report import torque_plots
 from armident.identify.report.page import BAND, INK, MEASURED, MODEL, MUTED, RESIDUAL, figure, render
-
-Array = NDArray[np.float64]
 
 LEVELS = {"no_gap": "trustworthy", "explained": "doubtful", "partly_explained": "unusable", "unexplained": "unusable"}
 """Colours of the verdicts, by the levels of an identification."""

@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import optimize
 
+from armident.arrays import Array
 from armident.identify.setup.bench import Bench
 from armident.identify.setup.fit import Hypothesis, regressors
 from armident.identify.setup.limited_least_squares import every_column
 
-Array = NDArray[np.float64]
 OrderCriterion = Callable[[Array], float]
 
 

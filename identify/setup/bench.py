@@ -8,14 +8,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.configs import DataError, RobotConfig
 from armident.identify.robot.arm import ArmModel
 from armident.identify.setup.torque_equations import ODD, Columns, Rows, columns_of, friction_terms, make_room
 from armident.identify.signals.bandwidth import motion_bandwidth
 from armident.identify.signals.decimate import Decimation, design
 from armident.identify.signals.experiments import Experiment
-
-Array = NDArray[np.float64]
 
 CUTOFF = 2.0
 """Cut-off of the equations in closed-loop bandwidths (thesis 2.3.1: ``w_Fp >= 2 w_dyn``)."""

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from armident.arrays import Array
 from armident.configs import DataError, RobotConfig
 from armident.identify.effects.recording_corrections import corrected_experiments
 from armident.identify.effects.wiring import PositionOffset
@@ -25,8 +26,6 @@ from armident.identify.setup.torque_shift import common_shift, long_torque_shift
 from armident.identify.setup.weight import weight_findings
 from armident.identify.setup.zero_offset import zero_offset
 from armident.identify.signals.experiments import Experiment, check_one_rate
-
-Array = NDArray[np.float64]
 
 LONGEST_SHIFT_S = 0.05
 """Longest common shift of the torques that references are asked for, s: filters of drives are faster."""

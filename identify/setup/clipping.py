@@ -12,10 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
+from armident.arrays import Array
 from armident.identify.setup.bench import Bench
 from armident.identify.setup.fit import Hypothesis, equations, fit_rows
-
-Array = NDArray[np.float64]
 
 NEAR = 0.94
 """Torque over its largest value from which on a row may be clipped: noise and filters blur the level."""

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
+from armident.arrays import Array
 from armident.configs import RobotConfig
 from armident.configs.schema.robot import Effect
 from armident.identify.setup.bench import Bench
@@ -18,8 +19,6 @@ from armident.identify.setup.prior import WIRING, Mistake
 from armident.identify.setup.result import SetupFinding
 from armident.identify.setup.scales import LEAST_TORQUE
 from armident.identify.setup.search import EACH_OWN, RANKED_ROWS, Step
-
-Array = NDArray[np.float64]
 
 SCALES = ("position_unit", "torque_unit", "side", "gear_ratio", "torque_scale", "torque_scales", "position_scale")
 """Families that scale signals."""

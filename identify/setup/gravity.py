@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import optimize
 
+from armident.arrays import Array
 from armident.identify.setup.fit import Hypothesis, Misfit
 
-Array = NDArray[np.float64]
 Criterion = Callable[[Hypothesis], float]
 SlopedCriterion = Callable[[Hypothesis], Misfit]
 

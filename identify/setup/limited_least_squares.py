@@ -9,10 +9,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from armident.arrays import Array, Mask
 from armident.compiled import ARITHMETIC, UNCOUNTED, compiled
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 Places = NDArray[np.int64]
 
 PASSES = 3

@@ -5,13 +5,11 @@ from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.configs import RobotConfig
 from armident.identify.effects.wiring import raw_scales
 from armident.identify.setup.fit import Hypothesis
-
-Array = NDArray[np.float64]
 
 DEGREES = np.pi / 180.0
 THOUSANDTH = 1e-3

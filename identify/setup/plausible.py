@@ -5,10 +5,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.identify.setup.bench import Bench
 from armident.identify.setup.fit import Hypothesis
-
-Array = NDArray[np.float64]
 
 POSITION_MOST = 1.2
 """Largest position over the limit that is plausible: limits of a configuration are often rounded."""

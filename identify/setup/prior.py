@@ -7,9 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.identify.setup.fit import Hypothesis
-
-Array = NDArray[np.float64]
 
 MISTAKE = math.log(100.0)
 """Cost of each mistake, nats: one set-up of a hundred has a mistake of a given kind."""

@@ -8,14 +8,13 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.identify.setup import assignment, gravity, moves, scales
 from armident.identify.setup.bench import Bench
 from armident.identify.setup.fit import Hypothesis, fit, fit_shares, held_out, joint_errors, misfit
 from armident.identify.setup.limited_least_squares import FLOOR
 from armident.identify.setup.plausible import LEAST_ODDS, equal_shares, log_plausibility, plausible_factor, worst_change
 from armident.identify.setup.prior import Mistake, between, composed, cost, wiring_cost
-
-Array = NDArray[np.float64]
 
 MOST_MISTAKES = 6
 """Largest number of mistakes that are corrected one after the other."""

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.configs import RobotConfig
 from armident.daq.recording.faults.jumps import JumpCriteria, jumps
 from armident.daq.recording.faults.updates import held, resolution
@@ -12,8 +13,6 @@ from armident.identify.setup.plausible import NO_LIMIT
 from armident.identify.setup.result import SetupFinding
 from armident.identify.signals.bandwidth import velocity_spectra
 from armident.identify.signals.experiments import Experiment
-
-Array = NDArray[np.float64]
 
 STILL_SHARE = 1e-3
 """Share of its position range below which a joint counts as not moving."""

@@ -9,8 +9,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.configs import DataError
 from armident.identify.regression.ar_noise import ArModel, fit_ar
 from armident.identify.setup.bench import Bench, make_bench
@@ -18,7 +18,6 @@ from armident.identify.setup.fit import Hypothesis
 from armident.identify.setup.result import CONVENTIONS, TorqueShift
 from armident.identify.signals.experiments import Experiment
 
-Array = NDArray[np.float64]
 Motion = tuple[Array, Array, Array]
 
 SHIFT_RATE = 20.0

@@ -7,8 +7,8 @@ place of the next axes, which the configuration states. The first joint's zero i
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.configs import RobotConfig
 from armident.configs.schema.robot import Effect
 from armident.identify.effects.wiring import PositionOffset
@@ -20,8 +20,6 @@ from armident.identify.setup.plausible import LEAST_ODDS
 from armident.identify.setup.prior import MISTAKE
 from armident.identify.setup.result import SetupFinding
 from armident.identify.setup.search import LEAST_DROP, independent_rows
-
-Array = NDArray[np.float64]
 
 LEAST = float(np.radians(1.0))
 """Least offset that is a mistake, rad: homing marks and stands are right within a degree."""

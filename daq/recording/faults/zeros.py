@@ -1,12 +1,9 @@
 """Efforts that are no measurement: zero in every row, or in rows between others that are not."""
 
 import numpy as np
-from numpy.typing import NDArray
 
+from armident.arrays import Array, Mask
 from armident.daq.recording.faults.jumps import JumpCriteria
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 NOTHING = 1e-300
 """Magnitude below which an effort is 0 in every unit: memory that was never written holds such numbers."""

@@ -6,12 +6,11 @@ from typing import Any, Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.configs import DataError, RobotConfig
 from armident.daq.recording import Field, StreamLayout
 from armident.identify.identification.set_points import between_set_points
 from armident.identify.monitoring.recursive.kernels import to_joint_side
-
-Array = NDArray[np.float64]
 
 EFFORTS: tuple[Literal["torque", "current", "voltage"], ...] = ("torque", "current", "voltage")
 LONGEST_WAIT = 8192
