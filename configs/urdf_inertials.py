@@ -39,10 +39,7 @@ class UrdfInertials:
 
 
 def read_inertials(file: Path, base: str | None = None, tip: str | None = None) -> UrdfInertials:
-    """Masses of the links between two links of a URDF, and friction of its joints; errors name file and element.
-
-    Links on fixed joints belong to the link that carries them, and everything after the tip to the last link.
-    """
+    """Masses of the links between two links of a URDF, and friction of its joints; errors name file and element."""
     joints = read_chain(file, base, tip)
     frames = mdh_of(joints, file).frames
     tree = read_tree(file)

@@ -164,10 +164,7 @@ def design_drives(
     scenario: Scenario | None,
     parameters: ArmParameters,
 ) -> servo.Servo:
-    """Design the drives of a virtual arm: gains of the scenario, else of its configuration, else tuned ones.
-
-    ``mass`` (n, n): of the healthy arm at power-on, joint side, with rotors. Raises ConfigError if gains do not fit.
-    """
+    """Design the drives of a virtual arm: gains of the scenario, else of its configuration, else tuned ones."""
     given = None if scenario is None or scenario.controller is None else scenario.controller
     known = None if given is None else given.gains
     if known is not None and not len(known.kp) == len(known.kv) == robot.n:

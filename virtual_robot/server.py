@@ -142,10 +142,7 @@ class Server:
             drive_bus.close()
 
     def run(self, stopped: Callable[[], bool], duration: float | None = None) -> ServerReport:
-        """Answer every SYNC until ``stopped`` or ``duration``, s; raises BusDown if the only bus goes down.
-
-        Of several buses the others go on, and a bus that is back is served again.
-        """
+        """Answer every SYNC until ``stopped`` or ``duration``, s; raises BusDown if the only bus goes down."""
         begin, cpu = time.monotonic(), time.process_time()
 
         def over() -> bool:

@@ -96,10 +96,7 @@ def at_period(session: SessionConfig, period_us: int) -> SessionConfig:
 
 
 def on_virtual_bus(session: SessionConfig, channel: str, cell: str) -> SessionConfig:
-    """Session on one vcan bus, without the cell's Zenoh, metrics and triggers: real drives and services stay apart.
-
-    Raises ConfigError if drives of several buses share a node id.
-    """
+    """Session on one vcan bus, without the cell's Zenoh, metrics and triggers: real drives and services stay apart."""
     nodes = [drive.node_id for drive in session.drives]
     if len(set(nodes)) < len(nodes):
         raise ConfigError(
@@ -235,10 +232,7 @@ def _session_for(path: Path, robot: RobotConfig) -> SessionConfig:
 
 
 def write_twin(twin: Twin, folder: Path) -> Path:
-    """Write ``robot.yaml``, ``cell.yaml`` and, without set points, ``trajectory.yaml`` for ``armident capture``.
-
-    Returns the session file; raises ConfigError if the files cannot be written.
-    """
+    """Write ``robot.yaml``, ``cell.yaml`` and, without set points, ``trajectory.yaml`` for ``armident capture``."""
     try:
         return _write_files(twin, folder)
     except OSError as error:

@@ -115,10 +115,7 @@ def is_recording(path: Path) -> bool:
 
 
 def unpacked_bytes(path: Path) -> int:
-    """Return the bytes of a recording's records if its chunks were unpacked; a damaged chunk counts nothing.
-
-    The arrays of `read_recording` are smaller. Raises OSError if the file cannot be read.
-    """
+    """Return the bytes of a recording's records if its chunks were unpacked; a damaged chunk counts nothing."""
     with path.open("rb") as file:
         if path.stat().st_size == 0:
             return 0

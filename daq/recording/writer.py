@@ -243,10 +243,7 @@ class RecordingWriter:
             self._event(topic, sync, self._last_ns, event)
 
     def close(self, counters: Mapping[str, int]) -> None:
-        """Write the rest, the counters of the capture and the summary; the file is complete afterwards.
-
-        Raises ConfigError if the end cannot be written; the file remains readable as a truncated one.
-        """
+        """Write the rest, the counters of the capture and the summary; the file is complete afterwards."""
         try:
             self.flush()
             # If the last rows could not be written, their gaps may still fit on the disk.

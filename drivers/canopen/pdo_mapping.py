@@ -70,10 +70,7 @@ def _disable_tpdo(sdo: DriveSdo, communication: int) -> None:
 
 
 def _map_stop(sdo: DriveSdo, rpdo: int) -> None:
-    """Map the controlword (6040h) into an event-driven RPDO, which stops a drive faster than SDO.
-
-    A drive without this RPDO, or that does not map the controlword, is stopped by SDO.
-    """
+    """Map the controlword (6040h) into an event-driven RPDO, which stops a drive faster than SDO."""
     communication, mapping = od.RPDO_COMMUNICATION + rpdo - 1, od.RPDO_MAPPING + rpdo - 1
     if communication not in sdo.node.object_dictionary or mapping not in sdo.node.object_dictionary:
         return

@@ -109,10 +109,7 @@ def alone(experiments: Sequence[Experiment], robot: RobotConfig, joint: int) -> 
 
 
 def plateaus(motions: Sequence[Alone]) -> list[tuple[Plateau, ...]]:
-    """Return the stretches of constant speed: pairs at one speed, forth and back over the same positions, and others.
-
-    The slowest first.
-    """
+    """Return the stretches of constant speed, slowest first: pairs at one speed over the same positions, and others."""
     found: list[tuple[Plateau, ...]] = []
     for one in motions:
         width, v = _width(one.dt), one.speed

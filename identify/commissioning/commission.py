@@ -199,10 +199,7 @@ def _wrong(finding: SetupFinding) -> Ended:
 
 
 def started(robot: RobotConfig, source: str | Path | None, folder: Path | None) -> CommissioningRun:
-    """Return a new commissioning; ``source``: path or name of the configuration, whose URDF has masses and shapes.
-
-    Raises ConfigError if the folder has one already.
-    """
+    """Return a new commissioning; ``source``: path or name of the configuration, whose URDF has masses and shapes."""
     if folder is not None:
         if (folder / FILE).exists():
             raise ConfigError(f"{folder}: has a commissioning already; go on with --continue, or give another --out")
@@ -212,10 +209,7 @@ def started(robot: RobotConfig, source: str | Path | None, folder: Path | None) 
 
 
 def resumed(folder: Path) -> CommissioningRun:
-    """Return the commissioning of a folder; a stage that did not pass is judged again by the present configuration.
-
-    Raises ConfigError if there is none, DataError if a recording changed.
-    """
+    """Return the commissioning of a folder; a stage that did not pass is judged again by the present configuration."""
     document = load_document(folder / FILE, CommissioningDocument)
     robot = load_robot(folder / ROBOT, "trajectory")
     recordings = [read_again(one.recording) for one in document.motions]

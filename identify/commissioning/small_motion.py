@@ -49,10 +49,7 @@ class SmallMotion(MotionFamily):
 
 
 def wrong_answer(robot: RobotConfig, joint: int, asked: Array, answer: Sequence[Experiment]) -> SetupFinding | None:
-    """Return the mistake that a small motion of one joint shows; ``None`` if its own signals answered.
-
-    ``asked`` (N,): positions of the joint, rad or m; ``answer``: recording, SI, joint side.
-    """
+    """Return the mistake that a small motion (N,) of one joint shows; ``None`` if its own signals answered."""
     names = [each.name for each in robot.joints]
     q, tau = (np.concatenate([getattr(e, signal) for e in answer]) for signal in ("q", "tau"))
     wanted, made = _farthest(asked[:, None])[0], _farthest(q)

@@ -166,10 +166,7 @@ class Competition:
         return Attribution(self.difference, changes, rest, p_rest, unexplained, share)
 
     def _within_first_order(self, found: Sequence["Whitened"], best: "Whitened") -> bool:
-        """True if a further change takes no more than what the directions of the others leave of large changes.
-
-        Those of parameters are exact. The others hold for small changes, and for noise models without them.
-        """
+        """True if a further change takes no more than what the directions of the others leave of large changes."""
         if all(one.change.scores is None for one in found):
             return False
         whole = float(self.target @ self.target)
@@ -249,10 +246,7 @@ class Whitened:
 
 
 def _prior(change: Change, pool: Sequence[Change], criteria: Criteria) -> float:
-    """Logarithm of the prior odds, divided among the places of an effect.
-
-    Loads of the flange, friction and offsets change more often than the rest, and loads of other links less.
-    """
+    """Logarithm of the prior odds, divided among the places of an effect."""
     alike = [c for c in pool if c.effect == change.effect]
     common = criteria.close if isinstance(change.effect, ParameterChange) else 0.0
     if not isinstance(change.effect, Payload):
@@ -284,10 +278,7 @@ def _log_likelihood(square: float, count: int) -> float:
 
 
 def _whitened_by(target: Array, found: Sequence[Whitened]) -> tuple[Array, float]:
-    """Matrix (r, r) that whitens the difference with some changes of their best sizes, and half its log determinant.
-
-    The sizes are those of all changes together: alone, one would take the size of another, too.
-    """
+    """Matrix (r, r) that whitens the difference with some changes of their best sizes, and half its log determinant."""
     sizes = [0.0] * len(found)
     for _ in range(SWEEPS if len(found) > 1 else 1):
         before = list(sizes)

@@ -13,10 +13,7 @@ KNOTS = 9
 
 
 def hats(x: Array, knots: Sequence[float] | Array) -> Array:
-    """Return piecewise linear functions (N, k), one at each of the increasing knots, constant beyond them.
-
-    They are all one where the knots coincide: those of a signal that never changes.
-    """
+    """Return piecewise linear functions (N, k), one at each of the increasing knots, constant beyond them."""
     at = np.asarray(knots, dtype=np.float64)
     if x.dtype == object:
         # Symbols in place of numbers: a formula is derived, see `armident.identify.model_export.formulas`.

@@ -230,10 +230,7 @@ class StribeckFrictionTable(FreeShape, StribeckBell):
         return ([motion.top_speed[place.joint]],)
 
     def possible(self, values: Array, shapes: Mapping[str, float]) -> bool:
-        """Return True if friction falls with the speed.
-
-        The value at rest is not judged alone: it contains the transition of dry friction at reversals.
-        """
+        """Return True if friction falls with the speed."""
         return bool(values[1] > 0.0 and values[1] >= values[-1] and values[0] + values[1] > 0.0)
 
 

@@ -71,10 +71,7 @@ def didim(
 def solve_didim(
     blocks: Sequence[ExperimentEquations], auxiliary: AuxiliaryModel, start: Array, iterations: int
 ) -> tuple[Iterations, Sequence[ExperimentEquations]]:
-    """Iterations of DIDIM (2.36), and the equations of every experiment simulated at their last theta.
-
-    Raises DataError if no auxiliary model runs, not even the first.
-    """
+    """Iterations of DIDIM (2.36), and the equations of every experiment simulated at their last theta."""
     scale = noise = joint_variances(blocks, np.zeros_like(start))
 
     def step(previous: Array, _: int) -> tuple[Array, float]:

@@ -64,10 +64,7 @@ class InverseController:
 
 
 def controller_gain(controller: DiscreteController, factor: int) -> Array:
-    """Gain (n, K) of each motor's controller from position noise to torque, up to the decimated Nyquist frequency.
-
-    Position noise enters with the tracking error and, in a velocity loop, with the position itself.
-    """
+    """Gain (n, K) of each motor's controller from position noise to torque, up to the decimated Nyquist frequency."""
     z = np.exp(-1j * np.pi * np.linspace(0.0, 1.0, FREQUENCIES) / factor)
 
     def response(taps: Array) -> NDArray[np.complex128]:

@@ -178,10 +178,7 @@ def _search(
 def with_objective(
     robot: RobotConfig, wanted: str | None, joint: str | None, against: str | None, theta: ArrayLike | None = None
 ) -> EffectObjective | None:
-    """Return the objective of the options ``--for``, ``--joint`` and ``--against``; ``None`` without ``--for``.
-
-    Speeds and loads at which the effect is to be visible are those of a typical trajectory of the robot.
-    """
+    """Return the objective of the options ``--for``, ``--joint`` and ``--against``; ``None`` without ``--for``."""
     if wanted is None:
         for option, value in (("--joint", joint), ("--against", against)):
             if value is not None:

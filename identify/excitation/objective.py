@@ -74,11 +74,7 @@ class EffectObjective:
 def effect_objective(
     robot: RobotConfig, wanted: str, joint: str | None, against: str | None, motion: Motion
 ) -> EffectObjective:
-    """Return the objective for an effect at one joint or at all joints.
-
-    ``motion``: typical motion; its speeds and loads give the nonlinear parameters. Raises ConfigError if the robot has
-    no such effect or joint, or any motion shows the effect.
-    """
+    """Return the objective for an effect at one joint or at all joints."""
     effect, rival = _designable(wanted, "--for"), None if against is None else _designable(against, "--against")
     if rival is not None and rival.name == effect.name:
         raise ConfigError(f"--against {against}: expected another effect than --for")

@@ -49,11 +49,7 @@ def previous_estimate(document: IdentificationDocument, robot: RobotConfig, wher
 
 
 def physical_estimate(document: IdentificationDocument, robot: RobotConfig, where: str) -> PreviousEstimate:
-    """Return the estimate of `previous_estimate` with parameters that an arm can have: others predict wrong torques.
-
-    They are the nearest physically consistent ones where the document has them. Raises DataError if the identification
-    is unusable, or friction, rotor inertias or mass matrix are impossible by more than their uncertainty.
-    """
+    """Return the estimate of `previous_estimate` with parameters that an arm can have: others predict wrong torques."""
     found = previous_estimate(document, robot, where)
     without = "Next: identify the arm from a better recording, or design without --known"
     if document.verdict == "unusable":

@@ -47,10 +47,7 @@ def safety_model(
     prior_name: str = "--known",
     masses: Path | None = None,
 ) -> SafetyModel:
-    """Collect masses and bodies of an arm: of an earlier estimate, of a file, of its configuration, of its URDF.
-
-    ``masses``: file of standard parameters from ``armident robot --truth``; replaces the masses of the URDF.
-    """
+    """Collect masses and bodies of an arm: of an earlier estimate, of a file, of its configuration, of its URDF."""
     shapes = None if source is None else load_shapes(source)
     capsules, unread = ([], []) if shapes is None else capsules_of(shapes.shapes)
     collision = CollisionModel(robot, capsules)

@@ -60,11 +60,7 @@ def closed_loop(
     bandwidth: float,
     excluded: str | None = None,
 ) -> ClosedLoop:
-    """Return the first closed loop whose simulation runs and moves like the robot (thesis 5.2).
-
-    The identified or known controller comes before a stiff PD controller, IDIM-LS (b,) before the initial parameters.
-    Raises DataError if all diverge and the method has no measured regressor.
-    """
+    """Return the first closed loop whose simulation runs and moves like the robot (thesis 5.2)."""
     model, experiments, signals = prepared.model, prepared.experiments, prepared.signals
     dt = experiments[0].dt
     starts = [("idim-ls", ls), ("initial_parameters", initial_parameters(model))]
@@ -118,10 +114,7 @@ def closed_loop(
 
 
 def _bandpassed(options: Options, bandwidth: float, dt: float) -> Callable[[Array, int], Derivatives] | None:
-    """The bandpass of the measured positions, for the instruments; ``None`` where another filter was chosen.
-
-    Other instruments have frequencies that the regressor lacks; the prefilter of IDIM-PIV takes them for information.
-    """
+    """The bandpass of the measured positions, for the instruments; ``None`` where another filter was chosen."""
     if options.derivatives != "bandpass" or not estimator(options.method).measured:
         return None
     return lambda q, _: differentiate(q, dt, "bandpass", bandwidth_hz=bandwidth)

@@ -129,10 +129,7 @@ def _converted(
 def experiments_of(
     recordings: Sequence[Recording], robot: RobotConfig, *, name_files: bool, stretches: StretchRule = WHOLE
 ) -> tuple[Sequence[Experiment], list[str]]:
-    """Experiments of recordings in order, and remarks, which begin with the file if ``name_files``.
-
-    Raises ConfigError if a recording is of another robot, DataError if one holds no experiment that can be used.
-    """
+    """Experiments of recordings in order, and remarks, which begin with the file if ``name_files``."""
     found: list[Sequence[Experiment]] = []
     notes: list[str] = []
     if sum(recording.samples.sync.size for recording in recordings) * robot.n > stretches.beyond:
@@ -241,10 +238,7 @@ def joint_positions(stream: Stream, quantity: Literal["position", "demand", "vel
 
 
 def joint_torques(stream: Stream, robot: RobotConfig) -> Array:
-    """Joint torques from the signals of the drives, shape (N, n), N m or N; DataError if missing or not finite.
-
-    Current and voltage belong to the motor, independently of the side of the positions; a torque names its side.
-    """
+    """Joint torques from the signals of the drives, shape (N, n), N m or N; DataError if missing or not finite."""
     wanted = robot.joints[0].drive.signal
     for quantity in sorted(EFFORTS, key=lambda effort: effort != wanted):
         name = stream.named(quantity)
@@ -402,10 +396,7 @@ def rest_notes(experiments: Sequence[Experiment], robot: RobotConfig) -> list[st
 
 
 def _rate_notes(recording: Recording) -> list[str]:
-    """Notes on a SYNC rate that differs from the nominal one by the receive times.
-
-    Whole periods that the producer skipped and counted are no clock error, but matter where a real arm moves on.
-    """
+    """Notes on a SYNC rate that differs from the nominal one by the receive times."""
     samples, nominal = recording.samples, recording.sample_rate_hz
     elapsed = float(samples.t_ns[-1] - samples.t_ns[0]) * 1e-9
     if elapsed <= 0:

@@ -140,10 +140,7 @@ def effect_columns(
     theta: Array,
     effects: Sequence[tuple[Effect, Place]],
 ) -> list[Array]:
-    """Columns (M, n, m) of effects in each experiment at some samples; ``theta`` (b,) predicts their torques.
-
-    They vary as slowly as the motion, so that the filter of the equations leaves them.
-    """
+    """Columns (M, n, m) of effects in each experiment at some samples; ``theta`` (b,) predicts their torques."""
     columns = []
     for e, s, at in zip(prepared.experiments, prepared.signals, numbers, strict=True):
         motion = replace(prepared.model.motion(s.q[at], s.qd[at], s.qdd[at], e.dt, e.start), theta=theta)

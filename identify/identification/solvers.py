@@ -63,11 +63,7 @@ def decimation_of(
     warnings: list[str] | None = None,
     reasons: list[Reason] | None = None,
 ) -> Decimation:
-    """Low-pass and decimation of a method, rough for one with a noise model; a chosen ``factor`` is kept.
-
-    Else at least ``rows`` equations are left (`least_rows`). A line is added to ``warnings`` if the cut-off was raised,
-    to ``reasons`` if too few equations are left.
-    """
+    """Low-pass and decimation of a method, rough for one with a noise model; a chosen ``factor`` is kept."""
     share = PIV_CUTOFF if estimator(method).prefiltered else LS_CUTOFF
     cutoff = share * bandwidth_hz if factor is None else 0.5 / (dt * factor)
     wanted = design(dt, cutoff, factor)

@@ -83,11 +83,7 @@ def next_motion(
     done: Sequence[MotionChoice],
     left_s: float,
 ) -> Chosen:
-    """Return the motion that tells the explanations apart most per second of robot time, among those not done yet.
-
-    ``state``: model as configured, fitted to all recordings so far. ``explanations``: of its joints. ``left_s``: time
-    of motion that is left, s.
-    """
+    """Return the motion that tells the explanations apart most per second of robot time, among those not done yet."""
     reach, past = reach_of_recordings(state), {_key(one) for one in done}
     open_questions, asked = _questions(state, explanations)
     made: list[tuple[float, MotionChoice, Trajectory]] = []
@@ -117,10 +113,7 @@ def next_motion(
 def next_recording(
     state: ModelState, explanations: Sequence[Explanation], offered: Sequence[Recording], done: Sequence[MotionChoice]
 ) -> Chosen:
-    """Return the recording of the past that tells the explanations apart most, among those not seen yet.
-
-    Its torques are not looked at before it is chosen.
-    """
+    """Return the recording of the past that tells the explanations apart most, among those not seen yet."""
     open_questions, asked = _questions(state, explanations)
     past = {one.words for one in done}
     made: list[tuple[MotionChoice, Recording]] = []
@@ -160,10 +153,7 @@ def excluded(
     collision: CollisionModel,
     covariance: Array | None = None,
 ) -> str | None:
-    """Return the limit that a motion violates, in words.
-
-    ``theta`` (b,) predicts its torques, with the uncertainty that follows from its ``covariance`` (b, b).
-    """
+    """Return the limit that a motion violates, in words."""
     try:
         trajectory.check(robot, "motion")
     except ConfigError as error:

@@ -124,10 +124,7 @@ def _pieces(motion: Motion) -> Iterator[Motion]:
 
 
 def _information(state: ModelState, rivals: Sequence[Rival], motions: Sequence[Motion]) -> Array:
-    """Return the information (c, c) of motions on the parameters of the model and of all rivals.
-
-    Times about reversals, where no model of dry friction is right, count only for effects that act there.
-    """
+    """Return the information (c, c) of motions on the parameters of the model and of all rivals."""
     study = state.study
     slowest, factor = 1.0 / np.asarray(state.robot.sign_smoothing), study.decimation.factor
     total: Array | float = 0.0

@@ -91,10 +91,7 @@ class Bench:
 
     @cached_property
     def instants_used(self) -> tuple[NDArray[np.int64], ...]:
-        """Instants of the equations in each segment, at most `rows_kept` of all, the same for all hypotheses.
-
-        All instants count where the joints seldom move at once.
-        """
+        """Instants of the equations in each segment, at most `rows_kept` of all, the same for all hypotheses."""
         moves = [
             np.all(np.abs(self.decimation(s.qd))[:, self.moving] > AT_REST * self._fastest[self.moving], axis=1)
             for s in self.segments

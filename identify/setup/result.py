@@ -77,10 +77,7 @@ class TorqueShift:
 
     @property
     def correction(self) -> float:
-        """Shift that is corrected, samples; 0 for none, and if the estimate is too uncertain.
-
-        That of an agreeing sampling convention, which is more exact; else the estimate up to one sample.
-        """
+        """Shift that is corrected, samples; 0 for none, and if the estimate is too uncertain."""
         if not self.determined:
             return 0.0
         if any(abs(self.samples - shift) <= SIGNIFICANT * self.std for shift in CONVENTIONS):
@@ -110,10 +107,7 @@ class TorqueShift:
 
     @property
     def confirmed(self) -> bool:
-        """True if it exceeds one sample; at least two joints confirm it, none contradicts it.
-
-        Never without instruments: friction and elasticity that the model lacks look like a shift, too.
-        """
+        """True if it exceeds one sample; at least two joints confirm it, none contradicts it."""
         size = abs(self.samples)
         telling = [(own, std) for own, std in self.by_joint.values() if SIGNIFICANT * std <= size]
         agree = all(abs(own - self.samples) <= SIGNIFICANT * std for own, std in telling)

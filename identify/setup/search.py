@@ -227,10 +227,7 @@ class Search:
         return best
 
     def _material(self, old: Hypothesis, new: Hypothesis, least: float) -> bool:
-        """True if a correction makes no joint implausible, and more joints improve by a factor than get worse.
-
-        With and without the free terms: helping these alone only fits an effect that the model lacks.
-        """
+        """True if a correction makes no joint implausible, and more joints improve by a factor than get worse."""
         if worst_change(self.bench, old, new) < -LEAST_ODDS:
             return False
         return all(self._improved(old, new, free=free) >= np.log(least) for free in (True, False))

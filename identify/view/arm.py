@@ -45,10 +45,7 @@ class Arm:
         return np.stack([_onto(axis).as_quat() for axis in self.frames.axes]), self.length / 20, self.length / 8
 
     def poses(self, q: Array) -> tuple[Array, Array]:
-        """Return each link in the one before it at positions (N, n): translations (N, n, 3), quaternions (N, n, 4).
-
-        Quaternions are x, y, z, w.
-        """
+        """Return each link in the one before it at q (N, n): translations (N, n, 3), quaternions xyzw (N, n, 4)."""
         translations = np.tile(self.frames.placements[:, :3, 3], (len(q), 1, 1))
         quaternions = np.empty((len(q), len(self.revolute), 4))
         for j, (placement, axis) in enumerate(zip(self.frames.placements, self.frames.axes, strict=True)):
@@ -63,10 +60,7 @@ class Arm:
 
 
 def arm_of(robot: RobotConfig, source: SourceUrdf | None) -> tuple[Arm, list[str]]:
-    """Return the arm of a URDF, else with lines between its joints, and remarks on meshes that cannot be shown.
-
-    Raises ConfigError if the URDF is wrong or of another arm.
-    """
+    """Return the arm of a URDF, else with lines between its joints, and remarks on meshes that cannot be shown."""
     frames = mdh_link_frames(robot) if source is None else source_frames(source, robot)
     bodies: list[list[Array]] = [[] for _ in range(robot.n + 1)]
     remarks = ["no URDF: the arm is shown as lines between its joints; --urdf FILE shows its links"]

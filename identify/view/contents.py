@@ -62,10 +62,7 @@ def prediction_of(
     remarks: list[str],
     report: Progress,
 ) -> TorquePrediction | None:
-    """Return the torques of a model, by default of the identification ``beside`` the recording, if it can be used.
-
-    ``robot``: configuration of the model; ``None``: its own. ``remarks`` takes the warnings, or why there are none.
-    """
+    """Return the torques of a model, by default of the identification ``beside`` the recording, if it can be used."""
     if model is None and not (beside / "identification.json").is_file():
         remarks.append("no model, so only measured signals: give --model, or run armident identify first")
         return None
@@ -83,10 +80,7 @@ def prediction_of(
 def contents_of(
     recording: Recording, robot: RobotConfig, arm: Arm, prediction: TorquePrediction | None, diagnosis: Path
 ) -> Contents:
-    """Return the contents of a recording with predicted torques; ``diagnosis``: file of findings, which need not exist.
-
-    Raises DataError if the recording has no samples or no torque.
-    """
+    """Return the contents of a recording with predicted torques; ``diagnosis``: file of findings, if any."""
     samples = recording.samples
     if samples.sync.size < 2:
         raise DataError(f"{recording.path}: has no samples")
@@ -123,10 +117,7 @@ def contents_of(
 
 
 def standardised(prediction: TorquePrediction) -> Array:
-    """Return the unexplained torques (M, n) in units of their standard deviations.
-
-    Variance: that of the residuals in the identification, in their frequency bands, and that of the parameters.
-    """
+    """Return the unexplained torques (M, n) in units of their standard deviations."""
     model = prediction.model
     power = {each.joint: sum(each.band_power) for each in model.document.residual_statistics or ()}
     if len(power) < model.n:

@@ -106,10 +106,7 @@ def hinge_damping(hidden: Sequence[Hidden], gravity: Array) -> Array:
 
 
 def add_rotors(rotor: Array, hidden: Sequence[Hidden], links: Array) -> None:
-    """Add hidden rotor inertias to ``rotor`` (n, n), joint side, in place.
-
-    Raises ConfigError if the mass matrix, with that of the ``links`` (n, n) at the start, is not positive definite.
-    """
+    """Add hidden rotor inertias to ``rotor`` (n, n), joint side, in place."""
     for h in hidden:
         if h.effect == "rotor_inertia":
             one, two = (h.joint, h.joint) if h.other < 0 else (h.joint, h.other)

@@ -157,10 +157,7 @@ def shared_steps(position: Array, steps: Sequence[tuple[int, int, float]]) -> se
 
 
 def repaired(recording: Recording) -> tuple[Recording, tuple[str, ...]]:
-    """Return a recording with its faults repaired, the same if it has none, and a sentence for each kind.
-
-    What an import has repaired is among the sentences.
-    """
+    """Return a recording with its faults repaired, the same if it has none, and a sentence for each kind."""
     before = tuple(line for line in recording.metadata.get(REPAIRS, "").split("\n") if line)
     samples, robot = recording.samples, recording.robot
     position = samples.named("position")

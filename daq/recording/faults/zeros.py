@@ -19,10 +19,7 @@ def never_measured(effort: Array) -> Mask:
 
 
 def zero_rows(effort: Array, holes: Mask, criteria: JumpCriteria) -> Mask:
-    """Mask (N, n) of zeros in few rows between efforts far from 0 on both sides.
-
-    Rows in which all joints are 0 count together: one of them that is far from 0 tells for all.
-    """
+    """Mask (N, n) of zeros in few rows between efforts far from 0 on both sides."""
     zero = np.abs(effort) < NOTHING
     found = np.zeros(effort.shape, dtype=np.bool_)
     used = ~zero.all(axis=0)

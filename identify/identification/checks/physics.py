@@ -67,10 +67,7 @@ def physics(judged: Judged, criteria: IdentificationCriteria) -> list[Reason]:
 def impossible_values(
     model: ArmModel, q: Array, theta: Array, covariance: Array, criteria: IdentificationCriteria
 ) -> list[str]:
-    """Parts of a sentence on impossible values: negative friction or rotor inertia, mass matrix not positive definite.
-
-    Only what is significant counts. ``q``: postures (N, n), rad or m; ``theta`` (b,) and ``covariance`` (b, b): SI.
-    """
+    """Parts of a sentence on significant impossible values: friction, rotor inertia or mass matrix."""
     return [*_negative(model, theta, covariance, criteria), *_indefinite(model, q, theta, covariance, criteria)]
 
 

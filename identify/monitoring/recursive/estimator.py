@@ -131,10 +131,7 @@ class RecursiveEstimator:
         self.speed_error = np.zeros((2, n))
 
     def handle(self, block: SampleBlock) -> None:
-        """Process a block of any stream: repeated rows are skipped, missing ones start the filters anew.
-
-        Raises DataError if the block has other joints than the robot, or lacks position or torque.
-        """
+        """Process a block of any stream: repeated rows are skipped, missing ones start the filters anew."""
         if self.matcher.add(block):
             self.start_capture(begun=True)
 

@@ -76,10 +76,7 @@ class RowMatcher:
         self.without_reference, self.repeated = 0, 0
 
     def add(self, block: SampleBlock) -> bool:
-        """Take over a block of any stream; True if another capture begins: SYNC numbers begin anew at a later time.
-
-        Raises DataError if the block has other joints than the robot, or lacks position or torque.
-        """
+        """Take over a block of any stream; True if another capture begins: SYNC numbers begin anew at a later time."""
         layout = block.layout
         names = tuple(joint.name for joint in self._robot.joints)
         if layout.joints != names:
