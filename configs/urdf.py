@@ -149,11 +149,7 @@ def _in_frames_of_the_chain(given: Collision, frames: dict[str, Array], where: P
 
 
 def _point(frame: Array, point: tuple[float, float, float]) -> tuple[float, float, float]:
-    return _triple(frame[:3, :3] @ point + frame[:3, 3])
-
-
-def _triple(values: Array) -> tuple[float, float, float]:
-    x, y, z = (float(v) for v in values)
+    x, y, z = (float(v) for v in frame[:3, :3] @ point + frame[:3, 3])
     return x, y, z
 
 

@@ -120,7 +120,8 @@ def simulate_recording(
         "samples", 1, sync, times(sync), sample_fields(robot),
         {"position": position, effort_of(robot): current, "status": np.full((total, n), OPERATION_ENABLED, np.uint16)},
     )  # fmt: skip
-    demands = Stream("demand", every, knots, times(knots), demand_fields(robot), {"demand": demand})
+    fields = {"demand": Field("demand", "demand", _position_unit(robot), "motor", _per_count(robot))}
+    demands = Stream("demand", every, knots, times(knots), fields, {"demand": demand})
     marks = (
         Mark("experiment_start", first, start_ns + first * step_ns),
         Mark("experiment_end", last, start_ns + last * step_ns),
@@ -155,11 +156,6 @@ def sample_fields(robot: RobotConfig) -> dict[str, Field]:
         effort: Field(effort, effort, unit, "motor", rated),
         "status": Field("status", "status", "", "motor", (1.0,) * robot.n),
     }
-
-
-def demand_fields(robot: RobotConfig) -> dict[str, Field]:
-    """Field of the ``demand`` stream: demanded motor positions."""
-    return {"demand": Field("demand", "demand", _position_unit(robot), "motor", _per_count(robot))}
 
 
 def _position_unit(robot: RobotConfig) -> str:

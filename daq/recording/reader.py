@@ -5,6 +5,7 @@ import mmap
 import os
 from contextlib import suppress
 from dataclasses import dataclass, field
+from operator import itemgetter
 from pathlib import Path
 from typing import BinaryIO
 
@@ -238,7 +239,7 @@ def _recording(path: Path, content: _Content) -> Recording:
     first = {layout.name: k for k, layout in reversed(scan.layouts.items())}
     streams = {
         name: _stream(content.rows_of(k), scan.layouts[k], scan.rewritten)
-        for name, k in sorted(first.items(), key=_by_channel)
+        for name, k in sorted(first.items(), key=itemgetter(1))
     }
     if "samples" not in streams:
         raise DataError(f"{path}: no topic /samples")
@@ -268,10 +269,6 @@ def _recording(path: Path, content: _Content) -> Recording:
         metadata=scan.metadata.get(FACTS, {}),
         missing="; ".join(missing) or None,
     )
-
-
-def _by_channel(entry: tuple[str, int]) -> int:
-    return entry[1]
 
 
 def _stream(rows: GrowingRows, layout: StreamLayout, rewritten: bool) -> Stream:

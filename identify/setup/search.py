@@ -142,10 +142,6 @@ class Search:
         """Few instants, with which all single mistakes are ranked first."""
         return self.bench.coarse(FEW_ROWS)
 
-    def few_rank(self, h: Hypothesis) -> float:
-        """Criterion of the ranking with few instants."""
-        return _rank(self.few, h)
-
     def run(self, start: Hypothesis) -> Step:
         """Return the corrected set-up. ``start``: the set-up as configured."""
         first = replace(Step(start), rank=self.rank(start))
@@ -308,7 +304,7 @@ class Search:
                 move
                 for j in joints
                 if len(joints) > 1
-                for move in scales.scale_moves(robot, j, h, self.few_rank, self.rank)
+                for move in scales.scale_moves(robot, j, h, partial(_rank, self.few), self.rank)
             ),
         )
         for move in singles:
