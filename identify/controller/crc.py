@@ -62,7 +62,7 @@ def identify_crc(
     *,
     length: int | Sequence[int] | None = None,
     velocity_loop: bool | None = None,
-    saturation: Array | None = None,
+    saturation: Array | None = None
 ) -> IdentifiedController:
     """Impulse response of each motor's controller from tracking error to torque.
 
@@ -94,11 +94,7 @@ def identify_crc(
 
 
 def _identify_joint(
-    error: list[Array],
-    motion: list[Array],
-    nu: list[Array],
-    lengths: Sequence[int],
-    structures: Sequence[bool],
+    error: list[Array], motion: list[Array], nu: list[Array], lengths: Sequence[int], structures: Sequence[bool]
 ) -> JointResponse:
     longest = max(lengths)
     best: tuple[float, JointResponse] | None = None

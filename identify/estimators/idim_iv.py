@@ -15,18 +15,13 @@ from armident.identify.regression.equations import (
     residual_norm,
     whitened_residuals,
 )
-from armident.identify.regression.iterations import ITERATIONS, iterate
+from armident.identify.regression.iterations import iterate
 from armident.identify.regression.iv import IvProducts, factored_parts, instrumented_parts, serial_covariance
 from armident.identify.signals.streamed import mapped
 
 
 def idim_iv(
-    blocks: Sequence[ExperimentEquations],
-    auxiliary: AuxiliaryModel,
-    start: Array,
-    iterations: int = ITERATIONS,
-    *,
-    serial_order: int = 0,
+    blocks: Sequence[ExperimentEquations], auxiliary: AuxiliaryModel, start: Array, *, serial_order: int = 0
 ) -> Estimate:
     """Iterate 2.33 with weights 2.24 to 2.26 on the instruments, the regressor and the torques alike.
 
@@ -38,8 +33,6 @@ def idim_iv(
         The simulated closed loop; its instruments pass the same filter.
     start
         First theta of the auxiliary model, shape (b,).
-    iterations
-        Most iterations.
     serial_order
         Highest order of an AR model of each joint's residuals, used for the covariance alone; 0: the residuals
         count as white (2.34).
@@ -61,7 +54,7 @@ def idim_iv(
         noise = joint_variances(blocks, estimate)
         return estimate, residual_norm(blocks, estimate, scale)
 
-    theta, done, converged, reason = iterate(step, start, iterations)
+    theta, done, converged, reason = iterate(step, start)
     noise = joint_variances(blocks, theta)
     zeta = auxiliary.instruments(theta)
     covariance = products(zeta).covariance

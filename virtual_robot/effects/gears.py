@@ -82,11 +82,7 @@ def twist_under(row: Array, torque: float) -> float:
 
 
 def gear_rows(
-    hidden: Sequence[Hidden],
-    robot: RobotConfig,
-    rotor: Array,
-    mass: Array,
-    least: Array,
+    hidden: Sequence[Hidden], robot: RobotConfig, rotor: Array, mass: Array, least: Array
 ) -> tuple[Array, Array]:
     """Rows (G, COLUMNS) of the elastic gears, and the inertia (G,) of the links that is assigned to each motor.
 
