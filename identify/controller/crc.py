@@ -62,7 +62,7 @@ def identify_crc(
     *,
     length: int | Sequence[int] | None = None,
     velocity_loop: bool | None = None,
-    saturation: Array | None = None
+    saturation: Array | None = None,
 ) -> IdentifiedController:
     """Impulse response of each motor's controller from tracking error to torque.
 
