@@ -69,10 +69,7 @@ class ServerReport:
 
 
 class Server:
-    """All virtual drives of a session on its buses (``with`` block), with the names of oddities by joint.
-
-    Raises ConfigError if a bus is missing or an EDS is unusable.
-    """
+    """All virtual drives of a session on its buses (``with`` block), with the names of oddities by joint."""
 
     def __init__(
         self,

@@ -154,10 +154,7 @@ class RecordingWriter:
     def append(
         self, stream: str, sync: NDArray[np.int64], t_ns: NDArray[np.int64], raw: Mapping[str, NDArray[Any]]
     ) -> None:
-        """Add rows to a stream.
-
-        SYNC numbers (N,), their receive times (N,), ns UTC, and raw values (N, n) of every field.
-        """
+        """Add rows to a stream: SYNC numbers (N,), receive times (N,), ns UTC, and raw values (N, n) of every field."""
         if len(sync) == 0:
             return
         channel, layout = self._layouts[stream]

@@ -82,10 +82,7 @@ def _map_stop(sdo: DriveSdo, rpdo: int) -> None:
 
 
 def _map_pdo(sdo: DriveSdo, communication: int, mapping: int, cob: int, entries: tuple[int, ...], every: int) -> None:
-    """Configure a PDO in the order of CiA 301 (section 7.5.2.36), as far as it differs.
-
-    Bit 30 of the COB-ID (no RTR) stays as the drive has it: it does not concern PDOs that answer SYNC.
-    """
+    """Configure a PDO in the order of CiA 301 (section 7.5.2.36), as far as it differs."""
     before = sdo.read(communication, 1, "I")
     mapped = read_mapping(sdo, mapping)
     right = mapped == entries and not (before ^ cob) & ~od.NO_RTR

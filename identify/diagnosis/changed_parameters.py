@@ -255,10 +255,7 @@ def _prior(change: Change, pool: Sequence[Change], criteria: Criteria) -> float:
 
 
 def _evidence(target: Array, columns: Array) -> tuple[float, float]:
-    """Logarithm of the likelihood of whitened differences (r,) with one change of the best size, and this size.
-
-    The variance of the rest is the larger of 1 and its mean square.
-    """
+    """Logarithm of the likelihood of whitened differences (r,) with one change of the best size, and this size."""
     u, s, _ = np.linalg.svd(columns, full_matrices=False)
     kept = s > RANK_TOLERANCE * max(float(s.max(initial=0.0)), 1e-300)
     along, s = u[:, kept].T @ target, s[kept]

@@ -200,10 +200,7 @@ class GravityDirection(TorqueDependent):
 
 
 class GravityDirectionOfVerticalJoint(GravityDirection):
-    """Tilt of the base of an arm whose first axis is vertical as configured.
-
-    Gravity along the axis never shows where the weight that turns with it is; across the axis it acts on that.
-    """
+    """Tilt of the base of an arm whose first axis is vertical as configured."""
 
     law = "vertical_joint"
     change_title = ""

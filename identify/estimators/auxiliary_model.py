@@ -41,10 +41,7 @@ class _Diverged(Exception):
 
 @dataclass(frozen=True)
 class Response:
-    """Response of the simulated loop, filtered and decimated like the equations.
-
-    ``torque``, ``position``: one (M, n) array per experiment, N m or N, rad or m.
-    """
+    """Simulated torques, N m or N, and positions, rad or m, (M, n) per experiment, filtered and decimated."""
 
     torque: tuple[Array, ...]
     position: tuple[Array, ...]

@@ -41,10 +41,7 @@ class InverseController:
         return cls(inverse, tuple(fit_spectrum(1.0 / row**2, order) for row in gain))
 
     def __call__(self, blocks: Sequence[ExperimentEquations]) -> list[ExperimentEquations]:
-        """The same equations, torques (M, n) and regressor (M, n, b), at the motors and through ``C_j^-1``.
-
-        An equation of a motor is kept where those of all joints that load it are.
-        """
+        """The same equations, torques (M, n) and regressor (M, n, b), at the motors and through ``C_j^-1``."""
         return [
             ExperimentEquations(
                 self._filtered(block.y @ self.to_motor),

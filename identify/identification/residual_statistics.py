@@ -83,10 +83,7 @@ class EffectDirection:
 def residual_statistics(
     prepared: Prepared, blocks: Sequence[ExperimentEquations], estimate: Estimate
 ) -> tuple[tuple[JointResidualStatistics, ...], tuple[EffectDirection, ...]]:
-    """Statistics of the residuals of every joint; the noise models of the estimate weigh them, else fitted ones.
-
-    Then the directions of changes for which the model has no parameter.
-    """
+    """Statistics of the residuals of every joint; the noise models of the estimate weigh them, else fitted ones."""
     noise: Sequence[ArModel] = estimate.noise
     if not any(ar.order for ar in noise):
         noise = noise_models(blocks, estimate.theta, estimate.covariance, MAX_AR_ORDER)

@@ -42,10 +42,7 @@ class Reach:
 
 
 def reach_of(robot: RobotConfig, home: Array, speeds: Array, accelerations: Array) -> Reach:
-    """Return the limits of motions of an arm whose recordings reach ``speeds`` and ``accelerations`` (n,) so far.
-
-    A motion is at most `FASTER` than they are, and a joint that never moved uses `FIRST_CONTACT` of its limits.
-    """
+    """Return the limits of motions of an arm whose recordings reach ``speeds`` and ``accelerations`` (n,) so far."""
     limits = [joint.limits for joint in robot.joints]
     bounds = np.array([limit.position for limit in limits])
     middle, half = bounds.mean(axis=1), 0.5 * (bounds[:, 1] - bounds[:, 0])

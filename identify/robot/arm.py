@@ -159,10 +159,7 @@ class ArmModel:
         sharp_sign: bool = False,
         out: Floats | None = None,
     ) -> Floats:
-        """Regressor (N, n, p - e) of the standard parameters without those of the terms.
-
-        ``out``: array to write into: zeros, or an earlier regressor of this model and length.
-        """
+        """Regressor (N, n, p - e) of the standard parameters without the terms'; ``out``: zeros, or an earlier one."""
         return self._regressor(self.columns, len(self.names) - self.e, q, qd, qdd, sharp_sign, out)
 
     def base_regressor(

@@ -249,11 +249,7 @@ def make_bench(
     working_rate: float = WORKING_RATE,
     known: Bench | None = None,
 ) -> Bench:
-    """Filter and differentiate recordings (SI, joint side, one rate); DataError if they are too short.
-
-    ``working_rate``: rate of the derivatives over the cut-off of the equations. ``known``: another bench of this
-    arm and motion, if there is one.
-    """
+    """Filter and differentiate recordings (SI, joint side, one rate); DataError if they are too short."""
     dt = experiments[0].dt
     bandwidth = motion_bandwidth([e.q for e in experiments], dt) if known is None else known.bandwidth
     cutoff = min(CUTOFF * bandwidth, 0.45 / dt)

@@ -408,10 +408,7 @@ def angle_between(a: Array, b: Array) -> float:
 
 
 def independent_rows(residual: Array) -> Array:
-    """Number (n,) of independent rows with the serial correlation of residuals (M, n), at least 4.
-
-    ``M (1 - r) / (1 + r)`` for the correlation r of neighbouring rows (Bartlett 1946).
-    """
+    """Number (n,), at least 4, of independent rows of serially correlated residuals (M, n) (Bartlett 1946)."""
     power = np.maximum((residual**2).sum(axis=0), 1e-300)
     r = np.clip((residual[1:] * residual[:-1]).sum(axis=0) / power, 0.0, 0.99)
     rows: Array = np.maximum(residual.shape[0] * (1 - r) / (1 + r), 4.0)

@@ -57,10 +57,7 @@ class ParameterSeries:
 
 
 class History:
-    """Identifications in a database (SQLAlchemy URL); missing or former tables are created or upgraded.
-
-    Raises ConfigError if the database or its driver is missing, or it is locked, damaged or of a newer version.
-    """
+    """Identifications in a database (SQLAlchemy URL); missing or former tables are created or upgraded."""
 
     def __init__(self, url: str = DEFAULT) -> None:
         self.url = shown(url)

@@ -70,10 +70,7 @@ class Row:
 
 @dataclass
 class _Baselines:
-    """The given baseline, or that of each arm, which an older recording that follows must not replace.
-
-    Documents stay in the history: ten thousand are gigabytes.
-    """
+    """The given baseline, or that of each arm, which an older recording that follows must not replace."""
 
     given: IdentificationDocument | None
     history: History
