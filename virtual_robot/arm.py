@@ -162,7 +162,7 @@ def design_drives(
     velocity_feedback: bool | None,
     period: float,
     scenario: Scenario | None,
-    parameters: ArmParameters
+    parameters: ArmParameters,
 ) -> servo.Servo:
     """Design the drives of a virtual arm: gains of the scenario, else of its configuration, else tuned ones."""
     given = None if scenario is None or scenario.controller is None else scenario.controller

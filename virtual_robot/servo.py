@@ -116,7 +116,7 @@ def tuned_drives(
     *,
     period: float | None = None,
     bandwidth_hz: Sequence[float] = BANDWIDTH_HZ,
-    known: Controller | None = None
+    known: Controller | None = None,
 ) -> Servo:
     """Design the drives of a virtual arm: a ``known`` controller (with velocity feedback), else tuned gains.
 

@@ -120,7 +120,7 @@ class PointToPointSearch:
         theta: ArrayLike | None,
         aim: EffectObjective | None,
         rng: np.random.Generator,
-        collision: CollisionModel | None = None
+        collision: CollisionModel | None = None,
     ) -> None:
         limits = [joint.limits for joint in robot.joints]
         bounds = np.array([limit.position for limit in limits])

@@ -151,7 +151,7 @@ def excluded(
     trajectory: Trajectory,
     theta: Array | None,
     collision: CollisionModel,
-    covariance: Array | None = None
+    covariance: Array | None = None,
 ) -> str | None:
     """Return the limit that a motion violates, in words."""
     try:
@@ -204,7 +204,7 @@ def excitation_of(
     theta: Array | None,
     collision: CollisionModel,
     duration: float = EXCITATION_S,
-    seed: int = 0
+    seed: int = 0,
 ) -> tuple[MotionChoice, Trajectory | None]:
     """Return an exciting trajectory within the reach; ``None`` with the reason if no trajectory keeps the limits."""
     joints = []

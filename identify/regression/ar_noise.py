@@ -86,7 +86,7 @@ def ar_models(
     *,
     keep: Sequence[NDArray[np.bool_]] | None = None,
     parameters: float = 0.0,
-    absorbed: Sequence[Array] | None = None
+    absorbed: Sequence[Array] | None = None,
 ) -> list[ArModel]:
     """AR model of the errors (M, n) of each joint (2.25, 2.26, 6.21 to 6.25); order at most a tenth of the samples.
 

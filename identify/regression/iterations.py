@@ -30,7 +30,7 @@ def iterate(
     step: Callable[[Array, int], tuple[Array, float]],
     start: Array,
     iterations: int = ITERATIONS,
-    tolerance: float = TOLERANCE
+    tolerance: float = TOLERANCE,
 ) -> Iterations:
     """Repeat ``step(theta, k)`` until theta and the residual norm change by at most ``tolerance``, relative.
 

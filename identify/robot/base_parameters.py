@@ -108,7 +108,7 @@ def independent_columns(
     columns: Columns,
     names: tuple[str, ...],
     candidates: Ints | None = None,
-    seed: int = 0
+    seed: int = 0,
 ) -> tuple[Ints, Array]:
     """Independent columns of a random regressor, and the dependence of the others on them (A.30 to A.35).
 

@@ -171,7 +171,7 @@ def rigid_torque(
     sine: Array,
     cosine: Array,
     work: Array,
-    tau: Array
+    tau: Array,
 ) -> None:
     """Compute the torques of the rigid chain, without friction and rotors, for one sample (A.22 to A.26).
 

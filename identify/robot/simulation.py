@@ -150,7 +150,7 @@ def friction(
     steep: Array,
     force: Array,
     slope: Array,
-    pair_slope: Array
+    pair_slope: Array,
 ) -> None:
     """Compute friction torques and their derivatives with respect to velocity (thesis equations 2.7, B.1).
 
@@ -230,7 +230,7 @@ def run(
     qdd: Array,
     tau: Array,
     joints: Sized,
-    couplings: Sized
+    couplings: Sized,
 ) -> int:
     """Simulate the closed loop; fill ``q, qd, qdd, tau`` from the state in the first row of ``q`` and ``qd``.
 

@@ -38,7 +38,7 @@ def differentiate(
     bandwidth_hz: float | None = None,
     *,
     q_ref: Array | None = None,
-    resolution: float | Sequence[float] | Array | None = None
+    resolution: float | Sequence[float] | Array | None = None,
 ) -> Derivatives:
     """Differentiate measured positions (N, n) twice.
 
@@ -109,7 +109,7 @@ def _ratios(
     derivatives: DerivativesName,
     nvr: float | Sequence[float] | Array | NvrRule | None,
     q_ref: Array | None,
-    resolution: float | Sequence[float] | Array | None
+    resolution: float | Sequence[float] | Array | None,
 ) -> tuple[NvrRule, list[float | None]]:
     """Return the rule, and the ratio of each joint if it is already known, otherwise ``None``."""
     n = q.shape[1]
